@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 import re
@@ -16,9 +15,8 @@ import shutil
 import signal
 import sqlite3
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,95 +24,24 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
+from commands import (
+    NEEDS_ROOT,
+    Result,
+    call,
+    refused,
+    run,
+    start,
+    tree,
+    unchanged,
+    without_progress,
+)
 from conftest import real
-from mp4ds.cli import app_for
 from mp4ds.plugins import demo as demo_of
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
 from waiting import WATCHDOG_S, until
 
 Compare = Callable[..., list[str]]
-ROOT = Path(mp4ds.__file__).parents[1]
-NEEDS_ROOT = "a file system can only be mounted by root"
-
-
-@dataclass(frozen=True)
-class Result:
-    """What a command did."""
-
-    code: int
-    out: str
-    err: str
-
-
-def without_progress(err: str) -> str:
-    """What is told of the progress depends on how long it takes."""
-    return re.sub(r"^\d\d:\d\d:\d\d (un)?packing .*\n", "", err, flags=re.MULTILINE)
-
-
-def call(*arguments: object) -> Result:
-    """A command in this process: its exit code and what it wrote, but for its progress."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            app_for()([str(argument) for argument in arguments])
-            code: Any = 0
-        except SystemExit as exit_:
-            code = exit_.code or 0
-    return Result(code, out.getvalue(), without_progress(err.getvalue()))
-
-
-def start(*arguments: object, **options: Any) -> subprocess.Popen[str]:
-    """A command as a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "mp4ds", *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **options.pop("env", {})},
-        **options,
-    )
-
-
-def run(*arguments: object, **options: Any) -> Result:
-    """A command as a process of its own: its exit code and what it wrote, but for its progress."""
-    with start(*arguments, **options) as process:
-        out, err = process.communicate(timeout=WATCHDOG_S)
-    return Result(process.returncode, out, without_progress(err))
-
-
-def tree(folder: Path) -> dict[str, str]:
-    """Everything below a folder, hidden files too: relative path -> SHA-256, link or ``/``."""
-    found = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_symlink():
-            content = f"-> {path.readlink()}"
-        elif path.is_dir():
-            content = "/"
-        elif path.is_file():
-            content = hashlib.sha256(path.read_bytes()).hexdigest()
-        else:
-            content = "special"
-        found[str(path.relative_to(folder))] = content
-    return found
-
-
-@contextlib.contextmanager
-def unchanged(folder: Path) -> Iterator[None]:
-    """Whatever is done, source, target and all beside them stay as they are."""
-    before = tree(folder)
-    yield
-    assert tree(folder) == before
-
-
-def refused(result: Result, code: int, *words: str) -> None:
-    """One sentence on stderr, with these words, and nothing on stdout."""
-    assert "Traceback" not in result.err
-    assert result.code == code, result.err
-    assert re.fullmatch(r"mp4ds: [^\n]+\n", result.err), result.err
-    for word in words:
-        assert word in result.err
-    assert result.out == ""
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from commands import call
 from mp4ds.dataset import collections
 from mp4ds.dataset.collections import datasets_in, each
 from mp4ds.errors import (
@@ -41,17 +42,6 @@ def drives(packed_bag: Path, tmp_path: Path) -> Path:
     (folder / "notes.txt").write_text("windy")
     (folder / "empty").mkdir()
     return folder
-
-
-def run(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mp4ds", *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-    )
 
 
 # ---------------------------------------------------------------- which
@@ -203,28 +193,30 @@ def test_all_are_unpacked(drives: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "more").exists()
 
 
-def test_the_table_of_all(drives: Path, tmp_path: Path) -> None:
-    done = run("info", "drives", folder=tmp_path)
-    lines = done.stdout.splitlines()
+def test_the_table_of_all(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = call("info", "drives")
+    lines = done.out.splitlines()
     assert [line.split()[0] for line in lines] == ["dataset", "a", "b", "deep/c", "3"]
-    rows = json.loads(run("info", "drives", "--json", folder=tmp_path).stdout)
+    rows = json.loads(call("info", "drives", "--json").out)
     one = brief(drives / "a")
     assert [row["messages"] for row in rows] == [one.messages] * 3
     assert re.search(rf" {3 * one.messages} ", lines[-1])
-    assert run("info", "drives", "--speed", folder=tmp_path).returncode == 2
+    assert call("info", "drives", "--speed").code == 2
 
 
-def test_all_are_validated(drives: Path, tmp_path: Path) -> None:
-    done = run("validate", "drives", folder=tmp_path)
-    assert (done.returncode, done.stdout) == (
+def test_all_are_validated(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = call("validate", "drives")
+    assert (done.code, done.out) == (
         0,
         "3 datasets: no problems; frames were not decoded (--deep does)\n",
     )
     (drives / "a" / "messages.mcap").unlink()
-    done = run("validate", "drives/a", "drives/b", "-j", "2", folder=tmp_path)
-    assert done.returncode == 1
-    assert "2 datasets: 1 problem in 1 of them" in done.stdout
-    rows = json.loads(run("validate", "drives", "--json", folder=tmp_path).stdout)
+    done = call("validate", "drives/a", "drives/b", "-j", "2")
+    assert done.code == 1
+    assert "2 datasets: 1 problem in 1 of them" in done.out
+    rows = json.loads(call("validate", "drives", "--json").out)
     assert [len(row["problems"]) for row in rows] == [1, 0, 0]
 
 

@@ -15,6 +15,7 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
+from commands import call
 from damage import Key, all_messages, pieces_of
 from mp4ds import FormatError, OptionError, SourceError, UnpackOptions
 from mp4ds.errors import VideoError
@@ -23,7 +24,6 @@ from mp4ds.records import Loss
 from player_scenes import RecordingPublisher
 from scenes import Record, Scene
 from sources import SOURCES, scene
-from test_bad_input import call
 
 FRAMES = 8
 CAMERAS = ("left", "right", "front")

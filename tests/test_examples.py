@@ -129,7 +129,8 @@ def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> No
     if not any(re.search(r"-o drive( |$)|pack drive[.]mcap$", line) for line in lines):
         shutil.copytree(demo_dataset, tmp_path / "drive")
     for line in lines:
-        run("bash", "-c", line, cwd=tmp_path)
+        brief = " --seconds 0.5" if line.startswith("mp4ds demo") else ""
+        run("bash", "-c", line + brief, cwd=tmp_path)
 
 
 def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
@@ -145,24 +146,7 @@ def test_the_list_of_commands_says_what_each_says_of_itself(name: str) -> None:
     assert (group.commands[name].help or "").splitlines()[0] == COMMANDS[name][1]
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        *(
-            "pack",
-            "unpack",
-            "export",
-            "play",
-            "record",
-            "evaluate",
-            "report",
-            "frames",
-            "validate",
-            "info",
-        ),
-        *("demo", "import images", "import ros-mp4"),
-    ],
-)
-def test_every_command_is_in_the_list_and_helps(command: str) -> None:
-    assert f"`mp4ds {command}" in (ROOT / "docs/commands.md").read_text()
-    assert "Usage" in run(sys.executable, "-m", "mp4ds", *command.split(), "--help", cwd=ROOT)
+def test_every_command_is_in_the_list() -> None:
+    text = (ROOT / "docs/commands.md").read_text()
+    for command in {*COMMANDS, "import images", "import ros-mp4"} - {"import", "repack"}:
+        assert f"`mp4ds {command}" in text

@@ -21,6 +21,7 @@ import yaml
 from PIL import Image
 
 import mp4ds
+from commands import call
 from export_scenes import (
     COLOUR,
     DEPTH,
@@ -764,25 +765,20 @@ def test_a_library_that_is_missing(
 # ---------------------------------------------------------------- the command
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "mp4ds", "export", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
 def test_the_command(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = run("tum", str(dataset), "-o", str(out), "-t", COLOUR, "--json")
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
+    done = call("export", "tum", dataset, "-o", out, "-t", COLOUR, "--json")
+    assert done.code == 0, done.err
+    told = json.loads(done.out)
     assert told["messages"] == {COLOUR: FRAMES}
     assert told["left_out"][GREY] == {"not selected": FRAMES}
     note = json.loads((out / "mp4ds_export.json").read_text())
     assert note["left_out"] == told["left_out"]
     with pytest.raises(mp4ds.TargetExistsError):
         mp4ds.export(dataset, "tum", out)
-    again = run("tum", str(dataset), "-o", str(out), "-t", DEPTH, "--force", "--every", "2")
-    assert again.returncode == 0, again.stderr
-    assert f"left out: {FRAMES // 2} messages of {DEPTH}: left out on request" in again.stdout
+    again = call("export", "tum", dataset, "-o", out, "-t", DEPTH, "--force", "--every", "2")
+    assert again.code == 0, again.err
+    assert f"left out: {FRAMES // 2} messages of {DEPTH}: left out on request" in again.out
     assert not (out / "rgb").exists()
 
 

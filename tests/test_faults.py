@@ -25,6 +25,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from commands import NEEDS_ROOT, run, start, tree
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.errors import Mp4dsError, PartsFailedError, SourceError, TargetError, WriteError
 from mp4ds.packing.options import PackOptions
@@ -32,7 +33,6 @@ from mp4ds.packing.work import command
 from mp4ds.plugins.demo import demo
 from round_trips import Compare, unpacked
 from sources import SOURCES, scene
-from test_bad_input import NEEDS_ROOT, run, start, tree
 from waiting import WATCHDOG_S, until
 
 IN_PARTS = PackOptions(window=3, codec="h264")

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from commands import call, refused, unchanged
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.reporting.report import ReportOptions, report
 from sources import SOURCES, scene
-from test_bad_input import call, refused, unchanged
 
 FOLDERS: dict[str, tuple[str, ...]] = {
     "pack": ("pack", "BAG", "--codec", "h264"),

@@ -24,7 +24,7 @@ from mp4ds import Mp4dsError
 from mp4ds.bags.formats import open_sources
 from sources import SOURCES, scene
 
-COUNT = 150
+COUNT = 90
 
 
 def _filled(size: int) -> str:

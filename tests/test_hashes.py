@@ -8,9 +8,6 @@ index, and counts a schema as often as it is told: such files are first written 
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +23,14 @@ from round_trips import journey, own_target, round_trip
 from scenes import Scene
 from sources import SOURCES, scene
 
-TOOL = shutil.which("pymcap-cli", path=str(Path(sys.executable).parent)) or shutil.which(
-    "pymcap-cli"
-)
-pytestmark = pytest.mark.skipif(
-    not TOOL, reason="pymcap-cli is not installed: pip install pymcap-cli, Python 3.10 or newer"
-)
+tool = pytest.importorskip("pymcap_cli.core.mcap_compare")
 
 
 def hash_of(path: Path) -> str:
-    """What the tool prints, or an empty string for a file that it refuses."""
-    done = subprocess.run(
-        [str(TOOL), "hash", str(path)], capture_output=True, text=True, check=False
-    )
-    return done.stdout.strip() if done.returncode == 0 else ""
+    """The hash of a file, which the tool must not refuse."""
+    found = tool.read_structural_identity_file(str(path))
+    assert found, f"the tool cannot read {path}"
+    return str(found.identity.digest)
 
 
 def storage_of(path: Path) -> Path:
@@ -105,7 +96,6 @@ def test_hashes_of_written_files(source: str, tmp_path: Path) -> None:
     done = journey(tmp_path, SOURCES[source], without_twins(scene("bgr8")), own_target(source))
     path = storage_of(done.sources[0])
     expected = hash_of(rewritten(path, tmp_path) if "unindexed" in source else path)
-    assert expected.startswith("mcap-index-v1:")
     assert hash_of(storage_of(done.output)) == expected
 
 
@@ -113,7 +103,6 @@ def test_hashes_of_written_files(source: str, tmp_path: Path) -> None:
 def test_hashes_of_coded_pictures(name: str, tmp_path: Path) -> None:
     done = journey(tmp_path, SOURCES["mcap-ros2-lz4"], without_twins(CODED[name]()), "mcap")
     expected = hash_of(done.sources[0])
-    assert expected.startswith("mcap-index-v1:")
     assert hash_of(done.output) == expected
 
 
@@ -121,7 +110,6 @@ def test_hashes_of_coded_pictures(name: str, tmp_path: Path) -> None:
 def test_hashes_of_foxglove_messages(source: str, tmp_path: Path) -> None:
     done = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE["jpeg-cut-one"](), "mcap")
     expected = hash_of(done.sources[0])
-    assert expected.startswith("mcap-index-v1:")
     assert hash_of(done.output) == expected
 
 
@@ -166,7 +154,6 @@ def test_hashes_of_real_files(name: str, tmp_path: Path) -> None:
     if path.name in TELLS_TWICE or not is_believed(path):
         path = rewritten(path, tmp_path)
     expected = hash_of(path)
-    assert expected.startswith("mcap-index-v1:")
     assert hash_of(output) == expected
 
 

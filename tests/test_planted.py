@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from commands import call, refused, tree
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.errors import PartsFailedError, TargetError
 from mp4ds.packing.manifest import dump_kept, load_kept
@@ -24,7 +25,6 @@ from mp4ds.packing.pack import pack_share
 from mp4ds.packing.workplace import Workplace
 from mp4ds.video.codecs import lossless_codecs, recipe_for, remade
 from sources import SOURCES, scene
-from test_bad_input import call, refused, tree
 
 IN_PARTS = PackOptions(window=3, codec="h264")
 WORK = ".out.mp4ds-part"

@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from commands import call
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from player_scenes import RecordingPublisher, make_drive, recorded
 from ros2_sides import alone_in_ros2
-from test_bad_input import call
 from waiting import WATCHDOG_S
 
 WAIT_S = WATCHDOG_S

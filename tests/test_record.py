@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from commands import call
 from mp4ds.bags.formats import open_sources
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError
@@ -36,7 +37,6 @@ from mp4ds.records import Message
 from record_scenes import PlayedSource, recorded
 from scenes import Scene, scene
 from sources import SOURCES
-from test_bad_input import call
 from waiting import WATCHDOG_S, until
 
 Compare = Callable[..., list[str]]

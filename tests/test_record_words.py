@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from commands import call
 from mp4ds.cli.record_words import known_words, spelled
 from mp4ds.errors import OptionError
 from roscore import RECORD
-from test_bad_input import call
 
 ROOT = Path(__file__).parents[1]
 JAZZY = {

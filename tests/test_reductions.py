@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED, MakeScene
+from commands import call
 from definitions import COMPRESSED, IMAGE, INFO
 from foxglove_scenes import FOXGLOVE
 from mp4ds.dataset.dataset import Dataset
@@ -557,16 +556,14 @@ def test_a_size_beyond_what_images_have(packed: Callable[..., Packed], tmp_path:
     assert not (tmp_path / "x.mcap").exists()
 
 
-@pytest.mark.slow
 def test_the_command_line(packed: Callable[..., Packed], tmp_path: Path) -> None:
     dataset = packed("raw-mono8").folder / "dataset"
-    command = [sys.executable, "-m", "mp4ds", "unpack", str(dataset), "--to", "mcap"]
+    command = ["unpack", dataset, "--to", "mcap"]
     command += ["--resize", "32x24", "--every", "2", "--max-rate", "1000"]
     output = tmp_path / "a.mcap"
-    done = subprocess.run([*command, "-o", str(output)], capture_output=True, text=True, check=True)
-    assert f"{TOPIC}: 4 messages left out" in done.stdout.splitlines()
+    done = call(*command, "-o", output)
+    assert f"{TOPIC}: 4 messages left out" in done.out.splitlines(), done.err
     images = [message.value for message in read(output) if message.type_name == IMAGE]
     assert [(value.width, value.height) for value in images] == [(32, 24)] * 4
-    again = [*command, "-o", str(tmp_path / "b.mcap"), "--json"]
-    done = subprocess.run(again, capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout)["thinned"] == {TOPIC: 4, "/cam/camera_info": 4}
+    done = call(*command, "-o", tmp_path / "b.mcap", "--json")
+    assert json.loads(done.out)["thinned"] == {TOPIC: 4, "/cam/camera_info": 4}

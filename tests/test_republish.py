@@ -9,8 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import product
@@ -24,6 +22,7 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED, MakeScene
+from commands import call
 from definitions import CODED_VIDEO, COMPRESSED, IMAGE, PACKET
 from encoders import cv, nal_units
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
@@ -1114,25 +1113,19 @@ def test_a_video_of_other_frames_is_refused(
     assert not output.exists()
 
 
-def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mp4ds", *map(str, arguments)], capture_output=True, text=True
-    )
-
-
 def test_the_command_line(packed: Pack, tmp_path: Path) -> None:
     made = packed("jpeg-cut-one", "mcap-ros2-zstd")
     arguments = ["unpack", made.folder / "dataset", "--to", "mcap", "--images", "png"]
-    done = command(*arguments, "--jpeg-quality", "80", "-o", tmp_path / "a.mcap")
-    assert done.returncode == 0, done.stderr
+    done = call(*arguments, "--jpeg-quality", "80", "-o", tmp_path / "a.mcap")
+    assert done.code == 0, done.err
     now = "/cam/image_raw/compressed_png, sensor_msgs/msg/CompressedImage"
-    assert f"/cam/image_raw/compressed: written as {now}" in done.stdout
-    assert "(the name /cam/image_raw/compressed is taken)" in done.stdout
-    assert "/cam/image_raw/compressed: 1 message as recorded: stored verbatim" in done.stdout
-    done = command(*arguments, "--json", "-o", tmp_path / "b.mcap")
-    told = json.loads(done.stdout)
+    assert f"/cam/image_raw/compressed: written as {now}" in done.out
+    assert "(the name /cam/image_raw/compressed is taken)" in done.out
+    assert "/cam/image_raw/compressed: 1 message as recorded: stored verbatim" in done.out
+    done = call(*arguments, "--json", "-o", tmp_path / "b.mcap")
+    told = json.loads(done.out)
     assert told["republished"]["/cam/image_raw/compressed"]["topic"].endswith("compressed_png")
     assert list(told["as_recorded"]["/cam/image_raw/compressed"].values()) == [1]
     for wrong in (["--images", "gif"], ["--jpeg-quality", "0"]):
-        done = command("unpack", made.folder / "dataset", "--to", "mcap", *wrong)
-        assert done.returncode == 2
+        done = call("unpack", made.folder / "dataset", "--to", "mcap", *wrong)
+        assert done.code == 2

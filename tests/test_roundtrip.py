@@ -36,7 +36,7 @@ def has_streams(folder: Path) -> bool:
     return bool(list(folder.glob("*.mp4")))
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("encoding", ["bayer_gbrg8", "mono16"])
 def test_every_source_returns_to_its_own_format(
@@ -49,7 +49,7 @@ def test_every_source_returns_to_its_own_format(
     assert compare(sources, output) == []
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("encoding", COMMON)
 @pytest.mark.parametrize("source", ["bag-lz4", "rosbag2-sqlite3-v9", "mcap-ros2-zstd"])
 def test_every_encoding_is_a_video_and_returns(
@@ -111,7 +111,7 @@ CROSSED = [
 ]
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("camera", "source", "target"), CROSSED)
 def test_from_any_ros_to_any_other(
     camera: str, source: str, target: str, tmp_path: Path, compare: Compare
@@ -218,7 +218,7 @@ REAL_FOLDERS = sorted(
 )
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", [*REAL, *REAL_FOLDERS] or ["bags"])
 def test_real_recordings_return(name: str, tmp_path: Path, compare: Compare) -> None:
     path = real(name)

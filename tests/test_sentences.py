@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from commands import call, refused, unchanged
 from mp4ds.cli import app_for, progress
 from mp4ds.cli.output import Column, print_table
 from scenes import START, Record, Scene
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
-from test_bad_input import call, refused, unchanged
 from test_terminal import Screen
 
 VIDEO, SIDECAR = "cam_image_raw.mp4", "cam_image_raw.yaml"

@@ -50,7 +50,7 @@ def hidden(dataset: Path) -> list[int]:
 # ---------------------------------------------------------------- of recordings and datasets
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("way", ["one-pass", "parts", "dataset", "dataset-anew", "unpack"])
 def test_what_is_taken(source: str, way: str, tmp_path: Path, compare: Compare) -> None:
@@ -81,7 +81,7 @@ def test_what_is_taken(source: str, way: str, tmp_path: Path, compare: Compare) 
     assert compare(paths, output) != []
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("trait", TRAITS)
 def test_of_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None:
     """Also where log times do not tell the order of messages, and so nothing can be copied."""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 
 import mp4ds
+from commands import call
 from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
 from mp4ds.options import time_of
 from mp4ds.plugins.reporting.proxies import Look
@@ -251,17 +250,12 @@ def test_what_cannot_be_saved(drive: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out.png").read_bytes() == b"mine"
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "mp4ds", "frames", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
 def test_the_command(drive: Path, tmp_path: Path) -> None:
     out = str(tmp_path / "out.png")
-    done = run(str(drive), "--topic", COLOUR, "--at", "+0.4", "-o", out)
-    assert done.returncode == 0, done.stderr
-    assert f"frame 12 of {COLOUR}" in done.stdout
-    assert run(str(drive), "--topic", COLOUR, "--at", "+0.4", "-o", out).returncode == 2
-    told = run(str(drive), "-t", COLOUR, "--sheet", "5x4", "-o", out, "--force", "--json")
-    assert len(json.loads(told.stdout)["frames"]) == 20
-    assert run(str(drive), "--topic", COLOUR, "--at", "+99", "-o", out, "-f").returncode == 2
+    done = call("frames", drive, "--topic", COLOUR, "--at", "+0.4", "-o", out)
+    assert done.code == 0, done.err
+    assert f"frame 12 of {COLOUR}" in done.out
+    assert call("frames", drive, "--topic", COLOUR, "--at", "+0.4", "-o", out).code == 2
+    told = call("frames", drive, "-t", COLOUR, "--sheet", "5x4", "-o", out, "--force", "--json")
+    assert len(json.loads(told.out)["frames"]) == 20
+    assert call("frames", drive, "--topic", COLOUR, "--at", "+99", "-o", out, "-f").code == 2

@@ -9,14 +9,14 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+import commands
 import mp4ds
-from mp4ds.cli import app_for
+from commands import Result
 from mp4ds.cli.progress import progress_of
 from scenes import Scene
 from sources import scene, write_mcap
@@ -33,23 +33,9 @@ class Screen(io.StringIO):
         return True
 
 
-@dataclass(frozen=True)
-class Result:
-    code: int
-    out: str
-    err: str
-
-
 def call(*arguments: object) -> Result:
     """A command in this process, on a terminal."""
-    out, err = Screen(), Screen()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            app_for()([str(argument) for argument in arguments])
-            code: Any = 0
-        except SystemExit as ended:
-            code = ended.code or 0
-    return Result(code, out.getvalue(), err.getvalue())
+    return commands.call(*arguments, screen=Screen)
 
 
 def drive() -> Scene:

@@ -64,7 +64,7 @@ def video_size(path: Path, samples: Sequence[Pixels], encoding: str, choice: Cho
 # ---------------------------------------------------------------- estimates
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_the_estimate_is_near_the_truth(encoding: str, tmp_path: Path) -> None:
     samples = scene(encoding, 24)
@@ -329,7 +329,7 @@ def test_an_archive_has_the_smallest() -> None:
     )
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_fast_forms_are_exact(
     encoding: str, tmp_path: Path, compare: Callable[..., list[str]]

@@ -1,0 +1,101 @@
+"""The command line, in this process or in one of its own, and what it leaves of folders."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mp4ds
+from mp4ds.cli import app_for
+from waiting import WATCHDOG_S
+
+ROOT = Path(mp4ds.__file__).parents[1]
+NEEDS_ROOT = "a file system can only be mounted by root"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a command did."""
+
+    code: int
+    out: str
+    err: str
+
+
+def without_progress(err: str) -> str:
+    """What is told of the progress depends on how long it takes."""
+    return re.sub(r"^\d\d:\d\d:\d\d (un)?packing .*\n", "", err, flags=re.MULTILINE)
+
+
+def call(*arguments: object, screen: Callable[[], io.StringIO] = io.StringIO) -> Result:
+    """A command in this process: its exit code and what it wrote, but for its progress."""
+    out, err = screen(), screen()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            app_for()([str(argument) for argument in arguments])
+            code: Any = 0
+        except SystemExit as exit_:
+            code = exit_.code or 0
+    return Result(code, out.getvalue(), without_progress(err.getvalue()))
+
+
+def start(*arguments: object, **options: Any) -> subprocess.Popen[str]:
+    """A command as a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "mp4ds", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **options.pop("env", {})},
+        **options,
+    )
+
+
+def run(*arguments: object, **options: Any) -> Result:
+    """A command as a process of its own: its exit code and what it wrote, but for its progress."""
+    with start(*arguments, **options) as process:
+        out, err = process.communicate(timeout=WATCHDOG_S)
+    return Result(process.returncode, out, without_progress(err))
+
+
+def tree(folder: Path) -> dict[str, str]:
+    """Everything below a folder, hidden files too: relative path -> SHA-256, link or ``/``."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_symlink():
+            content = f"-> {path.readlink()}"
+        elif path.is_dir():
+            content = "/"
+        elif path.is_file():
+            content = hashlib.sha256(path.read_bytes()).hexdigest()
+        else:
+            content = "special"
+        found[str(path.relative_to(folder))] = content
+    return found
+
+
+@contextlib.contextmanager
+def unchanged(folder: Path) -> Iterator[None]:
+    """Whatever is done, source, target and all beside them stay as they are."""
+    before = tree(folder)
+    yield
+    assert tree(folder) == before
+
+
+def refused(result: Result, code: int, *words: str) -> None:
+    """One sentence on stderr, with these words, and nothing on stdout."""
+    assert "Traceback" not in result.err
+    assert result.code == code, result.err
+    assert re.fullmatch(r"mp4ds: [^\n]+\n", result.err), result.err
+    for word in words:
+        assert word in result.err
+    assert result.out == ""
