@@ -136,9 +136,9 @@ def is_alive(pid: int) -> bool:
 def test_a_worker_ends_when_its_coordinator_is_killed(tmp_path: Path) -> None:
     """It waits for nobody: its standard input is closed then."""
     worker = (
-        "import os, sys, time, json, threading\n"
-        "from mp4ds.packing.work import _Orders\n"
-        "_Orders(['x']); print(json.dumps({'pid': os.getpid()}), flush=True); time.sleep(60)"
+        "import os, time\n"
+        "from mp4ds.packing.engine import serve, tell\n"
+        "serve(lambda: (tell({'pid': os.getpid()}), time.sleep(60)))"
     )
     coordinator = (
         "import sys\nfrom mp4ds.packing.engine import ProcessEngine\n"

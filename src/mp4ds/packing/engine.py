@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import io
 import json
+import os
 import queue
 import selectors
 import signal
 import subprocess
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -355,3 +358,58 @@ def _close(worker: _Worker) -> None:
         if stream is not None:
             with suppress(OSError):
                 stream.close()
+
+
+# ---------------------------------------------------------------- in such a process
+
+
+class _Orders:
+    """The tasks of this process: the first, then one for each line of its standard input.
+
+    If the input ends during a task, nobody waits for its result: the process exits.
+    """
+
+    def __init__(self, first: list[str]) -> None:
+        self._queue: queue.SimpleQueue[list[str] | None] = queue.SimpleQueue()
+        self._queue.put(first)
+        self._busy = True
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def _watch(self) -> None:
+        # unbuffered: Python could not end while another thread waits within a buffer
+        for line in io.FileIO(sys.stdin.fileno(), closefd=False):
+            self._queue.put(json.loads(line))
+        self._queue.put(None)
+        if self._busy:
+            os._exit(1)
+
+    def __iter__(self) -> Iterator[list[str]]:
+        while True:
+            self._busy = False
+            task = self._queue.get()
+            if task is None:
+                return
+            self._busy = True
+            yield task
+
+
+def tell(values: dict[str, Any]) -> None:
+    """Report to the `ProcessEngine` that started this process."""
+    sys.stdout.write(json.dumps(values) + "\n")
+    sys.stdout.flush()
+
+
+def serve(outcome_of: Callable[..., dict[str, Any]]) -> None:
+    """Run tasks in a process that a `ProcessEngine` started.
+
+    Args:
+        outcome_of: Runs a task, given its arguments. Returns what to report: ``error``, class name
+            and sentence, or ``done``; and ``ready`` if this process can take another task.
+    """
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    with suppress(BrokenPipeError):
+        for task in _Orders(sys.argv[1:]):
+            outcome = outcome_of(*task)
+            tell(outcome)
+            if not outcome.get("ready"):
+                sys.exit(0 if "done" in outcome else 1)

@@ -6,15 +6,10 @@ Every engine calls `run_task`. It is idempotent: if its result exists, it does n
 from __future__ import annotations
 
 import contextlib
-import io
-import json
-import os
-import queue
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +17,7 @@ from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import Mp4dsError, sentence_of
 from mp4ds.files.outputs import write_synced
 from mp4ds.files.sources import unchanged
-from mp4ds.packing.engine import give_back
+from mp4ds.packing.engine import give_back, serve, tell
 from mp4ds.packing.job import Job, Task, digest_source
 from mp4ds.packing.manifest import RECORD_NAME, Origin, PartRecord, dump_kept, write_manifest
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
@@ -136,46 +131,11 @@ def command(task: tuple[str, ...]) -> list[str]:
     return [sys.executable, "-m", "mp4ds.packing.work", *task]
 
 
-class _Orders:
-    """The tasks of this process: the first, then one for each line of its standard input.
-
-    If the input ends during a task, nobody waits for its result: the process exits.
-    """
-
-    def __init__(self, first: list[str]) -> None:
-        self._queue: queue.SimpleQueue[list[str] | None] = queue.SimpleQueue()
-        self._queue.put(first)
-        self._busy = True
-        threading.Thread(target=self._watch, daemon=True).start()
-
-    def _watch(self) -> None:
-        # unbuffered: Python could not end while another thread waits within a buffer
-        for line in io.FileIO(sys.stdin.fileno(), closefd=False):
-            self._queue.put(json.loads(line))
-        self._queue.put(None)
-        if self._busy:
-            os._exit(1)
-
-    def __iter__(self) -> Iterator[list[str]]:
-        while True:
-            self._busy = False
-            task = self._queue.get()
-            if task is None:
-                return
-            self._busy = True
-            yield task
-
-
-def _tell(values: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(values) + "\n")
-    sys.stdout.flush()
-
-
 def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
     """Run a task and report its outcome."""
     begun, used = time.monotonic(), time.process_time()
     try:
-        tasks.run(folder, name, _tell)
+        tasks.run(folder, name, tell)
     except MemoryError:
         return {"error": ("MemoryError", "out of memory; try fewer `jobs`")}
     except (Mp4dsError, OSError) as error:
@@ -204,15 +164,9 @@ def _memory(name: str) -> int:
 
 
 def _main() -> None:
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     with Tasks() as tasks:
-        for folder, name in _Orders(sys.argv[1:]):
-            outcome = _outcome(tasks, folder, name)
-            _tell(outcome)
-            if not outcome.get("ready"):
-                sys.exit(0 if "done" in outcome else 1)
+        serve(partial(_outcome, tasks))
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(BrokenPipeError):
-        _main()
+    _main()
