@@ -91,7 +91,7 @@ HOMES = {
     "cyclonedds": ("plugins/publishing", "plugins/recording"),
     "pyarrow": ("plugins/exporting",),
     "yaml": ("yamlio.py", "bags", "plugins/publishing"),
-    "pydantic": ("format", "dataset/checks.py"),
+    "pydantic": ("format", "dataset/checks.py", "plugins/evaluating"),
     "jsonschema": ("dataset/checks.py",),
 }
 

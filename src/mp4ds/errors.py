@@ -94,6 +94,15 @@ def reason_of(error: BaseException) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
+def size_text(count: float) -> str:
+    """A size in a suitable unit."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.2f} TB"
+
+
 def sentence_of(error: OSError) -> str:
     """A system error: where, and what; without a full stop."""
     return f"{path_text(error.filename or 'a file')}: {reason_of(error)}"

@@ -19,7 +19,7 @@ from unicodedata import east_asian_width
 
 import typer
 
-from mp4ds.errors import Mp4dsError, counted, path_text
+from mp4ds.errors import Mp4dsError, counted, path_text, size_text
 from mp4ds.options import iso_text, seconds_text
 from mp4ds.records import latched_text
 
@@ -98,15 +98,6 @@ def complain(value: object) -> None:
     """Print a line to stderr; failing to print it is not an error."""
     with suppress(OSError, ValueError):
         print(f"mp4ds: {shown(value)}", file=sys.stderr, flush=True)
-
-
-def size_text(count: float) -> str:
-    """A size in a suitable unit."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000:
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
-        count /= 1000
-    return f"{count:.2f} TB"
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
-from mp4ds.cli.output import is_quiet, shown, size_text
+from mp4ds.cli.output import is_quiet, shown
+from mp4ds.errors import size_text
 
 if TYPE_CHECKING:
     from rich.console import Console

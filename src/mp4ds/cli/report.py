@@ -18,11 +18,11 @@ from mp4ds.cli.options import (
     cores,
     takes,
 )
-from mp4ds.cli.output import print_json, printed, say, size_text
+from mp4ds.cli.output import print_json, printed, say
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
-from mp4ds.errors import OptionError, counted, path_text
+from mp4ds.errors import OptionError, counted, path_text, size_text
 from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary
 from mp4ds.plugins.reporting.report import report as run_report
 from mp4ds.plugins.reporting.stills import StillOptions

@@ -190,6 +190,15 @@ class VideoEncoder:
         except (FFmpegError, OSError):
             return
 
+    def __enter__(self) -> VideoEncoder:
+        return self
+
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
+        if exc_type is None:
+            self.close()
+        else:
+            self.abandon()
+
 
 def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
     """Size of the coded pictures, which is even where chroma is halved."""

@@ -33,38 +33,6 @@ STILL_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM", "WEBP")
 """Pillow's names of the formats allowed: some of its others run programs."""
 
 _GREY = ("1", "L", "LA")
-_COLOURS = ("RGB", "RGBA", "P", "CMYK", "YCbCr")
-
-
-def read_still(path: Path) -> tuple[str, NDArray[np.uint8]]:
-    """The pixels of an image file, without alpha.
-
-    Returns:
-        The ROS encoding, ``mono8`` or ``rgb8``, and pixels of shape (H, W) or (H, W, 3).
-
-    Raises:
-        SourceError: It is not an image, is too large, or has other than 8 bits.
-    """
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(path, formats=STILL_FORMATS) as image:
-                if max(image.size) > MAX_SIDE:
-                    raise SourceError(path, f"has sides of more than {MAX_SIDE} pixels")
-                if image.mode not in (*_GREY, *_COLOURS):
-                    raise SourceError(path, f"does not have 8-bit samples ({image.mode})")
-                is_grey = image.mode in _GREY
-                pixels = np.asarray(image.convert("L" if is_grey else "RGB"), np.uint8)
-    except SourceError:
-        raise
-    except (
-        OSError, ValueError, SyntaxError, EOFError,
-        Image.DecompressionBombError, Image.DecompressionBombWarning,
-    ) as error:  # fmt: skip
-        raise SourceError(path, f"cannot be read as an image: {error}") from None
-    return ("mono8" if is_grey else "rgb8"), pixels
 
 
 def png_file(rgb: NDArray[np.uint8]) -> bytes:

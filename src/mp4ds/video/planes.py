@@ -173,13 +173,14 @@ class PlaneSpool:
         path: The file to make; the caller removes it.
         width: Columns of a frame, even.
         height: Rows of a frame, even.
+        frames: How many frames an existing file has, to read it again; None: make a new one.
     """
 
-    def __init__(self, path: Path, width: int, height: int) -> None:
+    def __init__(self, path: Path, width: int, height: int, *, frames: int | None = None) -> None:
         self.width, self.height = width, height
         self._size = width * height * 3 // 2
-        self._file = path.open("w+b", buffering=0)
-        self._count = 0
+        self._file = path.open("w+b" if frames is None else "rb", buffering=0)
+        self._count = frames or 0
 
     def __len__(self) -> int:
         return self._count

@@ -10,307 +10,62 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+
+import numpy as np
 
 from mp4ds._version import __version__
-from mp4ds.errors import Refused, ScoringError, SourceError
+from mp4ds.errors import Refused, ScoringError, SourceError, counted
 from mp4ds.files.outputs import check_place, refuse_not_ours, work_folder, write_synced
-from mp4ds.files.urls import remote
-from mp4ds.plan import FileNames, Selection
-from mp4ds.plugins.evaluating.clips import (
-    Clip,
-    EvaluatedCamera,
-    EvaluatedSource,
-    chosen,
-    chosen_at_rate,
-    clip_seconds,
-    make_clip,
-    open_source,
-)
-from mp4ds.plugins.evaluating.options import (
-    EvaluateOptions,
-    Grid,
-    ScoreGoal,
-    Setting,
-    check_options,
-    first_guess,
-    grid_of,
-)
-from mp4ds.plugins.evaluating.page import write_files
+from mp4ds.files.urls import location, remote
+from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.packing.engine import Engine, ProcessEngine
+from mp4ds.plan import FileNames, Selection, visual_setting
+from mp4ds.plugins.cluster import ClusterEngine, Connection, check_address
+from mp4ds.plugins.evaluating.cameras import JPEG, Camera, open_cameras
+from mp4ds.plugins.evaluating.clips import Clip, chosen, chosen_at_rate, make_clip
+from mp4ds.plugins.evaluating.options import EvaluateOptions, ScoreGoal, Setting, settings_of
+from mp4ds.plugins.evaluating.page import PLOTS, write_files
 from mp4ds.plugins.evaluating.results import (
     CEILING_MARGIN,
     CameraEvaluation,
     Cell,
-    DataSet,
-    EvaluateProgress,
     Evaluation,
     RateRow,
     StorageRow,
     reachable_score,
     recommend,
     score_of,
-    storage,
 )
-from mp4ds.plugins.evaluating.trials import ClipPlace, Engines, Failure, Found, Trials, versions_of
-from mp4ds.video.codecs import MAX_CRF
+from mp4ds.plugins.evaluating.trials import (
+    CELLS,
+    PICTURES,
+    Trial,
+    command,
+    plain_recipe,
+    run_task,
+    try_out,
+    versions_of,
+)
+from mp4ds.video.codecs import AV1, MAX_CRF
+from mp4ds.video.images import jpeg_bytes
 from mp4ds.video.libvmaf import VMAF_MODEL, Ffmpeg, find_ffmpeg
-from mp4ds.video.scores import largest_crf
+from mp4ds.video.planes import rgb_of
+from mp4ds.video.scores import ScoreSummary, largest_crf
 
 _NEAR = 1.05  # rates that differ by less count as equal
 _SHORT = 30  # frames
 _MODEL_ROWS = 1080
-
-
-class CameraTrial:
-    """The trial of one camera.
-
-    Args:
-        camera: The camera.
-        name: Name for its files.
-        options: How.
-        grid: What to try.
-        trials: What runs it.
-        work: Folder for clips.
-        report: Called when something was done.
-    """
-
-    def __init__(
-        self,
-        camera: EvaluatedCamera,
-        name: str,
-        options: EvaluateOptions,
-        grid: Grid,
-        trials: Trials,
-        work: Path,
-        report: Callable[[EvaluateProgress], None] | None,
-    ) -> None:
-        self._camera = camera
-        self._name = name
-        self._options = options
-        self._target = options.wanted
-        self._grid = grid
-        self._trials = trials
-        self._work = work
-        self._report = report
-        self._notes: list[str] = []
-        self._done = 0
-        self._total = len(grid.settings())
-        self.known = 0  # settings with results of an earlier run
-
-    def run(self, origin: int) -> CameraEvaluation:
-        """Try all settings.
-
-        Args:
-            origin: Log time at which the source begins, nanoseconds.
-
-        Raises:
-            Refused: The camera's images are not usable.
-            ScoringError: No setting could be tried.
-        """
-        self._tell("reading")
-        place = self._clip(chosen(self._camera.times, origin, self._options), self._camera.rate)
-        try:
-            return self._evaluated(place)
-        finally:
-            place.path.unlink(missing_ok=True)
-
-    def _evaluated(self, place: ClipPlace) -> CameraEvaluation:
-        clip, target = place.clip, self._target
-        settings = self._grid.settings()
-        measured = self._trials.run(place, [None, *settings], self._count)
-        ceiling = _measured(measured, None)["scores"]
-        reachable = reachable_score(target, ceiling[target.metric].mean)
-        cells = self._cells(place, {item: measured[item] for item in settings})
-        self.known = sum(not self._trials.is_new(place, cell.setting) for cell in cells)
-        self._note(clip, reachable, cells)
-        recommended = recommend([(cells, reachable)], target)
-        rates = self._rates()
-        data_set = self._data_set()
-        rows: Sequence[StorageRow] = ()
-        if data_set is not None:
-            best = max(cells, key=lambda cell: score_of(cell, target))
-            wanted = recommended[0].setting if recommended else best.setting
-            shown = next(cell for cell in cells if cell.setting == wanted)
-            rows = storage(clip, place.path, shown, data_set)
-        return CameraEvaluation(
-            topic=clip.topic,
-            name=self._name,
-            encoding=clip.encoding,
-            size=clip.image_size,
-            rate=self._camera.rate,
-            frames=clip.frames,
-            start=clip.start,
-            seconds=clip_seconds(clip),
-            source_frames=clip.source_frames,
-            raw_bytes=clip.raw_bytes,
-            ceiling=ceiling,
-            target=target,
-            reachable=reachable,
-            cells=cells,
-            recommended=recommended,
-            rates=rates,
-            data_set=data_set,
-            storage=rows,
-            ground_truth=self._trials.picture(place, None),
-            notes=self._notes,
-        )
-
-    def _clip(self, indices: list[int], rate: float | None, suffix: str = "") -> ClipPlace:
-        path = self._work / f"{self._name}{suffix}.yuv"
-        return ClipPlace(make_clip(self._camera, indices, rate, path), path, self._name)
-
-    def _cells(self, place: ClipPlace, measured: dict[Setting | None, Found]) -> list[Cell]:
-        found = list(self._trials.cells(place, measured))
-        cells = [item for item in found if isinstance(item, Cell)]
-        failures = [item for item in found if isinstance(item, Failure)]
-        if not cells:
-            raise ScoringError(
-                f"{self._camera.topic}: no setting could be tried. {failures[0].sentence}"
-            )
-        told: dict[str, list[str]] = {}
-        for item in failures:
-            told.setdefault(item.sentence, []).append(item.setting.name if item.setting else "")
-        for sentence, names in told.items():
-            self._notes.append(f"not tried: {', '.join(names)}: {sentence}")
-        return cells
-
-    def _note(self, clip: Clip, reachable: float, cells: Sequence[Cell]) -> None:
-        target, options = self._target, self._options
-        if self._camera.lossy:
-            self._notes.append(
-                f"its images are already lossy ({self._camera.lossy}): scores measure the "
-                "distance from these, not from what the camera saw"
-            )
-        if reachable < target.score:
-            self._notes.append(
-                f"the clip scored against itself has {target.metric} "
-                f"{reachable + CEILING_MARGIN:.2f}, so the target is {CEILING_MARGIN} below that, "
-                f"{reachable:.2f} instead of {target.score:g}"
-            )
-        if all(score_of(cell, target) < reachable for cell in cells):
-            best = max(cells, key=lambda cell: score_of(cell, target))
-            self._notes.append(
-                f"no setting reaches {target.metric} {reachable:.2f}; the best is "
-                f"{best.setting.name} with {score_of(best, target):.2f}: try a lower --crf"
-            )
-        if clip.other_frames:
-            self._notes.append(
-                f"{clip.other_frames} images in the clip have a different size or encoding, or "
-                "cannot be read, and are left out"
-            )
-        if self._camera.is_jpeg:
-            self._notes.append(
-                "was recorded as JPEG files, which `mp4ds pack --transcode` re-encodes"
-            )
-        if clip.frames < _SHORT:
-            self._notes.append(f"a clip of {clip.frames} frames says little: give more --frames")
-        if clip.height > _MODEL_ROWS and "vmaf" in cells[0].scores:
-            self._notes.append(
-                f"{VMAF_MODEL} is made for {_MODEL_ROWS} rows; it is used for {clip.height} rows "
-                "too, instead of the 4K model, so that cameras are comparable"
-            )
-        if options.jobs > 1 or options.cluster:
-            self._notes.append("times were measured with several settings running at once")
-        machines = sorted({cell.machine for cell in cells} - {""})
-        if len(machines) > 1:
-            self._notes.append(
-                f"times were measured on {len(machines)} machines, {', '.join(machines)}, and are "
-                "comparable only if these are alike"
-            )
-
-    # ------------------------------------------------------------ rates
-
-    def _rates(self) -> list[RateRow]:
-        rows = []
-        for rate in sorted(set(self._options.rates)):
-            own = self._camera.rate
-            if own is None or rate > own * _NEAR:
-                self._notes.append(
-                    f"has fewer than {rate:g} images per second: not tried at this rate"
-                )
-                continue
-            self._tell(f"looking for the crf at {rate:g} Hz")
-            indices = chosen_at_rate(self._camera.times, rate, self._options.frames)
-            place = self._clip(indices, min(rate, own), f"-{rate:g}hz")
-            try:
-                codec, presets = next(iter(self._grid.presets.items()))
-                rows += [self._rate_row(place, rate, codec, preset) for preset in presets]
-            finally:
-                place.path.unlink(missing_ok=True)
-        return rows
-
-    def _rate_row(self, place: ClipPlace, rate: float, codec: str, preset: str) -> RateRow:
-        target = self._target
-        original = _measured(self._trials.run(place, [None]), None)
-        ceiling = original["scores"][target.metric].mean
-        cells: dict[int, Cell] = {}
-
-        def score(crf: int) -> float:
-            setting = Setting(codec, preset, crf, self._grid.gop)
-            measured = self._trials.run(place, [setting])
-            _measured(measured, setting)
-            (cells[crf],) = (
-                cell for cell in self._trials.cells(place, measured) if isinstance(cell, Cell)
-            )
-            return score_of(cells[crf], target)
-
-        crf, reached, tried = largest_crf(
-            score,
-            reachable_score(target, ceiling),
-            guess=first_guess(codec, rate),
-            largest=MAX_CRF[codec],
-        )
-        cell = cells[crf]
-        return RateRow(
-            rate=rate,
-            frames=place.clip.frames,
-            setting=cell.setting,
-            reached=reached,
-            score=score_of(cell, target),
-            frame_bytes=cell.frame_bytes,
-            frame_seconds=cell.encode_seconds / place.clip.frames,
-            kbps=cell.frame_bytes * rate * 8 / 1000,
-            ceiling=ceiling,
-            tried=tried,
-        )
-
-    # ------------------------------------------------------------ the rest
-
-    def _data_set(self) -> DataSet | None:
-        rate = self._camera.rate
-        if rate is None:
-            self._notes.append("has no frame rate, so no storage estimate is given")
-            return None
-        return DataSet(self._options.streams or 1, self._options.hours or 1.0, rate)
-
-    def _count(self, done: int) -> None:
-        self._done = done
-        self._tell("trying settings")
-
-    def _tell(self, what: str) -> None:
-        if self._report is not None:
-            self._report(EvaluateProgress(self._camera.topic, what, self._done, self._total))
-
-
-def _measured(found: dict[Setting | None, Found], setting: Setting | None) -> dict[str, Any]:
-    """The measurements of a setting.
-
-    Raises:
-        ScoringError: There are none; says why.
-    """
-    values = found[setting]
-    if isinstance(values, Failure):
-        raise ScoringError(values.sentence)
-    return values
-
-
-# ---------------------------------------------------------------- evaluate
-
-_FOLDERS = ("cells", "pictures", "plots")
+_JPEG_FRAMES = 20
+_DAY = 86_400
+_FOLDERS = (CELLS, PICTURES, PLOTS)
 _WORK = "work-"
 _NOTE_NAME = "mp4ds_evaluation.json"  # marks folders made by an evaluation
+
+Progress = Callable[[str, float | None], None]
 
 
 def evaluate(
@@ -318,7 +73,7 @@ def evaluate(
     options: EvaluateOptions | None = None,
     *,
     output: Path | str | None = None,
-    progress: Callable[[EvaluateProgress], None] | None = None,
+    progress: Progress | None = None,
 ) -> Evaluation:
     """Compare a grid of encoder settings on clips of a recording's cameras.
 
@@ -327,7 +82,7 @@ def evaluate(
         options: How.
         output: Folder of the results; None: ``NAME_evaluation`` in the current folder. Existing
             results are reused.
-        progress: Called when something was done.
+        progress: Called now and then with a phrase, and the share of settings done.
 
     Returns:
         The results; the folder has them as tables, plots and a page.
@@ -342,33 +97,39 @@ def evaluate(
         RemoteError: A store or web server fails.
         OSError: It cannot be written.
     """
-    chosen = options or EvaluateOptions()
-    check_options(chosen)
-    grid = grid_of(chosen)
-    engines = Engines(chosen, len(grid.settings()) + 1)
-    versions = versions_of(_ffmpeg(chosen.wanted))
-    with open_source(source, fps=chosen.fps) as found:
-        folder = _folder(found.path, output)
-        with _work_in(folder) as work, engines:
-            trials = Trials(
-                folder, work, engines, versions=versions, threads=chosen.encoder_threads
-            )
-            result = Evaluation(found.path, folder, [], dict(found.left_out), versions)
-            names = FileNames()
-            origin = _origin(found)
-            for camera in _selected(found, chosen):
+    asked = options or EvaluateOptions()
+    target, settings = asked.wanted, settings_of(asked)
+    if asked.cluster:
+        check_address(asked.cluster)
+    place, versions = location(source), versions_of(_ffmpeg(target))
+    with open_cameras(place, asked.fps) as (found, left_out):
+        cameras = [camera for camera in found if len(camera.times)]
+        cameras = _selected(cameras, left_out, asked)
+        # judging by its cameras
+        origin = min((int(camera.times[0]) for camera in found if len(camera.times)), default=0)
+        result = Evaluation(place, _folder(place, output), [], left_out, versions)
+        names = FileNames()
+        with _work_in(result.output) as work, _engine(asked, len(settings) + 1) as engine:
+            for number, camera in enumerate(cameras):
+
+                def tell(what: str, share: float, number: int = number) -> None:
+                    if progress is not None:
+                        topic = cameras[number].topic
+                        progress(f"{topic}: {what}", (number + share) / len(cameras))
+
                 name, _ = names.name_for(camera.topic)
-                trial = CameraTrial(camera, name, chosen, grid, trials, work, progress)
+                run = _CameraRun(camera, name, settings, asked, result, work, engine, tell)
                 try:
-                    result.cameras.append(trial.run(origin))
-                    result.known += trial.known
+                    result.cameras.append(run.evaluate(origin))
                 except Refused as reason:
-                    result.left_out[camera.topic] = str(reason)
-        _refuse_none(result)
+                    left_out[camera.topic] = str(reason)
+        if not result.cameras:
+            reasons = "; ".join(f"{topic} {reason}" for topic, reason in left_out.items())
+            why = f": {reasons}" if reasons else ""
+            raise SourceError(place, f"has no camera to try settings on{why}")
         rated = [(camera.cells, camera.reachable) for camera in result.cameras]
-        result.recommended = recommend(rated, chosen.wanted)
-        result.tried = sum(len(camera.cells) for camera in result.cameras) - result.known
-        write_files(result, chosen)
+        result.recommended = recommend(rated, target)
+        write_files(result, asked)
     return result
 
 
@@ -383,11 +144,19 @@ def _ffmpeg(target: ScoreGoal) -> Ffmpeg | None:
         return None
 
 
+def _selected(
+    cameras: Sequence[Camera], left_out: dict[str, str], options: EvaluateOptions
+) -> list[Camera]:
+    selection = Selection(options.topics, options.exclude)
+    selection.check([*(camera.topic for camera in cameras), *left_out])
+    wanted = (camera for camera in cameras if selection(camera.topic))
+    return sorted(wanted, key=lambda camera: camera.topic)
+
+
 def _folder(source: Path, output: Path | str | None) -> Path:
     name = output or f"{source.name if source.is_dir() else source.stem}_evaluation"
     target = Path(os.path.abspath(name))  # noqa: PTH100 - keeps links, unlike resolve()
-    sources = [] if remote(source) else [source]
-    check_place(target, sources)
+    check_place(target, [] if remote(source) else [source])
     if os.path.lexists(target) and not _is_evaluation(target):
         refuse_not_ours(target, None)
     return target
@@ -414,25 +183,231 @@ def _work_in(folder: Path) -> Iterator[Path]:
         yield work
 
 
-def _origin(source: EvaluatedSource) -> int:
-    """Log time at which the source begins, judging by its cameras, nanoseconds."""
-    return min((int(camera.times[0]) for camera in source.cameras if len(camera.times)), default=0)
-
-
-def _selected(source: EvaluatedSource, options: EvaluateOptions) -> Iterator[EvaluatedCamera]:
-    selection = Selection(options.topics, options.exclude)
-    selection.check([*(camera.topic for camera in source.cameras), *source.left_out])
-    return (
-        camera
-        for camera in sorted(source.cameras, key=lambda item: item.topic)
-        if selection(camera.topic) and len(camera.times)
-    )
-
-
-def _refuse_none(result: Evaluation) -> None:
-    if result.cameras:
+@contextmanager
+def _engine(options: EvaluateOptions, most: int) -> Iterator[Engine]:
+    """What runs up to so many trials at a time."""
+    if options.cluster is None:
+        yield ProcessEngine(command, options.jobs)
         return
-    reasons = "; ".join(f"{topic} {reason}" for topic, reason in result.left_out.items())
-    raise SourceError(
-        result.source, f"has no camera to try settings on{f': {reasons}' if reasons else ''}"
-    )
+    with Connection(options.cluster, most) as connection:
+        yield ClusterEngine(run_task, connection)
+
+
+# ---------------------------------------------------------------- one camera
+
+
+@dataclass
+class _CameraRun:
+    """The trials of one camera.
+
+    Attributes:
+        camera: The camera.
+        name: For names of files.
+        settings: What to try.
+        options: Of the evaluation.
+        result: Of the evaluation; what was tried is counted there.
+        work: Folder for temporary files.
+        engine: Runs the trials.
+        tell: Called with what is done, and the share of it.
+        notes: What is worth knowing.
+    """
+
+    camera: Camera
+    name: str
+    settings: Sequence[Setting]
+    options: EvaluateOptions
+    result: Evaluation
+    work: Path
+    engine: Engine
+    tell: Callable[[str, float], None]
+    notes: list[str] = field(default_factory=list)
+
+    def evaluate(self, origin: int) -> CameraEvaluation:
+        """Try all settings.
+
+        Args:
+            origin: Log time at which the source begins, nanoseconds.
+
+        Raises:
+            Refused: The camera's images are not usable.
+            ScoringError: No setting could be tried.
+        """
+        self.tell("reading", 0)
+        target = self.options.wanted
+        indices = chosen(self.camera.times, origin, self.options)
+        with self._clip(indices, self.camera.rate) as trial:
+            ceiling = self._ceiling(trial)
+            reachable = reachable_score(target, ceiling)
+            cells = self._cells(trial)
+            found = CameraEvaluation(
+                topic=self.camera.topic,
+                name=self.name,
+                clip=trial.clip,
+                ceiling=ceiling,
+                target=target,
+                reachable=reachable,
+                cells=cells,
+                recommended=recommend([(cells, reachable)], target),
+                ground_truth=trial.picture,
+                notes=self.notes,
+            )
+            self.notes += _notes(found, self.camera.lossy, self.options)
+            if self.camera.rate is not None:
+                self._estimate(found, trial.work, self.camera.rate)
+        found.rates = list(self._rates())
+        return found
+
+    @contextmanager
+    def _clip(self, indices: list[int], rate: float | None) -> Iterator[Trial]:
+        """A clip, as a trial that encodes nothing."""
+        # a folder of its own: a worker taken for lost may still be reading the clip before it
+        with TemporaryDirectory(dir=self.work, ignore_cleanup_errors=True) as folder:
+            yield Trial(
+                camera=self.name,
+                clip=make_clip(self.camera, indices, rate, Path(folder)),
+                setting=None,
+                threads=self.options.encoder_threads,
+                versions=self.result.versions,
+                work=Path(folder),
+                output=self.result.output,
+            )
+
+    def _ceiling(self, trial: Trial) -> dict[str, ScoreSummary]:
+        """The scores of a clip against itself, without which others are useless.
+
+        Raises:
+            ScoringError: It cannot be scored.
+        """
+        ((_, found, _),) = try_out([trial], self.engine)
+        if not isinstance(found, dict):
+            raise ScoringError(str(found))
+        return found
+
+    def _cells(self, trial: Trial) -> list[Cell]:
+        cells: list[Cell] = []
+        failures: dict[str, list[str]] = {}
+        trials = [replace(trial, setting=setting) for setting in self.settings]
+
+        def count(done: int) -> None:
+            self.tell(f"{done} of {len(trials)} settings", done / len(trials))
+
+        for tried, found, is_known in try_out(trials, self.engine, count):
+            if isinstance(found, Cell):
+                cells.append(found)
+                self.result.known += is_known
+                self.result.tried += not is_known
+            elif tried.setting is not None:
+                failures.setdefault(str(found), []).append(tried.setting.name)
+        if not cells:
+            reason = next(iter(failures))
+            raise ScoringError(f"{self.camera.topic}: no setting could be tried. {reason}")
+        for sentence, names in failures.items():
+            self.notes.append(f"not tried: {', '.join(names)}: {sentence}")
+        return cells
+
+    def _estimate(self, found: CameraEvaluation, work: Path, rate: float) -> None:
+        """Estimate the cost of storing a data set, in several forms."""
+        streams, hours, clip = self.options.streams or 1, self.options.hours or 1.0, found.clip
+        frames = streams * hours * 3600 * rate
+        found.data_set = (
+            f"{counted(streams, 'camera')} for {hours:g} hour{'s' * (hours != 1)} "
+            f"at {rate:.2f} Hz, {frames:.0f} frames"
+        )
+        encoding, (width, height) = ENCODINGS[clip.encoding], clip.image_size
+        sizes = {
+            "raw": float(encoding.size(width * encoding.pixel_bytes, height)),
+            "YUV 4:4:4": 3.0 * width * height,
+            "RGB": 3.0 * width * height,
+            **{f"JPEG {quality}": _jpeg_bytes(clip, work, quality) for quality in (90, 75)},
+        }
+        best = max(found.cells, key=lambda cell: score_of(cell, found.target)).setting
+        setting = found.recommended[0].setting if found.recommended else best
+        cell = next(cell for cell in found.cells if cell.setting == setting)
+        days = frames / clip.frames / _DAY
+        found.storage = [
+            *(StorageRow(form, size, size * frames / 1e9) for form, size in sizes.items()),
+            StorageRow(
+                setting.name,
+                cell.frame_bytes,
+                cell.frame_bytes * frames / 1e9,
+                days=cell.encode_seconds * days,
+                cpu_days=cell.encode_cpu_seconds * days,
+            ),
+        ]
+
+    def _rates(self) -> Iterator[RateRow]:
+        first, own = self.settings[0], self.camera.rate
+        presets = dict.fromkeys(item.preset for item in self.settings if item.codec == first.codec)
+        for rate in sorted(set(self.options.rates)):
+            if own is None or rate > own * _NEAR:
+                self.notes.append(
+                    f"has fewer than {rate:g} images per second: not tried at this rate"
+                )
+                continue
+            self.tell(f"looking for the crf at {rate:g} Hz", 1)
+            indices = chosen_at_rate(self.camera.times, rate, self.options.frames)
+            with self._clip(indices, min(rate, own)) as trial:
+                for preset in presets:
+                    yield self._rate_row(trial, rate, replace(first, preset=preset))
+
+    def _rate_row(self, trial: Trial, rate: float, setting: Setting) -> RateRow:
+        target, ceiling = self.options.wanted, self._ceiling(trial)
+        cells: dict[int, Cell] = {}
+
+        def score(crf: int) -> float:
+            tried = replace(trial, setting=replace(setting, crf=crf))
+            ((_, found, _),) = try_out([tried], self.engine)
+            if not isinstance(found, Cell):
+                raise ScoringError(str(found))
+            cells[crf] = found
+            return score_of(found, target)
+
+        usual, _ = visual_setting(rate)  # for AV1
+        crf, reached, _ = largest_crf(
+            score,
+            reachable_score(target, ceiling),
+            guess=usual if setting.codec in AV1 else usual - 2,
+            largest=MAX_CRF[setting.codec],
+        )
+        return RateRow(rate, trial.clip.frames, cells[crf], reached, ceiling[target.metric].mean)
+
+
+def _jpeg_bytes(clip: Clip, work: Path, quality: int) -> float:
+    """Mean bytes of JPEG files of some frames of a clip."""
+    recipe, is_grey = plain_recipe(clip), clip.picture_format == "gray"
+    numbers = np.unique(np.linspace(0, clip.frames - 1, _JPEG_FRAMES).round().astype(int))
+    with closing(clip.open(work)) as frames:
+        pictures = (rgb_of(frames.frame(number), recipe) for number in numbers.tolist())
+        sizes = [jpeg_bytes(picture, quality, is_grey=is_grey) for picture in pictures]
+    return sum(sizes) / len(sizes)
+
+
+def _notes(found: CameraEvaluation, lossy: str, options: EvaluateOptions) -> list[str]:
+    """What is worth knowing about the figures."""
+    clip, metric, reachable = found.clip, found.target.metric, found.reachable
+    best = max(found.cells, key=lambda cell: score_of(cell, found.target))
+    reached, machines = score_of(best, found.target), sorted({c.machine for c in found.cells})
+    notes = {
+        f"its images are already lossy ({lossy}): scores measure the distance from these, not "
+        "from what the camera saw": bool(lossy),
+        f"the clip scored against itself has {metric} {reachable + CEILING_MARGIN:.2f}, so the "
+        f"target is {CEILING_MARGIN} below that, {reachable:.2f} instead of "
+        f"{found.target.score:g}": reachable < found.target.score,
+        f"no setting reaches {metric} {reachable:.2f}; the best is {best.setting.name} with "
+        f"{reached:.2f}: try a lower --crf": reached < reachable,
+        f"{clip.left_out} images in the clip have a different size or encoding, or cannot be "
+        "read, and are left out": clip.left_out > 0,
+        "was recorded as JPEG files, which `mp4ds pack --transcode` re-encodes": lossy == JPEG,
+        f"a clip of {clip.frames} frames says little: give more --frames": clip.frames < _SHORT,
+        f"{VMAF_MODEL} is made for {_MODEL_ROWS} rows; it is used for {clip.size[1]} rows too, "
+        "instead of the 4K model, so that cameras are comparable": (
+            clip.size[1] > _MODEL_ROWS and "vmaf" in best.scores
+        ),
+        "times were measured with several settings running at once": (
+            options.jobs > 1 or bool(options.cluster)
+        ),
+        f"times were measured on {len(machines)} machines, {', '.join(machines)}, and are "
+        "comparable only if these are alike": len(machines) > 1,
+        "has no frame rate, so no storage estimate is given": clip.rate is None,
+    }
+    return [note for note, applies in notes.items() if applies]

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from mp4ds.errors import OptionError
 from mp4ds.options import Options, cluster, option, parse_words
-from mp4ds.plan import visual_setting
 from mp4ds.video.codecs import AV1, LOSSY_GOP, MAX_CRF, check_codec, codec_name
 from mp4ds.video.scores import METRICS
 
@@ -22,7 +21,8 @@ _DEFAULT_PRESETS = {
     "h265": ("medium",),
 }
 _MOST_CELLS = 10_000
-_CRF = re.compile(r"([0-9]{1,4})(?::([0-9]{1,4})(?::([0-9]{1,4}))?)?")
+_LEAST, _MOST = 0.001, 1_000_000  # of seconds, hours and hertz
+_CRF = re.compile(r"(?P<first>[0-9]{1,4})(:(?P<last>[0-9]{1,4})(:(?P<step>[0-9]{1,4}))?)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class Setting:
 
     Attributes:
         codec: ``av1``, ``av1-10bit``, ``h264`` or ``h265``.
-        preset: Of its encoder; empty if it has none.
+        preset: Of its encoder.
         crf: Constant rate factor.
         gop: Most frames between key frames.
     """
@@ -44,14 +44,13 @@ class Setting:
     @property
     def name(self) -> str:
         """A short name, unique within a grid."""
-        return " ".join(filter(None, (self.codec, self.preset, f"crf {self.crf}")))
+        return f"{self.codec} {self.preset} crf {self.crf}"
 
     @property
     def pack_options(self) -> str:
         """The corresponding options of ``mp4ds pack``."""
-        preset = f" --preset {self.preset}" if self.preset else ""
         gop = f" --gop {self.gop}" if self.gop != LOSSY_GOP else ""
-        return f"--quality crf={self.crf} --codec {self.codec}{preset}{gop}"
+        return f"--quality crf={self.crf} --codec {self.codec} --preset {self.preset}{gop}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +64,6 @@ class ScoreGoal:
 
     metric: str = "vmaf"
     score: float = 99.5
-
-    def __str__(self) -> str:
-        return f"{self.metric}={self.score:g}"
 
 
 def _rates(text: str) -> tuple[float, ...]:
@@ -101,11 +97,13 @@ class EvaluateOptions(Options):
     topics: Sequence[str] = option("Only matching cameras.", (), "-t", metavar="GLOB")
     exclude: Sequence[str] = option("Leave out matching cameras.", (), "-x", metavar="GLOB")
     start: float | None = option(
-        "Where the clips start; default: in the middle.", metavar="SECONDS"
+        "Where the clips start; default: in the middle.", metavar="SECONDS", least=0, most=_MOST
     )
-    duration: float | None = option("Length of the clips, instead of `frames`.", metavar="SECONDS")
+    duration: float | None = option(
+        "Length of the clips, instead of `frames`.", metavar="SECONDS", least=_LEAST, most=_MOST
+    )
     frames: int = option("Frames per clip.", 150, least=1)
-    fps: float = option("Frame rate of a folder of images.", 30.0)
+    fps: float = option("Frame rate of a folder of images.", 30.0, least=_LEAST, most=_MOST)
     target: str = option("Score to reach, such as vmaf=99.5, psnr_y=42 or ssim=0.98.", "vmaf=99.5")
     rates: Sequence[float] = option(
         "Also find the crf that reaches the target at these frame rates, such as 2,5,10,20,30,60.",
@@ -114,7 +112,9 @@ class EvaluateOptions(Options):
         parse=_rates,
     )
     streams: int | None = option("Number of cameras, to estimate the size of a dataset.", least=1)
-    hours: float | None = option("Hours of recording, to estimate the size of a dataset.")
+    hours: float | None = option(
+        "Hours of recording, to estimate the size of a dataset.", least=_LEAST, most=_MOST
+    )
     gop: int = option("Maximum key frame interval in frames.", LOSSY_GOP, least=1, most=100_000)
     threads: int | None = option(
         "Threads per encoder; default: all cores, or one on a cluster.", least=1, most=1024
@@ -123,6 +123,16 @@ class EvaluateOptions(Options):
         "Settings tried in parallel; use 1 for accurate times.", 1, "-j", least=1, most=1024
     )
     cluster: str | None = cluster()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for rate in self.rates:
+            if not _LEAST <= rate <= _MOST:
+                raise OptionError(f"`rates` {rate:g} is not from {_LEAST} to {_MOST}.")
+        if self.cluster and self.jobs != 1:
+            raise OptionError(
+                "`jobs` is for this machine; a `cluster` decides how many run at once."
+            )
 
     @property
     def encoder_threads(self) -> int:
@@ -141,33 +151,8 @@ class EvaluateOptions(Options):
         return parse_target(self.target)
 
 
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """The settings to try.
-
-    Attributes:
-        presets: Of each codec, in the requested order.
-        crfs: Increasing.
-        gop: Most frames between key frames.
-    """
-
-    presets: dict[str, tuple[str, ...]]
-    crfs: tuple[int, ...]
-    gop: int
-
-    def settings(self) -> list[Setting]:
-        """All of them; a codec is not tried with a crf that it does not have."""
-        return [
-            Setting(codec, preset, crf, self.gop)
-            for codec, presets in self.presets.items()
-            for preset in presets
-            for crf in self.crfs
-            if crf <= MAX_CRF[codec]
-        ]
-
-
-def grid_of(options: EvaluateOptions) -> Grid:
-    """The requested grid.
+def settings_of(options: EvaluateOptions) -> list[Setting]:
+    """The requested grid; a codec is not tried with a crf that it does not have.
 
     Raises:
         OptionError: There is no such codec, preset or crf, or too many of them.
@@ -175,13 +160,27 @@ def grid_of(options: EvaluateOptions) -> Grid:
     codecs = list(dict.fromkeys(map(_codec, options.codecs)))
     if not codecs:
         raise OptionError("`codecs` is empty.")
-    grid = Grid(_presets(codecs, options.presets), parse_crfs(options.crf), options.gop)
-    if not 0 < len(grid.settings()) <= _MOST_CELLS:
+    crfs = parse_crfs(options.crf)
+    presets: dict[str, Sequence[str]] = {}
+    for codec in codecs:
+        own = [preset for preset in dict.fromkeys(options.presets) if _has(codec, preset)]
+        presets[codec] = own or _DEFAULT_PRESETS[codec]
+    for preset in options.presets:
+        if not any(preset in own for own in presets.values()):
+            raise OptionError(f"`presets` {preset!r} is not a preset of {', '.join(codecs)}.")
+    settings = [
+        Setting(codec, preset, crf, options.gop)
+        for codec in codecs
+        for preset in presets[codec]
+        for crf in crfs
+        if crf <= MAX_CRF[codec]
+    ]
+    if not 0 < len(settings) <= _MOST_CELLS:
         raise OptionError(
-            f"{len(grid.settings())} settings were asked for; give `codecs`, `presets` and `crf` "
+            f"{len(settings)} settings were asked for; give `codecs`, `presets` and `crf` "
             f"that make 1 to {_MOST_CELLS}."
         )
-    return grid
+    return settings
 
 
 def _codec(name: str) -> str:
@@ -191,17 +190,6 @@ def _codec(name: str) -> str:
         known = ", ".join([*names, AV1[1]])
         raise OptionError(f"`codecs` {name!r} is not one of {known}.")
     return codec
-
-
-def _presets(codecs: Sequence[str], asked: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    found: dict[str, tuple[str, ...]] = {}
-    for codec in codecs:
-        own = tuple(dict.fromkeys(preset for preset in asked if _has(codec, preset)))
-        found[codec] = own or _DEFAULT_PRESETS[codec]
-    for preset in asked:
-        if not any(preset in own for own in found.values()):
-            raise OptionError(f"`presets` {preset!r} is not a preset of {', '.join(codecs)}.")
-    return found
 
 
 def _has(codec: str, preset: str) -> bool:
@@ -221,14 +209,13 @@ def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
     found: set[int] = set()
     for text in texts:
         match = _CRF.fullmatch(text.strip())
-        first, last, step = (int(word) if word else None for word in match.groups()) if match else (
-            None, None, None
-        )  # fmt: skip
-        if first is None or step == 0:
+        step = int(match["step"] or 1) if match else 0
+        if match is None or step == 0:
             raise OptionError(
                 f"`crf` {text!r} is not valid. Use a value such as 18, 16:25 or 16:25:3."
             )
-        found.update(range(first, (first if last is None else last) + 1, step or 1))
+        first = int(match["first"])
+        found.update(range(first, int(match["last"] or first) + 1, step))
     if not found or min(found) < 1 or max(found) > max(MAX_CRF.values()):
         raise OptionError(
             f"`crf` {', '.join(texts)} has values outside 1 to {max(MAX_CRF.values())}."
@@ -254,27 +241,3 @@ def parse_target(text: str) -> ScoreGoal:
             f"{', '.join(METRICS)}."
         )
     return ScoreGoal(metric, value)
-
-
-def check_options(options: EvaluateOptions) -> None:
-    """Refuse numbers that make no sense, and options that contradict each other.
-
-    Raises:
-        OptionError: Names one.
-    """
-    positive = [("duration", options.duration), ("fps", options.fps), ("hours", options.hours)]
-    rates = [("rates", rate) for rate in options.rates]
-    for name, value in [*positive, *rates]:
-        if value is not None and not 0 < value < float("inf"):
-            raise OptionError(f"`{name}` {value:g} is not above 0.")
-    if options.start is not None and not 0 <= options.start < float("inf"):
-        raise OptionError(f"`start` {options.start:g} is not a number of seconds.")
-    if options.cluster and options.jobs != 1:
-        raise OptionError("`jobs` is for this machine; a `cluster` decides how many run at once.")
-    parse_target(options.target)
-
-
-def first_guess(codec: str, rate: float | None) -> int:
-    """The crf at which to start the search for a target."""
-    crf, _ = visual_setting(rate)
-    return crf if codec in AV1 else crf - 2

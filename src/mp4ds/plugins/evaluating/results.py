@@ -1,19 +1,14 @@
-"""The results of an evaluation, and conclusions for each camera."""
+"""The results of an evaluation, conclusions for each camera, and both in words."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
-from mp4ds.errors import counted
-from mp4ds.plugins.evaluating.clips import Clip, ClipFile
+from mp4ds.errors import size_text
+from mp4ds.plugins.evaluating.clips import Clip
 from mp4ds.plugins.evaluating.options import ScoreGoal, Setting
-from mp4ds.video.codecs import recipe_for
-from mp4ds.video.images import jpeg_bytes
-from mp4ds.video.planes import rgb_of
 from mp4ds.video.scores import ScoreSummary
 
 
@@ -34,7 +29,7 @@ class Cell:
         picture: Name of the PNG file of its detail, in the folder of the evaluation.
         whole_bytes: Bytes of the camera's whole recording.
         whole_seconds: Time to encode the camera's whole recording.
-        machine: Name of the machine that measured the times; empty if unknown.
+        machine: Name of the machine that measured the times.
     """
 
     setting: Setting
@@ -49,7 +44,7 @@ class Cell:
     picture: str
     whole_bytes: float
     whole_seconds: float
-    machine: str = ""
+    machine: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,26 +54,16 @@ class RateRow:
     Attributes:
         rate: Frames per second.
         frames: Of the clip that was tried.
-        setting: The largest crf that reaches the target.
+        cell: Of the largest crf that reaches the target.
         reached: Whether it does; otherwise it is the best setting.
-        score: Of the target's metric, mean.
-        frame_bytes: Bytes of a frame of a long video.
-        frame_seconds: Time to encode a frame.
-        kbps: Kilobits per second.
         ceiling: Score of the clip against itself.
-        tried: Number of encodings in the search.
     """
 
     rate: float
     frames: int
-    setting: Setting
+    cell: Cell
     reached: bool
-    score: float
-    frame_bytes: float
-    frame_seconds: float
-    kbps: float
     ceiling: float
-    tried: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,33 +83,6 @@ class StorageRow:
     gigabytes: float
     days: float | None = None
     cpu_days: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class DataSet:
-    """A data set whose size is estimated.
-
-    Attributes:
-        streams: Cameras.
-        hours: How long they record.
-        rate: Frames per second of each.
-    """
-
-    streams: int
-    hours: float
-    rate: float
-
-    @property
-    def frames(self) -> float:
-        """Frames of all cameras."""
-        return self.streams * self.hours * 3600 * self.rate
-
-    @property
-    def described(self) -> str:
-        """A description in words."""
-        cameras = counted(self.streams, "camera")
-        hours = f"{self.hours:g} hour{'s' * (self.hours != 1)}"
-        return f"{cameras} for {hours} at {self.rate:.2f} Hz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,45 +109,31 @@ class CameraEvaluation:
     Attributes:
         topic: Of its images.
         name: Of its files.
-        encoding: ROS encoding of its images.
-        size: Width and height of an image.
-        rate: Images per second.
-        frames: Of the clip.
-        start: Seconds from the camera's first image at which the clip begins.
-        seconds: Duration of the clip.
-        source_frames: Total number of images.
-        raw_bytes: Bytes of an image as recorded.
+        clip: What was tried on.
         ceiling: Scores of the clip against itself, which no setting can exceed.
         target: The score to reach.
         reachable: The same, or lower if the ceiling is too close.
         cells: By setting, in the order of the grid.
         recommended: The smallest and the fastest setting that reach the target; empty if none.
-        rates: By rate and preset; empty if not asked for.
-        data_set: The data set that `storage` is for.
-        storage: The cost of storing it, in several forms.
         ground_truth: Name of the PNG file of the clip's detail.
+        rates: By rate and preset; empty if not asked for.
+        data_set: The data set that `storage` is for, in words.
+        storage: The cost of storing it, in several forms; empty if there is no frame rate.
         notes: Anything else worth knowing.
     """
 
     topic: str
     name: str
-    encoding: str
-    size: tuple[int, int]
-    rate: float | None
-    frames: int
-    start: float
-    seconds: float
-    source_frames: int
-    raw_bytes: int
+    clip: Clip
     ceiling: Mapping[str, ScoreSummary]
     target: ScoreGoal
     reachable: float
     cells: Sequence[Cell]
     recommended: Sequence[Recommendation]
-    rates: Sequence[RateRow]
-    data_set: DataSet | None
-    storage: Sequence[StorageRow]
     ground_truth: str
+    rates: Sequence[RateRow] = ()
+    data_set: str = ""
+    storage: Sequence[StorageRow] = ()
     notes: list[str] = field(default_factory=list)
 
 
@@ -219,44 +163,22 @@ class Evaluation:
     known: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class EvaluateProgress:
-    """Progress of an evaluation.
-
-    Attributes:
-        camera: Current topic.
-        what: Current activity.
-        done: Settings of this camera that are done, not counting searches.
-        total: Settings of this camera.
-    """
-
-    camera: str
-    what: str
-    done: int
-    total: int
-
-
-# ---------------------------------------------------------------- tables
+# ---------------------------------------------------------------- conclusions
 
 CEILING_MARGIN = 0.2
 """In VMAF: a target closer to the ceiling than this is indistinguishable from noise."""
 
-Rated = tuple[Sequence[Cell], float]
-"""The results for a camera, and the score to reach."""
 
-_JPEG_QUALITIES = (90, 75)
-_JPEG_FRAMES = 20
-_DAY = 86_400
-
-
-def reachable_score(target: ScoreGoal, ceiling: float) -> float:
+def reachable_score(target: ScoreGoal, ceiling: Mapping[str, ScoreSummary]) -> float:
     """The target, or less if the ceiling is too close.
 
     Args:
         target: The requested target.
-        ceiling: Score of the clip against itself.
+        ceiling: Scores of the clip against itself.
     """
-    return min(target.score, ceiling - CEILING_MARGIN) if target.metric == "vmaf" else target.score
+    if target.metric != "vmaf":
+        return target.score
+    return min(target.score, ceiling["vmaf"].mean - CEILING_MARGIN)
 
 
 def score_of(cell: Cell, target: ScoreGoal) -> float:
@@ -264,11 +186,13 @@ def score_of(cell: Cell, target: ScoreGoal) -> float:
     return cell.scores[target.metric].mean
 
 
-def recommend(cameras: Sequence[Rated], target: ScoreGoal) -> list[Recommendation]:
+def recommend(
+    cameras: Sequence[tuple[Sequence[Cell], float]], target: ScoreGoal
+) -> list[Recommendation]:
     """The smallest and the fastest setting that reach the scores of all cameras.
 
     Args:
-        cameras: At least one.
+        cameras: At least one: its cells, and the score to reach.
         target: The target, whose metric is compared.
 
     Returns:
@@ -280,88 +204,113 @@ def recommend(cameras: Sequence[Rated], target: ScoreGoal) -> list[Recommendatio
             for cells, due in cameras
         )
     )
-    if not able:
-        return []
     cells = [cell for own, _ in cameras for cell in own if cell.setting in able]
 
     def total(setting: Setting, figure: str) -> float:
         return sum(float(getattr(cell, figure)) for cell in cells if cell.setting == setting)
 
-    # so that ties are resolved consistently
-    ordered = sorted(able, key=lambda setting: setting.name)
     found = []
     for why, figure in (("smallest", "frame_bytes"), ("fastest", "encode_cpu_seconds")):
-        setting = min(ordered, key=lambda item, figure=figure: total(item, figure))  # type: ignore[misc]
-        score = min(score_of(cell, target) for cell in cells if cell.setting == setting)
-        found.append(Recommendation(why, setting, score, setting.pack_options))
+        # by name, so that ties are resolved consistently
+        costs = {(total(setting, figure), setting.name): setting for setting in able}
+        if costs:
+            setting = costs[min(costs)]
+            score = min(score_of(cell, target) for cell in cells if cell.setting == setting)
+            found.append(Recommendation(why, setting, score, setting.pack_options))
     return found
 
 
-def pareto(cells: Sequence[Cell], cost: Sequence[float], target: ScoreGoal) -> list[int]:
-    """Indices of the Pareto-optimal cells, the cheapest first.
+# ---------------------------------------------------------------- in words
 
-    Args:
-        cells: Of one camera.
-        cost: Of each cell.
-        target: The target, whose metric is compared.
-    """
-    found: list[int] = []
-    best = -np.inf
-    for number in sorted(range(len(cells)), key=lambda n: (cost[n], -score_of(cells[n], target))):
-        if score_of(cells[number], target) > best:
-            best = score_of(cells[number], target)
-            found.append(number)
-    return found
+Row = dict[str, str]
+"""A row of a table: headings and texts."""
 
 
-def storage(clip: Clip, path: Path, chosen: Cell, data_set: DataSet) -> list[StorageRow]:
-    """The cost of storing the frames of a data set, in several forms.
-
-    JPEG files are made from some of the clip's frames.
-
-    Args:
-        clip: Of the camera.
-        path: Of the clip's frames.
-        chosen: The setting to compare with.
-        data_set: How many frames there are.
-    """
+def told(camera: CameraEvaluation) -> Iterator[str | list[Row]]:
+    """What was found for a camera, in sentences and tables."""
+    clip, target = camera.clip, camera.target
     width, height = clip.image_size
-    plain = 3 * width * height
-    forms: list[tuple[str, float]] = [
-        ("raw", clip.raw_bytes),
-        ("YUV 4:4:4", plain),
-        ("RGB", plain),
-    ]
-    for quality in _JPEG_QUALITIES:
-        forms.append((f"JPEG {quality}", jpeg_frame_bytes(path, quality)))
-    rows = [StorageRow(form, size, size * data_set.frames / 1e9) for form, size in forms]
-    scale = data_set.frames / clip.frames / _DAY
-    rows.append(
-        StorageRow(
-            chosen.setting.name,
-            chosen.frame_bytes,
-            chosen.frame_bytes * data_set.frames / 1e9,
-            days=chosen.encode_seconds * scale,
-            cpu_days=chosen.encode_cpu_seconds * scale,
-        )
+    rate = f" at {clip.rate:.2f} Hz" if clip.rate else ""
+    yield (
+        f"{camera.topic}: {clip.encoding} {width}x{height}{rate}; clip of {clip.frames} of "
+        f"{clip.source_frames} frames, starting at {clip.start:.2f} s"
     )
-    return rows
+    yield [_cell_row(camera, cell) for cell in camera.cells]
+    scores = ", ".join(f"{name} {value.mean:.2f}" for name, value in camera.ceiling.items())
+    yield f"ceiling, the clip scored against itself: {scores}"
+    if camera.rates:
+        yield f"crf that reaches {target.metric} {target.score:g}, by frame rate:"
+        yield [_rate_row(row, target) for row in camera.rates]
+    if camera.storage:
+        yield f"{camera.data_set}:"
+        yield [_storage_row(row) for row in camera.storage]
+    yield from (f"note: {note}" for note in camera.notes)
+    for item in camera.recommended:
+        yield f"{item.why}: {item.options} ({target.metric} {item.score:.2f})"
 
 
-def jpeg_frame_bytes(path: Path, quality: int) -> float:
-    """Mean bytes of JPEG files of some frames of a clip.
+def _cell_row(camera: CameraEvaluation, cell: Cell) -> Row:
+    def score(metric: str, statistic: str = "mean", digits: int = 2) -> str:
+        summary = cell.scores.get(metric)
+        return f"{getattr(summary, statistic):.{digits}f}" if summary else ""
 
-    Args:
-        path: Of the clip's frames.
-        quality: 1 to 100.
-    """
-    file = ClipFile(path)
-    clip = file.clip
-    recipe = recipe_for(clip.picture_format, lossless=False, crf=1)
-    numbers = np.unique(np.linspace(0, clip.frames - 1, _JPEG_FRAMES).round().astype(int))
-    is_grey = clip.picture_format == "gray"
-    sizes = [
-        jpeg_bytes(rgb_of(file.planes(int(number)), recipe), quality, is_grey=is_grey)
-        for number in numbers
-    ]
-    return sum(sizes) / len(sizes)
+    return {
+        "codec": cell.setting.codec,
+        "preset": cell.setting.preset,
+        "crf": str(cell.setting.crf),
+        "kbit/s": f"{cell.kbps:.0f}",
+        "B/frame": f"{cell.frame_bytes:.0f}",
+        "fps": f"{cell.encode_fps:.1f}",
+        "CPU s": f"{cell.encode_cpu_seconds:.2f}",
+        "decoded/CPU s": f"{cell.decode_fps:.0f}",
+        "VMAF": score("vmaf"),
+        "harmonic": score("vmaf", "harmonic_mean"),
+        "5 %": score("vmaf", "percentile_5"),
+        "least": score("vmaf", "minimum"),
+        "PSNR Y": score("psnr_y"),
+        "PSNR Cb": score("psnr_cb"),
+        "PSNR Cr": score("psnr_cr"),
+        "SSIM": score("ssim", digits=4),
+        "whole": size_text(cell.whole_bytes),
+        "time": _time_text(cell.whole_seconds),
+        "best": why_of(camera, cell),
+    }
+
+
+def why_of(camera: CameraEvaluation, cell: Cell) -> str:
+    """Why a cell is recommended; empty if it is not."""
+    return " ".join(item.why for item in camera.recommended if item.setting == cell.setting)
+
+
+def _rate_row(row: RateRow, target: ScoreGoal) -> Row:
+    cell = row.cell
+    return {
+        "Hz": f"{row.rate:g}",
+        "frames": str(row.frames),
+        "codec": cell.setting.codec,
+        "preset": cell.setting.preset,
+        "crf": str(cell.setting.crf),
+        "score": f"{score_of(cell, target):.2f}" + ("" if row.reached else " (not reached)"),
+        "ceiling": f"{row.ceiling:.2f}",
+        "B/frame": f"{cell.frame_bytes:.0f}",
+        "ms/frame": f"{cell.encode_seconds / row.frames * 1000:.1f}",
+        "kbit/s": f"{cell.kbps:.0f}",
+    }
+
+
+def _storage_row(row: StorageRow) -> Row:
+    return {
+        "stored as": row.form,
+        "B/frame": f"{row.frame_bytes:.0f}",
+        "size": f"{row.gigabytes:.1f} GB",
+        "days": "" if row.days is None else f"{row.days:.2f}",
+        "CPU days": "" if row.cpu_days is None else f"{row.cpu_days:.2f}",
+    }
+
+
+def _time_text(seconds: float) -> str:
+    """A duration in a suitable unit."""
+    for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172_800, "h", 3600)):
+        if seconds < limit:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds / 86_400:.1f} days"

@@ -1,0 +1,173 @@
+"""The cameras of a recording, dataset, video or folder of images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.formats import open_reader
+from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.dataset import open_dataset
+from mp4ds.dataset.frames import Frames
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import Refused, SourceNotFoundError
+from mp4ds.files.urls import remote
+from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.messages.encodings import ENCODINGS, Pixels
+from mp4ds.messages.serializations import is_camera, kind_of
+from mp4ds.messages.wire import CodedFields
+from mp4ds.packing.look import Looker, depends_on_others
+from mp4ds.packing.options import ImageFolder
+from mp4ds.plan import LOSSLESS
+from mp4ds.plugins.importing.layouts import images_in, open_images
+from mp4ds.records import Channel, Excerpt, Message
+
+JPEG = "JPEG"
+"""What `Camera.lossy` is if images are recorded as JPEG files, which ``mp4ds pack`` re-encodes only
+on request."""
+
+_VIDEOS = (".mp4", ".m4v", ".mov", ".yaml", ".yml")
+_AT_ONCE = 8  # frames of a dataset in memory at once
+
+
+class Shot(NamedTuple):
+    """One image of a camera.
+
+    Attributes:
+        kind: ROS encoding, width and height.
+        pixels: Of the encoding.
+        stamp: Header stamp, nanoseconds.
+        log_time: When it was recorded, nanoseconds.
+    """
+
+    kind: tuple[str, int, int]
+    pixels: Pixels
+    stamp: int
+    log_time: int
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera of a source.
+
+    Attributes:
+        topic: Its topic, or the name of a video.
+        times: Log times of all its images, nanoseconds, sorted.
+        read: Yields images by increasing number, without messages that hold none.
+        lossy: The lossy encoding they already went through; empty if none is known.
+    """
+
+    topic: str
+    times: NDArray[np.int64]
+    read: Callable[[Sequence[int]], Iterator[Shot]]
+    lossy: str = ""
+
+    @property
+    def rate(self) -> float | None:
+        """Images per second; None below two, or without a time span."""
+        span = int(self.times[-1] - self.times[0]) if len(self.times) > 1 else 0
+        return (len(self.times) - 1) * 1e9 / span if span > 0 else None
+
+
+@contextmanager
+def open_cameras(place: Path, fps: float) -> Iterator[tuple[list[Camera], dict[str, str]]]:
+    """Open a recording, a dataset, a video, or a folder of images.
+
+    Args:
+        place: Where it is; a folder of images is on this machine.
+        fps: Frames per second of a folder of images.
+
+    Yields:
+        Its cameras, and the topics of those whose images no encoder takes, with the reason.
+
+    Raises:
+        SourceError: It is none of these.
+        FormatError: It is a dataset, and breaks a rule of the format.
+    """
+    if not place.exists():
+        raise SourceNotFoundError(place)
+    if (place / MANIFEST_NAME).exists() or place.suffix.lower() in _VIDEOS:
+        with open_dataset(place) as dataset:
+            yield [_of_frames(frames) for frames in dataset], {}
+        return
+    with _reader_of(place, fps) as reader:
+        yield _of_recording(reader)
+
+
+def _reader_of(place: Path, fps: float) -> BagReader:
+    # a rosbag2 folder may hold pictures, too
+    is_plain = place.is_dir() and not (place / "metadata.yaml").exists()
+    if is_plain and not remote(place) and images_in(place):
+        return open_images(place, ImageFolder(layout="plain", rate=str(fps)))
+    return open_reader(place)
+
+
+def _of_recording(reader: BagReader) -> tuple[list[Camera], dict[str, str]]:
+    times = reader.times()
+    cameras: list[Camera] = []
+    left_out: dict[str, str] = {}
+    for channel in filter(is_camera, reader.channels):
+        own = times.get(channel.id, np.empty(0, np.int64))
+        first = reader.first(channel)
+        if first is None or not len(own):
+            left_out[channel.topic] = "has no images"
+        elif kind_of(channel) is CodedFields and depends_on_others(channel, first):
+            left_out[channel.topic] = "has video packets, which `mp4ds pack` copies"
+        else:
+            cameras.append(_of_channel(reader, channel, own, JPEG if _is_jpeg(first) else ""))
+    return cameras, left_out
+
+
+def _is_jpeg(message: Message) -> bool:
+    with suppress(Refused):
+        return Looker(message.channel).look(message).key.codec == "mjpeg"
+    return False
+
+
+def _of_channel(
+    reader: BagReader, channel: Channel, times: NDArray[np.int64], lossy: str
+) -> Camera:
+    def read(indices: Sequence[int]) -> Iterator[Shot]:
+        wanted = set(indices)
+        first, last = int(times[indices[0]]), int(times[indices[-1]])
+        number = int(np.searchsorted(times, first))
+        excerpt = Excerpt(first, last + 1, frozenset([channel.topic]), others=False)
+        looker = Looker(channel, transcode=True)
+        for record in reader.records(excerpt):
+            if not isinstance(record, Message) or record.channel.id != channel.id:
+                continue
+            if number in wanted:
+                with suppress(Refused):
+                    seen = looker.look(record)
+                    if seen.pixels is not None:
+                        kind = seen.key.encoding, seen.key.width, seen.key.height
+                        yield Shot(kind, seen.pixels, seen.parts.stamp, record.log_time)
+            number += 1
+
+    return Camera(channel.topic, times, read, lossy)
+
+
+def _of_frames(frames: Frames) -> Camera:
+    lossy, form = "", "native"
+    if isinstance(frames, Stream) and frames.sidecar.video.codec == "mjpeg":
+        lossy = JPEG
+    if isinstance(frames, Stream) and frames.sidecar.profile != LOSSLESS:
+        lossy = f"a dataset of {frames.sidecar.profile}"
+        # a lossy video has already been demosaiced; doing it again would not help
+        form = "rgb" if ENCODINGS[frames.encoding].mosaic else "native"
+    order = np.argsort(frames.log_times, kind="stable")
+
+    def read(indices: Sequence[int]) -> Iterator[Shot]:
+        for at in range(0, len(indices), _AT_ONCE):
+            numbers = [int(order[index]) for index in indices[at : at + _AT_ONCE]]
+            for frame in frames.get(numbers, format=form):
+                kind = (frame.encoding, *frames.image_size)
+                yield Shot(kind, frame.data, frame.stamp_ns, frame.log_time_ns)
+
+    return Camera(frames.topic, frames.log_times[order], read, lossy)
