@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import shutil
 import sqlite3
+import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import replace
@@ -520,12 +521,15 @@ def compress_files(folder: Path, spelling: str = "FILE") -> None:
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 @pytest.mark.parametrize("spelling", ["file", "FILE"])
-def test_compressed_files(tmp_path: Path, storage: str, spelling: str) -> None:
+def test_compressed_files(
+    tmp_path: Path, storage: str, spelling: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = split(tmp_path, storage, [scene()[:25], scene()[25:]])
     compress_files(folder, spelling)
     work = tmp_path / "work"
     work.mkdir()
-    with Rosbag2Reader(folder, workdir=work) as reader:
+    monkeypatch.setattr(tempfile, "tempdir", str(work))
+    with Rosbag2Reader(folder) as reader:
         known = len(reader.channels)
         assert known == (4 if storage == "sqlite3" else 0)
         for _ in range(2):
@@ -538,11 +542,14 @@ def test_compressed_files(tmp_path: Path, storage: str, spelling: str) -> None:
     assert list(work.iterdir()) == []
 
 
-def test_a_first_file_that_was_not_read_is_removed_too(tmp_path: Path) -> None:
+def test_a_first_file_that_was_not_read_is_removed_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = split(tmp_path, "sqlite3", [scene()])
     compress_files(folder)
     (tmp_path / "work").mkdir()
-    with Rosbag2Reader(folder, workdir=tmp_path / "work") as reader:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "work"))
+    with Rosbag2Reader(folder) as reader:
         assert len(list((tmp_path / "work").iterdir())) == 1
         assert reader.stats() != {}
     assert list((tmp_path / "work").iterdir()) == []

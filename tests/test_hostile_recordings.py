@@ -25,10 +25,10 @@ from mcap.writer import CompressionType, Writer
 import mp4ds
 from jail import Jail, Outcome
 from mp4ds import yamlio
-from mp4ds.bags import protocols
+from mp4ds.bags import files
 from mp4ds.bags.convert import Converter
+from mp4ds.bags.files import DamageError, unzstd
 from mp4ds.bags.mcap import McapReader
-from mp4ds.bags.mcap_records import DamageError, unzstd
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.ros1_write import Ros1Writer
 from mp4ds.bags.rosbag2_metadata import parse_qos
@@ -602,7 +602,7 @@ def test_the_limit_is_yours_to_set(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_what_is_written_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also a large black picture, whose chunk would look like a bomb."""
-    monkeypatch.setattr(protocols, "_ALWAYS", 2**20)
+    monkeypatch.setattr(files, "_ALWAYS", 2**20)
     channel = Channel(1, "/a", "cdr", None)
     payloads = [b"small", bytes(2**21), b"x" * 2**18, bytes(2**19 + 1), b"last"]
     path = tmp_path / "a.mcap"

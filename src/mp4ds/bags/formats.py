@@ -1,19 +1,16 @@
-"""The table of recording formats, several recordings read as one, and their digests."""
+"""The table of recording formats, and digests of recordings."""
 
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Literal, overload
+from typing import Any, BinaryIO
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mp4ds.bags.protocols import BagReader, BagWriter, SourcePart, merged
+from mp4ds.bags.combined import MultiReader
+from mp4ds.bags.protocols import BagReader, BagWriter
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.outputs import begins_with
 from mp4ds.files.sources import (
@@ -25,10 +22,7 @@ from mp4ds.files.sources import (
     video_at,
 )
 from mp4ds.files.urls import remote
-from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
-
-if TYPE_CHECKING:
-    from mp4ds.bags.salvage.losses import Salvage, SalvageReader
+from mp4ds.records import Channel, Message
 
 _BLOCK = 2**20
 
@@ -116,213 +110,25 @@ class SourceHasher:
         self._close()
 
 
-# ---------------------------------------------------------------- several recordings
-
-_NO_STATS = ChannelStats(0, 0, 0)
-
-
-class MultiReader:
-    """A split recording, or recordings made side by side.
-
-    Consecutive parts are read one after another; overlapping parts are merged by log time. Channels
-    equal in all fields are one channel.
-
-    Args:
-        openers: Each opens one part; a part is open only while it is read.
-
-    Attributes:
-        is_indexed: Whether all parts are.
-    """
-
-    def __init__(self, openers: Sequence[Callable[[], BagReader]]) -> None:
-        self._openers = openers
-        self._channels: dict[tuple[object, ...], Channel] = {}
-        self._schemas: dict[Schema, None] = {}
-        self._skipped: Counter[str] = Counter()
-        self._done = 0
-        self._active: list[BagReader] = []
-        self._stats: dict[int, ChannelStats] = {}
-        self.is_indexed = True
-        spans: list[tuple[int, int, int]] = []
-        files: list[list[Path]] = []
-        for number, opener in enumerate(openers):
-            with opener() as part:
-                if number == 0:
-                    self.path, self.format = part.path, part.format
-                    self.profile, self.library = part.profile, part.library
-                elif part.profile != self.profile:
-                    self.profile = ""
-                self.is_indexed &= part.is_indexed
-                files.append(list(part.files))
-                for channel in part.channels:
-                    self._shared(channel)
-                self._schemas.update(dict.fromkeys(part.unused_schemas))
-                stats = part.stats()
-                self._add_stats(part, stats)
-                known = [item for item in stats.values() if item.count]
-                start = min((item.start for item in known), default=0)
-                end = max((item.end for item in known), default=2**63)
-                spans.append((start, end, number))
-        self._spans = sorted(spans)
-        self.files: Sequence[Path] = [file for *_, number in self._spans for file in files[number]]
-
-    def _shared(self, channel: Channel) -> Channel:
-        key = channel.identity
-        if key not in self._channels:
-            self._channels[key] = replace(channel, id=len(self._channels))
-        return self._channels[key]
-
-    def _add_stats(self, part: BagReader, stats: Mapping[int, ChannelStats]) -> None:
-        for channel in part.channels:
-            if channel.id in stats and stats[channel.id].count:
-                shared = self._shared(channel).id
-                self._stats[shared] = self._stats.get(shared, _NO_STATS).plus(stats[channel.id])
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """See `BagReader.channels`."""
-        return list(self._channels.values())
-
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """See `BagReader.unused_schemas`."""
-        return list(self._schemas)
-
-    @property
-    def skipped(self) -> Mapping[str, int]:
-        """See `BagReader.skipped`."""
-        return self._skipped
-
-    @property
-    def position(self) -> int:
-        """See `BagReader.position`."""
-        return self._done + sum(part.position for part in self._active)
-
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
-        """See `BagReader.records`."""
-        self._done = 0
-        self._skipped.clear()
-        if self.is_indexed:
-            return self._merged(excerpt)
-        # Otherwise, out-of-order messages would be merged differently in an excerpt.
-        return filter(excerpt.has, self._merged(EVERYTHING if excerpt.has_messages else excerpt))
-
-    def _merged(self, excerpt: Excerpt) -> Iterator[Record]:
-        return merged(
-            [
-                SourcePart(start, partial(self._part_records, number, excerpt))
-                for start, end, number in self._spans
-                if excerpt.others or excerpt.touches(start, end)
-            ]
-        )
-
-    def _part_records(self, number: int, excerpt: Excerpt) -> Iterator[Record]:
-        part = self._openers[number]()
-        self._active.append(part)
-        try:
-            for record in part.records(excerpt):
-                if isinstance(record, Message):
-                    yield record.of_channel(self._shared(record.channel))
-                else:
-                    yield record
-            for channel in part.channels:
-                self._shared(channel)
-            self._skipped.update(part.skipped)
-            self._schemas.update(dict.fromkeys(part.unused_schemas))
-            self._done += sum(file.stat().st_size for file in part.files)
-        finally:
-            self._active.remove(part)
-            part.__exit__()
-
-    def stats(self) -> Mapping[int, ChannelStats]:
-        """See `BagReader.stats`."""
-        return self._stats
-
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """See `BagReader.times`."""
-        found: dict[int, list[NDArray[np.int64]]] = {}
-        for opener in self._openers:
-            with opener() as part:
-                times = part.times()
-                for channel in part.channels:
-                    if channel.id in times:
-                        found.setdefault(self._shared(channel).id, []).append(times[channel.id])
-        return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
-
-    def first(self, channel: Channel) -> Message | None:
-        """See `BagReader.first`."""
-        best: Message | None = None
-        for opener in self._openers:
-            with opener() as part:
-                for own in part.channels:
-                    if self._shared(own).id != channel.id:
-                        continue
-                    message = part.first(own)
-                    if message and (best is None or message.log_time < best.log_time):
-                        best = message.of_channel(channel)
-        return best
-
-    def __enter__(self) -> MultiReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for part in self._active:
-            part.__exit__()
-
-
 # ---------------------------------------------------------------- formats
 
-# each imports its library when needed: a recording has one format
-
-
-def _read_bag(path: Path) -> BagReader:
-    from mp4ds.bags.ros1 import Ros1Reader
-
-    return Ros1Reader(path)
-
-
-def _read_mcap(path: Path) -> BagReader:
-    from mp4ds.bags.mcap import McapReader
-
-    return McapReader(path)
-
-
-def _read_rosbag2(path: Path) -> BagReader:
-    from mp4ds.bags.rosbag2 import Rosbag2Reader
-
-    return Rosbag2Reader(path)
-
-
-_READERS: dict[str, Callable[[Path], BagReader]] = {
-    "bag": _read_bag,
-    "mcap": _read_mcap,
-    "rosbag2": _read_rosbag2,
+# by name: each imports its library, and a recording has one format
+_READERS = {
+    "bag": "ros1:Ros1Reader",
+    "mcap": "mcap:McapReader",
+    "rosbag2": "rosbag2:Rosbag2Reader",
+}
+_SALVAGERS = {
+    "bag": "salvage.ros1:Ros1Salvage",
+    "mcap": "salvage.mcap:McapSalvage",
+    "rosbag2": "salvage.rosbag2:Rosbag2Salvage",
 }
 
 
-def _salvage_bag(path: Path) -> Salvage:
-    from mp4ds.bags.salvage.ros1 import Ros1Salvage
+def _class(name: str) -> Any:
+    module, _, found = name.partition(":")
+    return getattr(import_module(f"mp4ds.bags.{module}"), found)
 
-    return Ros1Salvage(path)
-
-
-def _salvage_mcap(path: Path) -> Salvage:
-    from mp4ds.bags.salvage.mcap import McapSalvage
-
-    return McapSalvage(path)
-
-
-def _salvage_rosbag2(path: Path) -> Salvage:
-    from mp4ds.bags.salvage.rosbag2 import Rosbag2Salvage
-
-    return Rosbag2Salvage(path)
-
-
-_SALVAGERS: dict[str, Callable[[Path], Salvage]] = {
-    "bag": _salvage_bag,
-    "mcap": _salvage_mcap,
-    "rosbag2": _salvage_rosbag2,
-}
 
 _MAGIC = {b"#ROSBAG V": "bag", b"\x89MCAP0\r\n": "mcap", b"SQLite format 3\0": "rosbag2"}
 _FILE_MAGIC = [magic for magic, name in _MAGIC.items() if name != "rosbag2"]
@@ -385,19 +191,8 @@ def open_reader(path: Path) -> BagReader:
     Raises:
         SourceError: It cannot be read; says why, and what to do.
     """
-    return _READERS[format_of(path)](path)
-
-
-@overload
-def open_sources(
-    paths: Sequence[Path], *, salvage: Literal[True], opener: Opener = ...
-) -> SalvageReader: ...
-
-
-@overload
-def open_sources(
-    paths: Sequence[Path], *, salvage: bool = False, opener: Opener = ...
-) -> BagReader: ...
+    reader: BagReader = _class(_READERS[format_of(path)])(path)
+    return reader
 
 
 def open_sources(
@@ -407,7 +202,8 @@ def open_sources(
 
     Args:
         paths: The recordings.
-        salvage: Read what is readable of damaged ones, with a `SalvageReader`.
+        salvage: Read what is readable of damaged ones, instead of failing: the reader's `losses`
+            then say what is not.
         opener: Opens one of them, unless they are salvaged.
 
     Raises:
@@ -421,22 +217,18 @@ def open_sources(
         if resolved in seen:
             raise SourceError(path, "is given twice")
         seen.add(resolved)
+    is_alone = len(paths) == 1
     if salvage:
-        return _open_salvaged(paths)
-    if len(paths) == 1:
-        return opener(paths[0])
-    return MultiReader([partial(opener, path) for path in paths])
+        for path in filter(remote, paths):
+            problem = "cannot be salvaged from a remote location"
+            raise SourceError(path, problem, "Download it first.")
+        formats = {path: format_of(path) for path in paths}
 
+        def opener(path: Path) -> BagReader:
+            reader: BagReader = _class(_SALVAGERS[formats[path]])(path, is_alone=is_alone)
+            return reader
 
-def _open_salvaged(paths: Sequence[Path]) -> SalvageReader:
-    for path in filter(remote, paths):
-        raise SourceError(path, "cannot be salvaged from a remote location", "Download it first.")
-    openers = [partial(_SALVAGERS[format_of(path)], path) for path in paths]
-    if len(paths) == 1:
-        return openers[0]()
-    from mp4ds.bags.salvage.losses import MultiSalvage
-
-    return MultiSalvage(openers)
+    return opener(paths[0]) if is_alone else MultiReader([partial(opener, path) for path in paths])
 
 
 def limits_of(

@@ -15,6 +15,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mp4ds.bags import protocols
+from mp4ds.bags.files import SALVAGE_REMEDY, DamageError, ZstdStream, open_source, unreadable
 from mp4ds.bags.mcap_index import (
     Between,
     ChunkEntry,
@@ -24,28 +25,21 @@ from mp4ds.bags.mcap_index import (
     read_summary,
 )
 from mp4ds.bags.mcap_records import (
-    MAGIC,
     PRIVATE_OPCODE,
-    SALVAGE_REMEDY,
-    ByteStream,
-    DamageError,
     Declared,
     MessageHead,
     RecordStream,
     chunk_record,
     chunk_records,
-    open_source,
     parse,
     parse_message,
     unpack_chunk,
-    unreadable,
 )
 from mp4ds.bags.protocols import (
-    Format,
+    BagReader,
     HoldBack,
     first_of,
     sorted_times,
-    times_of,
     with_own_payload,
 )
 from mp4ds.errors import SourceError
@@ -171,16 +165,15 @@ def _check(head: MessageHead, chunk: ChunkEntry, summary: McapSummary) -> None:
 # ---------------------------------------------------------------- the reader
 
 
-class McapReader:
-    """Reads an MCAP file. See `BagReader`.
+class McapReader(BagReader):
+    """Reads an MCAP file.
 
     Where the file lists its chunks, messages come in log-time order, ties in file order;
     else they come in file order. Every pass reopens the file, so that several may run.
 
     Args:
         path: The file.
-        open_stream: Opens a stream to read instead of the file: its decompressed content, not
-            seekable, whose ``tell()`` counts bytes of the file.
+        is_compressed: Whether it is compressed with zstd as a whole; then it has no index.
         message_decompress: Decompresses the payload of a message; raises `DamageError` if it
             cannot.
 
@@ -188,21 +181,20 @@ class McapReader:
         SourceError: The file is missing, not an MCAP file, or cut short.
     """
 
-    format: Format = "mcap"
+    format = "mcap"
 
     def __init__(
         self,
         path: Path,
         *,
-        open_stream: Callable[[], ByteStream] | None = None,
+        is_compressed: bool = False,
         message_decompress: Callable[[memoryview], bytes] | None = None,
     ) -> None:
         self.path = path
-        self.files: Sequence[Path] = [path]
-        self._open_stream = open_stream
+        self.files = [path]
+        self._is_compressed = is_compressed
         self._decompress = message_decompress
         self._declared = Declared()
-        self._first: dict[int, Message] | None = None
         self._pass: RecordStream | None = None
         self._position = 0
         self._summary: McapSummary | None = None
@@ -229,8 +221,8 @@ class McapReader:
                     self._declared.add_channel(channel)  # otherwise its schema is only in the data
 
     def _start_pass(self) -> RecordStream:
-        if self._open_stream:
-            stream = RecordStream(self._open_stream(), self.path, None)
+        if self._is_compressed:
+            stream = RecordStream(ZstdStream(self.path), self.path, None)
         else:
             file = open_source(self.path)
             size = file.seek(0, os.SEEK_END)
@@ -259,14 +251,14 @@ class McapReader:
         return dict(self._declared.skipped)
 
     @property
-    def has_statistics(self) -> bool:
-        """Whether the file states how many messages it has."""
+    def has_all_channels(self) -> bool:
+        """Whether the file states how many messages each of its channels has."""
         return self._summary is not None and self._summary.statistics is not None
 
     @property
-    def start(self) -> int | None:
-        """The earliest log time in nanoseconds, from the summary; None if not stated."""
-        return self._summary.start if self._summary else None
+    def span(self) -> tuple[int, int] | None:
+        """Earliest and latest log time in nanoseconds, from the summary; None if not stated."""
+        return self._summary.span() if self._summary else None
 
     @property
     def position(self) -> int:
@@ -275,7 +267,7 @@ class McapReader:
 
     @property
     def is_indexed(self) -> bool:
-        """See `BagReader.is_indexed`: whether the summary is complete and consistent."""
+        """Whether the summary is complete and consistent."""
         return self._between is not None
 
     @cached_property
@@ -304,7 +296,7 @@ class McapReader:
         return self._found_between is not None
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
-        """Read everything once, or a part of it. See `BagReader.records`."""
+        """Read everything once, or a part of it."""
         return self._one_pass(lambda stream: self._read(stream, excerpt))
 
     def as_it_stands(self) -> Iterator[Record]:
@@ -429,22 +421,16 @@ class McapReader:
             indexed = sum(len(piece) for found in pieces.values() for piece in found)
             if self._summary.covers(indexed):
                 return {key: sorted_times(np.concatenate(found)) for key, found in pieces.items()}
-        return self._times_by_reading()
+        return super().times()
 
-    def _times_by_reading(self) -> dict[int, NDArray[np.int64]]:
-        with closing(self._start_pass()) as stream:
-            return times_of(self._read_through(stream, None))
+    @cached_property
+    def _first_messages(self) -> Mapping[int, Message]:
+        found = self._first_by_index()
+        return first_of(self.records()) if found is None else found
 
     def first(self, channel: Channel) -> Message | None:
-        """The channel's first message by log time, or None.
-
-        Without an index this reads the file, once for all channels.
-        """
-        if self._first is None:
-            self._first = self._first_by_index()
-        if self._first is None:
-            self._first = self._first_by_reading()
-        return self._first.get(channel.id)
+        """The channel's first message by log time, or None; read once for all channels."""
+        return self._first_messages.get(channel.id)
 
     def _first_by_index(self) -> dict[int, Message] | None:
         if not self._summary or not self._summary.chunks.has_messages:
@@ -478,29 +464,7 @@ class McapReader:
             message = self._declared.message(head, "the first message")
             yield channel_id, with_own_payload(self._unpacked(message))
 
-    def _first_by_reading(self) -> dict[int, Message]:
-        with closing(self._start_pass()) as stream:
-            return first_of(self._read_through(stream, self._hold_back()))
-
-    def __enter__(self) -> McapReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Close the file."""
         if self._pass:
             self._pass.close()
-
-
-def is_mcap(path: Path, is_compressed: bool) -> bool:
-    """Whether a storage file of rosbag2 is an MCAP file.
-
-    Args:
-        path: The file.
-        is_compressed: Whether it is compressed as a whole, so that only its name can tell.
-
-    Raises:
-        SourceError: It cannot be read.
-    """
-    if is_compressed:
-        return ".mcap" in path.suffixes
-    with open_source(path) as stream:
-        return stream.read(len(MAGIC)) == MAGIC

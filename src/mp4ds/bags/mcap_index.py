@@ -15,13 +15,13 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from mp4ds.bags.files import DamageError
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
     MAGIC,
     MAX_RECORD_BYTES,
     OF_SUMMARY,
     PRIVATE_OPCODE,
-    DamageError,
     RecordStream,
     parse,
 )
@@ -269,14 +269,8 @@ class McapSummary:
     chunks: ChunkTable = field(default_factory=ChunkTable)
     private: Counter[int] = field(default_factory=Counter)
 
-    @property
-    def start(self) -> int | None:
-        """The earliest log time; None without messages, or if unknown."""
-        span = self._span()
-        return span[0] if span else None
-
-    def _span(self) -> tuple[int, int] | None:
-        """The earliest and latest log time stated anywhere."""
+    def span(self) -> tuple[int, int] | None:
+        """The earliest and latest log time stated anywhere; None without messages."""
         statistics, listed = self.statistics, self.chunks.span()
         if not statistics or not statistics.message_count:
             return listed
@@ -309,7 +303,7 @@ class McapSummary:
         counts = statistics.channel_message_counts
         if not self.covers(sum(counts.values())):
             return {}
-        whole, spans = self._span() or (0, 0), self.chunks.spans()
+        whole, spans = self.span() or (0, 0), self.chunks.spans()
         stats = {}
         for channel_id in self.channels.keys() | counts.keys():
             count = counts.get(channel_id, 0)

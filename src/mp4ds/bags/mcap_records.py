@@ -11,14 +11,24 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol, TypeVar
 
 import lz4.frame
-import zstandard
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from mp4ds.bags.protocols import DECOMPRESSED, ZSTD_PIECE, most_held
-from mp4ds.errors import SourceError, SourceNotFoundError
+from mp4ds.bags.files import (
+    SALVAGE,
+    SALVAGE_REMEDY,
+    DamageError,
+    OversizeError,
+    ZstdStream,
+    expand,
+    most_held,
+    other_begin,
+    unreadable,
+    unzstd,
+)
+from mp4ds.errors import SourceError
 from mp4ds.files.urls import expect
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
 
@@ -37,52 +47,13 @@ OF_SUMMARY = frozenset(
         Opcode.SUMMARY_OFFSET,
     }
 )
-SALVAGE = "use `mp4ds pack --salvage` to pack what is still readable."
-SALVAGE_REMEDY = "U" + SALVAGE[1:]
 CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`, or {SALVAGE}"
-
-_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _PIECE_BYTES = 16 * 2**20
-_PACKED_PIECE = 2**16
 _FRAME = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 
 _RecordT = TypeVar("_RecordT", covariant=True)
-
-
-class DamageError(ValueError):
-    """Damage inside a record; the reader adds where it is."""
-
-
-class OversizeError(DamageError):
-    """A chunk or message that would take too much memory, or says so because it is damaged.
-
-    Args:
-        what: What it is, a phrase.
-        most: Bytes that it may have.
-    """
-
-    def __init__(self, what: str, most: int) -> None:
-        super().__init__(f"{what}, over the limit of {most}")
-
-
-def unreadable(path: Path, place: str, error: Exception, remedy: str) -> SourceError:
-    """The error for a recording with damage, or with something too large.
-
-    Args:
-        path: The recording.
-        place: Where in it; comes after "is damaged".
-        error: What is wrong there.
-        remedy: What to do about damage.
-    """
-    if isinstance(error, OversizeError):
-        remedy = (
-            f"If it is sound, and fits in memory, set the environment variable {DECOMPRESSED} to a "
-            f"larger size, such as 4G, or {SALVAGE}"
-        )
-        return SourceError(path, f"cannot be read{place}: {error}", remedy)
-    return SourceError(path, f"is damaged{place}: {error}", remedy)
 
 
 class MessageHead(NamedTuple):
@@ -95,67 +66,9 @@ class MessageHead(NamedTuple):
     data: memoryview
 
 
-class ByteStream(Protocol):
-    """A file to read, or its decompressed content."""
-
-    def read(self, length: int, /) -> bytes:
-        """Read that many bytes; fewer at the end only."""
-        ...
-
-    def tell(self) -> int:
-        """Bytes of the file consumed."""
-        ...
-
-    def seek(self, offset: int, /) -> int:
-        """Continue at a byte offset, where the stream has a known size."""
-        ...
-
-    def close(self) -> None:
-        """Close it."""
-        ...
-
-
 class _Parsed(Protocol[_RecordT]):
     @staticmethod
     def read(stream: ReadDataStream) -> _RecordT: ...
-
-
-def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
-    """Open a file of a recording, refusing anything else.
-
-    Args:
-        path: The file.
-        shown: Its name in errors, if it is a decompressed copy.
-
-    Raises:
-        SourceError: It is missing, unreadable, not a regular file, empty, or a git-lfs pointer.
-    """
-    shown = shown or path
-    try:
-        if not path.is_file() and not path.is_dir() and path.exists():
-            raise SourceError(shown, "is not a regular file")  # opening a pipe could block forever
-        stream = path.open("rb")
-    except FileNotFoundError:
-        raise SourceNotFoundError(shown) from None
-    except OSError as error:
-        raise SourceError(shown, f"cannot be read: {error.strerror}") from None
-    head = stream.read(len(_LFS_POINTER))
-    stream.seek(0)
-    if head and head != _LFS_POINTER:
-        return stream
-    stream.close()
-    if not head:
-        raise SourceError(shown, "is empty")
-    raise SourceError(shown, "is a git-lfs pointer, not the recording", "Run `git lfs pull`.")
-
-
-def other_begin(path: Path, kind: str, magic: bytes, start: bytes) -> SourceError:
-    """The error for a file that does not begin with the magic bytes of its kind."""
-    if start.startswith(magic.rstrip()):
-        problem = f"is {kind} with converted line endings, as if copied in text mode"
-        return SourceError(path, problem, f"Copy it again in binary mode, or {SALVAGE}")
-    remedy = f"If it is damaged, {SALVAGE}"
-    return SourceError(path, f"is not {kind}: it does not start like one", remedy)
 
 
 class RecordStream:
@@ -170,7 +83,7 @@ class RecordStream:
         start: Byte offset of the record that was read last.
     """
 
-    def __init__(self, stream: ByteStream, path: Path, size: int | None) -> None:
+    def __init__(self, stream: BinaryIO | ZstdStream, path: Path, size: int | None) -> None:
         self._stream = stream
         self.path = path
         self.size = size
@@ -355,87 +268,6 @@ def _decompress(compression: str, data: memoryview, size: int) -> bytes | memory
     raise DamageError(
         f"a chunk is compressed with {compression!r}; only zstd and lz4 are supported"
     )
-
-
-class Decompressor(Protocol):
-    """What bz2 and lz4 have in common."""
-
-    @property
-    def eof(self) -> bool:
-        """Whether the data are complete."""
-        ...
-
-    @property
-    def needs_input(self) -> bool:
-        """Whether all data was used."""
-        ...
-
-    @property
-    def unused_data(self) -> bytes | None:
-        """What followed the data."""
-        ...
-
-    def decompress(self, data: bytes | memoryview, /, max_length: int) -> bytes:
-        """Decompress data, and what was left over before."""
-        ...
-
-
-def expand(machine: Decompressor, data: bytes | memoryview, size: int) -> bytes:
-    """Decompress data to a size, or to a byte more if there is more.
-
-    A large result is made in pieces: both libraries need twice its memory to make it at once.
-    """
-    if size <= _PIECE_BYTES:
-        return machine.decompress(data, max_length=size + 1)
-    content = io.BytesIO()
-    for at in range(0, len(data), _PACKED_PIECE):
-        piece = data[at : at + _PACKED_PIECE]
-        while not machine.eof and (left := size + 1 - content.tell()) > 0:
-            content.write(machine.decompress(piece, max_length=min(left, _PIECE_BYTES)))
-            piece = b""
-            if machine.needs_input:
-                break
-    return content.getvalue()
-
-
-def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
-    """Decompress one zstd frame.
-
-    Args:
-        data: The frame.
-        size: Size of the content if known; otherwise the frame must state it.
-
-    Raises:
-        DamageError: It is not a zstd frame, damaged, or of another size.
-    """
-    try:
-        stated = zstandard.frame_content_size(data)
-        if stated < 0 and size is None:
-            return _unzstd_unsized(data)
-        if size is not None and stated not in (-1, size):
-            raise DamageError(f"zstd data holds {stated} bytes instead of {size}")
-        if stated > (most := most_held(len(data))):
-            raise OversizeError(f"zstd data declares {stated} bytes but has {len(data)}", most)
-        return zstandard.ZstdDecompressor().decompress(
-            data, max_output_size=size or 0, allow_extra_data=False
-        )
-    except zstandard.ZstdError as error:
-        raise DamageError(f"zstd data is damaged: {error}") from None
-
-
-def _unzstd_unsized(data: bytes | memoryview) -> bytes:
-    decompressor = zstandard.ZstdDecompressor().decompressobj()
-    content = io.BytesIO()
-    most = most_held(len(data))
-    used = 0
-    while used < len(data) and not decompressor.eof:
-        content.write(decompressor.decompress(data[used : used + ZSTD_PIECE]))
-        used += ZSTD_PIECE
-        if content.tell() > most:
-            raise OversizeError(f"zstd data of {len(data)} bytes unpacks to {content.tell()}", most)
-    if not decompressor.eof or decompressor.unused_data or used < len(data):
-        raise DamageError("zstd data is cut short, or holds more than one frame")
-    return content.getvalue()
 
 
 def chunk_records(content: bytes | memoryview) -> Iterator[tuple[int, int, memoryview]]:

@@ -12,7 +12,7 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from mp4ds._version import __version__
-from mp4ds.bags.protocols import most_unpacked
+from mp4ds.bags.files import most_unpacked
 from mp4ds.errors import ConversionError, Mp4dsError, OptionError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
 

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import heapq
-import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from types import MappingProxyType
+from typing import Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.errors import OptionError
-from mp4ds.options import parse_size
 from mp4ds.records import (
     EVERYTHING,
     Attachment,
     Channel,
     ChannelStats,
     Excerpt,
+    Loss,
     Message,
     MetadataRecord,
     Record,
@@ -27,35 +28,38 @@ from mp4ds.records import (
 )
 
 Format = Literal["bag", "rosbag2", "mcap"]
+_Reader = TypeVar("_Reader", bound="BagReader")
 
 
-class BagReader(Protocol):
+class BagReader(ABC):
     """One recording, opened for reading. A context manager; the file is never changed.
 
+    A reader has at least `channels` and `records`, from which everything else follows; it overrides
+    what its index makes faster.
+
     Attributes:
+        format: ``bag``, ``rosbag2`` or ``mcap``.
         path: The file or folder that was opened.
         profile: ``ros1``, ``ros2`` or any other MCAP profile; empty for none.
         library: The MCAP header's library string; empty for other formats.
         files: All files of the recording, in reading order.
+        tables: Small tables of a database, verbatim: a name -> content; empty for other formats.
     """
 
+    format: Format
     path: Path
-    profile: str
-    library: str
     files: Sequence[Path]
+    profile: str = ""
+    library: str = ""
+    tables: Mapping[str, str] = MappingProxyType({})
 
     @property
-    def format(self) -> Format:
-        """``bag``, ``rosbag2`` or ``mcap``."""
-        ...
-
-    @property
+    @abstractmethod
     def channels(self) -> Sequence[Channel]:
         """All channels known so far.
 
-        Complete once `records` of everything is exhausted, or if the recording `is_indexed`.
+        Complete once `records` of everything is exhausted, or if it `has_all_channels`.
         """
-        ...
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
@@ -63,7 +67,7 @@ class BagReader(Protocol):
 
         Complete once `records` of everything is exhausted, or if the recording `is_indexed`.
         """
-        ...
+        return ()
 
     @property
     def skipped(self) -> Mapping[str, int]:
@@ -71,18 +75,29 @@ class BagReader(Protocol):
 
         As found by the last `records`.
         """
-        ...
+        return {}
+
+    @property
+    def losses(self) -> Sequence[Loss]:
+        """What the last `records` could not read, if damaged recordings are salvaged."""
+        return ()
 
     @property
     def position(self) -> int:
         """Bytes of `files` that `records` of everything has consumed, for progress and hashing."""
-        ...
+        return 0
+
+    @property
+    def has_all_channels(self) -> bool:
+        """Whether `channels` is complete before anything is read."""
+        return self.is_indexed
 
     @property
     def is_indexed(self) -> bool:
         """Whether an excerpt can be read, in log-time order, without reading the rest."""
-        ...
+        return False
 
+    @abstractmethod
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Read everything once, or a part of it.
 
@@ -102,26 +117,44 @@ class BagReader(Protocol):
         Raises:
             SourceError: The file is damaged; names the file and, if known, the topic.
         """
-        ...
-
-    def stats(self) -> Mapping[int, ChannelStats]:
-        """Counts and time spans by channel id, as far as known from an index, without reading."""
-        ...
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Log times of every message, nanoseconds, sorted, by channel id.
+        """Log times of every message, nanoseconds, sorted, by channel id."""
+        return times_of(self.records())
 
-        Uses the index if there is one, otherwise reads the file.
-        """
-        ...
+    def stats(self) -> Mapping[int, ChannelStats]:
+        """Counts and time spans by channel id, as far as known without reading messages."""
+        return stats_of(self.times()) if self.is_indexed else {}
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """Earliest and latest log time, nanoseconds; None if not known without reading messages."""
+        known = [one for one in self.stats().values() if one.count]
+        return (min(one.start for one in known), max(one.end for one in known)) if known else None
 
     def first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None."""
-        ...
+        if not self.is_indexed:
+            return self._first_messages.get(channel.id)
+        times = self.times().get(channel.id)
+        if times is None or not len(times):
+            return None
+        start = int(times[0])
+        only = Excerpt(start, start + 1, frozenset([channel.topic]), others=False)
+        return first_of(self.records(only)).get(channel.id)
 
-    def __enter__(self) -> BagReader: ...
+    @cached_property
+    def _first_messages(self) -> Mapping[int, Message]:
+        return first_of(self.records())
 
-    def __exit__(self, *_: object) -> None: ...
+    def close(self) -> None:  # noqa: B027 - most readers have nothing open between two records
+        """Close what is open."""
+
+    def __enter__(self: _Reader) -> _Reader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class BagWriter(Protocol):
@@ -266,51 +299,6 @@ def merged(parts: Sequence[SourcePart]) -> Iterator[Record]:
             yield record
 
 
-# ---------------------------------------------------------------- bounds
-
-DECOMPRESSED = "MP4DS_MAX_DECOMPRESSED"
-"""Environment variable with the bytes that one chunk or message may decompress to."""
-
-ZSTD_PIECE = 2**11
-"""Bytes of zstd decompressed at a time, which give 64 MiB at most."""
-
-_ALWAYS = 128 * 2**20
-_CHUNK_RATIO = 256  # of lz4 it is 255
-_FILE_RATIO = 1024
-_MOST = 512 * 2**20  # recorders make chunks of 1 to 4 MiB unless told otherwise
-
-
-def most_unpacked(packed: int) -> int:
-    """Maximum decompressed size of a chunk or message of so many bytes, unless told otherwise.
-
-    Small ones are not limited by their ratio: they may hold a black picture.
-    """
-    return min(max(_ALWAYS, _CHUNK_RATIO * packed), _MOST)
-
-
-def most_in_file(packed: int) -> int:
-    """Maximum decompressed size of a file of so many bytes, which is not held in memory."""
-    return max(_ALWAYS, _FILE_RATIO * packed)
-
-
-def most_held(packed: int | None = None) -> int:
-    """Maximum decompressed size of a chunk or message, as `DECOMPRESSED` says if it is set.
-
-    Args:
-        packed: Its compressed size; None where that of the whole file is known only.
-
-    Raises:
-        OptionError: The variable does not hold a size.
-    """
-    told = os.environ.get(DECOMPRESSED)
-    if not told:
-        return _MOST if packed is None else most_unpacked(packed)
-    try:
-        return parse_size(told)
-    except OptionError as error:
-        raise OptionError(f"{DECOMPRESSED}: {error}") from None
-
-
 # ---------------------------------------------------------------- without an index
 
 _INT64_MAX = np.uint64(2**63 - 1)
@@ -328,6 +316,14 @@ def times_of(records: Iterable[Record]) -> dict[int, NDArray[np.int64]]:
 def sorted_times(times: NDArray[np.uint64]) -> NDArray[np.int64]:
     """Log times, sorted; those past the year 2262 are clamped."""
     return np.sort(np.minimum(times, _INT64_MAX)).astype(np.int64)
+
+
+def stats_of(times: Mapping[int, NDArray[np.int64]]) -> dict[int, ChannelStats]:
+    """Counts and spans of sorted log times; a channel without messages has times of 0."""
+    return {
+        key: ChannelStats(len(found), *(map(int, found[[0, -1]]) if len(found) else (0, 0)))
+        for key, found in times.items()
+    }
 
 
 def first_of(records: Iterable[Record]) -> dict[int, Message]:

@@ -12,14 +12,13 @@ from collections import OrderedDict, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_records import DamageError
-from mp4ds.bags.protocols import Format
+from mp4ds.bags.files import DamageError
+from mp4ds.bags.protocols import BagReader
 from mp4ds.bags.ros1_records import (
     DAMAGE,
     MAGIC,
@@ -37,7 +36,7 @@ from mp4ds.bags.ros1_records import (
     unpack_chunk,
 )
 from mp4ds.files.urls import expect
-from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
+from mp4ds.records import EVERYTHING, Channel, Excerpt, Message, Record
 
 CACHED_CHUNKS = 8
 CACHED_BYTES = 64 * 2**20
@@ -65,8 +64,8 @@ class _Index(NamedTuple):
         return _Index(self.times[start:end], self.chunks[start:end], self.offsets[start:end])
 
 
-class Ros1Reader:
-    """Reads a ROS 1 bag. See `BagReader`.
+class Ros1Reader(BagReader):
+    """Reads a ROS 1 bag.
 
     Messages come in log-time order, ties in file order. Payloads are slices of their decompressed
     chunk, which they keep in memory.
@@ -78,16 +77,14 @@ class Ros1Reader:
         SourceError: The file is missing, not a bag, not indexed, encrypted, or damaged.
     """
 
-    format: Format = "bag"
+    format = "bag"
     profile = "ros1"
-    library = ""
-    unused_schemas: Sequence[Schema] = ()
-    skipped: Mapping[str, int] = MappingProxyType({})
+    position = 0
+    is_indexed = True  # bags without an index are refused
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.files: Sequence[Path] = [path]
-        self._position = 0
+        self.files = [path]
         self._size = check_bag(path)
         self._chunks: OrderedDict[int, memoryview] = OrderedDict()
         try:
@@ -100,7 +97,7 @@ class Ros1Reader:
                 if not any(chunk.counts.values()):
                     self._chunk(number)  # otherwise nothing would check whether it holds messages
         except DAMAGE as error:
-            self._close()
+            self.close()
             raise damaged(path, error) from None
 
     @property
@@ -108,28 +105,18 @@ class Ros1Reader:
         """All connections, in the order of the bag's index."""
         return list(self._bag.channels.values())
 
-    @property
-    def position(self) -> int:
-        """Bytes of the chunks that `records` has reached; the file's size at the end."""
-        return self._position
-
-    @property
-    def is_indexed(self) -> bool:
-        """See `BagReader.is_indexed`: bags without an index are refused."""
-        return True
-
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
-        """Messages in log-time order, from the chunks that hold them. See `BagReader.records`."""
-        self._position = 0
+        """Messages in log-time order, from the chunks that hold them."""
+        self.position = 0
         visited: set[int] = set()
         for channel, time, chunk, offset, is_last in self._entries(excerpt):
             if chunk not in visited:
                 visited.add(chunk)
-                self._position += self._bag.chunks[chunk].packed
+                self.position += self._bag.chunks[chunk].packed
             yield self._message(channel, time, chunk, offset)
             if is_last:
                 self._chunks.pop(chunk, None)
-        self._position = self._size
+        self.position = self._size
 
     def _entries(self, excerpt: Excerpt) -> Iterator[tuple[Channel, int, int, int, bool]]:
         """Per message: channel, log time, chunk number, offset, whether it is the chunk's last."""
@@ -169,13 +156,6 @@ class Ros1Reader:
         unpacked = self._chunks[number] = self._bag.content(number)
         return unpacked
 
-    def stats(self) -> Mapping[int, ChannelStats]:
-        """Counts and spans from the index; a channel without messages has times of 0."""
-        return {
-            key: ChannelStats(len(times), *(map(int, times[[0, -1]]) if len(times) else (0, 0)))
-            for key, times in self.times().items()
-        }
-
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times from the index."""
         return {key: index.times for key, index in self._index.items()}
@@ -188,13 +168,8 @@ class Ros1Reader:
         time, chunk, offset = (int(column[0]) for column in index)
         return self._message(channel, time, chunk, offset)
 
-    def __enter__(self) -> Ros1Reader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Close the file."""
         self._chunks.clear()
         self._bag.file.close()
 

@@ -15,16 +15,16 @@ from typing import BinaryIO
 
 import lz4.frame
 
-from mp4ds.bags.mcap_records import (
+from mp4ds.bags.files import (
     SALVAGE,
     DamageError,
     OversizeError,
     expand,
+    most_held,
     open_source,
     other_begin,
     unreadable,
 )
-from mp4ds.bags.protocols import most_held
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, Schema
 

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from functools import partial
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mp4ds.bags.mcap import McapReader, is_mcap
-from mp4ds.bags.mcap_records import SALVAGE, unzstd
-from mp4ds.bags.protocols import Format, SourcePart, merged
-from mp4ds.bags.rosbag2_files import (
-    SharedChannels,
-    ZstdFile,
-    consecutive,
+from mp4ds.bags.combined import CombinedReader
+from mp4ds.bags.files import (
+    SALVAGE,
+    ZSTD_MAGIC,
     copy_file,
     decompress_file,
-    is_zstd,
-    unlisted_storage,
+    open_source,
+    unzstd,
 )
+from mp4ds.bags.mcap import McapReader
+from mp4ds.bags.mcap_records import MAGIC as MCAP_MAGIC
+from mp4ds.bags.protocols import BagReader
 from mp4ds.bags.rosbag2_metadata import (
     METADATA_FILE,
     RECORD,
@@ -37,264 +36,208 @@ from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.files.urls import remote
 from mp4ds.records import (
     EVERYTHING,
+    QOS_KEY,
     Channel,
     ChannelStats,
     Excerpt,
-    Message,
     MetadataRecord,
     Record,
-    Schema,
 )
 
-StorageReader = McapReader | SqliteReader
-_NO_STATS = ChannelStats(0, 0, 0)
+Decompress = Callable[[Any], bytes]
+"""Makes the payload of a message from what the file holds; raises `DamageError` if it cannot."""
+
+_NEVER = 2**64  # past all log times
 
 
-class Rosbag2Reader:
-    """Reads a rosbag2 recording of sqlite3 or MCAP storage. See `BagReader`.
+class Rosbag2Reader(CombinedReader):
+    """Reads a rosbag2 recording of sqlite3 or MCAP storage: its files and one metadata record.
 
-    The first record is a metadata record ``mp4ds:rosbag2`` that holds the metadata.yaml and
-    the small tables of the storage files, verbatim. Individually compressed payloads are
-    decompressed.
+    This record, ``mp4ds:rosbag2``, comes first and holds the metadata.yaml and the small tables of
+    the storage files, verbatim. Individually compressed payloads are decompressed. A file whose
+    times are not known is taken to follow those listed before it.
 
     Args:
         path: A folder, or one ``.db3`` or ``.mcap`` file.
-        workdir: Where an sqlite3 file that is compressed as a whole is decompressed, or a remote
-            one copied, while it is read; by default, the system's temporary folder.
 
     Raises:
         SourceError: The recording is incomplete, damaged, or of an unknown kind.
     """
 
-    format: Format = "rosbag2"
+    format = "rosbag2"
     profile = "ros2"
 
-    def __init__(self, path: Path, *, workdir: Path | None = None) -> None:
+    def __init__(self, path: Path) -> None:
+        super().__init__()
         self.path = path
-        self._workdir = workdir
-        self._info: BagInfo | None = None
-        self._storage_files: list[Path] = [path]
-        if path.is_dir():
-            self._info = _folder_info(path)
-            self._storage_files = [path / name for name in self._info.file_names]
-        elif not path.exists():
-            raise SourceNotFoundError(path)
-        else:
-            self._info = _sibling_info(path)
-        head = [path / METADATA_FILE] if path.is_dir() else []
-        self.files: Sequence[Path] = [*head, *self._storage_files]
-        self._unpacked: ExitStack | None = None
-        self._active: list[tuple[int, StorageReader]] = []
-        self._done = 0
-        self._readers = [self._storage_reader(file) for file in self._storage_files]
-        mcaps = [reader for reader in self._readers if isinstance(reader, McapReader)]
+        self._first_copy = ExitStack()
+        self._info, self._storage_files = self._find_storage()
+        self._readers = self._open_storage()
+        self._is_packed = [reader is None for reader in self._readers]
+        has_yaml = path.is_dir() and (path / METADATA_FILE).is_file()
+        self._head = [path / METADATA_FILE] if has_yaml else []
+        self.files = [*self._head, *self._storage_files]
+        mcaps = [reader for reader in self._readers if reader and reader.format == "mcap"]
         self.library = mcaps[0].library if mcaps else ""
         self._storage = "mcap" if mcaps else "sqlite3" if self._readers else ""
-        self._channels = SharedChannels(self._info, self._storage, is_folder=path.is_dir())
-        self._is_packed = [reader is None for reader in self._readers]
         for number, reader in enumerate(self._readers):
             if reader:
-                self._channels.take_over(number, reader)
-        if self._readers and self._readers[0] is None:
+                self._declare(number, reader)
+        if any(self._is_packed[:1]):
             self._unpack_first()
-        self._tables = {
-            number: reader.tables
-            for number, reader in enumerate(self._readers)
-            if isinstance(reader, SqliteReader)
-        }
-        if all(reader is not None and _is_complete(reader) for reader in self._readers):
-            self._channels.add_listed()
+        self._tables = [reader.tables for reader in self._readers if reader]
+        if all(reader is not None and reader.has_all_channels for reader in self._readers):
+            self._declare_listed()
 
-    def _storage_reader(self, file: Path) -> StorageReader | None:
-        """The reader of a storage file; None if it must be decompressed or fetched first."""
-        decompress = unzstd if self._info and self._info.compression == "message" else None
-        compressed = is_zstd(file)
-        if (self._info and self._info.storage == "mcap") or is_mcap(file, compressed):
-            opener = partial(ZstdFile, file) if compressed else None
-            return McapReader(file, open_stream=opener, message_decompress=decompress)
-        return None if compressed or remote(file) else self._sqlite_reader(file)
+    def _find_storage(self) -> tuple[BagInfo | None, list[Path]]:
+        """The metadata.yaml, and the storage files in reading order."""
+        if self.path.is_dir():
+            info = _folder_info(self.path)
+            return info, [self.path / name for name in info.file_names]
+        if not self.path.exists():
+            raise SourceNotFoundError(self.path)
+        return _sibling_info(self.path), [self.path]
 
-    def _sqlite_reader(self, file: Path, shown: Path | None = None) -> SqliteReader:
-        decompress = unzstd if self._info and self._info.compression == "message" else None
-        reader = SqliteReader(file, shown=shown, message_decompress=decompress)
-        if not self._info and _tells_message_compression(reader):
-            return SqliteReader(file, shown=shown, message_decompress=unzstd)
-        return reader
+    def _open_storage(self) -> list[BagReader | None]:
+        """The files' readers; None for a database that must be decompressed or fetched first."""
+        return [self._storage_reader(file) for file in self._storage_files]
 
-    def _unpack_first(self) -> None:
-        # Its channels are needed before anything is read: keep it until then.
-        with ExitStack() as stack:
-            reader = stack.enter_context(self._opened(0))
-            self._readers[0] = reader
-            self._channels.take_over(0, reader)
-            self._unpacked = stack.pop_all()
+    def _storage_reader(self, file: Path) -> BagReader | None:
+        start = _start(file)
+        is_compressed = start.startswith(ZSTD_MAGIC)
+        is_named_mcap = file.name.removesuffix(".zstd").endswith(".mcap")
+        is_listed_mcap = self._info is not None and self._info.storage == "mcap"
+        if start == MCAP_MAGIC or is_named_mcap or is_listed_mcap:
+            return self._of_compression(partial(self._mcap_reader, file, is_compressed))
+        if is_compressed or remote(file):
+            return None
+        return self._of_compression(partial(self._sqlite_reader, file, file))
+
+    def _of_compression(self, opener: Callable[[Decompress | None], BagReader]) -> BagReader:
+        """The reader of a file whose messages are, or are not, individually compressed."""
+        if self._info:
+            return opener(unzstd if self._info.compression == "message" else None)
+        reader = opener(None)
+        return opener(unzstd) if self._holds_zstd(reader) else reader
+
+    def _mcap_reader(
+        self, file: Path, is_compressed: bool, decompress: Decompress | None
+    ) -> BagReader:
+        return McapReader(file, is_compressed=is_compressed, message_decompress=decompress)
+
+    def _sqlite_reader(self, file: Path, shown: Path, decompress: Decompress | None) -> BagReader:
+        return SqliteReader(file, shown=shown, message_decompress=decompress)
+
+    def _holds_zstd(self, reader: BagReader) -> bool:
+        """Whether the messages of a file without metadata.yaml are individually compressed."""
+        texts = [text for key, text in reader.tables.items() if ":metadata:" in key]
+        return bool(texts) and parse_bag_info(texts[-1], reader.path).compression == "message"
+
+    def _opened(self, number: int) -> AbstractContextManager[BagReader]:
+        reader = self._readers[number]
+        return nullcontext(reader) if reader else self._unpacked(number)
 
     @contextmanager
-    def _opened(self, number: int) -> Iterator[StorageReader]:
-        """The reader of a storage file, which is decompressed while it is needed."""
-        reader = self._readers[number]
-        if reader:
-            yield reader
-            return
+    def _unpacked(self, number: int) -> Iterator[BagReader]:
         file = self._storage_files[number]
-        with tempfile.TemporaryDirectory(prefix="mp4ds-", dir=self._workdir) as folder:
+        with tempfile.TemporaryDirectory(prefix="mp4ds-") as folder:
             copy = Path(folder) / "storage.db3"
-            (decompress_file if is_zstd(file) else copy_file)(file, copy)
-            yield self._sqlite_reader(copy, file)
+            self._unpack(file, copy)
+            yield self._of_compression(partial(self._sqlite_reader, copy, file))
 
-    def _drop_unpacked(self) -> None:
-        if self._unpacked:
+    def _unpack(self, file: Path, target: Path) -> None:
+        (decompress_file if _start(file).startswith(ZSTD_MAGIC) else copy_file)(file, target)
+
+    def _unpack_first(self) -> None:
+        """Open the first file, whose channels are needed before anything is read, until then."""
+        reader = self._first_copy.enter_context(self._unpacked(0))
+        self._readers[0] = reader
+        self._declare(0, reader)
+
+    def _drop_first(self) -> None:
+        if any(self._is_packed[:1]):
             self._readers[0] = None
-            self._unpacked.close()
-            self._unpacked = None
+            self._first_copy.close()
 
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """See `BagReader.channels`."""
-        return self._channels.all
+    def _share(self, number: int, channel: Channel) -> Channel:
+        """The recording's channel for one of a file, with the QoS of metadata.yaml if it has none.
 
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """See `BagReader.unused_schemas`."""
-        return self._channels.unused_schemas
+        Databases of early versions have no column for it.
+        """
+        if self._info and self._storage == "sqlite3" and QOS_KEY not in channel.metadata:
+            for topic in self._info.topics:
+                name = topic.name, topic.type_name
+                if topic.qos and name == (channel.topic, channel.type_name):
+                    metadata = {**channel.metadata, QOS_KEY: topic.qos}
+                    return super()._share(number, replace(channel, metadata=metadata))
+        return super()._share(number, channel)
 
-    @property
-    def skipped(self) -> Mapping[str, int]:
-        """Records that only the application that wrote them understands: name -> count."""
-        skipped: Counter[str] = Counter()
-        for reader in self._readers:
-            if isinstance(reader, McapReader):
-                skipped.update(reader.skipped)
-        return dict(skipped)
-
-    @property
-    def position(self) -> int:
-        """Bytes consumed; within an sqlite3 file by the part of its messages read."""
-        return self._done + sum(
-            reader.position
-            if isinstance(reader, McapReader)
-            else int(reader.fraction * self._storage_files[number].stat().st_size)
-            for number, reader in self._active
-        )
+    def _declare_listed(self) -> None:
+        """Declare the topics that only metadata.yaml lists, since they have no messages."""
+        if not self._info or not self.path.is_dir():
+            return
+        known = {(channel.topic, channel.type_name) for channel in self.channels}
+        for topic in self._info.topics:
+            if (topic.name, topic.type_name) not in known:
+                channel = topic.to_channel(len(self._channels))
+                self._channels[channel.identity, 0] = channel
 
     @property
     def is_indexed(self) -> bool:
-        """See `BagReader.is_indexed`; files that must be decompressed as a whole are not."""
-        return self._gives_excerpts and all(
-            reader and reader.is_indexed for reader in self._readers
+        """Whether all files are; those that must be decompressed as a whole are not."""
+        return not any(self._is_packed) and all(
+            reader is not None and reader.is_indexed for reader in self._readers
         )
 
-    @property
-    def _gives_excerpts(self) -> bool:
-        """Whether each storage file gives excerpts in log-time order, though perhaps slowly."""
-        return not any(self._is_packed) and all(
-            isinstance(reader, SqliteReader) or (reader is not None and reader.is_indexed)
-            for reader in self._readers
-        )
+    @cached_property
+    def spans(self) -> Sequence[tuple[int, int]]:
+        """Of each file, bounds of its log times, nanoseconds."""
+        starts: list[int] = []
+        for reader in reversed(self._readers):
+            span = reader.span if reader else None
+            starts.append(span[0] if span else min(starts, default=_NEVER))
+        return [(start, _NEVER) for start in reversed(starts)]
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
-        """Read everything once, or a part of it. See `BagReader.records`."""
-        self._done = 0
+        """The metadata record, then the records of all files, merged."""
         if excerpt.others:
-            yield self._info_record()
-        if self.path.is_dir():
-            self._done += self.files[0].stat().st_size
-        if self._gives_excerpts:
-            starts = [reader.start or 0 for reader in self._readers if reader]
-            yield from merged(
-                [
-                    SourcePart(start, partial(self._file_records, number, excerpt))
-                    for number, start in enumerate(starts)
-                ]
-            )
-        else:
-            yield from filter(excerpt.has, self._consecutive_records(excerpt))
-        self._channels.add_listed()
+            yield self._metadata_record()
+        yield from super().records(excerpt)
+        self._done += sum(file.stat().st_size for file in self._head)
+        self._declare_listed()
 
-    def _consecutive_records(self, excerpt: Excerpt) -> Iterator[Record]:
-        """The minimum to read for an excerpt, file by file."""
-        part = EVERYTHING if excerpt.has_messages else excerpt
-        return consecutive(self._readers, lambda number: self._file_records(number, part))
-
-    def _file_records(self, number: int, excerpt: Excerpt) -> Iterator[Record]:
-        with self._opened(number) as reader:
-            self._channels.take_over(number, reader)
-            if isinstance(reader, SqliteReader) and number not in self._tables:
-                yield MetadataRecord(TABLES_RECORD, reader.tables)
-            self._active.append((number, reader))
-            try:
-                for record in reader.records(excerpt):
-                    if isinstance(record, Message):
-                        yield record.of_channel(self._channels.share(number, record.channel))
-                    else:
-                        yield record
-            finally:
-                self._active.remove((number, reader))
-            self._channels.take_over(number, reader)
-        self._done += self._storage_files[number].stat().st_size
-        if number == 0:
-            self._drop_unpacked()
-
-    def _info_record(self) -> MetadataRecord:
-        content = {
-            "storage": self._storage,
-            "files": "\n".join(file.name for file in self._storage_files),
-        }
+    def _metadata_record(self) -> MetadataRecord:
+        names = "\n".join(file.name for file in self._storage_files)
+        content = {"storage": self._storage, "files": names}
         if self._info:
             content[METADATA_FILE] = self._info.text
-        for tables in self._tables.values():
+        for tables in self._tables:
             content.update(tables)
         return MetadataRecord(RECORD, content)
 
+    def _records_of(self, number: int, excerpt: Excerpt) -> Iterator[Record]:
+        yield from super()._records_of(number, excerpt)
+        if number == 0:
+            self._drop_first()
+
+    def _part_records(self, number: int, part: BagReader, excerpt: Excerpt) -> Iterator[Record]:
+        if number > 0 and self._is_packed[number]:
+            yield MetadataRecord(TABLES_RECORD, part.tables)
+        yield from part.records(excerpt)
+
     def stats(self) -> Mapping[int, ChannelStats]:
-        """See `BagReader.stats`; empty if it is unknown for one of the files."""
-        total: dict[int, ChannelStats] = {}
-        for number, reader in enumerate(self._readers):
-            stats = reader.stats() if reader and _is_complete(reader) else {}
-            if not reader or not _is_complete(reader) or (reader.channels and not stats):
-                return {}
-            for channel in reader.channels:
-                shared = self._channels.share(number, channel).id
-                total[shared] = total.get(shared, _NO_STATS).plus(stats.get(channel.id, _NO_STATS))
-        for channel in self._channels.all:
-            total.setdefault(channel.id, _NO_STATS)
-        return total
+        """Those of all files; empty if one of them must be decompressed first."""
+        return {} if None in self._readers else super().stats()
 
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """See `BagReader.times`."""
-        found: dict[int, list[NDArray[np.int64]]] = {}
-        for number in range(len(self._storage_files)):
-            with self._opened(number) as reader:
-                times = reader.times()
-                for channel in reader.channels:
-                    if channel.id in times:
-                        shared = self._channels.share(number, channel)
-                        found.setdefault(shared.id, []).append(times[channel.id])
-        return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
+    def close(self) -> None:
+        """Close the files, and remove those that were decompressed."""
+        super().close()
+        self._drop_first()
 
-    def first(self, channel: Channel) -> Message | None:
-        """See `BagReader.first`; files to be decompressed are assumed to be consecutive in time."""
-        best: Message | None = None
-        for number, known in enumerate(self._readers):
-            if best and (not known or (known.start or 0) > best.log_time):
-                continue
-            with self._opened(number) as reader:
-                for own in reader.channels:
-                    if self._channels.share(number, own).id != channel.id:
-                        continue
-                    message = reader.first(own)
-                    if message and (best is None or message.log_time < best.log_time):
-                        best = message.of_channel(channel)
-        return best
 
-    def __enter__(self) -> Rosbag2Reader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for reader in self._readers:
-            if isinstance(reader, McapReader):
-                reader.__exit__()
-        self._drop_unpacked()
+def _start(file: Path) -> bytes:
+    with open_source(file) as stream:
+        return stream.read(len(MCAP_MAGIC))
 
 
 def _folder_info(path: Path) -> BagInfo:
@@ -333,11 +276,29 @@ def _sibling_info(path: Path) -> BagInfo | None:
     return info if path.name in info.file_names else None
 
 
-def _tells_message_compression(reader: SqliteReader) -> bool:
-    texts = [text for key, text in reader.tables.items() if ":metadata:" in key]
-    return bool(texts) and parse_bag_info(texts[-1], reader.path).compression == "message"
+STORAGE_NAME = re.compile(r"(?P<stem>.*?)(?:_(?P<number>\d+))?\.(?:db3|mcap)(?:\.zstd)?")
+"""Names of storage files: the recording's name with a number."""
 
 
-def _is_complete(reader: StorageReader) -> bool:
-    """Whether all channels are known without reading."""
-    return isinstance(reader, SqliteReader) or reader.has_statistics
+def unlisted_storage(folder: Path, listed: Collection[str]) -> list[str]:
+    """Storage files of a recording that its metadata.yaml does not list.
+
+    Args:
+        folder: The recording.
+        listed: Those that it lists.
+    """
+
+    def stem(name: str) -> str:
+        match = STORAGE_NAME.fullmatch(name)
+        return match["stem"] if match else name
+
+    there = [file.name for file in folder.iterdir() if file.is_file()]
+    stems = {stem(name) for name in listed if name in there}
+    return [
+        name
+        for name in there
+        if STORAGE_NAME.fullmatch(name)
+        and name not in listed
+        and f"{name}.zstd" not in listed  # ROS 2 leaves behind the files it decompressed to play
+        and (not stems or stem(name) in stems)
+    ]

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from mp4ds import yamlio
-from mp4ds.bags.mcap_records import SALVAGE, SALVAGE_REMEDY
+from mp4ds.bags.files import SALVAGE, SALVAGE_REMEDY
 from mp4ds.errors import SourceError
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 

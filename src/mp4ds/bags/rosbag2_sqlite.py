@@ -8,22 +8,23 @@ import sys
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_records import (
+from mp4ds.bags.files import (
     SALVAGE,
     SALVAGE_REMEDY,
     DamageError,
     OversizeError,
+    most_held,
     open_source,
     unreadable,
 )
-from mp4ds.bags.protocols import most_held
+from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import SourceError
 from mp4ds.records import EVERYTHING, HASH_KEY, Channel, ChannelStats, Excerpt, Message, Schema
 
@@ -166,7 +167,7 @@ _TIME_INDEXES = """
 _INT64 = -(2**63), 2**63 - 1
 
 
-class SqliteReader:
+class SqliteReader(BagReader):
     """Reads one ``.db3`` file. Channel ids are the ids of the topic rows.
 
     Every pass has its own connection, so that several can run.
@@ -186,6 +187,12 @@ class SqliteReader:
         SourceError: The file is missing, damaged, or not a rosbag2 database.
     """
 
+    format = "rosbag2"
+    profile = "ros2"
+    position = 0
+    is_indexed = False
+    has_all_channels = True
+
     def __init__(
         self,
         path: Path,
@@ -197,10 +204,8 @@ class SqliteReader:
         self.path = path
         self._damaged = damaged
         self._shown = shown or path
+        self.files = [self._shown]
         self._decompress = message_decompress
-        self._rows_read = 0
-        self._rows: int | None = None
-        self._start: int | None = None
         self._definitions: list[tuple[Schema, str]] = []
         with closing(open_source(path, self._shown)) as stream:
             if stream.read(len(_MAGIC)) != _MAGIC:
@@ -315,19 +320,13 @@ class SqliteReader:
         used = {channel.schema for channel in self._channels.values()}
         return list(dict.fromkeys(item[0] for item in self._definitions if item[0] not in used))
 
-    @property
-    def start(self) -> int | None:
-        """The earliest log time, nanoseconds; None without messages."""
-        if self._start is None:
-            with self._opened() as tables:
-                row = tables.select("SELECT MIN(timestamp) FROM messages").fetchone()
-            self._start = row[0] if isinstance(row[0], int) else None
-        return self._start
-
-    @property
-    def fraction(self) -> float:
-        """Fraction of the messages that `records` has read."""
-        return min(1.0, self._rows_read / self._rows) if self._rows else 0.0
+    @cached_property
+    def span(self) -> tuple[int, int] | None:
+        """Earliest and latest log time, nanoseconds; None without messages."""
+        ends = (f"(SELECT {end}(timestamp) FROM messages)" for end in ("MIN", "MAX"))
+        with self._opened() as tables:
+            first, last = tables.select(f"SELECT {', '.join(ends)}").fetchone()
+        return (first, last) if isinstance(first, int) and isinstance(last, int) else None
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Message]:
         """Read all messages or an excerpt by log time, ties by row id."""
@@ -337,23 +336,25 @@ class SqliteReader:
             yield from self._excerpt_records(excerpt)
 
     def _all_records(self) -> Iterator[Message]:
+        size = self._shown.stat().st_size
         with self._opened() as tables:
-            self._rows_read = 0
             # Counted without the index, which may lack messages where it is damaged.
             # COUNT(*) would continue without a look at signals.
             query = "SELECT COUNT(1) FROM messages NOT INDEXED"
-            (self._rows,) = tables.select(query).fetchone()
+            (rows,) = tables.select(query).fetchone()
+            read = self.position = 0
             # Ids first: without an index, sorting whole rows would copy the recording.
             query = "SELECT id, timestamp FROM messages ORDER BY timestamp, id"
             before = None
             for row in tables.select(query):
-                self._rows_read += 1
-                message = self._message(tables, row[0], f"message {self._rows_read}")
+                read += 1
+                message = self._message(tables, row[0], f"message {read}")
                 if row == before or row[1] != message.log_time:  # one twice, another not at all
                     raise self._bad_index()
                 before = row
+                self.position = min(size, size * read // max(1, rows))
                 yield message
-            if self._rows_read != self._rows:
+            if read != rows:
                 raise self._bad_index()
 
     def _excerpt_records(self, excerpt: Excerpt) -> Iterator[Message]:

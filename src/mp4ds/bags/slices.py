@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.latched import begun_by, latched_before
-from mp4ds.bags.protocols import BagReader, Format, first_of
-from mp4ds.bags.salvage.losses import losses_of
+from mp4ds.bags.protocols import BagReader, first_of
 from mp4ds.errors import SourceError
 from mp4ds.options import Slice
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Loss, Message, Record, Schema
@@ -20,7 +19,7 @@ from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Loss, Mess
 _NO_TIMES = np.empty(0, np.int64)
 
 
-class SliceReader:
+class SliceReader(BagReader):
     """The messages of a recording logged within a time slice. See `BagReader`.
 
     Attachments, metadata records, channels and definitions are those of the whole recording. If
@@ -32,7 +31,7 @@ class SliceReader:
         begin: The time from which it is counted, nanoseconds; None for the first message.
 
     Attributes:
-        span: The slice, as times of the recording.
+        excerpt: The slice, as times of the recording.
 
     Raises:
         OptionError: It is empty, or a time is not valid.
@@ -41,6 +40,7 @@ class SliceReader:
 
     def __init__(self, reader: BagReader, asked: Slice, begin: int | None = None) -> None:
         self._reader = reader
+        self.format = reader.format
         self.path, self.profile = reader.path, reader.profile
         self.library, self.files = reader.library, reader.files
         known = [item for item in reader.stats().values() if item.count]
@@ -51,13 +51,8 @@ class SliceReader:
             raise SourceError(reader.path, "has no messages to take a slice of")
         first, last = min(item.start for item in known), max(item.end for item in known)
         first = max(first, begin or first)
-        self.span = Excerpt(*asked.times(first, last, reader.path))
-        self._has_latched = asked.latched and self.span.start is not None
-
-    @property
-    def format(self) -> Format:
-        """See `BagReader.format`."""
-        return self._reader.format
+        self.excerpt = Excerpt(*asked.times(first, last, reader.path))
+        self._has_latched = asked.latched and self.excerpt.start is not None
 
     @property
     def channels(self) -> Sequence[Channel]:
@@ -77,7 +72,7 @@ class SliceReader:
     @property
     def losses(self) -> Sequence[Loss]:
         """The losses of the whole recording."""
-        return losses_of(self._reader)
+        return self._reader.losses
 
     @property
     def position(self) -> int:
@@ -92,13 +87,13 @@ class SliceReader:
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """See `BagReader.records`."""
         latched = [message for message in self._latched[0] if excerpt.has(message)]
-        return begun_by(latched, self._reader.records(excerpt.within(self.span)))
+        return begun_by(latched, self._reader.records(excerpt.within(self.excerpt)))
 
     @cached_property
     def _latched(self) -> tuple[Sequence[Message], Sequence[str]]:
         if not self._has_latched:
             return (), ()
-        times, before = self._reader.times(), Excerpt(end=self.span.start, others=False)
+        times, before = self._reader.times(), Excerpt(end=self.excerpt.start, others=False)
         sent = [c for c in self.channels if len(in_span(times.get(c.id, _NO_TIMES), before))]
 
         def read(topics: frozenset[str], _: int) -> Iterator[Record]:
@@ -136,7 +131,7 @@ class SliceReader:
             early.setdefault(message.channel.id, []).append(message.log_time)
         found = {
             key: np.concatenate(
-                [np.sort(np.array(early.get(key, ()), np.int64)), in_span(times, self.span)]
+                [np.sort(np.array(early.get(key, ()), np.int64)), in_span(times, self.excerpt)]
             )
             for key, times in self._reader.times().items()
         }
@@ -150,11 +145,9 @@ class SliceReader:
         excerpt = Excerpt(start, start + 1, frozenset([channel.topic]), others=False)
         return first_of(self.records(excerpt)).get(channel.id)
 
-    def __enter__(self) -> SliceReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._reader.__exit__()
+    def close(self) -> None:
+        """Close the recording."""
+        self._reader.close()
 
 
 def in_span(times: NDArray[np.int64], span: Excerpt) -> NDArray[np.int64]:

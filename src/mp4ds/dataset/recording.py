@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.protocols import Format, first_of
+from mp4ds.bags.protocols import BagReader, stats_of
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import advising
 from mp4ds.format.manifest import Manifest
@@ -19,8 +19,8 @@ from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, R
 _BEST_JPEG = 100
 
 
-class DatasetReader:
-    """The recording held by a dataset. See `BagReader`.
+class DatasetReader(BagReader):
+    """The recording held by a dataset.
 
     Messages of lossy streams have the pixels of the videos; re-encoded JPEG files are made with the
     best quality.
@@ -43,42 +43,37 @@ class DatasetReader:
             self._dataset.verify_sidecars()
         self.path = self._dataset.path
         self.manifest: Manifest = load_manifest(self.path / MANIFEST_NAME)
+        self.format = self.manifest.format
         self.profile = self.manifest.recording_profile
         self.library = self.manifest.library
         self.slice_start = self._dataset.slice_start
         names = [MANIFEST_NAME, *(entry.name for entry in self.manifest.files)]
-        self.files: Sequence[Path] = [self.path / name for name in names]
-        self.skipped: Mapping[str, int] = {}
+        self.files = [self.path / name for name in names]
         self._read = 0
 
     @property
-    def format(self) -> Format:
-        """See `BagReader.format`."""
-        return self.manifest.format
-
-    @property
     def channels(self) -> Sequence[Channel]:
-        """See `BagReader.channels`."""
+        """All channels."""
         return self._dataset.channels
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
-        """See `BagReader.unused_schemas`."""
+        """Definitions that no channel refers to."""
         return self._dataset.unused_schemas
 
     @property
     def position(self) -> int:
-        """See `BagReader.position`; by the number of messages."""
+        """Bytes of its files in proportion to the messages read."""
         total = sum(entry.size for entry in self.manifest.files)
         return total * self._read // max(1, self.manifest.messages)
 
     @cached_property
     def is_indexed(self) -> bool:
-        """See `BagReader.is_indexed`."""
+        """Whether the messages of each channel are in the order of their log times."""
         return self._dataset.is_in_time
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
-        """See `BagReader.records`."""
+        """Its records, decoded; without those that an excerpt lacks."""
         self._read = 0
         with advising(COPY_AGAIN):
             for record in self._records(excerpt):
@@ -106,33 +101,18 @@ class DatasetReader:
             channel.topic for channel in self.channels if excerpt.has_topic(channel.topic)
         )
 
-    def stats(self) -> Mapping[int, ChannelStats]:
-        """See `BagReader.stats`."""
-        return {
-            key: ChannelStats(len(times), int(times[0]), int(times[-1]))
-            for key, times in self.times().items()
-            if len(times)
-        }
-
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """See `BagReader.times`."""
-        return self._times
-
     @cached_property
     def _times(self) -> Mapping[int, NDArray[np.int64]]:
         return self._dataset.times()
 
-    def first(self, channel: Channel) -> Message | None:
-        """See `BagReader.first`."""
-        times = self._times.get(channel.id)
-        if times is None or not len(times):
-            return None
-        start = int(times[0])
-        span = Excerpt(start, start + 1, frozenset([channel.topic]), others=False)
-        return first_of(self.records(span)).get(channel.id)
+    def times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Log times by channel id, nanoseconds, from the sidecars."""
+        return self._times
 
-    def __enter__(self) -> DatasetReader:
-        return self
+    def stats(self) -> Mapping[int, ChannelStats]:
+        """Counts and spans of the log times, whether they are in order or not."""
+        return stats_of(self._times)
 
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Close the dataset."""
         self._dataset.close()

@@ -398,7 +398,7 @@ def is_hashed(path: Path, asked: Slice) -> bool:
 
 def span_of(reader: BagReader) -> Excerpt:
     """The part of a recording that is read."""
-    return reader.span if isinstance(reader, SliceReader) else EVERYTHING
+    return reader.excerpt if isinstance(reader, SliceReader) else EVERYTHING
 
 
 def with_latched(summary: PackSummary, reader: BagReader) -> PackSummary:

@@ -12,21 +12,17 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mp4ds.bags.protocols import Format
+from mp4ds.bags.protocols import BagReader, Format
 from mp4ds.files.sources import JOURNAL_NAME
 from mp4ds.packing.engine import Workers
 from mp4ds.packing.journal import Journal
 from mp4ds.packing.manifest import PartRecord
 from mp4ds.packing.packer import TOO_LATE, Packer, PartSettings
-from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
+from mp4ds.records import EVERYTHING, Channel, Excerpt, Message, Record
 from mp4ds.times import INT64_MAX
 
 LATE_S = 0.5
@@ -177,8 +173,8 @@ class PromptWorkers(Workers):
         self._raise_error()
 
 
-class LiveRecording:
-    """What is told of a recording while it is made. See `BagReader`.
+class LiveRecording(BagReader):
+    """What is told of a recording while it is made.
 
     Args:
         path: Where it is made.
@@ -187,12 +183,8 @@ class LiveRecording:
         others: What it holds besides messages.
     """
 
-    library = ""
-    files: Sequence[Path] = ()
-    unused_schemas: Sequence[Schema] = ()
-    skipped: Mapping[str, int] = MappingProxyType({})
-    position = 0
-    is_indexed = False
+    files = ()
+    channels: Sequence[Channel] = ()
 
     def __init__(
         self,
@@ -202,7 +194,7 @@ class LiveRecording:
         others: Sequence[Record] = (),
     ) -> None:
         self.path = path
-        self.format: Format = format
+        self.format = format
         self.profile = profile
         self.channels: list[Channel] = []
         self._others = others
@@ -211,25 +203,6 @@ class LiveRecording:
         """What it holds besides messages, which come to `LivePacker`."""
         del excerpt
         return iter(self._others)
-
-    def stats(self) -> Mapping[int, ChannelStats]:
-        """Nothing is known of what will come."""
-        return {}
-
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Nothing is known of what will come."""
-        return {}
-
-    def first(self, channel: Channel) -> Message | None:
-        """Nothing is known of what will come."""
-        del channel
-        return None
-
-    def __enter__(self) -> LiveRecording:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
 
 class LivePacker(Packer):

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 import xxhash
 
 from mp4ds._version import __version__
+from mp4ds.bags.combined import bounded
 from mp4ds.bags.protocols import BagReader, BagWriter, Format
-from mp4ds.bags.salvage.losses import bounded
 from mp4ds.errors import FormatError, SourceError, advising
 from mp4ds.files.outputs import digest_file, write_synced
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME, of_types

@@ -10,7 +10,6 @@ from typing import TypeVar
 
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.protocols import BagReader
-from mp4ds.bags.salvage.losses import losses_of
 from mp4ds.errors import OutOfReachError, Refused
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
@@ -405,7 +404,7 @@ class Packer:
         self._calibrations.finish()
         if excerpt.others:
             self._part.skipped = dict(self._reader.skipped)
-            self._part.losses = list(losses_of(self._reader))
+            self._part.losses = list(self._reader.losses)
 
     def _take(self, record: Record, workers: Workers) -> None:
         part = self._part

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from mp4ds.bags.mcap_records import MAGIC
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.protocols import Format, write_record
-from mp4ds.bags.salvage.losses import losses_of
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.rebuild import columns_model
@@ -201,8 +200,7 @@ class _Recovery:
         if not (path.is_file() and path.stat().st_size and begins_with(path, MAGIC)):
             return  # nothing of it reached the disk
         transforms = TransformCollector()
-        with McapSalvage(path) as reader:
-            reader.is_alone = False
+        with McapSalvage(path, is_alone=False) as reader:
             for record in reader.records():
                 if isinstance(record, MetadataRecord):
                     writer.add_metadata(record)
@@ -213,7 +211,7 @@ class _Recovery:
                 self._kept[channel.id] += is_camera(channel)
                 transforms.add(channel, record.data)
                 write_record(writer, record.of_channel(channel))
-            part.losses.extend(losses_of(reader))
+            part.losses.extend(reader.losses)
         part.transforms = transforms.transforms
 
     def _known(self, channel: Channel) -> Channel:

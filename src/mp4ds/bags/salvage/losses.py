@@ -1,34 +1,16 @@
-"""The losses of a recording, and what all salvage readers have in common."""
+"""The losses of a file, and what all readers of damaged files have in common."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mp4ds.bags.formats import MultiReader
-from mp4ds.bags.protocols import BagReader, Format, first_of, times_of
-from mp4ds.records import (
-    EVERYTHING,
-    MAX_LOSSES,
-    MAX_LOST_TOPICS,
-    Channel,
-    ChannelStats,
-    Excerpt,
-    Loss,
-    Message,
-    Record,
-    Schema,
-)
-
-_MORE = " more places that could not be read"
+from mp4ds.bags.combined import MORE_LOSSES
+from mp4ds.bags.protocols import BagReader
+from mp4ds.records import EVERYTHING, MAX_LOSSES, MAX_LOST_TOPICS, Excerpt, Loss, Message, Record
 
 
 @dataclass(eq=False)
@@ -133,7 +115,7 @@ class LossLog:
         if not self._more:
             self._more.append(Draft(None, 0, ""))
         more = self._more[0]
-        more.problem = f"{self._number_more}{_MORE}"
+        more.problem = f"{self._number_more}{MORE_LOSSES}"
         more.size = (more.size or 0) + (draft.size or 0)
         return more
 
@@ -155,28 +137,6 @@ class LossLog:
             for draft in unknown[1:]:
                 draft.messages = 0
         return [draft.finished(self._file) for draft in drafts]
-
-
-def bounded(losses: Sequence[Loss]) -> list[Loss]:
-    """Losses of several files; the last one sums up those beyond the limit."""
-    if len(losses) <= MAX_LOSSES:
-        return list(losses)
-    rest = losses[MAX_LOSSES - 1 :]
-    number = sum(_places(loss) for loss in rest)
-    counts = [loss.messages for loss in rest if loss.messages is not None]
-    more = Loss(
-        rest[0].file,
-        None,
-        sum(loss.size or 0 for loss in rest),
-        f"{number}{_MORE}",
-        sum(counts) if len(counts) == len(rest) else None,
-    )
-    return [*losses[: MAX_LOSSES - 1], more]
-
-
-def _places(loss: Loss) -> int:
-    number = loss.problem.removesuffix(_MORE)
-    return int(number) if loss.problem.endswith(_MORE) and number.isdecimal() else 1
 
 
 # ---------------------------------------------------------------- tally
@@ -377,125 +337,35 @@ def _total(found: tuple[int, Counter[int]] | None) -> float:
 # ---------------------------------------------------------------- the reader
 
 
-class SalvageReader(BagReader, Protocol):
-    """Reads what is readable of a recording, in one pass, and records what is not.
+class FileSalvage(BagReader):
+    """Reads what is readable of a file, in one pass, and records what is not.
 
     It never fails because of damage. For an intact recording, it gives the same as the usual
     reader. Messages come in log-time order if the index at the end of the file is readable,
     otherwise in file order. Some doubtful messages are included: if a checksum shows that a chunk
     is damaged but not where, the loss says so.
-    """
-
-    @property
-    def losses(self) -> Sequence[Loss]:
-        """What could not be read; complete once `records` of everything is exhausted."""
-        ...
-
-
-class Salvage(ABC):
-    """What all salvage readers share. See `SalvageReader`.
-
-    Args:
-        path: What to read.
-
-    Attributes:
-        when_read: Called with the losses when `records` is exhausted.
-        is_alone: Whether it is an error, not just a loss, if nothing can be read.
-    """
-
-    format: Format
-    profile: str = ""
-    library: str = ""
-    is_indexed = False
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.files: Sequence[Path] = [path]
-        self.when_read: Callable[[Sequence[Loss]], None] | None = None
-        self.is_alone = True
-        self._losses: list[Loss] = []
-        self._first: dict[int, Message] | None = None
-
-    @abstractmethod
-    def _read(self, losses: list[Loss]) -> Iterator[Record]:
-        """Read everything once, and append what is lost at the end."""
-
-    @property
-    @abstractmethod
-    def channels(self) -> Sequence[Channel]:
-        """All channels known so far."""
-
-    @property
-    @abstractmethod
-    def position(self) -> int:
-        """Bytes of the files that `records` has reached."""
-
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """See `BagReader.unused_schemas`."""
-        return ()
-
-    @property
-    def skipped(self) -> Mapping[str, int]:
-        """See `BagReader.skipped`."""
-        return {}
-
-    @property
-    def losses(self) -> Sequence[Loss]:
-        """See `SalvageReader.losses`."""
-        return self._losses
-
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
-        """Everything readable. See `BagReader.records`."""
-        self._losses = []
-        losses: list[Loss] = []
-        for record in self._read(losses):
-            if excerpt is EVERYTHING or excerpt.has(record):
-                yield record
-        self._losses = losses
-        if self.when_read:
-            self.when_read(losses)
-
-    def stats(self) -> Mapping[int, ChannelStats]:
-        """Counts and spans from an index at the end, including lost messages; otherwise empty."""
-        return {}
-
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Log times of everything readable, by reading it."""
-        return times_of(self._read([]))
-
-    def first(self, channel: Channel) -> Message | None:
-        """The channel's first message by log time, by reading once for all channels."""
-        if self._first is None:
-            self._first = first_of(self._read([]))
-        return self._first.get(channel.id)
-
-    def __enter__(self) -> Salvage:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
-
-
-class FileSalvage(Salvage):
-    """A salvage reader of one file.
 
     Args:
         path: The file.
         shown: Its name in losses, if it is a decompressed copy.
+        is_alone: Whether it is an error, not just a loss, if nothing can be read.
     """
 
-    def __init__(self, path: Path, shown: Path | None = None) -> None:
-        super().__init__(path)
+    position = 0
+    losses: Sequence[Loss] = ()
+
+    def __init__(self, path: Path, *, shown: Path | None = None, is_alone: bool = True) -> None:
+        self.path = path
         self._shown = shown or path
-        self._position = 0
+        self.files = [self._shown]
+        self._is_alone = is_alone
 
     @abstractmethod
     def _pass(self, log: LossLog) -> Iterator[Record]:
         """Read everything once, recording what is lost."""
 
     @property
-    def _orderly(self) -> Callable[[], BagReader] | None:
+    def _usual(self) -> Callable[[], BagReader] | None:
         """Opens the usual reader, if the file is more out of order than can be held back.
 
         If the file is intact, that reader can still sort it.
@@ -506,60 +376,23 @@ class FileSalvage(Salvage):
         """Messages lost in the last pass, if the file states how many there were."""
         return None
 
-    @property
-    def position(self) -> int:
-        """Bytes of the file that `records` has reached."""
-        return self._position
-
-    def _read(self, losses: list[Loss]) -> Iterator[Record]:
-        opener = self._orderly
-        if opener is not None and self._is_intact():
-            with opener() as usual:
-                for record in usual.records():
-                    self._position = usual.position
-                    yield record
-                self._position = usual.position
-            return
+    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+        """Everything readable, of which all but the excerpt is dropped."""
+        self.losses = []
         log = LossLog(self._shown.name)
-        yield from self._pass(log)
-        losses += log.finish(self._lost_in_all())
+        if self._usual is not None and self._is_intact():
+            with self._usual() as usual:
+                for record in usual.records():
+                    self.position = usual.position
+                    if excerpt.has(record):
+                        yield record
+                self.position = usual.position
+            return
+        yield from filter(excerpt.has, self._pass(log))
+        self.losses = log.finish(self._lost_in_all())
 
     def _is_intact(self) -> bool:
         log = LossLog(self._shown.name)
         for _ in self._pass(log):
             pass
         return not log.finish()
-
-
-def losses_of(reader: BagReader) -> Sequence[Loss]:
-    """The losses of a reader; empty for one that reads everything or fails."""
-    losses: Sequence[Loss] = getattr(reader, "losses", ())
-    return losses
-
-
-# ---------------------------------------------------------------- several recordings
-
-
-class MultiSalvage(MultiReader):
-    """Like `MultiReader`, for what is readable of each part. See `SalvageReader`.
-
-    Args:
-        openers: Each opens one part; a part is open only while it is read.
-    """
-
-    def __init__(self, openers: Sequence[Callable[[], Salvage]]) -> None:
-        self._found: dict[int, Sequence[Loss]] = {}
-        super().__init__(
-            [partial(self._open, number, opener) for number, opener in enumerate(openers)]
-        )
-
-    def _open(self, number: int, opener: Callable[[], Salvage]) -> Salvage:
-        part = opener()
-        part.is_alone = False
-        part.when_read = partial(self._found.__setitem__, number)
-        return part
-
-    @property
-    def losses(self) -> Sequence[Loss]:
-        """The losses of all parts, in order."""
-        return bounded([loss for number in sorted(self._found) for loss in self._found[number]])

@@ -15,20 +15,18 @@ import numpy as np
 from mcap import records as mcap_records
 from mcap.opcode import Opcode
 
+from mp4ds.bags.files import DamageError, ZstdStream, open_source
 from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.mcap_records import (
     MAGIC,
     MAX_RECORD_BYTES,
-    DamageError,
     Declared,
     chunk_records,
-    open_source,
     parse,
     parse_message,
     unpack_chunk,
 )
-from mp4ds.bags.protocols import HOLD_BYTES, BagReader, Format, HoldBack
-from mp4ds.bags.rosbag2_files import ZstdStream
+from mp4ds.bags.protocols import HOLD_BYTES, BagReader, HoldBack
 from mp4ds.bags.salvage.losses import Draft, FileSalvage, LossLog, Tally
 from mp4ds.bags.salvage.mcap_summary import McapFraming, SalvagedSummary, read_summary
 from mp4ds.bags.salvage.scan import MAX_UNPROVEN, RecordFrame, Scan, Window, lost_by, unpack
@@ -408,10 +406,11 @@ def _key(message: bytes | memoryview) -> tuple[int, int]:
 
 
 class McapSalvage(FileSalvage):
-    """Reads what is left of an MCAP file. See `SalvageReader`.
+    """Reads what is left of an MCAP file.
 
     Args:
         path: The file.
+        is_alone: See `FileSalvage`.
         is_compressed: Whether it is compressed with zstd as a whole. Offsets of losses then refer
             to its content.
         message_decompress: Decompresses the payload of a message; raises `DamageError` if it
@@ -421,16 +420,17 @@ class McapSalvage(FileSalvage):
         SourceError: The file is missing, empty, or unreadable.
     """
 
-    format: Format = "mcap"
+    format = "mcap"
 
     def __init__(
         self,
         path: Path,
         *,
+        is_alone: bool = True,
         is_compressed: bool = False,
         message_decompress: Callable[[memoryview], bytes] | None = None,
     ) -> None:
-        super().__init__(path)
+        super().__init__(path, is_alone=is_alone)
         open_source(path).close()
         self._is_compressed = is_compressed
         self._decompress = message_decompress
@@ -468,7 +468,7 @@ class McapSalvage(FileSalvage):
 
     def _window(self) -> Window:
         if self._is_compressed:
-            return Window(ZstdStream(self.path), self.path)
+            return Window(ZstdStream(self.path, to_damage=True), self.path)
         return Window.of_file(self.path)
 
     @property
@@ -487,20 +487,14 @@ class McapSalvage(FileSalvage):
         return dict(self._declared.skipped)
 
     @property
-    def has_statistics(self) -> bool:
+    def has_all_channels(self) -> bool:
         """Whether the file states how many messages it has."""
         return self._summary.statistics is not None
 
     @property
-    def is_ordered(self) -> bool:
-        """Whether messages come in log-time order."""
-        return self._summary.chunks.has_messages
-
-    @property
-    def start(self) -> int | None:
-        """The earliest log time from the summary, ns; None if unknown."""
-        span = self._summary.chunks.span()
-        return span[0] if span else None
+    def span(self) -> tuple[int, int] | None:
+        """Earliest and latest log time from the summary, ns; None if unknown."""
+        return self._summary.chunks.span()
 
     def stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the summary, including lost messages; otherwise empty."""
@@ -510,7 +504,7 @@ class McapSalvage(FileSalvage):
         return None if self._count is None else max(0, self._count - self._given)
 
     @property
-    def _orderly(self) -> Callable[[], BagReader] | None:
+    def _usual(self) -> Callable[[], BagReader] | None:
         if self._summary.chunks.held_in_file_order() <= HOLD_BYTES:
             return None
         return partial(McapReader, self.path, message_decompress=self._decompress)
@@ -519,14 +513,14 @@ class McapSalvage(FileSalvage):
         self._declared.skipped.clear()
         self._given = 0
         chunks = self._summary.chunks
-        held = HoldBack() if self.is_ordered else None
+        held = HoldBack() if chunks.has_messages else None
         with self._window() as window:
             reading = McapPass(
                 self.path, window, log, self._declared, self._summary, self._decompress
             )
             others: list[Record] = []
             for record in reading.records():
-                self._position = window.position
+                self.position = window.position
                 if isinstance(record, Message):
                     self._given += 1
                     if held is None:
@@ -542,7 +536,7 @@ class McapSalvage(FileSalvage):
                     others.clear()
             if held is not None:
                 yield from held.release(None)
-            self._position = window.position
+            self.position = window.position
             self._count = reading.count
-            if self.is_alone and not reading.found and not self._declared.channels:
+            if self._is_alone and not reading.found and not self._declared.channels:
                 raise SourceError(self.path, "holds no MCAP records")

@@ -13,13 +13,13 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from mp4ds.bags.files import DamageError
 from mp4ds.bags.mcap_index import ChunkTable
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
     MAGIC,
     OF_SUMMARY,
     PRIVATE_OPCODE,
-    DamageError,
     parse,
 )
 from mp4ds.bags.salvage.scan import RecordFrame, Scan, Window

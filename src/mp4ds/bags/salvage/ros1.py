@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mp4ds.bags.mcap_records import DamageError, open_source
-from mp4ds.bags.protocols import HOLD_BYTES, BagReader, Format, HoldBack
+from mp4ds.bags.files import DamageError, open_source
+from mp4ds.bags.protocols import HOLD_BYTES, BagReader, HoldBack
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.bags.ros1_records import (
     MAGIC,
@@ -293,20 +293,17 @@ _INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
 
 
 class Ros1Salvage(FileSalvage):
-    """Reads what is left of a ROS 1 bag. See `SalvageReader`.
-
-    Args:
-        path: The file.
+    """Reads what is left of a ROS 1 bag.
 
     Raises:
         SourceError: The file is missing, empty, encrypted, of another version, or not a bag.
     """
 
-    format: Format = "bag"
+    format = "bag"
     profile = "ros1"
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, *, is_alone: bool = True) -> None:
+        super().__init__(path, is_alone=is_alone)
         with open_source(path) as stream:
             start = stream.read(32)
         self._has_magic = start.startswith(MAGIC)
@@ -325,7 +322,7 @@ class Ros1Salvage(FileSalvage):
         return self._index.stats(self._channels)
 
     @property
-    def _orderly(self) -> Callable[[], BagReader] | None:
+    def _usual(self) -> Callable[[], BagReader] | None:
         is_far_out = self._index.held_in_file_order() > HOLD_BYTES // _MOST_PACKED
         return partial(Ros1Reader, self.path) if is_far_out else None
 
@@ -334,7 +331,7 @@ class Ros1Salvage(FileSalvage):
             reading = _Pass(self.path, window, log, self._index, self._channels)
             held = HoldBack() if self._index.chunks else None
             for message in reading.messages():
-                self._position = window.offset
+                self.position = window.offset
                 if held is None:
                     yield message
                     continue
@@ -344,8 +341,8 @@ class Ros1Salvage(FileSalvage):
                 held.add(message)
             if held:
                 yield from held.release(None)
-            self._position = window.offset
-            if self.is_alone and not reading.found and not self._channels:
+            self.position = window.offset
+            if self._is_alone and not reading.found and not self._channels:
                 raise SourceError(self.path, "holds no ROS 1 bag records")
 
 

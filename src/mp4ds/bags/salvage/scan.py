@@ -8,30 +8,29 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, Generic, NamedTuple, Protocol, TypeVar
 
 import lz4.frame
 import zstandard
 
-from mp4ds.bags.mcap_records import DamageError, Decompressor, OversizeError, open_source
-from mp4ds.bags.protocols import DECOMPRESSED, ZSTD_PIECE, most_held
+from mp4ds.bags.files import (
+    DECOMPRESSED,
+    ZSTD_MAGIC,
+    ZSTD_PIECE,
+    DamageError,
+    OversizeError,
+    ZstdStream,
+    most_held,
+    open_source,
+)
 from mp4ds.errors import SourceError
+
+if TYPE_CHECKING:
+    from mp4ds.bags.files import Decompressor
 
 BLOCK = 2**20
 _PIECE = 16 * 2**20
 _MAX_AHEAD = 64 * 2**20
-
-
-class ByteStream(Protocol):
-    """The stream under a window: a file, or the content of a compressed one."""
-
-    def read(self, length: int, /) -> bytes:
-        """Read that many bytes; fewer at the end only."""
-        ...
-
-    def close(self) -> None:
-        """Close it."""
-        ...
 
 
 class Window:
@@ -49,7 +48,7 @@ class Window:
     """
 
     def __init__(
-        self, source: ByteStream, path: Path, *, size: int | None = None, offset: int = 0
+        self, source: BinaryIO | ZstdStream, path: Path, *, size: int | None = None, offset: int = 0
     ) -> None:
         self._source = source
         self._path = path
@@ -81,13 +80,12 @@ class Window:
     @property
     def position(self) -> int:
         """Bytes of the file that the reader has reached."""
-        consumed = getattr(self._source, "consumed", None)
-        return self.offset if consumed is None else int(consumed)
+        return self._source.tell() if isinstance(self._source, ZstdStream) else self.offset
 
     @property
     def problem(self) -> str:
         """Why the content ended before the file did, a phrase; empty if it did not."""
-        return str(getattr(self._source, "problem", ""))
+        return self._source.problem if isinstance(self._source, ZstdStream) else ""
 
     @property
     def left(self) -> int | None:
@@ -339,7 +337,7 @@ _LZ4_BLOCK = 2**23  # the largest is 4 MiB, and one may be pending
 
 _MAX_AT_ONCE = 64 * 2**20
 
-_MAGIC = {b"BZh": "bz2", b"\x04\x22\x4d\x18": "lz4", b"\x28\xb5\x2f\xfd": "zstd"}
+_MAGIC = {b"BZh": "bz2", b"\x04\x22\x4d\x18": "lz4", ZSTD_MAGIC: "zstd"}
 
 
 class Unpacked(NamedTuple):

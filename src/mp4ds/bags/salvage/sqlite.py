@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.mcap_records import DamageError, OversizeError
-from mp4ds.bags.protocols import Format, most_held
+from mp4ds.bags.files import DamageError, OversizeError, most_held
 from mp4ds.bags.rosbag2_sqlite import SqliteReader, Tables, open_tables
 from mp4ds.bags.salvage.losses import FileSalvage, LossLog
 from mp4ds.bags.salvage.scan import lost_by
@@ -47,9 +46,9 @@ class SqliteSalvage(FileSalvage):
         SourceError: sqlite3 cannot open it, or its topics are damaged.
     """
 
-    format: Format = "rosbag2"
+    format = "rosbag2"
     profile = "ros2"
-    is_ordered = True
+    has_all_channels = True
 
     def __init__(
         self,
@@ -59,10 +58,10 @@ class SqliteSalvage(FileSalvage):
         message_decompress: Callable[[bytes], bytes] | None = None,
         expected: int | None = None,
     ) -> None:
-        super().__init__(path, shown)
+        super().__init__(path, shown=shown, is_alone=False)
         self._decompress = message_decompress
         self._expected = expected
-        self._rows, self._rows_read, self._lost = 0, 0, 0
+        self._lost = 0
         try:
             self._small = SqliteReader(path, shown=shown, damaged=True)
         except SourceError as error:
@@ -82,40 +81,33 @@ class SqliteSalvage(FileSalvage):
         return self._small.unused_schemas
 
     @property
-    def start(self) -> int | None:
-        """The earliest log time, ns, if sqlite3 can find it; otherwise None."""
+    def span(self) -> tuple[int, int] | None:
+        """Earliest and latest log time, ns, if sqlite3 can find them; otherwise None."""
         try:
-            return self._small.start
+            return self._small.span
         except SourceError:
             return None
 
-    @property
-    def fraction(self) -> float:
-        """Part of the messages that `records` has read."""
-        return min(1.0, self._rows_read / self._rows) if self._rows else 0.0
-
     def _pass(self, log: LossLog) -> Iterator[Record]:
-        self._rows_read = given = 0
-        self._lost = 0
-        size = self.path.stat().st_size
+        given = self._lost = 0
+        size = self._shown.stat().st_size
         with open_tables(self.path, self._shown, damaged=True) as tables:
-            keys, times, problem = _index(tables, size // _LEAST_ROW, self._expected)
-            self._rows = len(keys)
-            for position in np.lexsort((keys, times)).tolist():
-                self._rows_read += 1
-                message = self._message(tables, int(keys[position]), log)
+            most_rows = self.path.stat().st_size // _LEAST_ROW
+            keys, times, problem = _index(tables, most_rows, self._expected)
+            for read, row in enumerate(np.lexsort((keys, times)).tolist(), 1):
+                message = self._message(tables, int(keys[row]), log)
                 if message is not None:
                     given += 1
                     log.gave(message.log_time)
                     yield message
-                self._position = int(self.fraction * size)
+                self.position = size * read // len(keys)
         # rosbag2 numbers its messages from 1 without gaps
         expected = self._expected or (int(keys.max(initial=0)) if problem else 0)
         missing = expected - given - self._lost
         if problem or missing > 0:
             problem = f"the table of messages: {problem}" if problem else "messages without a row"
             log.lost(None, None, problem + _MORE).add(max(0, missing), ())
-        self._position = size
+        self.position = size
 
     def _message(self, tables: Tables, key: int, log: LossLog) -> Message | None:
         """A message; None if it is lost, which is recorded."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.convert import ros2_channel
 from mp4ds.bags.latched import LATCHED_QOS
-from mp4ds.bags.protocols import Format
+from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.files.outputs import csv_cell
 from mp4ds.files.sources import source_name, source_size
@@ -28,11 +28,9 @@ from mp4ds.records import (
     EVERYTHING,
     Attachment,
     Channel,
-    ChannelStats,
     Excerpt,
     Message,
     Record,
-    Schema,
 )
 from mp4ds.video.images import read_image
 
@@ -161,8 +159,8 @@ class _Track:
         return ((int(self.stamps[number]), place, number) for number in self.within(excerpt))
 
 
-class ImagesReader:
-    """Reads a scene found by a layout. See `BagReader`.
+class ImagesReader(BagReader):
+    """Reads a scene found by a layout.
 
     Log times and publish times are the stamps. JPEG files become CompressedImage unchanged, all
     other images Image; each image has a CameraInfo if its calibration is known.
@@ -172,17 +170,16 @@ class ImagesReader:
     """
 
     # what a recorder of such messages would have written
-    format: Format = "mcap"
+    format = "mcap"
     profile = "ros2"
-    library = ""
     is_indexed = True
-    unused_schemas: Sequence[Schema] = ()
+    position = 0
+    skipped: Mapping[str, int] = {}
 
     def __init__(self, scene: Scene) -> None:
         self.path = scene.folder
-        self.files: Sequence[Path] = list(dict.fromkeys(scene.files))
-        self.skipped: Mapping[str, int] = dict(scene.skipped)
-        self.position = 0
+        self.files = list(dict.fromkeys(scene.files))
+        self.skipped = dict(scene.skipped)
         self._kept = scene.kept
         self._tracks: list[_Track] = []
         for camera in scene.cameras:
@@ -242,7 +239,7 @@ class ImagesReader:
         return [track.channel for track in self._tracks]
 
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
-        """Attachments, then messages by log time. See `BagReader.records`."""
+        """Attachments, then messages by log time."""
         self.position = 0
         if excerpt.others:
             yield from self._attachments()
@@ -280,30 +277,9 @@ class ImagesReader:
                 writer.writerow((csv_cell(track.channel.topic), stamp, name))
         return text.getvalue().encode(errors="backslashreplace")
 
-    def stats(self) -> Mapping[int, ChannelStats]:
-        """See `BagReader.stats`."""
-        return {
-            track.channel.id: ChannelStats(len(track.stamps), *map(int, track.stamps[[0, -1]]))
-            for track in self._tracks
-            if len(track.stamps)
-        }
-
     def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """See `BagReader.times`."""
+        """The stamps of each channel."""
         return {track.channel.id: track.stamps for track in self._tracks}
-
-    def first(self, channel: Channel) -> Message | None:
-        """See `BagReader.first`."""
-        for track in self._tracks:
-            if track.channel.id == channel.id and len(track.stamps):
-                return track.message(0)
-        return None
-
-    def __enter__(self) -> ImagesReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing is open between two messages."""
 
 
 def _size(path: Path) -> int:

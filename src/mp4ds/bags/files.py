@@ -1,0 +1,333 @@
+"""Files of recordings: opening them, saying what is wrong with them, and decompressing them."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, TypeAlias
+
+import zstandard
+
+from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+from mp4ds.options import parse_size
+
+if TYPE_CHECKING:
+    from bz2 import BZ2Decompressor
+
+    from lz4.frame import LZ4FrameDecompressor
+
+    Decompressor: TypeAlias = BZ2Decompressor | LZ4FrameDecompressor
+
+SALVAGE = "use `mp4ds pack --salvage` to pack what is still readable."
+SALVAGE_REMEDY = "U" + SALVAGE[1:]
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+_PIECE_BYTES = 16 * 2**20
+_PACKED_PIECE = 2**16
+_COPY_BYTES = 2**22
+
+
+class DamageError(ValueError):
+    """Damage inside a record; the reader adds where it is."""
+
+
+class OversizeError(DamageError):
+    """A chunk or message that would take too much memory, or says so because it is damaged.
+
+    Args:
+        what: What it is, a phrase.
+        most: Bytes that it may have.
+    """
+
+    def __init__(self, what: str, most: int) -> None:
+        super().__init__(f"{what}, over the limit of {most}")
+
+
+def unreadable(path: Path, place: str, error: Exception, remedy: str) -> SourceError:
+    """The error for a recording with damage, or with something too large.
+
+    Args:
+        path: The recording.
+        place: Where in it; comes after "is damaged".
+        error: What is wrong there.
+        remedy: What to do about damage.
+    """
+    if isinstance(error, OversizeError):
+        remedy = (
+            f"If it is sound, and fits in memory, set the environment variable {DECOMPRESSED} to a "
+            f"larger size, such as 4G, or {SALVAGE}"
+        )
+        return SourceError(path, f"cannot be read{place}: {error}", remedy)
+    return SourceError(path, f"is damaged{place}: {error}", remedy)
+
+
+def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
+    """Open a file of a recording, refusing anything else.
+
+    Args:
+        path: The file.
+        shown: Its name in errors, if it is a decompressed copy.
+
+    Raises:
+        SourceError: It is missing, unreadable, not a regular file, empty, or a git-lfs pointer.
+    """
+    shown = shown or path
+    try:
+        if not path.is_file() and not path.is_dir() and path.exists():
+            raise SourceError(shown, "is not a regular file")  # opening a pipe could block forever
+        stream = path.open("rb")
+    except FileNotFoundError:
+        raise SourceNotFoundError(shown) from None
+    except OSError as error:
+        raise SourceError(shown, f"cannot be read: {error.strerror}") from None
+    head = stream.read(len(_LFS_POINTER))
+    stream.seek(0)
+    if head and head != _LFS_POINTER:
+        return stream
+    stream.close()
+    if not head:
+        raise SourceError(shown, "is empty")
+    raise SourceError(shown, "is a git-lfs pointer, not the recording", "Run `git lfs pull`.")
+
+
+def other_begin(path: Path, kind: str, magic: bytes, start: bytes) -> SourceError:
+    """The error for a file that does not begin with the magic bytes of its kind."""
+    if start.startswith(magic.rstrip()):
+        problem = f"is {kind} with converted line endings, as if copied in text mode"
+        return SourceError(path, problem, f"Copy it again in binary mode, or {SALVAGE}")
+    remedy = f"If it is damaged, {SALVAGE}"
+    return SourceError(path, f"is not {kind}: it does not start like one", remedy)
+
+
+# ---------------------------------------------------------------- bounds
+
+DECOMPRESSED = "MP4DS_MAX_DECOMPRESSED"
+"""Environment variable with the bytes that one chunk or message may decompress to."""
+
+ZSTD_PIECE = 2**11
+"""Bytes of zstd decompressed at a time, which give 64 MiB at most."""
+
+_ALWAYS = 128 * 2**20
+_CHUNK_RATIO = 256  # of lz4 it is 255
+_FILE_RATIO = 1024
+_MOST = 512 * 2**20  # recorders make chunks of 1 to 4 MiB unless told otherwise
+
+
+def most_unpacked(packed: int) -> int:
+    """Maximum decompressed size of a chunk or message of so many bytes, unless told otherwise.
+
+    Small ones are not limited by their ratio: they may hold a black picture.
+    """
+    return min(max(_ALWAYS, _CHUNK_RATIO * packed), _MOST)
+
+
+def most_in_file(packed: int) -> int:
+    """Maximum decompressed size of a file of so many bytes, which is not held in memory."""
+    return max(_ALWAYS, _FILE_RATIO * packed)
+
+
+def most_held(packed: int | None = None) -> int:
+    """Maximum decompressed size of a chunk or message, as `DECOMPRESSED` says if it is set.
+
+    Args:
+        packed: Its compressed size; None where that of the whole file is known only.
+
+    Raises:
+        OptionError: The variable does not hold a size.
+    """
+    told = os.environ.get(DECOMPRESSED)
+    if not told:
+        return _MOST if packed is None else most_unpacked(packed)
+    try:
+        return parse_size(told)
+    except OptionError as error:
+        raise OptionError(f"{DECOMPRESSED}: {error}") from None
+
+
+# ---------------------------------------------------------------- decompressing
+
+
+def expand(machine: Decompressor, data: bytes | memoryview, size: int) -> bytes:
+    """Decompress data to a size, or to a byte more if there is more.
+
+    A large result is made in pieces: both libraries need twice its memory to make it at once.
+    """
+    if size <= _PIECE_BYTES:
+        return machine.decompress(data, max_length=size + 1)
+    content = io.BytesIO()
+    for at in range(0, len(data), _PACKED_PIECE):
+        piece = data[at : at + _PACKED_PIECE]
+        while not machine.eof and (left := size + 1 - content.tell()) > 0:
+            content.write(machine.decompress(piece, max_length=min(left, _PIECE_BYTES)))
+            piece = b""
+            if machine.needs_input:
+                break
+    return content.getvalue()
+
+
+def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
+    """Decompress one zstd frame.
+
+    Args:
+        data: The frame.
+        size: Size of the content if known; otherwise the frame must state it.
+
+    Raises:
+        DamageError: It is not a zstd frame, damaged, or of another size.
+    """
+    try:
+        stated = zstandard.frame_content_size(data)
+        if stated < 0 and size is None:
+            return _unzstd_unsized(data)
+        if size is not None and stated not in (-1, size):
+            raise DamageError(f"zstd data holds {stated} bytes instead of {size}")
+        if stated > (most := most_held(len(data))):
+            raise OversizeError(f"zstd data declares {stated} bytes but has {len(data)}", most)
+        return zstandard.ZstdDecompressor().decompress(
+            data, max_output_size=size or 0, allow_extra_data=False
+        )
+    except zstandard.ZstdError as error:
+        raise DamageError(f"zstd data is damaged: {error}") from None
+
+
+def _unzstd_unsized(data: bytes | memoryview) -> bytes:
+    decompressor = zstandard.ZstdDecompressor().decompressobj()
+    content = io.BytesIO()
+    most = most_held(len(data))
+    used = 0
+    while used < len(data) and not decompressor.eof:
+        content.write(decompressor.decompress(data[used : used + ZSTD_PIECE]))
+        used += ZSTD_PIECE
+        if content.tell() > most:
+            raise OversizeError(f"zstd data of {len(data)} bytes unpacks to {content.tell()}", most)
+    if not decompressor.eof or decompressor.unused_data or used < len(data):
+        raise DamageError("zstd data is cut short, or holds more than one frame")
+    return content.getvalue()
+
+
+# ---------------------------------------------------------------- files compressed as a whole
+
+
+class ZstdStream:
+    """The content of a compressed file, read once from its start.
+
+    Args:
+        path: The compressed file.
+        to_damage: Whether the content ends where the file is damaged, instead of failing there.
+
+    Attributes:
+        problem: Why the content ended before the file did, a phrase; empty if it did not.
+
+    Raises:
+        SourceError: It cannot be opened, or is empty.
+    """
+
+    def __init__(self, path: Path, *, to_damage: bool = False) -> None:
+        self._path = path
+        self._to_damage = to_damage
+        self._file = open_source(path)
+        self._frame = zstandard.ZstdDecompressor().decompressobj()
+        self._most = most_in_file(path.stat().st_size)
+        self._given = 0
+        self._is_within = False
+        self._left = bytearray()
+        self._ended = False
+        self._consumed = 0
+        self.problem = ""
+
+    def read(self, length: int, /) -> bytes:
+        """Read that many decompressed bytes; fewer at the end only.
+
+        Raises:
+            SourceError: It is damaged, cut short, or decompresses to too much.
+        """
+        while len(self._left) < length and not self._ended:
+            piece = self._file.read(ZSTD_PIECE)
+            if not piece:
+                self._end("its zstd data is cut short" if self._is_within else "")
+            self._take(piece)
+            self._consumed += len(piece)
+        data = bytes(self._left[:length])
+        del self._left[:length]
+        self._given += len(data)
+        if self.problem and len(data) < length and not self._to_damage:
+            raise SourceError(self._path, self.problem, f"Copy it again, or {SALVAGE}")
+        return data
+
+    def tell(self) -> int:
+        """Bytes of the compressed file consumed."""
+        return self._consumed
+
+    def seek(self, offset: int, /) -> int:
+        """Not possible."""
+        raise io.UnsupportedOperation("seek")
+
+    def _take(self, piece: bytes) -> None:
+        while piece:
+            try:
+                self._left += self._frame.decompress(piece)
+            except zstandard.ZstdError as error:
+                self._end(f"its zstd data is damaged near byte {self._consumed}: {error}")
+                return
+            if self._given + len(self._left) > self._most:
+                self._end(f"it unpacks to more than {self._most} bytes, too many for its size")
+                return
+            self._is_within = not self._frame.eof
+            piece = b"" if self._is_within else self._frame.unused_data
+            if not self._is_within:
+                self._frame = zstandard.ZstdDecompressor().decompressobj()
+
+    def _end(self, problem: str) -> None:
+        self._ended, self.problem = True, problem
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def copy_file(path: Path, target: Path) -> None:
+    """Download a remote file, with the -wal or -journal beside a database that was not closed.
+
+    Raises:
+        SourceError: There is not enough space for it.
+        RemoteError: It cannot be read.
+        OSError: The target cannot be written.
+    """
+    sides = [path, *(path.with_name(path.name + ending) for ending in ("-wal", "-journal"))]
+    found = [side for side in sides if side is path or side.exists()]
+    size = sum(side.stat().st_size for side in found)
+    if size > shutil.disk_usage(target.parent).free:
+        raise SourceError(
+            path,
+            f"is an sqlite3 database of {size} bytes, which must be copied to {target.parent} to "
+            "be read, and there is not enough space",
+            "Set TMPDIR to another folder.",
+        )
+    for side in found:
+        ending = side.name.removeprefix(path.name)
+        with closing(side.open("rb")) as stream, Path(f"{target}{ending}").open("wb") as output:
+            shutil.copyfileobj(stream, output, _COPY_BYTES)
+
+
+def decompress_file(path: Path, target: Path, *, to_damage: bool = False) -> None:
+    """Decompress a file into another one.
+
+    Args:
+        path: The compressed file.
+        target: The file to write.
+        to_damage: Whether to decompress a damaged one as far as possible.
+
+    Raises:
+        SourceError: The file is damaged, cut short, or decompresses to too much; or to nothing.
+        OSError: The target cannot be written.
+    """
+    with closing(ZstdStream(path, to_damage=to_damage)) as stream, target.open("wb") as output:
+        while piece := stream.read(_COPY_BYTES):
+            output.write(piece)
+        if not output.tell():
+            raise SourceError(path, stream.problem or "holds nothing")
