@@ -8,18 +8,21 @@ bash tools/install.sh test
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 .venv/bin/mypy
-trap 'exit 130' INT # Ctrl-C ends both
-failed=0 found=5 # 5, of pytest: no test was chosen
-stage() { # both run, whatever comes of the first; the worst outcome is that of all
-  local outcome=0
-  .venv/bin/pytest -rs "$@" || outcome=$?
-  [ $outcome = 5 ] || found=0
-  [ $outcome = 5 ] || [ $outcome -le $failed ] || failed=$outcome
-}
+# of no other file than those of NETWORKS in tests/conftest.py: to collect all takes 10 seconds
+networks=(tests/test_play_ros1.py tests/test_publish_{dds,ros1,ros2}.py
+  tests/test_record_{ros1,ros2}.py tests/test_ros_packages.py)
+# both run, whatever comes of the other; those of networks mostly wait, and so beside the others
+report=$(mktemp)
+trap 'kill "$beside" 2>/dev/null || true; rm -f "$report"; exit 130' INT TERM
+.venv/bin/pytest -rs -n 1 -m "network and not slow" "${@:-${networks[@]}}" >"$report" 2>&1 &
+beside=$! outcome=0
 # the tests of a file stay together, and share what it packs, until a process has nothing to do
-stage -n auto --dist worksteal -m "not network and not slow" "$@"
-# of no other file than those of NETWORKS in tests/conftest.py: to collect all takes 5 seconds
-[ $# -gt 0 ] || set -- tests/test_play_ros1.py tests/test_publish_{dds,ros1,ros2}.py \
-  tests/test_record_{ros1,ros2}.py tests/test_ros_packages.py
-stage -n 2 --dist loadgroup -m "network and not slow" "$@"
-exit $((failed > found ? failed : found))
+.venv/bin/pytest -rs -n auto --dist worksteal -m "not network and not slow" "$@" || outcome=$?
+other=0
+wait "$beside" || other=$?
+cat "$report"
+rm -f "$report"
+# 5, of pytest: no test was chosen, which is a failure if it is so in both
+[ $outcome != 5 ] || { outcome=$other other=5; }
+[ $other = 5 ] || [ $other -le $outcome ] || outcome=$other
+exit $outcome
