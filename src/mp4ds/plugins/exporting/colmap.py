@@ -38,8 +38,8 @@ def write(job: ExportJob) -> None:
     """Write the format."""
     source = job.source
     poses = _poses(job)  # first: no frame is decoded if the topic is unsuitable
-    cameras = that_png_holds(source.cameras, source.ledger)
-    cameras = [of_different_times(camera, source.ledger) for camera in cameras]
+    cameras = that_png_holds(source.cameras, source.stats)
+    cameras = [of_different_times(camera, source.stats) for camera in cameras]
     folder = job.path / _MODEL
     folder.mkdir(parents=True)
     names = FileNames()
@@ -60,7 +60,7 @@ def write(job: ExportJob) -> None:
                 f"{calibration.distortion_model!r}, so it is not in cameras.txt"
             )
             continue
-        hold_calibration(camera, source.ledger)
+        hold_calibration(camera, source.stats)
         images.append((len(images) + 1, camera, files))
         width, height = camera.size
         values = " ".join(map(repr, found[1]))
@@ -191,6 +191,6 @@ def _write_images(
                     f"{camera.topic}: {missing} of {len(camera)} images are before the first or "
                     "after the last pose, so they are not in images.txt"
                 )
-    job.source.ledger.hold(poses.topic, len(track.times))
+    job.source.stats.add_exported(poses.topic, len(track.times))
     job.places[f"{_MODEL}/images.txt"] = poses.topic
     job.note(f"{poses.topic}: poses of images are interpolated between the recorded ones")

@@ -41,8 +41,8 @@ def write(job: ExportJob) -> None:
     """Write the format."""
     source = job.source
     poses = Poses(source.dataset, job.options.poses) if job.options.poses else None
-    cameras = that_png_holds(source.cameras, source.ledger)
-    cameras = [of_different_times(camera, source.ledger) for camera in cameras]
+    cameras = that_png_holds(source.cameras, source.stats)
+    cameras = [of_different_times(camera, source.stats) for camera in cameras]
     imus = topics_of(source.dataset, _IMU, source.chosen)
     frames = [frame_of(source.dataset, topic) for topic in imus]
     body = next(iter([*frames, *(camera.frame_id for camera in cameras)]), "")
@@ -84,7 +84,7 @@ def _write_camera(job: ExportJob, place: str, camera: ExportedCamera, pose: Pose
         )
     width, height = camera.size
     lines = [f"rate_hz: {camera.rate:.6g}", f"resolution: [{width}, {height}]"]
-    calibration = hold_calibration(camera, job.source.ledger)
+    calibration = hold_calibration(camera, job.source.stats)
     if calibration is None:
         job.note(f"{camera.topic}: not calibrated")
     else:
@@ -121,7 +121,7 @@ def _write_rows(job: ExportJob, place: str, topic: str, head: str, rows: Iterato
             file.write(f"{time},{','.join(map(repr, map(float, values)))}\n")
             count += 1
     job.places[place] = topic
-    job.source.ledger.hold(topic, count)
+    job.source.stats.add_exported(topic, count)
 
 
 def _write_sensor(

@@ -152,11 +152,11 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
 def _summary(job: ExportJob, to: str) -> ExportSummary:
     summary = ExportSummary(job.target, to, job.places)
     for source in job.sources:
-        ledger = source.ledger
-        ledger.settle(source.chosen, FORMATS[to])
-        for topic, count in ledger.held.items():
+        stats = source.stats
+        stats.add_rest(source.chosen, FORMATS[to])
+        for topic, count in stats.exported.items():
             summary.messages[topic] = summary.messages.get(topic, 0) + count
-        for topic, reasons in ledger.left_out.items():
+        for topic, reasons in stats.left_out.items():
             into = summary.left_out.setdefault(topic, {})
             for reason, count in reasons.items():
                 into[reason] = into.get(reason, 0) + count

@@ -145,17 +145,17 @@ class ExportSummary:
     notes: list[str] = field(default_factory=list)
 
 
-# ---------------------------------------------------------------- ledger
+# ---------------------------------------------------------------- stats
 
 AS_RECORDED = "stored as recorded in messages.mcap, not as video"
 NOT_CHOSEN = "not selected"
 
 
-class Ledger:
+class ExportStats:
     """Counts the messages of a dataset, by topic.
 
     Attributes:
-        held: Kept messages, by topic.
+        exported: Messages exported, by topic.
         left_out: Topic -> reason -> messages.
     """
 
@@ -166,24 +166,24 @@ class Ledger:
         for channel in dataset.channels:
             self._channels[channel.topic] = channel
             self._totals[channel.topic] += counts.get(channel.id, 0)
-        self.held: dict[str, int] = {}
+        self.exported: dict[str, int] = {}
         self.left_out: dict[str, dict[str, int]] = {}
 
     def total(self, topic: str) -> int:
         """Number of the dataset's messages on a topic."""
         return self._totals[topic]
 
-    def hold(self, topic: str, count: int = 1) -> None:
+    def add_exported(self, topic: str, count: int = 1) -> None:
         """Count kept messages."""
-        self.held[topic] = self.held.get(topic, 0) + count
+        self.exported[topic] = self.exported.get(topic, 0) + count
 
-    def leave(self, topic: str, reason: str, count: int) -> None:
+    def add_left_out(self, topic: str, reason: str, count: int) -> None:
         """Count messages that are left out."""
         if count:
             reasons = self.left_out.setdefault(topic, {})
             reasons[reason] = reasons.get(reason, 0) + count
 
-    def settle(self, chosen: Callable[[str], bool], name: str) -> None:
+    def add_rest(self, chosen: Callable[[str], bool], name: str) -> None:
         """Count the remaining messages with their reason.
 
         Args:
@@ -191,7 +191,7 @@ class Ledger:
             name: Of the format.
         """
         for topic, total in self._totals.items():
-            told = self.held.get(topic, 0) + sum(self.left_out.get(topic, {}).values())
+            told = self.exported.get(topic, 0) + sum(self.left_out.get(topic, {}).values())
             channel = self._channels[topic]
             if not chosen(topic):
                 reason = NOT_CHOSEN
@@ -199,7 +199,7 @@ class Ledger:
                 reason = AS_RECORDED
             else:
                 reason = f"{name} has no place for {channel.type_name or 'such messages'}"
-            self.leave(topic, reason, total - told)
+            self.add_left_out(topic, reason, total - told)
 
 
 # ---------------------------------------------------------------- cameras
@@ -293,14 +293,14 @@ class ExportedCamera:
 
 
 def chosen_cameras(
-    streams: Sequence[Stream], options: ExportOptions, ledger: Ledger, notes: list[str]
+    streams: Sequence[Stream], options: ExportOptions, stats: ExportStats, notes: list[str]
 ) -> list[ExportedCamera]:
     """The cameras of some streams: calibrated ones first, then by topic.
 
     Args:
         streams: The streams.
         options: Which frames, and how.
-        ledger: Counts those that are left out.
+        stats: Counts those that are left out.
         notes: Receives what frames are converted to.
 
     Raises:
@@ -311,11 +311,11 @@ def chosen_cameras(
     for stream in streams:
         sidecar = stream.sidecar
         if any(is_inverse_depth(sidecar, header) for header in sidecar.headers):
-            ledger.leave(stream.topic, _INVERSE, len(stream))
+            stats.add_left_out(stream.topic, _INVERSE, len(stream))
             continue
         columns = stream.columns
         kept = np.flatnonzero(reduction.kept(columns))
-        ledger.leave(stream.topic, _THINNED, len(stream) - len(kept))
+        stats.add_left_out(stream.topic, _THINNED, len(stream) - len(kept))
         times = times_of(columns)
         if times is not columns.stamp:
             notes.append(
@@ -326,7 +326,7 @@ def chosen_cameras(
         cameras.append(ExportedCamera(stream, kept, times[kept], view))
     cameras.sort(key=lambda camera: (camera.calibration is None, camera.topic))
     if options.tolerance_ns is not None and len(cameras) > 1:
-        cameras = _matched(cameras, options.tolerance_ns, ledger)
+        cameras = _matched(cameras, options.tolerance_ns, stats)
     return [camera for camera in cameras if len(camera)]
 
 
@@ -354,19 +354,19 @@ def is_plain(encoding: Encoding) -> bool:
 
 
 def _matched(
-    cameras: list[ExportedCamera], tolerance_ns: int, ledger: Ledger
+    cameras: list[ExportedCamera], tolerance_ns: int, stats: ExportStats
 ) -> list[ExportedCamera]:
     """The frames that every camera has, frame n of each taken at the same time."""
     times = {str(number): camera.times for number, camera in enumerate(cameras)}
     matches = synchronize(times, tolerance_ns=tolerance_ns)
     for number, camera in enumerate(cameras):
         reason = "not every camera has a frame at this time (--sync)"
-        ledger.leave(camera.topic, reason, len(matches.unmatched[str(number)]))
+        stats.add_left_out(camera.topic, reason, len(matches.unmatched[str(number)]))
     columns = zip(cameras, matches.indices.T, strict=True)
     return [camera.at(places) for camera, places in columns]
 
 
-def that_png_holds(cameras: Sequence[ExportedCamera], ledger: Ledger) -> list[ExportedCamera]:
+def that_png_holds(cameras: Sequence[ExportedCamera], stats: ExportStats) -> list[ExportedCamera]:
     """The cameras whose images PNG files can hold; the others are left out."""
     found = []
     for camera in cameras:
@@ -374,16 +374,16 @@ def that_png_holds(cameras: Sequence[ExportedCamera], ledger: Ledger) -> list[Ex
         try:
             ImageFile(name, "png")
         except OptionError:
-            ledger.leave(camera.topic, f"PNG cannot hold {name} images", len(camera))
+            stats.add_left_out(camera.topic, f"PNG cannot hold {name} images", len(camera))
         else:
             found.append(camera)
     return found
 
 
-def of_different_times(camera: ExportedCamera, ledger: Ledger) -> ExportedCamera:
+def of_different_times(camera: ExportedCamera, stats: ExportStats) -> ExportedCamera:
     """The camera with one frame per time, for formats that name files by time."""
     is_new = np.diff(camera.times, prepend=camera.times[:1] - 1) != 0
-    ledger.leave(
+    stats.add_left_out(
         camera.topic,
         "another frame has the same time, and therefore the same name",
         int((~is_new).sum()),
@@ -391,7 +391,7 @@ def of_different_times(camera: ExportedCamera, ledger: Ledger) -> ExportedCamera
     return camera.at(np.flatnonzero(is_new))
 
 
-def hold_calibration(camera: ExportedCamera, ledger: Ledger) -> Calibration | None:
+def hold_calibration(camera: ExportedCamera, stats: ExportStats) -> Calibration | None:
     """The calibration of a camera, counted as kept once: formats cannot hold its times."""
     info = camera.stream.sidecar.camera_info
     if info is None or camera.calibration is None:
@@ -402,9 +402,9 @@ def hold_calibration(camera: ExportedCamera, ledger: Ledger) -> Calibration | No
         used = camera.stream.intrinsics_at(int(camera.numbers[0]))
         same = [number for number, item in enumerate(info.calibrations) if item is used]
         is_same = np.isin(columns.variant, same)
-        ledger.hold(topic)
-        ledger.leave(topic, "repeats the exported calibration", int(is_same.sum()) - 1)
-        ledger.leave(
+        stats.add_exported(topic)
+        stats.add_left_out(topic, "repeats the exported calibration", int(is_same.sum()) - 1)
+        stats.add_left_out(
             topic, "a different calibration: only one per camera is exported", int((~is_same).sum())
         )
     return camera.calibration
@@ -420,7 +420,7 @@ class ExportedDataset:
 
     Attributes:
         dataset: The dataset.
-        ledger: Counts its messages.
+        stats: Counts its messages.
         chosen: Whether a topic was selected.
         cameras: Its selected streams.
         notes: Deviations from the recording.
@@ -429,7 +429,7 @@ class ExportedDataset:
     def __init__(self, dataset: Dataset, options: ExportOptions) -> None:
         dataset.verify_messages()
         self.dataset = dataset
-        self.ledger = Ledger(dataset)
+        self.stats = ExportStats(dataset)
         self.notes = [
             f"damaged, but not needed for the selected topics: {problem}"
             for problem in dataset.unread
@@ -438,7 +438,7 @@ class ExportedDataset:
         self.chosen = options.chosen
         dataset.verify_sidecars(self.chosen)
         streams = [stream for stream in dataset.streams if options.selected(stream.topic)]
-        self.cameras = chosen_cameras(streams, options, self.ledger, self.notes)
+        self.cameras = chosen_cameras(streams, options, self.stats, self.notes)
 
 
 @dataclass
@@ -486,7 +486,7 @@ class ExportJob:
         for position, data in self.counted(files, f"{camera.topic} as {place}", len(camera)):
             (self.path / names[position]).write_bytes(data)
         self.places[place] = camera.topic
-        self.source.ledger.hold(camera.topic, len(camera))
+        self.source.stats.add_exported(camera.topic, len(camera))
 
     def counted(
         self, items: Iterator[tuple[int, bytes]], what: str, total: int

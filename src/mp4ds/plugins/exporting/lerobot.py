@@ -263,10 +263,10 @@ def _shown(source: ExportedDataset) -> list[ExportedCamera]:
         if camera.view.encoding.name != "rgb8":
             reason = f"LeRobot's videos are in 8-bit colour, not {camera.stream.encoding}"
         if reason or not len(camera):
-            source.ledger.leave(camera.topic, reason, len(camera))
+            source.stats.add_left_out(camera.topic, reason, len(camera))
             continue
         is_later = camera.numbers >= np.maximum.accumulate(camera.numbers)
-        source.ledger.leave(camera.topic, "its stamp goes backwards", int((~is_later).sum()))
+        source.stats.add_left_out(camera.topic, "its stamp goes backwards", int((~is_later).sum()))
         found.append(camera.at(np.flatnonzero(is_later)))
     if not found:
         raise OptionError(
@@ -320,19 +320,19 @@ class _Maker:
         return episode
 
     def _write_video(self, camera: ExportedCamera, feature: str) -> dict[str, Any]:
-        ledger, length = self._source.ledger, len(self._times)
+        stats, length = self._source.stats, len(self._times)
         places = nearest(camera.times, self._times)
         used, repeats = np.unique(places, return_counts=True)
-        ledger.hold(camera.topic, len(used))
+        stats.add_exported(camera.topic, len(used))
         is_within = (camera.times >= self._times[0]) & (camera.times <= self._times[-1])
         unused = np.ones(len(camera), np.bool_)
         unused[used] = False
-        ledger.leave(
+        stats.add_left_out(
             camera.topic,
             f"another frame is nearer at {self._fps} frames per second",
             int((unused & is_within).sum()),
         )
-        ledger.leave(
+        stats.add_left_out(
             camera.topic,
             "before the first or after the last frame of all cameras",
             int((unused & ~is_within).sum()),
@@ -416,8 +416,8 @@ class _Maker:
             rows.append(values)
         places = nearest(np.array(times, np.int64), self._times)
         used = len(np.unique(places))
-        self._source.ledger.hold(vectors.topic, used)
-        self._source.ledger.leave(
+        self._source.stats.add_exported(vectors.topic, used)
+        self._source.stats.add_left_out(
             vectors.topic,
             f"another message is nearer at {self._fps} frames per second",
             len(rows) - used,

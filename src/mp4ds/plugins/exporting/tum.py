@@ -29,15 +29,15 @@ def write(job: ExportJob) -> None:
     """Write the format."""
     source = job.source
     poses = Poses(source.dataset, job.options.poses) if job.options.poses else None
-    cameras = that_png_holds(source.cameras, source.ledger)
+    cameras = that_png_holds(source.cameras, source.stats)
     job.path.mkdir()
     for kind, wanted in (("rgb", False), ("depth", True)):
         alike = [camera for camera in cameras if is_depth(camera) is wanted]
         for camera in alike[:1]:
-            _write_images(job, kind, of_different_times(camera, source.ledger))
+            _write_images(job, kind, of_different_times(camera, source.stats))
         for camera in alike[1:]:
             reason = f"TUM has one {kind} camera, here {alike[0].topic} (select with --topics)"
-            source.ledger.leave(camera.topic, reason, len(camera))
+            source.stats.add_left_out(camera.topic, reason, len(camera))
     imus = topics_of(source.dataset, _IMU, source.chosen)
     if imus:
         rows = ((time, values[3:]) for time, values in imu_rows(source.dataset, imus[0]))
@@ -74,7 +74,7 @@ def _write_rows(job: ExportJob, name: str, topic: str, head: str, rows: Iterable
 
     _write_list(job.path / name, [f"file: {topic}", head], lines())
     job.places[name] = topic
-    job.source.ledger.hold(topic, count)
+    job.source.stats.add_exported(topic, count)
 
 
 def _write_list(path: Path, heads: Iterable[str], lines: Iterable[str]) -> None:
