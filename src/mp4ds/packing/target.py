@@ -212,7 +212,7 @@ class WindowCoder:
             OSError: It cannot be written.
         """
         width, height = self.coded_size
-        encoder = VideoEncoder(
+        with VideoEncoder(
             path,
             replace(self.recipe, options={**self.recipe.options, "crf": str(crf)}),
             picture_format=PLANES_FORMAT,
@@ -221,14 +221,9 @@ class WindowCoder:
             gop=self.gop,
             threads=self.threads,
             rate=self.rate,
-        )
-        try:
+        ) as encoder:
             for planes, tick in zip(frames, ticks, strict=True):
                 encoder.write(planes, tick - ticks[0])
-        except BaseException:
-            encoder.abandon()
-            raise
-        encoder.close()
         return self._scores(frames, decoded_planes(path))
 
     def reachable(self, frames: PlaneSpool) -> float:

@@ -370,7 +370,8 @@ class _Maker:
         options = self._job.options
         recipe = recipe_for("rgb24", lossless=False, codec=options.codec, crf=options.crf)
         recipe = replace(recipe, full_range=False)  # which LeRobot's decoder assumes for all AV1
-        encoder = VideoEncoder(
+        due = iter(ticks)
+        with VideoEncoder(
             path,
             recipe,
             picture_format="rgb24",
@@ -379,18 +380,12 @@ class _Maker:
             gop=_GOP,
             threads=min(os.cpu_count() or 1, _MOST_THREADS),
             rate=float(self._fps),
-        )
-        due = iter(ticks)
-        try:
+        ) as encoder:
             for number, (place, pixels) in enumerate(camera.pictures()):
                 if number % _TELL_EVERY == 0:
                     self._job.tell(f"{camera.topic}: frame {number} of {len(camera)}", None)
                 for _ in range(repeats[place]):
                     encoder.write((pixels,), next(due))
-        except BaseException:
-            encoder.abandon()
-            raise
-        encoder.close()
         return _video_facts(path, (encoder.width, encoder.height), options.codec)
 
     def _sampled(self, camera: ExportedCamera) -> Statistics:

@@ -287,15 +287,14 @@ def make_proxy(
     )
     picture: Bytes = np.zeros((size[1], size[0], 3), np.uint8)
     try:
-        for number, pixels in pictures_in_order(stream):
-            if pixels is not None:  # otherwise the previous one stays
-                picture = look.picture(pixels)
-            encoder.write((picture,), int(times[number]))
-            if number % _TELL_EVERY == 0:
-                progress(f"{stream.topic}: frame {number} of {len(stream)} for the page")
+        with encoder:
+            for number, pixels in pictures_in_order(stream):
+                if pixels is not None:  # otherwise the previous one stays
+                    picture = look.picture(pixels)
+                encoder.write((picture,), int(times[number]))
+                if number % _TELL_EVERY == 0:
+                    progress(f"{stream.topic}: frame {number} of {len(stream)} for the page")
     except BaseException:
-        encoder.abandon()
         path.unlink(missing_ok=True)
         raise
-    encoder.close()
     return look.caption
