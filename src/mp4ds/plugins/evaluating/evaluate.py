@@ -314,26 +314,22 @@ class _CameraRun:
             f"at {rate:.2f} Hz, {frames:.0f} frames"
         )
         encoding, (width, height) = ENCODINGS[clip.encoding], clip.image_size
+        best = max(found.cells, key=lambda cell: score_of(cell, found.target)).setting
+        setting = found.recommended[0].setting if found.recommended else best
+        cell = next(cell for cell in found.cells if cell.setting == setting)
         sizes = {
             "raw": float(encoding.size(width * encoding.pixel_bytes, height)),
             "YUV 4:4:4": 3.0 * width * height,
             "RGB": 3.0 * width * height,
             **{f"JPEG {quality}": _jpeg_bytes(clip, work, quality) for quality in (90, 75)},
+            setting.name: cell.frame_bytes,
         }
-        best = max(found.cells, key=lambda cell: score_of(cell, found.target)).setting
-        setting = found.recommended[0].setting if found.recommended else best
-        cell = next(cell for cell in found.cells if cell.setting == setting)
+        rows = [StorageRow(form, size, size * frames / 1e9) for form, size in sizes.items()]
         days = frames / clip.frames / _DAY
-        found.storage = [
-            *(StorageRow(form, size, size * frames / 1e9) for form, size in sizes.items()),
-            StorageRow(
-                setting.name,
-                cell.frame_bytes,
-                cell.frame_bytes * frames / 1e9,
-                days=cell.encode_seconds * days,
-                cpu_days=cell.encode_cpu_seconds * days,
-            ),
-        ]
+        ours = replace(
+            rows[-1], days=cell.encode_seconds * days, cpu_days=cell.encode_cpu_seconds * days
+        )
+        found.storage = [*rows[:-1], ours]
 
     def _rates(self) -> Iterator[RateRow]:
         first, own = self.settings[0], self.camera.rate
@@ -395,8 +391,8 @@ def _notes(found: CameraEvaluation, lossy: str, options: EvaluateOptions) -> lis
         f"{found.target.score:g}": reachable < found.target.score,
         f"no setting reaches {metric} {reachable:.2f}; the best is {best.setting.name} with "
         f"{reached:.2f}: try a lower --crf": reached < reachable,
-        f"{clip.left_out} images in the clip have a different size or encoding, or cannot be "
-        "read, and are left out": clip.left_out > 0,
+        f"left out of the clip: {counted(clip.left_out, 'image')} of a different size or "
+        "encoding, or that cannot be read": clip.left_out > 0,
         "was recorded as JPEG files, which `mp4ds pack --transcode` re-encodes": lossy == JPEG,
         f"a clip of {clip.frames} frames says little: give more --frames": clip.frames < _SHORT,
         f"{VMAF_MODEL} is made for {_MODEL_ROWS} rows; it is used for {clip.size[1]} rows too, "
