@@ -17,8 +17,10 @@ converted (BT.601, full range). The same seed gives the same clip.
 
 Range images, and pictures that are no camera's, are in depth_clips.py.
 
-The scenes are in the folder ``../shared/data`` beside the project, or in $MP4DS_DATA. Where that
-is missing, the scene of ``mp4ds demo`` is used.
+    python benchmarks/clips.py SCENE ENCODING CLIP.bag [--noise N] [--frames N] [--size WxH]
+
+records one as a ROS 1 bag. The scenes are in the folder ``../shared/data`` beside the project, or
+in $MP4DS_DATA. Where that is missing, the scene of ``mp4ds demo`` is used.
 """
 
 from __future__ import annotations
@@ -38,6 +40,8 @@ from numpy.typing import NDArray
 
 import depth_clips
 from depth_clips import read_pnm, sobel
+from measure import parse_size, parser_of
+from recordings import write_bag
 
 Pixels = NDArray[Any]  # shape (H, W) or (H, W, C); nv12: (H * 3 / 2, W)
 Signal = NDArray[np.float32]
@@ -197,18 +201,13 @@ def make(spec: ClipSpec) -> Iterator[Pixels]:
         paths = sorted(folder.glob(SCENES[spec.scene].pattern))
         yield from (_read_still(path) for path in paths[: spec.frames])
         return
-    for number, rgb in enumerate(islice(_rgb_frames(spec), spec.frames)):
+    for number, rgb in enumerate(islice(rgb_frames(spec), spec.frames)):
         yield _camera(spec, rgb, SENSORS[spec.noise], noise_of(spec.noise, number))
 
 
 def expose(encoding: str, rgb: Signal, sensor: Sensor, rng: np.random.Generator) -> Pixels:
     """What a camera publishes of a picture of a scene, given in grey levels, 0 to 255."""
     return _CAMERA[encoding](rgb, sensor, rng)
-
-
-def first_picture(scene: str) -> Signal:
-    """The first frame of one of `MOVING`, or of the demo where there is no data, 0 to 255."""
-    return next(_rgb_frames(ClipSpec(scene, "rgb8", "low", 1)))
 
 
 def noise_of(noise: str, number: int) -> np.random.Generator:
@@ -344,7 +343,8 @@ def nv12(rgb: Pixels) -> Pixels:
 # ---------------------------------------------------------------- scenes
 
 
-def _rgb_frames(spec: ClipSpec) -> Iterator[Signal]:
+def rgb_frames(spec: ClipSpec) -> Iterator[Signal]:
+    """The frames of a scene without noise, 0 to 255, fitted to the clip's size."""
     folder = data_folder()
     if spec.scene == DEMO or folder is None:
         frames = _demo_frames(spec.frames)
@@ -399,3 +399,22 @@ def _read_still(path: Path) -> Pixels:
     if path.suffix == ".raw":  # 16 bits without a header, as its name says
         return np.fromfile(path, "<u2").reshape(1080, 1920)
     return read_pnm(path)
+
+
+def main() -> None:
+    """Record a clip."""
+    parser = parser_of(__doc__)
+    parser.add_argument("scene", choices=MOVING)
+    parser.add_argument("encoding", choices=CAMERA_FAMILIES)
+    parser.add_argument("bag", type=Path)
+    parser.add_argument("--noise", choices=SENSORS, default="low")
+    parser.add_argument("--frames", type=int, default=90)
+    parser.add_argument("--size", type=parse_size, default=(640, 480), help="WxH")
+    options = parser.parse_args()
+    check_data()
+    spec = ClipSpec(options.scene, options.encoding, options.noise, options.frames, options.size)
+    write_bag(options.bag, make(spec), spec.encoding)
+
+
+if __name__ == "__main__":
+    main()

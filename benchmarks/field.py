@@ -40,11 +40,10 @@ from rosbags.typesys import Stores, get_typestore
 
 import clips
 import mp4ds
-from loader_clips import write_lerobot_video
-from measure import parse_size, print_machine, print_table
-from recordings import write_mcap
+from loader_readers import write_lerobot_video
+from measure import parse_size, parser_of, print_machine, print_table, psnr, size_of
+from recordings import HERTZ, write_mcap
 
-HERTZ = 30
 TRANSPORT = {"qmax": "10", "b": "8242880", "g": "15", "bf": "0"}
 """Of x264, as ffmpeg_image_transport 3 sets it unless asked."""
 Pixels = NDArray[np.uint8]
@@ -62,12 +61,6 @@ class Made:
 
     path: Path
     video: Path | None = None
-
-    def size(self) -> int:
-        """Bytes of all files."""
-        if self.path.is_file():
-            return self.path.stat().st_size
-        return sum(file.stat().st_size for file in self.path.rglob("*") if file.is_file())
 
 
 def rosbag2(source: Path, frames: Pixels, folder: Path) -> Made:
@@ -187,10 +180,10 @@ def measure(frames: Pixels, makers: dict[str, Make]) -> Iterator[tuple[str, floa
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         source = folder / "clip.mcap"
-        write_mcap(source, frames, len(frames), "rgb8", compression="none", hertz=HERTZ)
+        write_mcap(source, frames, "rgb8", compression="none")
         for form, make in makers.items():
             made = make(source, frames, folder)
-            yield form, source.stat().st_size / made.size(), error_of(made, frames)
+            yield form, source.stat().st_size / size_of(made.path), error_of(made, frames)
 
 
 def draw(found: Mapping[str, tuple[Sequence[float], str]], path: Path) -> None:
@@ -228,16 +221,9 @@ def draw(found: Mapping[str, tuple[Sequence[float], str]], path: Path) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
-def psnr(error: float) -> str:
-    """In dB."""
-    return f"{10 * np.log10(255**2 / error):.1f}" if error else "exact"
-
-
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=90)
     parser.add_argument("--size", type=parse_size, default=(640, 480), help="WxH")
     parser.add_argument("--noise", nargs="+", choices=clips.SENSORS, default=[*clips.SENSORS])

@@ -1,249 +1,162 @@
 """What frames on demand cost, against other readers and other ways to store them.
 
-    python benchmarks/loader.py frames [--codec C ...] [--gop N ...] [--peer P ...] [--plot F.svg]
-    python benchmarks/loader.py report [--plot F.svg]
-    python benchmarks/loader.py epoch  [--epochs N] ...
-    python benchmarks/loader.py open   [--streams N] [--datasets N] ...
-    python benchmarks/loader.py sizes  [--made WxH] [--way CODEC-GOP ...] ...
+    python benchmarks/loader.py frames [--codec C ...] [--gop N ...] [--way NAME ...]
+                                       [--peer P ...] [--resize WxH] [--plot F.svg]
 
-``frames``: all readers (loader_peers.py) read the same mp4 files, of the same clip
-(loader_clips.py), encoded with several GOPs; beside them LeRobot's loader with LeRobot's encoding,
-and folders of PNG and JPEG files. Measured are single frames at random, batches of 32 random
-frames, windows of 8 consecutive frames at random places, and all frames in order. Each reader is in
-a process of its own, for ``--seconds`` a pattern, and they take turns within each round; places are
-the same for all. CPU time is user and system time of all threads, opening and imports left out.
+All readers (loader_readers.py) read the same mp4 files, of the same clip, encoded with several
+GOPs; beside them LeRobot's encoding as its loader reads it, and folders of PNG and JPEG files.
+Measured are single frames at random, batches of 32 random frames, windows of 8 consecutive frames
+at random places, and all frames in order. Each reader is in a process of its own, for ``--seconds``
+a pattern, and they take turns within each round; places are the same for all. CPU time is user and
+system time of all threads, opening and imports left out.
 
 Every frame that is read is compared with one pass in order: ours by all pixels (which are read
 once more for it), the others by 16 x 16 of its pixels, which have to be more like those of this
 frame than of any other. Frames that are less than 30 dB like ours are told as of other colours.
 
-Files stay in ``--folder``, figures in its ``figures.jsonl``, of which ``report`` prints the tables.
+With ``--resize`` frames are asked for in another size: of mp4ds with ``resize=``, of torchcodec
+with its own Resize transform, of PyAV with swscale's default. Some are compared with the whole ones
+reduced by Pillow's box filter, and told if they are less than 30 dB like these.
 
-``epoch``, ``open`` and ``sizes`` are in loader_epoch.py, loader_open.py and loader_sizes.py.
+Files stay in ``--folder``.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
-import sys
+import re
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-import loader_epoch
-import loader_open
-import loader_sizes
-from loader_clips import (
+from loader_readers import (
     BATCH,
     CODECS,
+    OURS,
     PATTERNS,
     WINDOW,
+    Peer,
+    Size,
     Store,
     Stored,
     digest,
     grid,
+    peers_for,
+    versions,
     ways,
 )
-from loader_peers import OURS, Peer, peers_for, versions
-from loader_report import report
-from measure import cpu_seconds, parse_size, print_machine
+from measure import cpu_seconds, isolated, parse_size, parser_of, print_machine, print_table
 
 GOPS = (2, 30, 120, 240)
 LEAST_DB = 30.0
 _LEAST_READS = 4
-_FIGURES = "figures.jsonl"
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    commands = parser.add_subparsers(dest="command", required=True)
-    choices: dict[str, Callable[[argparse.ArgumentParser], object]] = {
-        "frames": _frames_options,
-        "report": _report_options,
-        "epoch": loader_epoch.options,
-        "open": loader_open.options,
-        "sizes": loader_sizes.options,
-        "job": lambda command: command.add_argument("arguments"),
-    }
-    for name, add_options in choices.items():
-        command = commands.add_parser(name)
-        command.add_argument(
-            "--folder", type=Path, default=Path(tempfile.gettempdir()) / "mp4ds-loader"
-        )
-        add_options(command)
+    parser = parser_of(__doc__)
+    command = parser.add_subparsers(required=True).add_parser("frames")
+    command.add_argument("--frames", type=int, default=2000, help="of the clip")
+    command.add_argument("--size", type=parse_size, default=(1280, 720), help="WxH")
+    command.add_argument("--codec", nargs="+", choices=CODECS, default=list(CODECS))
+    command.add_argument("--gop", nargs="+", type=int, default=list(GOPS))
+    command.add_argument("--way", nargs="+", help="CODEC-GOP, lerobot, png, jpeg; instead of both")
+    command.add_argument("--peer", nargs="+", help="all by default")
+    command.add_argument("--pattern", nargs="+", choices=PATTERNS, default=list(PATTERNS))
+    command.add_argument("--resize", type=parse_size, help="WxH to ask for")
+    command.add_argument("--seconds", type=float, default=3.0, help="of each pattern")
+    command.add_argument("--rounds", type=int, default=3)
+    command.add_argument("--stills", type=int, default=300, help="PNG and JPEG files")
+    command.add_argument("--plot", type=Path, help="an SVG to draw")
+    folder = Path(tempfile.gettempdir()) / "mp4ds-loader"
+    command.add_argument("--folder", type=Path, default=folder)
     options = parser.parse_args()
-    if options.command == "job":
-        print(json.dumps(job(**json.loads(options.arguments))), flush=True)
-        return
-    options.folder.mkdir(parents=True, exist_ok=True)
-    if options.command == "report":
-        report(_figures(options.folder), PATTERNS, options.plot)
-        return
     print_machine()
-    runs = {"frames": frames, "epoch": loader_epoch.run, "open": loader_open.run}
-    (runs | {"sizes": loader_sizes.run})[options.command](options)
-
-
-def _frames_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--frames", type=int, default=2000, help="of the clip")
-    parser.add_argument("--size", type=parse_size, default=(1280, 720), help="WxH")
-    parser.add_argument("--codec", nargs="+", choices=CODECS, default=list(CODECS))
-    parser.add_argument("--gop", nargs="+", type=int, default=list(GOPS))
-    parser.add_argument("--way", nargs="+", help="CODEC-GOP, lerobot, png, jpeg; instead of both")
-    parser.add_argument("--peer", nargs="+", help="all by default")
-    parser.add_argument("--pattern", nargs="+", choices=PATTERNS, default=list(PATTERNS))
-    parser.add_argument("--seconds", type=float, default=3.0, help="of each pattern")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--stills", type=int, default=300, help="PNG and JPEG files")
-    parser.add_argument("--append", action="store_true", help="to the figures there are")
-    parser.add_argument("--only-make", action="store_true", help="the files, and stop")
-    _report_options(parser)
-
-
-def _report_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--plot", type=Path, help="an SVG to draw")
-
-
-# ---------------------------------------------------------------- frames
-
-
-def frames(options: argparse.Namespace) -> None:
-    """Measure all cells, round by round, then print the tables."""
     print(f"- {versions()}")
     print(
         f"- {options.frames} frames of {options.size[0]}x{options.size[1]}, "
         f"{options.seconds:g} s a pattern, {options.rounds} rounds",
         flush=True,
     )
+    options.folder.mkdir(parents=True, exist_ok=True)
     store = Store(options.folder, options.frames, options.size, options.stills)
-    names = options.way or ways(options.codec, options.gop)
-    sizes = {name: store.stored(name).bytes_per_frame for name in names}
-    if options.only_make:
-        return
-    with (options.folder / _FIGURES).open("a" if options.append else "w") as kept:
-        for number in range(options.rounds):
-            for name in names:
-                for figure in _round(store, name, number, options):
-                    figure["bytes"] = sizes[name]
-                    kept.write(json.dumps(figure) + "\n")
-                    kept.flush()
-    report(_figures(options.folder), PATTERNS, options.plot)
+    stored = [store.stored(name) for name in options.way or ways(options.codec, options.gop)]
+    cells: Cells = defaultdict(Cell)
+    for number in range(options.rounds):
+        for one in stored:
+            take_turns(cells, one, number, options)
+    report(dict(cells), {one.name: one.bytes_per_frame for one in stored}, options.pattern)
+    if options.plot:
+        draw(cells, {one.name: one.bytes_per_frame for one in stored}, options.plot)
 
 
-def _figures(folder: Path) -> list[dict[str, Any]]:
-    path = folder / _FIGURES
-    if not path.exists():
-        raise SystemExit(f"{path} is not there: run `loader.py frames` with this --folder first.")
-    return [json.loads(line) for line in path.read_text().splitlines()]
+# ---------------------------------------------------------------- measuring
 
 
-def _round(
-    store: Store, name: str, number: int, options: argparse.Namespace
-) -> Iterator[dict[str, Any]]:
+def take_turns(cells: Cells, stored: Stored, number: int, options: argparse.Namespace) -> None:
     """One turn of all that read what is stored in a way."""
-    peers = [peer for peer in peers_for(name) if not options.peer or peer in options.peer]
+    peers = [peer for peer in peers_for(stored.name) if not options.peer or peer in options.peer]
     turn = number % max(len(peers), 1)
     for peer in [*peers[turn:], *peers[:turn]]:
-        arguments = {
-            "folder": str(options.folder),
-            "clip": [store.frames, store.size, store.stills],
-            "name": name,
-            "peer": peer,
-            "patterns": options.pattern,
-            "seconds": options.seconds,
-            "seed": number,
-        }
-        for figure in _run(arguments):
-            yield {"way": name, "peer": peer, "round": number, **figure}
+        for pattern in options.pattern:
+            cell = cells[stored.name, pattern, peer]
+            arguments = stored, peer, pattern, options.resize, options.seconds, number
+            try:
+                frames, cpu, wall, fault = isolated(measured, *arguments)
+            except Exception as error:  # whatever a library raises, or that it is missing
+                cell.failures[short(f"{type(error).__name__}: {error}")] = None
+                continue
+            cell.per_cpu.append(frames / cpu)
+            cell.per_second.append(frames / wall)
+            if fault:
+                cell.faults[fault.partition(" (")[0]] = fault
 
 
-def _run(arguments: dict[str, Any]) -> list[dict[str, Any]]:
-    """Figures of a process of its own; what went wrong if it fails."""
-    command = [sys.executable, __file__, "job", json.dumps(arguments)]
-    patterns, limit = arguments["patterns"], 120 + 40 * arguments["seconds"]
-    try:
-        run = subprocess.run(command, capture_output=True, text=True, timeout=limit, check=False)
-    except subprocess.TimeoutExpired:
-        return [{"pattern": pattern, "failed": "takes too long"} for pattern in patterns]
-    if run.returncode:
-        last = run.stderr.strip().splitlines()[-1:] or [f"exit code {run.returncode}"]
-        return [{"pattern": pattern, "failed": last[0]} for pattern in patterns]
-    found: list[dict[str, Any]] = json.loads(run.stdout.splitlines()[-1])
-    return found
-
-
-def job(
-    folder: str,
-    clip: tuple[int, tuple[int, int], int],
-    name: str,
-    peer: str,
-    patterns: Sequence[str],
-    seconds: float,
-    seed: int,
-) -> list[dict[str, Any]]:
-    """Measure one reader of one video with several patterns."""
-    count, size, stills = clip
-    stored = Store(Path(folder), count, (size[0], size[1]), stills).stored(name)
-    kind = peers_for(name)[peer]
-    figures = []
-    for pattern in patterns:
-        try:
-            opened = _warm(kind.opener, stored)
-            figure, numbers, grids = _measure(opened, stored.frames, pattern, seconds, seed)
-        except ModuleNotFoundError as error:
-            figures.append({"pattern": pattern, "failed": f"not installed: {error.name}"})
-            continue
-        except Exception as error:  # whatever a library raises
-            figures.append({"pattern": pattern, "failed": f"{type(error).__name__}: {error}"})
-            continue
-        exact = peer == OURS and stored.dataset is not None
-        figure["verdict"] = verdict(stored, numbers, grids, exact=exact)
-        if exact and not figure["verdict"]:
-            figure["verdict"] = _replay(opened, stored, numbers, pattern)
-        figures.append({"pattern": pattern, **figure})
-    return figures
-
-
-def _warm(opener: Any, stored: Stored) -> Peer:
-    """Opened, with what is loaded when the first frame is read."""
-    peer: Peer = opener(stored)
-    peer.read([0])
-    return peer
-
-
-def _measure(
-    peer: Peer, count: int, pattern: str, seconds: float, seed: int
-) -> tuple[dict[str, Any], NDArray[np.int64], NDArray[Any]]:
-    """What a pattern costs; which frames were read, and some of their pixels."""
+def measured(
+    stored: Stored, name: str, pattern: str, size: Size | None, seconds: float, seed: int
+) -> tuple[int, float, float, str]:
+    """Frames, CPU seconds and seconds of one reader with one pattern; what is wrong with them."""
+    peer = peers_for(stored.name)[name](stored, size)
+    peer.read([0])  # with what is loaded when the first frame is read
     numbers: list[int] = []
     grids: list[Any] = []
     start, cpu = time.perf_counter(), cpu_seconds()
-    for reads, (wanted, found) in enumerate(_reads(peer, count, pattern, seed), 1):
+    for reads, (wanted, found) in enumerate(_reads(peer, stored, pattern, size, seed), 1):
         grids.extend(np.array(some) for some in grid(found))
         numbers += wanted
         if time.perf_counter() - start >= seconds and reads >= _LEAST_READS:
             break
     cpu, wall = cpu_seconds() - cpu, time.perf_counter() - start
-    figure = {"frames": len(numbers), "cpu": cpu, "wall": wall}
-    return figure, np.array(numbers), np.stack(grids)
+    if size:
+        fault = reduced_verdict(peer, stored, size)
+    else:
+        exact = name == OURS and stored.dataset is not None
+        fault = verdict(stored, np.array(numbers), np.stack(grids), exact=exact)
+        if exact and not fault:
+            fault = _replay(peer, stored, np.array(numbers), pattern)
+    return len(numbers), cpu, wall, fault
 
 
-def _reads(peer: Peer, count: int, pattern: str, seed: int) -> Iterator[tuple[list[int], Any]]:
+def _reads(
+    peer: Peer, stored: Stored, pattern: str, size: Size | None, seed: int
+) -> Iterator[tuple[list[int], Any]]:
     """Frames that are wanted, and what is read, without end."""
-    if pattern == "order":
-        while True:
-            for number, frame in enumerate(peer.in_order()):
-                yield [number], frame[None]
+    count = stored.frames
+    while pattern == "order":
+        if size:  # which not all can do while they iterate
+            yield from (([number], peer.read([number])) for number in range(count))
+            continue
+        for number, frame in enumerate(peer.in_order()):
+            yield [number], frame[None]
     rng = np.random.default_rng((seed, list(PATTERNS).index(pattern)))
     while True:
         if pattern == "single":
@@ -283,6 +196,16 @@ def _shapes(grids: NDArray[Any]) -> NDArray[np.float32]:
     return shapes
 
 
+def reduced_verdict(peer: Peer, stored: Stored, size: Size) -> str:
+    """Whether frames of another size are like the whole ones, reduced."""
+    numbers = np.linspace(0, stored.frames - 1, 8).astype(int).tolist()
+    wholes = peers_for(stored.name)[OURS](stored, None).read(numbers)
+    reduced = [Image.fromarray(one).resize(size, Image.Resampling.BOX) for one in wholes]
+    error = np.square(np.asarray(peer.read(numbers), np.float32) - np.stack(reduced))
+    decibel = 10 * np.log10(255**2 / error.mean(axis=(1, 2, 3)).max())
+    return "" if decibel > LEAST_DB else f"other colours ({decibel:.0f} dB)"
+
+
 def _replay(peer: Peer, stored: Stored, numbers: NDArray[np.int64], pattern: str) -> str:
     """Read the same frames once more, and compare all of their pixels."""
     digests = stored.reference["digests"]
@@ -297,6 +220,185 @@ def _replay(peer: Peer, stored: Stored, numbers: NDArray[np.int64], pattern: str
             if digest(frame) != int(digests[number]):
                 return "not exact"
     return ""
+
+
+# ---------------------------------------------------------------- tables
+
+
+@dataclass
+class Cell:
+    """One reader, one way to store, one pattern.
+
+    Attributes:
+        per_cpu: Frames per CPU second, of each round.
+        per_second: Frames per second on the clock, of each round.
+        faults: What is wrong with its frames, and how much of the last round.
+        failures: Why there are none.
+    """
+
+    per_cpu: list[float] = field(default_factory=list)
+    per_second: list[float] = field(default_factory=list)
+    faults: dict[str, str] = field(default_factory=dict)
+    failures: dict[str, None] = field(default_factory=dict)
+
+    @property
+    def rate(self) -> float:
+        """Frames per CPU second, the median."""
+        return median(self.per_cpu) if self.per_cpu else 0.0
+
+    @property
+    def counts(self) -> bool:
+        """Whether it gives the frames that are wanted."""
+        return bool(self.per_cpu) and not self.failures and set(self.faults) <= {"other colours"}
+
+    def __str__(self) -> str:
+        if self.failures:
+            return "fails"
+        if not self.per_cpu:
+            return ""
+        faults = ", ".join(self.faults.values())
+        text = number(self.rate)
+        if len(self.per_cpu) > 1:
+            text += f" ({number(min(self.per_cpu))} to {number(max(self.per_cpu))})"
+        text += f", {number(median(self.per_second))}/s"
+        return f"{text}; {faults}" if faults else text
+
+
+def number(value: float) -> str:
+    """With three digits."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def short(failure: str) -> str:
+    """The beginning of what went wrong, without times and addresses."""
+    return re.sub(r"\[[\d:]+\]|/\S+/", "", " ".join(failure.split()))[:120]
+
+
+Cells = dict[tuple[str, str, str], Cell]
+
+
+def report(cells: Cells, sizes: Mapping[str, float], patterns: Sequence[str]) -> None:
+    """Print the tables."""
+    videos = [way for way in sizes if "-" in way]
+    best = "frames per CPU second: median (least to most), and frames per second on the clock"
+    print(f"\nThe same files, {best}:")
+    header: tuple[str, ...]
+    header = ("codec", "GOP", "kB a frame", "pattern", OURS, "best other", "", "mp4ds / other")
+    print_table(header, _against_best(cells, sizes, videos, patterns))
+    print(f"\nOther ways to store the same frames, {best}:")
+    header = ("stored as", "kB a frame", "pattern", "read by", "")
+    print_table(header, _others(cells, sizes, videos))
+    print(f"\nAll readers, {best}:")
+    readers = list(dict.fromkeys(peer for way, _, peer in cells if way in videos))
+    print_table(("codec", "GOP", "pattern", *readers), _all(cells, videos, patterns, readers))
+    failures = {
+        f"- {peer}, {way}: {text}"
+        for (way, _, peer), cell in cells.items()
+        for text in cell.failures
+    }
+    print("\n".join(["", *sorted(failures)]))
+
+
+def _against_best(
+    cells: Cells, sizes: Mapping[str, float], ways: Sequence[str], patterns: Sequence[str]
+) -> Iterator[tuple[object, ...]]:
+    for way in ways:
+        codec, _, gop = way.partition("-")
+        for pattern in patterns:
+            ours = cells.get((way, pattern, OURS), Cell())
+            name, best = _best(cells, way, pattern)
+            ratio = f"{ours.rate / best.rate:.2f}" if ours.counts and best.counts else ""
+            told = f"{sizes[way] / 1000:.1f}", PATTERNS[pattern]
+            yield codec, gop, *told, ours, name, best, ratio
+
+
+def _best(cells: Cells, way: str, pattern: str) -> tuple[str, Cell]:
+    """The quickest of the others that gives the frames that are wanted."""
+    found = {
+        peer: cell
+        for (a, b, peer), cell in cells.items()
+        if (a, b) == (way, pattern) and peer != OURS and cell.counts
+    }
+    if not found:
+        return "", Cell()
+    return max(found.items(), key=lambda item: item[1].rate)
+
+
+def _others(
+    cells: Cells, sizes: Mapping[str, float], videos: Sequence[str]
+) -> Iterator[tuple[object, ...]]:
+    for (way, pattern, peer), cell in cells.items():
+        if way not in videos:
+            yield way, f"{sizes[way] / 1000:.1f}", PATTERNS[pattern], peer, cell
+
+
+def _all(
+    cells: Cells, ways: Sequence[str], patterns: Sequence[str], readers: Sequence[str]
+) -> Iterator[tuple[object, ...]]:
+    for way in ways:
+        codec, _, gop = way.partition("-")
+        for pattern in patterns:
+            found = (cells.get((way, pattern, peer), "") for peer in readers)
+            yield codec, gop, PATTERNS[pattern], *found
+
+
+# ---------------------------------------------------------------- a drawing
+
+_COLOURS = {"mp4ds": "#0b5fff", "torchcodec": "#d1495b", "pyav": "#8a8a8a"}
+_OTHER = "#444444"
+_TICKS = ((5, 10, 20, 50, 100, 200, 500, 1000, 2000), (10, 20, 50, 100, 200, 500))
+
+
+def curves_of(
+    cells: Cells, sizes: Mapping[str, float]
+) -> dict[tuple[str, str], dict[float, tuple[float, str]]]:
+    """Of each codec and reader, by bytes a frame: random frames per CPU second, and the GOP.
+
+    Of torchcodec's modes the best at each point.
+    """
+    curves: dict[tuple[str, str], dict[float, tuple[float, str]]] = defaultdict(dict)
+    for (way, pattern, peer), cell in cells.items():
+        # how we read LeRobot's file is no way to store frames
+        if pattern != "single" or not cell.counts or (way, peer) == ("lerobot", OURS):
+            continue
+        codec, _, gop = way.partition("-")
+        curve = curves[codec, peer.partition(" ")[0] if gop else ""]
+        curve[sizes[way]] = max(curve.get(sizes[way], (0.0, gop)), (cell.rate, gop))
+    return curves
+
+
+def draw(cells: Cells, sizes: Mapping[str, float], path: Path) -> None:
+    """Draw bytes of a frame against random frames per CPU second, as an SVG."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    matplotlib.rcParams["svg.fonttype"] = "none"
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(9, 5))
+    for (codec, reader), curve in curves_of(cells, sizes).items():
+        name = f"{codec}, {reader}" if reader else codec
+        style = "--" if codec == "h264" else "-"
+        points = sorted((size / 1e3, *point) for size, point in curve.items())
+        places, rates = [point[0] for point in points], [point[1] for point in points]
+        color = _COLOURS.get(reader, _OTHER)
+        width = 3.0 if reader == "mp4ds" else 1.5
+        axes.plot(places, rates, style, color=color, linewidth=width, marker="o", label=name)
+        for size, rate, label in points:
+            text = label if reader in _COLOURS else name
+            axes.annotate(text, (size, rate), xytext=(6, 4), textcoords="offset points")
+    axes.set(xscale="log", yscale="log")
+    for axis, ticks in zip((axes.xaxis, axes.yaxis), _TICKS, strict=True):
+        axis.set_major_locator(matplotlib.ticker.FixedLocator(ticks))
+        axis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%d"))
+        axis.set_minor_locator(matplotlib.ticker.NullLocator())
+    axes.set(xlabel="kB a frame", ylabel="random frames per CPU second")
+    axes.grid(visible=True, alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    lines = [line for line in axes.get_lines() if len(line.get_xdata()) > 1]
+    axes.legend(handles=lines, frameon=False, loc=(0.5, 0.15))
+    figure.tight_layout()
+    figure.savefig(path, metadata={"Date": None})
 
 
 if __name__ == "__main__":

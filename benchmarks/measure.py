@@ -1,22 +1,23 @@
-"""Running benchmark jobs as processes of their own, and reporting what they cost."""
+"""What the benchmarks share: processes of their own, what they cost, and tables."""
 
 from __future__ import annotations
 
-import json
+import argparse
+import math
+import multiprocessing
 import os
 import platform
 import resource
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
 from typing import Any
-
-_JOBS = str(Path(__file__).with_name("jobs.py"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +35,14 @@ class Run:
     output: str
 
 
-def python(*arguments: str) -> Run:
+def python(*arguments: object) -> Run:
     """Run a Python interpreter and measure it.
 
     Raises:
         SystemExit: It failed; what it said is on stderr.
     """
     start = time.perf_counter()
-    command = [sys.executable, *arguments]
+    command = [sys.executable, *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         output = process.stdout.read() if process.stdout else ""
         _, status, usage = os.wait4(process.pid, 0)
@@ -51,22 +52,33 @@ def python(*arguments: str) -> Run:
     return Run(usage.ru_utime + usage.ru_stime, time.perf_counter() - start, output)
 
 
+def isolated(function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """The result of a function that runs in a new process."""
+    context = multiprocessing.get_context("spawn")  # so that it has no memory of this one
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(function, *arguments, **options).result()
+
+
 def cpu_seconds() -> float:
     """User and system time of this process, all threads."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime
 
 
-def job(name: str, **arguments: Any) -> dict[str, Any]:
-    """Run a function of jobs.py in a process of its own and return what it returns."""
-    run = python(_JOBS, name, json.dumps(arguments, default=str))
-    result: dict[str, Any] = json.loads(run.output.splitlines()[-1])
-    return result
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def spread(values: Sequence[float], digits: int = 2) -> str:
     """Median, least and most."""
     return f"{median(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
+
+
+def psnr(error: float) -> str:
+    """Of a mean squared error of 8 bits, dB."""
+    return f"{10 * math.log10(255**2 / error):.1f}" if error else "exact"
 
 
 def print_machine() -> None:
@@ -77,17 +89,11 @@ def print_machine() -> None:
         model = next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
     except (OSError, StopIteration):
         pass
-    packages = ("av", "mcap", "rosbags", "numpy", "pillow", "zstandard", "pydantic")
+    packages = ("mp4ds", "av", "mcap", "rosbags", "numpy", "pillow", "zstandard", "pydantic")
     versions = ", ".join(f"{name} {version(name)}" for name in packages)
     print(f"- machine: {model}, {os.cpu_count()} cores, {platform.system()} {platform.release()}")
-    print(f"- Python {platform.python_version()}, mp4ds {_mp4ds_version()}, {versions}")
+    print(f"- Python {platform.python_version()}, {versions}")
     print(f"- load before: {os.getloadavg()[0]:.2f}", flush=True)
-
-
-def _mp4ds_version() -> str:
-    from mp4ds import __version__
-
-    return __version__
 
 
 def print_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -95,6 +101,13 @@ def print_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None
     print(f"\n| {' | '.join(header)} |\n|{' --- |' * len(header)}", flush=True)
     for row in rows:
         print(f"| {' | '.join(map(str, row))} |", flush=True)
+
+
+def parser_of(description: str | None) -> argparse.ArgumentParser:
+    """A command line whose help is the docstring of its module."""
+    return argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawTextHelpFormatter
+    )
 
 
 def parse_size(text: str) -> tuple[int, int]:

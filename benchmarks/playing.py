@@ -8,27 +8,19 @@ and an ordinary subscriber, by rospy. A grey camera of the scene ``cups`` with t
 
 - timing: how much later than planned messages arrive. The player's zero is not known to others, so
   that of each run is its least late message. Players take turns.
-- clock: /clock at 100 Hz: how often it comes, and whether it ever runs back.
 - rate: the recording's time over that of arrival, from the first message to the last, in percent of
   what was asked for.
 - most: frames a second at which all arrive and the asked rate is kept within 3 %: in steps of a
-  quarter, the last one that holds. CPU time is that of the player at the recorded rate, less what a
-  single frame costs, and that of the subscriber, who for the bag of JPEG files decodes them. MB is
-  what is read for a frame.
-- step: two players, of which the second follows the first one's /clock: how much messages of the
-  same stamp are apart.
+  quarter, the last one that holds; and what is read for a frame.
 """
 
 from __future__ import annotations
 
-import argparse
-import io
 import os
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -36,12 +28,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
-from rosbags.rosbag1 import Reader, Writer
+from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 import clips
-from measure import print_machine, print_table
+from measure import parser_of, print_machine, print_table, size_of
 from measure import python as measured
 from recordings import TOPIC, write_bag
 
@@ -51,8 +42,6 @@ from roscore import PLAY, Core, missing, python
 
 RECEIVER = str(Path(__file__).with_name("playing_receiver.py"))
 NS = 10**9
-JPEG_QUALITY = 90
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
 RATES = (0.1, 0.5, 1.0, 2.0, 10.0)
 STEP = 1.25
 MAX_RATE = 64.0
@@ -65,7 +54,6 @@ class Camera:
     name: str
     hertz: float
     bag: Path
-    jpeg: Path
     lossless: Path
     visual: Path
     log_times: dict[int, int]  # by stamp, ns
@@ -83,14 +71,10 @@ class Played:
     Attributes:
         stamps: Of the messages in order of arrival, nanoseconds.
         arrivals: Seconds.
-        player_cpu: Seconds of the player, with its start.
-        receiver_cpu: Seconds of the subscriber while it received.
     """
 
     stamps: NDArray[np.int64]
     arrivals: NDArray[np.float64]
-    player_cpu: float
-    receiver_cpu: float
 
     @property
     def hertz(self) -> float:
@@ -100,9 +84,7 @@ class Played:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each recording")
     parser.add_argument("--rounds", type=int, default=3, help="of the timing")
     parser.add_argument("--only", action="append", choices=SECTIONS, help="all by default")
@@ -136,55 +118,28 @@ def make_camera(folder: Path, size: tuple[int, int], hertz: float, seconds: floa
     spec = clips.ClipSpec(
         "cups" if clips.data_folder() else clips.DEMO, "mono8", "low", count, size
     )
-    bag, jpeg = folder / f"{spec.name}.bag", folder / f"{spec.name}-jpeg.bag"
-    if not jpeg.exists():
-        bag.unlink(missing_ok=True)
-        write_bag(bag, clips.make(spec), count, "mono8", hertz=hertz)
-        part = jpeg.with_suffix(".part")
-        part.unlink(missing_ok=True)
-        write_jpeg_bag(part, bag)
-        part.rename(jpeg)
+    bag = folder / f"{spec.name}.bag"
+    if not bag.exists():
+        write_bag(bag, clips.make(spec), "mono8", hertz=hertz)
     packed = {}
     for quality in ("lossless", "visual"):
         packed[quality] = folder / f"{spec.name}-{quality}"
         if not packed[quality].exists():
-            command = ("-m", "mp4ds", "pack", str(bag), "-o", str(packed[quality]))
-            measured(
-                *command, "--quality", quality
-            )  # SVT-AV1 changes the scheduling of its process
-    times = {stamp: time for _, stamp, time in images(bag)}
-    return Camera(name, hertz, bag, jpeg, packed["lossless"], packed["visual"], times)
+            # by itself, since SVT-AV1 changes the scheduling of its process
+            measured("-m", "mp4ds", "pack", bag, "-o", packed[quality], "--quality", quality)
+    times = dict(images(bag))
+    return Camera(name, hertz, bag, packed["lossless"], packed["visual"], times)
 
 
-def images(bag: Path) -> Iterator[tuple[Any, int, int]]:
-    """Message, stamp and log time of each image of a bag, nanoseconds."""
+def images(bag: Path) -> Iterator[tuple[int, int]]:
+    """Stamp and log time of each image of a bag, nanoseconds."""
     store = get_typestore(Stores.ROS1_NOETIC)
     with Reader(bag) as reader:
         for connection, time, data in reader.messages():
             if connection.topic == TOPIC:
                 message: Any = store.deserialize_ros1(data, connection.msgtype)
                 stamp = message.header.stamp
-                yield message, stamp.sec * NS + stamp.nanosec, time
-
-
-def write_jpeg_bag(path: Path, bag: Path) -> None:
-    """The same images as JPEG files, on the same topic."""
-    store = get_typestore(Stores.ROS1_NOETIC)
-    with Writer(path) as writer:
-        connection = writer.add_connection(TOPIC, COMPRESSED, typestore=store)
-        for message, _, time in images(bag):
-            pixels = message.data.reshape(message.height, message.width)
-            file = io.BytesIO()
-            Image.fromarray(pixels).save(file, "jpeg", quality=JPEG_QUALITY)
-            data = np.frombuffer(file.getvalue(), np.uint8)
-            made = store.types[COMPRESSED](message.header, "jpeg", data)
-            writer.write(connection, time, store.serialize_ros1(made, COMPRESSED))
-
-
-def size_of(path: Path) -> int:
-    """Bytes of a file, or of the files in a folder."""
-    files = path.rglob("*") if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
+                yield stamp.sec * NS + stamp.nanosec, time
 
 
 # ---------------------------------------------------------------- playing
@@ -203,47 +158,20 @@ def theirs(bag: Path, *options: str) -> list[str]:
     return [PLAY, "--quiet", *options, "--bags", str(bag), *OPTIONS]
 
 
-def play(
-    core: Core, *commands: Sequence[str], topics: Sequence[str] = (TOPIC,), decode: bool = False
-) -> dict[str, Played]:
-    """What arrives by topic while players run; the first is started last, and measured."""
+def play(core: Core, command: Sequence[str]) -> Played:
+    """What arrives while a player runs."""
     result = core.folder / "received.npz"
     result.unlink(missing_ok=True)
-    receiver = core.script(RECEIVER, str(result), "decode" if decode else "keep", *topics)
+    receiver = core.script(RECEIVER, str(result), TOPIC)
     if receiver.next() != "ready":
         raise SystemExit("the subscriber has not started")
-    others = [core.start(*command) for command in commands[1:]]
-    if others:
-        time.sleep(6)
-    player = core.start(*commands[0])
-    _, status, usage = os.wait4(player.pid, 0)
-    player.returncode = os.waitstatus_to_exitcode(status)
-    if player.returncode:
-        raise SystemExit(f"failed with exit code {player.returncode}: {' '.join(commands[0])}")
+    if code := core.start(*command).wait():
+        raise SystemExit(f"failed with exit code {code}: {' '.join(command)}")
     time.sleep(1)
-    for other in others:
-        end(other)
-    cpu = receiver.ask("done")
+    receiver.ask("done")
     receiver.end()
     with np.load(result) as arrays:
-        return {
-            topic: Played(
-                arrays[f"stamps{i}"],
-                arrays[f"arrivals{i}"],
-                usage.ru_utime + usage.ru_stime,
-                cpu,
-            )
-            for i, topic in enumerate(topics)
-        }
-
-
-def end(follower: subprocess.Popen[str]) -> None:
-    """Wait for one that follows, which the last /clock of its leader may not let end."""
-    try:
-        follower.wait(10)
-    except subprocess.TimeoutExpired:
-        follower.terminate()
-        follower.wait(60)
+        return Played(arrays["stamps"], arrays["arrivals"])
 
 
 def percentiles(values: NDArray[np.float64]) -> list[str]:
@@ -262,7 +190,7 @@ def timing(core: Core, cameras: Sequence[Camera], rounds: int) -> None:
             late: dict[str, list[NDArray[np.float64]]] = {}
             for _ in range(rounds):
                 for name, command in players(camera):
-                    played = play(core, command)[TOPIC]
+                    played = play(core, command)
                     late.setdefault(name, []).append(lateness(camera, played))
             for name, found in late.items():
                 joined = np.concatenate(found)
@@ -290,24 +218,6 @@ def lateness(camera: Camera, played: Played) -> NDArray[np.float64]:
     return late - late.min()
 
 
-def clock(core: Core, cameras: Sequence[Camera], _: int) -> None:
-    """How /clock comes."""
-
-    def rows() -> Iterator[list[object]]:
-        for camera in cameras:
-            for name, command in players(camera, "--clock"):
-                found = play(core, command, topics=("/clock",))["/clock"]
-                steps = np.diff(found.stamps)
-                gaps = np.diff(found.arrivals)
-                backward = int((steps < 0).sum())
-                share = [f"{1000 * value:.1f}" for value in np.percentile(gaps, (50, 99, 100))]
-                yield [camera.name, name, f"{found.hertz:.1f}", backward, *share]
-
-    print_table(
-        ("camera", "player", "Hz", "runs back", "gap p50, ms", "gap p99, ms", "gap max, ms"), rows()
-    )
-
-
 def rate(core: Core, cameras: Sequence[Camera], _: int) -> None:
     """Whether a rate is kept."""
     camera = cameras[0]
@@ -317,7 +227,7 @@ def rate(core: Core, cameras: Sequence[Camera], _: int) -> None:
         for asked, (name, _) in product(RATES, players(camera)):
             seconds = min(length, max(1.0, 3 * asked))
             options = ("--rate", f"{asked:g}", "--duration", f"{seconds:g}")
-            played = play(core, dict(players(camera, *options))[name])[TOPIC]
+            played = play(core, dict(players(camera, *options))[name])
             first, last = (camera.log_times[int(played.stamps[i])] for i in (0, -1))
             found = (last - first) / NS / float(played.arrivals[-1] - played.arrivals[0])
             yield [f"{asked:g}", name, len(played.stamps), f"{100 * (found / asked - 1):+.2f} %"]
@@ -326,40 +236,24 @@ def rate(core: Core, cameras: Sequence[Camera], _: int) -> None:
 
 
 def most(core: Core, cameras: Sequence[Camera], _: int) -> None:
-    """How many frames a second, and what a frame costs."""
+    """How many frames a second."""
 
     def rows() -> Iterator[list[object]]:
         for camera in cameras:
-            forms: list[tuple[str, Path, Callable[..., list[str]]]] = [
-                ("mp4ds, lossless", camera.lossless, ours),
-                ("mp4ds, visual", camera.visual, ours),
-                ("rosbag play", camera.bag, theirs),
-                ("rosbag play, JPEG", camera.jpeg, theirs),
-            ]
-            for name, path, command in forms:
-                decode = path == camera.jpeg
-                whole = play(core, command(path), decode=decode)[TOPIC]
-                single = play(core, command(path, "--duration", "0.001"), decode=decode)[TOPIC]
-                frames = len(whole.stamps) - len(single.stamps)
-                cpu = (
-                    1000 * (whole.player_cpu - single.player_cpu) / frames,
-                    1000 * (whole.receiver_cpu - single.receiver_cpu) / frames,
-                )
-                hertz = highest(core, camera, lambda *o, c=command, p=path: c(p, *o), decode=decode)
-                megabytes = f"{size_of(path) / camera.frames / 1e6:.3f}"
-                yield [camera.name, name, f"{hertz:.0f}", *(f"{ms:.1f}" for ms in cpu), megabytes]
+            sources = (camera.lossless, camera.visual, camera.bag)
+            for source, (name, _) in zip(sources, players(camera), strict=True):
+                hertz = highest(core, camera, name)
+                megabytes = f"{size_of(source) / camera.frames / 1e6:.3f}"
+                yield [camera.name, name, f"{hertz:.0f}", megabytes]
 
-    header = ("camera", "player", "frames/s", "player CPU, ms", "subscriber CPU, ms", "MB")
-    print_table(header, rows())
+    print_table(("camera", "player", "frames/s", "MB"), rows())
 
 
-def highest(
-    core: Core, camera: Camera, command: Callable[..., list[str]], *, decode: bool
-) -> float:
+def highest(core: Core, camera: Camera, player: str) -> float:
     """The highest rate at which all frames arrive in time, Hz; 0 if even the recorded one fails."""
     kept, asked = 0.0, 1.0
     while asked <= MAX_RATE:
-        played = play(core, command("--rate", f"{asked:g}"), decode=decode)[TOPIC]
+        played = play(core, dict(players(camera, "--rate", f"{asked:g}"))[player])
         if len(played.stamps) < camera.frames or played.hertz < 0.97 * asked * camera.hertz:
             break
         kept = played.hertz
@@ -367,29 +261,7 @@ def highest(
     return kept
 
 
-def step(core: Core, cameras: Sequence[Camera], _: int) -> None:
-    """Two players that keep in step."""
-    second = "/second" + TOPIC
-
-    def rows() -> Iterator[list[object]]:
-        for camera in cameras:
-            follow = ("--ros1", "--follow-clock", "--no-progress", "--prefix", "/second")
-            follower = python("mp4ds", "play", str(camera.lossless), *follow, "--topics", TOPIC)
-            for name, leader in players(camera, "--clock"):
-                found = play(core, leader, follower, topics=(TOPIC, second))
-                arrivals = [
-                    dict(zip(played.stamps.tolist(), played.arrivals.tolist(), strict=True))
-                    for played in (found[TOPIC], found[second])
-                ]
-                both = arrivals[0].keys() & arrivals[1].keys()
-                apart = np.array([abs(arrivals[1][key] - arrivals[0][key]) for key in both])
-                share = f"{len(both)} of {camera.frames}"
-                yield [camera.name, name, share, *percentiles(apart)]
-
-    print_table(("camera", "leader", "pairs", "p50, ms", "p90, ms", "p99, ms", "max, ms"), rows())
-
-
-SECTIONS = {"timing": timing, "clock": clock, "rate": rate, "most": most, "step": step}
+SECTIONS = {"timing": timing, "rate": rate, "most": most}
 
 if __name__ == "__main__":
     main()

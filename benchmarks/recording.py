@@ -16,7 +16,6 @@ node that publishes, and ROS's own recorder. Sections:
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -35,10 +34,11 @@ import xxhash
 from rosbags.rosbag1 import Reader
 
 import clips
-from measure import print_machine, print_table
+from measure import parser_of, print_machine, print_table, size_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from mp4ds.format.sidecars import load_manifest
 from roscore import RECORD, Core, missing, python, wait_until
 
 PUBLISHER = str(Path(__file__).with_name("recording_publisher.py"))
@@ -170,14 +170,17 @@ def beside(core: Core, folder: Path, seconds: float, *robot: Any) -> None:
             f"{100 * (after[name].cpu - before[name].cpu) / elapsed:.0f} %",
             f"{(after[name].written - before[name].written) / 1e6 / elapsed:.1f}",
             f"{after[name].peak / 2**20:.0f}",
-            f"{sum(path.stat().st_size for path in files) / 1e6:.0f}",
+            f"{size_of(path) / 1e6:.0f}",
             codes[name],
         )
-        for name, files in (("mp4ds", list(dataset.iterdir())), ("rosbag", [bag]))
+        for name, path in (("mp4ds", dataset), ("rosbag", bag))
     ]
     print_table(("", "CPU of a core", "MB/s to disk", "peak MiB", "MB in all", "exit code"), rows)
     print()
-    kept = json.loads(_info(dataset))
+    kept = {
+        one.topic: f"{one.messages}: {one.reason}"
+        for one in load_manifest(dataset / "dataset.yaml").verbatim
+    }
     rows = []
     for topic in sorted({*due, *found}):
         one, other = dict(found.get(topic, [])), dict(due.get(topic, []))
@@ -195,14 +198,6 @@ def beside(core: Core, folder: Path, seconds: float, *robot: Any) -> None:
         )
     columns = ("topic", "published", "in mp4ds", "in rosbag", "only in rosbag, or other bytes")
     print_table((*columns, "verbatim", "connection"), rows)
-
-
-def _info(dataset: Path) -> str:
-    """Messages of each topic that were kept verbatim, with reasons, as JSON."""
-    from mp4ds.format.sidecars import load_manifest
-
-    entries = load_manifest(dataset / "dataset.yaml").verbatim
-    return json.dumps({one.topic: f"{one.messages}: {one.reason}" for one in entries})
 
 
 # ---------------------------------------------------------------- kills
@@ -259,9 +254,7 @@ SECTIONS = ("steady", "overload", "kills")
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=60.0, help="of the steady recording")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--only", action="append", choices=SECTIONS, help="all by default")

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 TOPIC = "/camera/image_raw"
 TOPICS = {TOPIC: IMAGE, "/camera/camera_info": INFO}
 START_NS = 1_712_647_128_027_473_200
+HERTZ = 30
 CHUNK_BYTES = 1 << 20  # the MCAP libraries' own default
 _ROWS = {"nv12": Fraction(3, 2)}  # of the array for each of the image, where not 1
 _QOS = """\
@@ -36,23 +38,22 @@ def _store(ros: int) -> Any:
     return get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
 
 
-def times(count: int, hertz: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def times(hertz: float) -> Iterator[tuple[int, int]]:
     """Header stamps and log times of a camera, nanoseconds: shutter and driver are both late."""
-    rng = np.random.default_rng(count)
-    ideal = START_NS + (np.arange(count) * (1e9 / hertz)).astype(np.int64)
-    stamps = ideal + rng.integers(0, 200_000, count)
-    return stamps, stamps + rng.integers(2_000_000, 6_000_000, count)
+    rng = np.random.default_rng(1)
+    for number in count():
+        stamp = START_NS + int(number * 1e9 / hertz) + int(rng.integers(0, 200_000))
+        yield stamp, stamp + int(rng.integers(2_000_000, 6_000_000))
 
 
 def write_mcap(
-    path: Path, frames: Iterable[Any], count: int, encoding: str, *, compression: str, hertz: float
+    path: Path, frames: Iterable[Any], encoding: str, *, compression: str, hertz: float = HERTZ
 ) -> None:
     """A ROS 2 recording.
 
     Args:
         path: The file to write.
         frames: Pixels of each image, taken one by one.
-        count: Number of frames.
         encoding: ROS image encoding.
         compression: Of the chunks: ``zstd``, ``lz4`` or ``none``.
         hertz: Frames per second.
@@ -71,36 +72,31 @@ def write_mcap(
                 topic, "cdr", schema, {"offered_qos_profiles": _QOS}
             )
         for number, (topic, stamp, time, message) in enumerate(
-            _messages(frames, count, encoding, hertz, ros=2)
+            _messages(frames, encoding, hertz, ros=2)
         ):
             payload = store.serialize_cdr(message, TOPICS[topic])
             writer.add_message(channels[topic], time, payload, (stamp + time) // 2, number)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def write_bag(
-    path: Path, frames: Iterable[Any], count: int, encoding: str, *, hertz: float
-) -> None:
-    """A ROS 1 bag without compression, as ``rosbag record`` writes it. See `write_mcap`."""
+def write_bag(path: Path, frames: Iterable[Any], encoding: str, *, hertz: float = HERTZ) -> None:
+    """A ROS 1 bag without compression, as ``rosbag record`` writes it."""
     store = _store(1)
     with BagWriter(path) as writer:
         connections = {
             topic: writer.add_connection(topic, msgtype, typestore=store, callerid="/driver")
             for topic, msgtype in TOPICS.items()
         }
-        for topic, _, time, message in _messages(frames, count, encoding, hertz, ros=1):
+        for topic, _, time, message in _messages(frames, encoding, hertz, ros=1):
             payload = store.serialize_ros1(message, TOPICS[topic])
             writer.write(connections[topic], time, payload)
 
 
 def _messages(
-    frames: Iterable[Any], count: int, encoding: str, hertz: float, *, ros: int
+    frames: Iterable[Any], encoding: str, hertz: float, *, ros: int
 ) -> Iterator[tuple[str, int, int, Any]]:
     """Topic, stamp, log time and message of each, in log-time order."""
-    stamps, log_times = times(count, hertz)
-    for seq, (pixels, stamp, time) in enumerate(
-        zip(frames, stamps.tolist(), log_times.tolist(), strict=False)
-    ):
+    for seq, (pixels, (stamp, time)) in enumerate(zip(frames, times(hertz), strict=False)):
         header = _header(seq, stamp, ros)
         height, width = image_size(pixels, encoding)
         yield TOPIC, stamp, time, _image(header, pixels, encoding, ros)

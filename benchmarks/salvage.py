@@ -11,7 +11,6 @@ or, where that gives less, ``.dump``.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import random
@@ -32,7 +31,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from measure import print_table
+from measure import parser_of, print_table
 from mp4ds.bags.formats import open_sources
 from mp4ds.errors import SourceError
 from mp4ds.records import Message
@@ -353,7 +352,7 @@ def verdict(ours: tuple[int, int], theirs: tuple[int, int]) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--places", type=int, default=10)
     parser.add_argument("--rosbag", default=sys.executable, help="a Python that has rosbag")

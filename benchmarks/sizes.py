@@ -21,19 +21,16 @@ from PIL import Image
 
 import clips
 import mp4ds
-from measure import parse_size, print_machine, print_table
+from measure import parse_size, parser_of, print_machine, print_table, size_of
 from recordings import TOPIC, write_bag
 
-HERTZ = 30.0
 JPEG = (90, 75)
 PACKED = ("lossless", "visual")
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=90)
     parser.add_argument("--size", type=parse_size, default=(640, 480), help="WxH")
     encodings = ("bayer_rggb8", "mono8", "rgb8")
@@ -68,13 +65,13 @@ def measure(frames: NDArray[Any], encoding: str) -> list[int]:
     """Bytes of all frames in each form."""
     with tempfile.TemporaryDirectory() as made:
         bag = Path(made, "clip.bag")
-        write_bag(bag, frames, len(frames), encoding, hertz=HERTZ)
+        write_bag(bag, frames, encoding)
         found = [frames.nbytes, sum(still(pixels, "PNG") for pixels in frames)]
         packed = []
         for quality in PACKED:
             target = Path(made, quality)
             mp4ds.pack(bag, target, mp4ds.PackOptions(quality=quality))
-            packed.append(sum(path.stat().st_size for path in target.rglob("*")))
+            packed.append(size_of(target))
         with mp4ds.open(Path(made, "lossless")) as dataset:
             seen = "gray" if encoding == "mono8" else "rgb"
             for jpeg in JPEG:

@@ -13,7 +13,6 @@ handles the whole file for each range.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -21,13 +20,17 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from measure import print_machine, print_table
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import s3fs
+
+from measure import parser_of, print_machine, print_table, python, size_of
 from recordings import START_NS, write_bag, write_mcap
+from remote_servers import BUCKET, s3_server
 
 ROOT = Path(__file__).parents[1]
 HERTZ = 15.0
@@ -63,36 +66,12 @@ def frames(count: int) -> Iterator[NDArray[np.uint8]]:
         yield moved + noise[:, at : at + 320]
 
 
-def write_rosbag2(path: Path, bag: Path) -> None:
-    """The messages of a ROS 1 bag as rosbag2 with sqlite3, by rosbags' own converter."""
-    command = [sys.executable, "-m", "rosbags.convert", "--src", str(bag), "--dst", str(path)]
-    subprocess.run(command, check=True)
-
-
-def sizes(path: Path) -> int:
-    """Bytes of a file or folder."""
-    files = [path] if path.is_file() else path.rglob("*")
-    return sum(item.stat().st_size for item in files if item.is_file())
-
-
-def measured(source: str, small: Path, target: Path, to: str, start: str, duration: float) -> Any:
-    """Seconds on the clock, CPU seconds and bytes of read calls."""
-    arguments = [source, str(small), str(target), to, str(start), str(duration)]
-    done = subprocess.run(
-        [sys.executable, "-c", _PROGRAM, *arguments], check=True, capture_output=True, text=True
-    )
-    return json.loads(done.stdout)
-
-
 def is_equal(source: Path, dataset: Path, to: str, work: Path, span: tuple[int, int]) -> str:
     """What `tools/compare.py` says of the slice."""
     output = dataset
     if not to:
         output = work / ("again" + source.suffix)
-        subprocess.run(
-            [sys.executable, "-m", "mp4ds", "unpack", dataset, "-o", output, "--force"],
-            check=True, capture_output=True,
-        )  # fmt: skip
+        python("-m", "mp4ds", "-q", "unpack", dataset, "-o", output, "--force")
     command = [sys.executable, str(ROOT / "tools" / "compare.py"), source, output]
     command += ["--start", str(span[0]), "--end", str(span[1])]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -101,7 +80,7 @@ def is_equal(source: Path, dataset: Path, to: str, work: Path, span: tuple[int, 
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--minutes", type=float, default=10)
     parser.add_argument("--seconds", type=float, default=10)
     parser.add_argument("--remote", action="store_true")
@@ -119,15 +98,12 @@ def report(work: Path, length: float, duration: float, *, is_remote: bool) -> No
     first = START_NS + round(start * 1e9)
     span = first, first + round(duration * 1e9)
     bag, mcap, dataset = work / "drive.bag", work / "drive.mcap", work / "dataset"
-    write_bag(bag, frames(count), count, "mono8", hertz=HERTZ)
-    write_mcap(mcap, frames(count), count, "mono8", compression="zstd", hertz=HERTZ)
-    write_rosbag2(work / "rosbag2", bag)
-    write_bag(work / "small.bag", frames(8), 8, "mono8", hertz=HERTZ)
+    write_bag(bag, frames(count), "mono8", hertz=HERTZ)
+    write_mcap(mcap, frames(count), "mono8", compression="zstd", hertz=HERTZ)
+    python("-m", "rosbags.convert", "--src", bag, "--dst", work / "rosbag2")
+    write_bag(work / "small.bag", frames(8), "mono8", hertz=HERTZ)
     for source, target in ((bag, dataset), (work / "small.bag", work / "small")):
-        subprocess.run(
-            [sys.executable, "-m", "mp4ds", "pack", source, "-o", target],
-            check=True, capture_output=True,
-        )  # fmt: skip
+        python("-m", "mp4ds", "-q", "pack", source, "-o", target)
     rows = [
         ("pack", "bag", bag, bag, ""),
         ("pack", "MCAP, zstd", mcap, mcap, ""),
@@ -135,8 +111,6 @@ def report(work: Path, length: float, duration: float, *, is_remote: bool) -> No
         ("pack", "dataset", dataset, bag, ""),
         ("unpack", "dataset", dataset, bag, "bag"),
     ]
-    sys.path.insert(0, str(ROOT / "tests"))
-    from remote_servers import BUCKET, s3_server
 
     def lines() -> Iterator[list[object]]:
         with s3_server() as server:
@@ -146,8 +120,6 @@ def report(work: Path, length: float, duration: float, *, is_remote: bool) -> No
                 "AWS_SECRET_ACCESS_KEY": "b",
                 "AWS_DEFAULT_REGION": "us-east-1",
             }
-            import s3fs
-
             files = s3fs.S3FileSystem(use_listings_cache=False)
             if not files.exists(BUCKET):
                 files.mkdir(BUCKET)
@@ -160,13 +132,14 @@ def report(work: Path, length: float, duration: float, *, is_remote: bool) -> No
                 small = work / ("small" if source is dataset else "small.bag")
                 where = url if is_remote else str(source)
                 begin = f"{first // 10**9}.{first % 10**9:09d}"
-                wall, cpu, read = measured(where, small, target, to, begin, duration)
+                told = python("-c", _PROGRAM, where, small, target, to, begin, duration).output
+                wall, cpu, read = json.loads(told)
                 if is_remote:
                     asked = [item.span for item in server.requests if item.method == "GET"]
-                    read = sum(min(s[1] + 1, sizes(source)) - s[0] for s in asked if s)
+                    read = sum(min(s[1] + 1, size_of(source)) - s[0] for s in asked if s)
                     files.rm(url, recursive=True)
                 result = is_equal(recorded, target, to, work, span)
-                share = f"{read / 1e6:.1f} MB of {sizes(source) / 1e6:.0f}"
+                share = f"{read / 1e6:.1f} MB of {size_of(source) / 1e6:.0f}"
                 yield [command, what, f"{wall:.1f}", f"{cpu:.1f}", share, result]
 
     print_table(["", "of", "s", "CPU s", "read", "compared"], lines())

@@ -140,7 +140,7 @@ _X264_FAST = MappingProxyType({"x264-params": "cabac=0"})
 _YUV = ("yuv420p", "yuv422p", "yuv444p")
 
 
-# as small as x264's default preset without loss, at half its time (benchmarks/RESULTS.md)
+# as small as x264's default preset without loss, at half its time (spec/notes.md)
 _TUNING = "ref=3:mixed-refs=1:subme=5:me=dia:weightp=0:scenecut=0"
 
 
@@ -235,7 +235,7 @@ _AV1_FAST = 11
 _SMALL = "hierarchical-levels=3:enable-qm=1:qm-min=8:ac-bias=1.0"
 _LOSSY: Mapping[str, _Lossy] = {
     "av1": _Lossy(_Coding("libsvtav1", "yuv420p", {}, "6"), _AV1_PRESETS, 63, 2),
-    # a sixth fewer bits for 1.3 times the time (benchmarks/RESULTS.md)
+    # a sixth fewer bits for 1.3 times the time (spec/notes.md)
     "av1-10bit": _Lossy(
         _Coding("libsvtav1", TEN_BITS, {"svtav1-params": _SMALL}, "6", codec="av1"),
         _AV1_PRESETS, 63, 2,

@@ -1,4 +1,4 @@
-"""What benchmarks/loader.py reads: a clip of a moving camera, as videos, as stills, as LeRobot's.
+"""What benchmarks/loader.py reads, and who reads it.
 
 The clip is the scenes of clips.py, one after the other, each enlarged to cover a window that moves
 over it as a camera that is carried, and exposed anew by a sensor with noise (a standard deviation
@@ -8,30 +8,48 @@ path. The same numbers give the same clip.
 All is made once, below a folder: the clip as an MCAP file, and of this file a dataset for each
 codec and GOP, LeRobot's video, PNG and JPEG files, and for each video its *reference*: of each
 frame of one pass in order a digest, and 16 x 16 of its pixels.
+
+Each reader is used as its documentation shows, with its defaults, and is kept open between reads.
+All give RGB of 8 bits, but for LeRobot's, which gives floats.
+
+- mp4ds: `Stream.read` with ``format="rgb"``; in order, iteration.
+- pyav: seeks to the key frame before each wanted frame, unless the frames up to it can be had by
+  decoding on, and decodes up to it. The presentation times are known beforehand.
+- torchcodec: `get_frames_at` with each of its seek modes; custom frame mappings are the file's own
+  index, made beforehand.
+- lerobot (emulated): a torchcodec decoder of the mode that LeRobot uses, and its conversion to
+  floats; lerobot, uint8: without the conversion, as LeRobot 0.6 reads on request.
+- pil: one file per frame.
 """
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
-from itertools import chain, islice
+from functools import cached_property, partial
+from importlib.metadata import PackageNotFoundError, version
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import av
 import numpy as np
 import xxhash
+from mcap.reader import make_reader
 from numpy.typing import NDArray
+from PIL import Image
+from rosbags.typesys import Stores, get_typestore
 
-from clips import SCENES, SEED, ClipSpec, Sensor, data_folder, demosaic_bilinear, make
-from recordings import START_NS, TOPIC, write_mcap
+import mp4ds
+from clips import SCENES, SEED, ClipSpec, Sensor, data_folder, expose, rgb_frames
+from measure import size_of
+from recordings import HERTZ, IMAGE, TOPIC, write_mcap
 
 Pixels = NDArray[Any]
 
-HERTZ = 30
 SENSOR = Sensor(full_well=5_000, read_electrons=5)
 MARGIN = 48  # pixels that the window moves each way
 GRID = 16
@@ -55,63 +73,30 @@ _PART = 480  # frames of each part of a pack, more than any GOP
 # ---------------------------------------------------------------- frames
 
 
-def moving(count: int, size: tuple[int, int], *, seed: int = 0) -> Iterator[Pixels]:
+def moving(count: int, size: tuple[int, int]) -> Iterator[Pixels]:
     """The clip's frames, rgb of 8 bits, shape (H, W, 3)."""
-    phases = np.random.default_rng((SEED, seed)).uniform(0, 2 * np.pi, 4)
+    phases = np.random.default_rng((SEED, 0)).uniform(0, 2 * np.pi, 4)
     periods = np.array([7.0, 2.3, 5.0, 1.7])  # seconds: a slow and a quick swing each way
     for number, scene in enumerate(islice(_scenes(size), count)):
         swing = np.sin(phases + 2 * np.pi * number / HERTZ / periods) * [0.8, 0.2, 0.8, 0.2]
         # even, so that the mosaic keeps its phase
         x, y = (int(MARGIN * (1 + swing[i] + swing[i + 1])) // 2 * 2 for i in (0, 2))
-        rng = np.random.default_rng((SEED, seed, number))
-        window = scene[y : y + size[1], x : x + size[0]]
-        yield demosaic_bilinear(SENSOR.expose(_mosaic(window), 255, rng))
+        rng = np.random.default_rng((SEED, 0, number))
+        yield expose("rgb8", scene[y : y + size[1], x : x + size[0]], SENSOR, rng)
 
 
 def _scenes(size: tuple[int, int]) -> Iterator[NDArray[np.float32]]:
     """Frames of all scenes without noise, a margin larger than asked, over and over."""
-    wide = (size[0] + 2 * MARGIN, size[1] + 2 * MARGIN)
-    while True:
-        for name in _scene_names():
-            spec = ClipSpec(name, "rgb8", "low", 10_000, wide)
-            yield from (pixels.astype(np.float32) for pixels in _clean(spec))
-
-
-def _scene_names() -> list[str]:
     folder = data_folder()
+    wide = (size[0] + 2 * MARGIN, size[1] + 2 * MARGIN)
     found = [
         name
         for name, scene in SCENES.items()
         if folder and not scene.encodings and any(folder.glob(scene.pattern))
     ]
-    return found or ["demo"]
-
-
-def _clean(spec: ClipSpec) -> Iterator[Pixels]:
-    """A scene as it is on disk, enlarged to cover a size."""
-    folder = data_folder()
-    if folder is None:
-        yield from islice(make(spec), 300)
-        return
-    width, height = spec.size or (0, 0)
-    with av.open(str(folder / SCENES[spec.scene].pattern)) as container:
-        for frame in container.decode(video=0):
-            scale = max(width / frame.width, height / frame.height)
-            scaled = frame.reformat(
-                width=max(width, round(frame.width * scale)),
-                height=max(height, round(frame.height * scale)),
-                format="rgb24",
-                interpolation="BICUBIC",
-            ).to_ndarray()
-            top, left = (scaled.shape[0] - height) // 2, (scaled.shape[1] - width) // 2
-            yield scaled[top : top + height, left : left + width]
-
-
-def _mosaic(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    mosaic = np.empty(rgb.shape[:2], np.float32)
-    for row, column, color in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)):
-        mosaic[row::2, column::2] = rgb[row::2, column::2, color]
-    return mosaic
+    while True:
+        for name in found or ["demo"]:
+            yield from rgb_frames(ClipSpec(name, "rgb8", "low", 300, wide))
 
 
 # ---------------------------------------------------------------- what is on disk
@@ -151,8 +136,7 @@ class Stored:
     @cached_property
     def bytes_per_frame(self) -> float:
         """Of the video, or of the files."""
-        files = self.path.iterdir() if self.path.is_dir() else [self.path]
-        return sum(file.stat().st_size for file in files) / self.frames
+        return size_of(self.path) / self.frames
 
     def still(self, number: int) -> str:
         """The file of a frame."""
@@ -189,14 +173,10 @@ class Stored:
 
     def _in_order(self) -> Iterator[Pixels]:
         if self.is_stills:
-            from PIL import Image
-
             for number in range(self.frames):
                 with Image.open(self.still(number)) as image:
                     yield np.asarray(image)
         elif self.dataset:
-            import mp4ds
-
             with mp4ds.open(self.dataset) as opened:
                 yield from (frame.data for frame in opened[TOPIC])
         else:
@@ -264,24 +244,19 @@ class Store:
         if not path.exists():
             part = path.with_suffix(".part")
             frames = moving(self.frames, self.size)
-            write_mcap(part, frames, self.frames, "rgb8", compression="none", hertz=HERTZ)
+            write_mcap(part, frames, "rgb8", compression="none")
             part.rename(path)
         return path
 
     def recorded(self) -> Iterator[Pixels]:
         """The frames of the recording."""
-        from mcap.reader import make_reader
-        from rosbags.typesys import Stores, get_typestore
-
         store = get_typestore(Stores.ROS2_HUMBLE)
         with self.recording.open("rb") as stream:
             for _, _, message in make_reader(stream).iter_messages(topics=[TOPIC]):
-                image: Any = store.deserialize_cdr(message.data, "sensor_msgs/msg/Image")
+                image: Any = store.deserialize_cdr(message.data, IMAGE)
                 yield image.data.reshape(image.height, image.width, 3)
 
     def _dataset(self, name: str) -> Path:
-        import mp4ds
-
         path = self.folder / name
         if not path.exists():
             codec, _, gop = name.partition("-")
@@ -304,8 +279,6 @@ class Store:
         return path
 
     def _stills(self, kind: str) -> Path:
-        from PIL import Image
-
         path = self.folder / kind
         part = self.folder / f"{kind}.part"
         if not path.exists():
@@ -333,42 +306,192 @@ def write_lerobot_video(path: Path, frames: Iterable[Pixels]) -> None:
         container.mux(stream.encode())
 
 
-def write_cameras(path: Path, cameras: dict[str, Iterable[Pixels]], encoding: str) -> None:
-    """A ROS 2 recording of several cameras that are triggered together.
-
-    Args:
-        path: The MCAP file to make.
-        cameras: Frames by topic; as many of each.
-        encoding: ROS image encoding of all.
-    """
-    from mcap.writer import CompressionType, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    image_type = "sensor_msgs/msg/Image"
-    types = store.types
-    with path.open("wb") as stream:
-        writer = Writer(stream, compression=CompressionType.NONE)
-        writer.start("ros2", "recorder")
-        definition = store.generate_msgdef(image_type, ros_version=2)[0].encode()
-        schema = writer.register_schema(image_type, "ros2msg", definition)
-        channels = {topic: writer.register_channel(topic, "cdr", schema) for topic in cameras}
-        for number, frames in enumerate(zip(*cameras.values(), strict=True)):
-            for place, (topic, frame) in enumerate(zip(cameras, frames, strict=True)):
-                stamp = START_NS + number * 10**9 // HERTZ + place * 20_000
-                header = types["std_msgs/msg/Header"](
-                    types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), topic.strip("/")
-                )
-                height, width = frame.shape[:2]
-                data = np.ascontiguousarray(frame).reshape(-1)
-                step = len(data) // height
-                image = types[image_type](header, height, width, encoding, 0, step, data)
-                payload = bytes(store.serialize_cdr(image, image_type))
-                writer.add_message(channels[topic], stamp + 3_000_000, payload, stamp, number)
-        writer.finish()  # type: ignore[no-untyped-call]
-
-
 def ways(codecs: Iterable[str], gops: Iterable[int]) -> list[str]:
     """Names of all ways to store the clip, LeRobot's and the stills included."""
-    videos = (f"{codec}-{gop}" for codec in codecs for gop in gops)
-    return list(chain(videos, ["lerobot"], STILLS))
+    return [*(f"{codec}-{gop}" for codec in codecs for gop in gops), "lerobot", *STILLS]
+
+
+# ---------------------------------------------------------------- readers
+
+Size = tuple[int, int]
+"""Width and height, pixels."""
+
+
+class Peer(Protocol):
+    """An opened video, or folder of stills."""
+
+    def read(self, numbers: Sequence[int]) -> Any:
+        """Frames, shape (len(numbers), H, W, 3), a numpy array or tensor."""
+
+    def in_order(self) -> Iterator[Any]:
+        """All frames, each of shape (H, W, 3)."""
+
+
+class Mp4ds:
+    """Our own."""
+
+    def __init__(self, stored: Stored, size: Size | None = None) -> None:
+        self._size = size
+        self._dataset = mp4ds.open(stored.dataset or stored.path)
+        self._stream: Any = self._dataset[TOPIC if stored.dataset else stored.path.stem]
+
+    def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102
+        return self._stream.read(numbers, format="rgb", resize=self._size)
+
+    def in_order(self) -> Iterator[Any]:  # noqa: D102
+        for frame in self._stream:
+            yield frame.data
+
+
+class PyAv:
+    """PyAV."""
+
+    def __init__(self, stored: Stored, size: Size | None = None) -> None:
+        self._made = {"width": size[0], "height": size[1]} if size else {}
+        self._container = av.open(str(stored.path))
+        self._stream = self._container.streams.video[0]
+        self._pts = stored.reference["pts"]
+        # of each frame the key frame that it is decoded from
+        self._keys = np.maximum.accumulate(
+            np.where(stored.reference["keys"], np.arange(len(self._pts)), 0)
+        )
+        self._decoded: Iterator[Any] = iter(())
+        self._next = len(self._pts)
+
+    def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102
+        found = {number: self._one(number) for number in sorted(set(numbers))}
+        return np.stack([found[number] for number in numbers])
+
+    def _one(self, number: int) -> Any:
+        if not self._keys[number] <= self._next <= number:
+            self._container.seek(int(self._pts[number]), stream=self._stream)
+            self._decoded = self._container.decode(self._stream)
+        for frame in self._decoded:
+            if frame.pts is not None and frame.pts >= self._pts[number]:
+                self._next = number + 1
+                return frame.to_ndarray(format="rgb24", **self._made)
+        raise ValueError(f"frame {number} does not come")
+
+    def in_order(self) -> Iterator[Any]:  # noqa: D102
+        self._container.seek(0, stream=self._stream)
+        for frame in self._container.decode(self._stream):
+            yield frame.to_ndarray(format="rgb24")
+
+
+class TorchCodec:
+    """torchcodec.
+
+    Args:
+        stored: What to read.
+        size: Width and height to make, by its Resize.
+        mode: ``exact``, ``approximate`` or ``mappings``.
+    """
+
+    def __init__(self, stored: Stored, size: Size | None = None, *, mode: str) -> None:
+        from torchcodec.decoders import VideoDecoder
+
+        how: dict[str, Any] = {"seek_mode": mode}
+        if mode == "mappings":
+            how = {"custom_frame_mappings": _mappings(stored)}
+        if size:
+            from torchcodec.transforms import Resize
+
+            how["transforms"] = [Resize((size[1], size[0]))]
+        self._decoder: Any = VideoDecoder(str(stored.path), dimension_order="NHWC", **how)
+
+    def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102
+        return self._decoder.get_frames_at(list(numbers)).data
+
+    def in_order(self) -> Iterator[Any]:  # noqa: D102
+        yield from self._decoder
+
+
+def _mappings(stored: Stored) -> str:
+    pts, keys = stored.reference["pts"].tolist(), stored.reference["keys"].tolist()
+    last = int(stored.reference["ticks"]) // HERTZ
+    frames = [
+        {"pts": start, "duration": end - start, "key_frame": int(key)}
+        for start, end, key in zip(pts, [*pts[1:], pts[-1] + last], keys, strict=True)
+    ]
+    return json.dumps({"frames": frames})
+
+
+class EmulatedLeRobot:
+    """What LeRobot does with torchcodec, without LeRobot.
+
+    Args:
+        stored: What to read.
+        floats: Whether to convert to 0 to 1.
+    """
+
+    def __init__(self, stored: Stored, _: Size | None = None, *, floats: bool) -> None:
+        from torchcodec.decoders import VideoDecoder
+
+        self._decoder: Any = VideoDecoder(str(stored.path), seek_mode="approximate")
+        self._floats = floats
+
+    def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102
+        import torch
+
+        found = self._decoder.get_frames_at(list(numbers)).data
+        frames = torch.stack(list(found))  # it stacks what it picks by time
+        if self._floats:
+            frames = (frames / 255.0).type(torch.float32)
+        return frames.permute(0, 2, 3, 1)
+
+    def in_order(self) -> Iterator[Any]:  # noqa: D102
+        for number in range(len(self._decoder)):
+            yield self.read([number])[0]
+
+
+class PilStills:
+    """Pillow."""
+
+    def __init__(self, stored: Stored, _: Size | None = None) -> None:
+        self._stored = stored
+
+    def _one(self, number: int) -> Any:
+        with Image.open(self._stored.still(number)) as image:
+            return np.asarray(image)
+
+    def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102
+        return np.stack([self._one(number) for number in numbers])
+
+    def in_order(self) -> Iterator[Any]:  # noqa: D102
+        yield from map(self._one, range(self._stored.frames))
+
+
+OURS = "mp4ds"
+Opener = Callable[[Stored, Size | None], Peer]
+VIDEO_PEERS: dict[str, Opener] = {
+    OURS: Mp4ds,
+    "pyav": PyAv,
+    **{
+        f"torchcodec {mode}": partial(TorchCodec, mode=mode)
+        for mode in ("exact", "approximate", "mappings")
+    },
+}
+LEROBOT_PEERS: dict[str, Opener] = {
+    "lerobot, uint8 (emulated)": partial(EmulatedLeRobot, floats=False),
+    "lerobot (emulated)": partial(EmulatedLeRobot, floats=True),
+    OURS: Mp4ds,
+}
+STILL_PEERS: dict[str, Opener] = {"pil": PilStills}
+
+
+def peers_for(name: str) -> dict[str, Opener]:
+    """Who reads what is stored in a way."""
+    if name == "lerobot":
+        return LEROBOT_PEERS
+    return STILL_PEERS if name in STILLS else VIDEO_PEERS
+
+
+def versions() -> str:
+    """Of the readers, and which are missing."""
+    found = {}
+    for package in ("torchcodec", "torch"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "missing"
+    return ", ".join(f"{package} {told}" for package, told in found.items())
