@@ -39,8 +39,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import depth_clips
-from depth_clips import read_pnm, sobel
+import mp4ds
+from depth_clips import read_pnm
 from measure import parse_size, parser_of
+from mp4ds.plugins.demo import CAMERA_HZ, demo
 from recordings import write_bag
 
 Pixels = NDArray[Any]  # shape (H, W) or (H, W, C); nv12: (H * 3 / 2, W)
@@ -48,7 +50,7 @@ Signal = NDArray[np.float32]
 
 FAMILIES = (
     *("bayer_rggb8", "mono8", "rgb8", "mono16", "bayer_rggb16", "rgb16", "rgba8"),
-    *("yuv422", "nv12", "16UC1", "16SC1", "32FC1"),
+    *("yuv422", "nv12", "16UC1", "32FC1"),
 )
 SEED = 20240409
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -69,11 +71,6 @@ class Sensor:
     def gain(self, levels: int) -> float:
         """Grey levels per electron, where ``levels`` is full scale."""
         return levels / self.full_well
-
-    def deviation(self, signal: float, levels: int) -> float:
-        """Standard deviation in grey levels at a signal in grey levels."""
-        gain = self.gain(levels)
-        return float(((self.read_electrons * gain) ** 2 + gain * signal) ** 0.5)
 
     def expose(self, signal: Signal, levels: int, rng: np.random.Generator) -> Pixels:
         """Pixels of a signal in grey levels, 0 to ``levels``."""
@@ -115,8 +112,8 @@ MOVING = {
 }
 """The scenes that are videos, for lossy codecs."""
 DEMO = "demo"
-GRADIENT, WIDE = "gradient", "wide"
-"""Made of a camera's pictures: 16SC1 and 16UC1 (see depth_clips.py)."""
+WIDE = "wide"
+"""16UC1 that is a camera's picture of 16 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +179,8 @@ def specs(
         if encoding == family and (needs is None or (folder and any(folder.glob(needs)))):
             recorded = scene_name in depth_clips.RECORDED
             found.append(ClipSpec(scene_name, family, AS_RECORDED if recorded else AS_MADE, frames))
-    made_of_camera = {"16SC1": GRADIENT, "16UC1": WIDE}.get(family)
-    if made_of_camera:
-        found.append(ClipSpec(made_of_camera, family, "low", frames, size))
+    if family == "16UC1":
+        found.append(ClipSpec(WIDE, family, "low", frames, size))
     return found
 
 
@@ -215,23 +211,9 @@ def noise_of(noise: str, number: int) -> np.random.Generator:
     return np.random.default_rng((SEED, list(SENSORS).index(noise), number))
 
 
-def load(spec: ClipSpec, cache: Path | None = None) -> Pixels:
-    """A whole clip, shape (frames, H, W) or (frames, H, W, 3).
-
-    Args:
-        spec: Which.
-        cache: Folder to keep it in as .npy, mapped into memory; None makes it in memory.
-    """
-    if cache is None:
-        return np.stack(list(make(spec)))
-    cache.mkdir(parents=True, exist_ok=True)
-    path = cache / f"{spec.name}.npy"
-    if not path.exists():
-        part = path.with_suffix(".part.npy")
-        np.save(part, np.stack(list(make(spec))))
-        part.rename(path)
-    clip: Pixels = np.load(path, mmap_mode="r")
-    return clip
+def load(spec: ClipSpec) -> Pixels:
+    """A whole clip, shape (frames, H, W) or (frames, H, W, 3)."""
+    return np.stack(list(make(spec)))
 
 
 def _mono(levels: int) -> Callable[[Signal, Sensor, np.random.Generator], Pixels]:
@@ -267,8 +249,6 @@ CAMERA_FAMILIES = tuple(_CAMERA)
 
 
 def _camera(spec: ClipSpec, rgb: Signal, sensor: Sensor, rng: np.random.Generator) -> Pixels:
-    if spec.scene == GRADIENT:
-        return sobel(_GRAY8(rgb, sensor, rng))
     if spec.scene == WIDE:
         return _GRAY16(rgb, sensor, rng)
     return _CAMERA[spec.encoding](rgb, sensor, rng)
@@ -349,7 +329,7 @@ def rgb_frames(spec: ClipSpec) -> Iterator[Signal]:
     if spec.scene == DEMO or folder is None:
         frames = _demo_frames(spec.frames)
     else:
-        scene = "cups" if spec.scene in (GRADIENT, WIDE) else spec.scene
+        scene = "cups" if spec.scene == WIDE else spec.scene
         frames = _video_frames(folder / {**SCENES, **MOVING}[scene].pattern)
     for frame in frames:
         yield _fit(frame, spec.size)
@@ -378,21 +358,13 @@ def _fit(frame: av.VideoFrame, size: tuple[int, int] | None) -> Signal:
 
 def _demo_frames(count: int) -> Iterator[av.VideoFrame]:
     """The demo's rgb camera, which has a little noise of its own."""
-    from rosbags.rosbag1 import Reader
-    from rosbags.typesys import Stores, get_typestore
-
-    from mp4ds.plugins.demo import CAMERA_HZ, demo
-
-    store = get_typestore(Stores.ROS1_NOETIC)
     with tempfile.TemporaryDirectory() as folder:
-        bag = Path(folder) / "demo.bag"
+        bag, dataset = Path(folder) / "demo.bag", Path(folder) / "demo"
         demo(bag, seconds=(count + 1) / CAMERA_HZ)
-        with Reader(bag) as reader:
-            images = [c for c in reader.connections if c.topic == "/right/image_raw"]
-            for connection, _, data in reader.messages(images):
-                image: Any = store.deserialize_ros1(data, connection.msgtype)
-                rgb = image.data.reshape(image.height, image.width, 3)
-                yield av.VideoFrame.from_ndarray(rgb, format="rgb24")
+        mp4ds.pack(bag, dataset)
+        with mp4ds.open(dataset) as opened:
+            for frame in opened["/right/image_raw"]:
+                yield av.VideoFrame.from_ndarray(frame.data, format="rgb24")
 
 
 def _read_still(path: Path) -> Pixels:

@@ -9,12 +9,9 @@
     tof16      to 16 bits
     aloe       a disparity map, moved a little from frame to frame, matched anew each time:
                noise before the matcher's steps of 1/16 pixel, pixels lost at random
-               16UC1 millimetres, 32FC1 metres (focal length * baseline / disparity),
-               16SC1 the disparity itself in sixteenths, -16 where unknown
+               16UC1 millimetres, 32FC1 metres (focal length * baseline / disparity)
     waves      32FC1 that follow from no integer: a smooth surface with noise in every pixel
-    gradient   16SC1: horizontal Sobel derivative of a noisy camera's picture
     wide       16UC1 over the full range: a noisy camera of 16 bits
-    noise      all values equally likely
 
 The noise is independent from pixel to pixel and from frame to frame. The same seed gives the
 same clip.
@@ -129,9 +126,6 @@ def aloe(folder: Path, encoding: str, count: int) -> Iterator[Pixels]:
         steps = np.rint((true + noise) * STEPS).astype(np.int16)
         known = (true > 0) & (steps > 0) & (rng.random(true.shape, np.float32) > LOST)
         steps[~known] = -STEPS
-        if encoding == "16SC1":
-            yield steps
-            continue
         disparity = np.where(known, steps, STEPS).astype(np.float32) / np.float32(STEPS)
         distance = np.float32(FOCAL_TIMES_BASELINE) / disparity
         if encoding == "32FC1":
@@ -149,22 +143,6 @@ def waves(folder: Path, encoding: str, count: int) -> Iterator[Pixels]:
         yield smooth + rng.standard_normal(smooth.shape, np.float32) * np.float32(0.002)
 
 
-def noise(folder: Path, encoding: str, count: int) -> Iterator[Pixels]:
-    """640x480 of equally likely values."""
-    dtype = np.uint8 if encoding == "mono8" else np.uint16
-    for number in range(count):
-        rng = np.random.default_rng((SEED, number))
-        yield rng.integers(0, np.iinfo(dtype).max, (480, 640), dtype, endpoint=True)
-
-
-def sobel(picture: Pixels) -> Pixels:
-    """Horizontal derivative of an 8-bit picture, int16, rows weighted 1 2 1."""
-    padded = np.pad(picture.astype(np.int16), 1, mode="edge")
-    slope = padded[:, 2:] - padded[:, :-2]
-    weighted: Pixels = slope[:-2] + 2 * slope[1:-1] + slope[2:]
-    return weighted
-
-
 def _moved(scene: Pixels, number: int) -> Pixels:
     """A view of a scene, `MARGIN` smaller, that moves to and fro by a pixel at a time."""
     height, width = ((side - MARGIN) // 2 * 2 for side in scene.shape)
@@ -180,14 +158,11 @@ MAKERS: dict[tuple[str, str], Callable[[Path, str, int], Iterator[Pixels]]] = {
     ("tof12", "16UC1"): scaled(12),
     ("tof16", "16UC1"): scaled(16),
     ("aloe", "16UC1"): aloe,
-    ("noise", "16UC1"): noise,
-    ("aloe", "16SC1"): aloe,
     ("kinect", "32FC1"): kinect,
     ("realsense", "32FC1"): realsense,
     ("tof", "32FC1"): tof,
     ("aloe", "32FC1"): aloe,
     ("waves", "32FC1"): waves,
-    ("noise", "mono8"): noise,
 }
 """(scene, encoding) -> what makes the frames, in order."""
 

@@ -1,10 +1,10 @@
 """Changes small valid recordings and datasets and holds mp4ds to its rules.
 
-    nice python benchmarks/fuzz.py --count 100000 --seed 1 --jobs 2 --keep findings
+    nice python benchmarks/fuzz.py --count 100000 --seed 1 --keep findings
 
-What is changed is told in fuzz_records.py, fuzz_mcap.py, fuzz_dataset.py (records, boxes, values)
-and fuzz_bytes.py; the rules are in fuzz_rules.py: whatever is read comes back, deep validation
-finds all that plain does, what passes it unpacks, salvage finds no fewer messages than reading.
+What is changed, and the rules, are in fuzz_rules.py, how it is changed in fuzz_changes.py: whatever
+is read comes back, deep validation finds all that plain does, what passes it unpacks, salvage finds
+no fewer messages than reading.
 Besides, no input may lead to another error than an `Mp4dsError`, to a file that is written beside
 the output, or changed, to more than 1 GiB of address space beyond what the idle process has, to
 256 MiB of memory, or to 10 seconds. Every batch is read in a process of its own.
@@ -14,19 +14,16 @@ A finding is told by its seed, which makes the input again: ``--only SEED``; ``-
 
 from __future__ import annotations
 
-import argparse
 import gc
 import hashlib
 import json
 import math
 import os
-import platform
 import random
 import resource
 import select
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -40,12 +37,9 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-sys.path.insert(0, str(Path(__file__).parent))
 
-import av
-
-import mp4ds
-from fuzz_kinds import Kind, make_kinds
+from fuzz_rules import Kind, make_kinds
+from measure import parser_of, print_machine
 from mp4ds import Mp4dsError
 
 MEMORY = 2**30
@@ -207,7 +201,6 @@ def run(
     seed: int,
     seconds: float,
     around: Path,
-    share: tuple[int, int] = (0, 1),
 ) -> tuple[dict[str, Counter[str]], list[tuple[Finding, str]]]:
     """Check inputs of all kinds in turn.
 
@@ -217,7 +210,6 @@ def run(
         seed: Of the first of them.
         seconds: After which no further batch is begun.
         around: An empty folder, in which nothing may be written but by us.
-        share: Which of the batches are run, and of how many shares.
 
     Returns:
         Results by kind, and the findings with their tracebacks.
@@ -234,7 +226,7 @@ def run(
         for name, due in zip(names, per_kind, strict=True)
         if first < due
     ]
-    for name, first, last in batches[share[0] :: share[1]]:
+    for name, first, last in batches:
         if time.monotonic() > end:
             break
         seeds = [f"{seed}:{name}:{number}" for number in range(first, last)]
@@ -247,18 +239,14 @@ def run(
 
 def main() -> None:
     """See the module."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=3600.0)
-    parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
     parser.add_argument("--kind", action="append", help="only this one; may be repeated")
     parser.add_argument("--only", help="check the input of this seed alone, here")
     parser.add_argument("--keep", type=Path, help="a folder for inputs that are findings")
-    parser.add_argument("--share", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.jobs > 1 and not options.only:
-        sys.exit(_run_jobs(options.jobs))
     fast = Path("/dev/shm")
     with tempfile.TemporaryDirectory(prefix="fuzz-", dir=fast if fast.is_dir() else None) as name:
         folder = Path(name)
@@ -274,58 +262,26 @@ def main() -> None:
             print(*try_input(kind, options.only, folder / "around"), sep="\n")
             return
         start, wanted = time.monotonic(), {key: kinds[key] for key in options.kind or kinds}
-        share = tuple(map(int, options.share.split("/"))) if options.share else (0, 1)
         counts, findings = run(
             wanted,
             count=options.count,
             seed=options.seed,
             seconds=options.seconds,
             around=folder / "around",
-            share=share,  # type: ignore[arg-type]
         )
         for finding, text in findings:
             if options.keep:
                 _keep(finding, text, kinds[finding.kind], options.keep)
-    told = [[finding.kind, finding.seed, finding.what] for finding, _ in findings]
-    if options.share:
-        print(json.dumps([counts, told]))
-        return
-    sys.exit(_tell(counts, told, time.monotonic() - start, options.seed))
-
-
-def _run_jobs(jobs: int) -> bool:
-    """Run the shares of a run side by side, and tell what came of them together."""
-    start = time.monotonic()
-    command = [sys.executable, *sys.argv, "--jobs", "1", "--share"]
-    running = [
-        subprocess.Popen([*command, f"{number}/{jobs}"], stdout=subprocess.PIPE)
-        for number in range(jobs)
-    ]
-    counts: dict[str, Counter[str]] = {}
-    told: list[list[str]] = []
-    for process in running:
-        found, findings = json.loads(process.communicate()[0])
-        told += findings
-        for name, results in found.items():
-            counts.setdefault(name, Counter()).update(results)
-    seed = sys.argv[sys.argv.index("--seed") + 1] if "--seed" in sys.argv else "0"
-    return _tell(counts, told, time.monotonic() - start, seed)
-
-
-def _tell(
-    counts: dict[str, Counter[str]], told: list[list[str]], seconds: float, seed: object
-) -> bool:
-    """Print what came of a run; returns whether anything was found."""
+    total = sum(sum(results.values()) for results in counts.values())
+    seconds = time.monotonic() - start
     for key, results in counts.items():
         print(f"{key:32}", *(f"{what} {n}" for what, n in sorted(results.items())))
-    total = sum(sum(results.values()) for results in counts.values())
-    print(f"all {total}, findings {len(told)}, seed {seed}")
+    print(f"all {total}, findings {len(findings)}, seed {options.seed}")
     print(f"{seconds:.0f} s, {total / seconds:.0f} inputs a second")
-    print(f"mp4ds {mp4ds.__version__}, PyAV {av.__version__}, Python {platform.python_version()}")
-    print(f"{platform.platform()}, {os.cpu_count()} cores")
-    for finding in sorted(told):
-        print(*finding)
-    return bool(told)
+    print_machine()
+    for finding, _ in findings:
+        print(finding.kind, finding.seed, finding.what)
+    sys.exit(bool(findings))
 
 
 def _keep(finding: Finding, text: str, kind: Kind, keep: Path) -> None:

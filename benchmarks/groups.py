@@ -12,13 +12,8 @@ from __future__ import annotations
 import random
 import tempfile
 import time
-from collections.abc import Callable
 from itertools import product
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 import clips
 import mp4ds
@@ -26,23 +21,13 @@ from measure import cpu_seconds, parse_size, parser_of, print_machine, print_tab
 from mp4ds import PackOptions
 from recordings import TOPIC, write_mcap
 
-Pixels = NDArray[Any]
-
-
-def _mosaic(rgb: Pixels) -> Pixels:
-    mosaic = np.ascontiguousarray(rgb[..., 1])
-    mosaic[::2, ::2] = rgb[::2, ::2, 0]
-    mosaic[1::2, 1::2] = rgb[1::2, 1::2, 2]
-    return mosaic
-
-
-KINDS: dict[str, tuple[str, str, Callable[[Pixels], Pixels]]] = {
-    # encoding, quality, and its pixels from those of the clip
-    "mono8, lossless": ("mono8", "lossless", lambda rgb: np.ascontiguousarray(rgb[..., 1])),
-    "bayer_rggb8, lossless": ("bayer_rggb8", "lossless", _mosaic),
-    "rgb8, lossless": ("rgb8", "lossless", lambda rgb: rgb),
-    "rgb8, visual": ("rgb8", "visual", lambda rgb: rgb),
+KINDS = {
+    "mono8, lossless": ("mono8", "lossless"),
+    "bayer_rggb8, lossless": ("bayer_rggb8", "lossless"),
+    "rgb8, lossless": ("rgb8", "lossless"),
+    "rgb8, visual": ("rgb8", "visual"),
 }
+"""Encoding and quality."""
 PURPOSES = (None, "training", "training=40", "archive")
 
 
@@ -60,14 +45,13 @@ def main() -> None:
     print_machine()
     rows: list[tuple[object, ...]] = []
     for scene, kind in product(options.clip, options.kind):
-        encoding, quality, pixels_of = KINDS[kind]
+        encoding, quality = KINDS[kind]
         base: tuple[float, ...] = ()
         with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as name:
             folder = Path(name)
-            spec = clips.ClipSpec(scene, "rgb8", "low", options.frames, options.size)
-            images = map(pixels_of, clips.make(spec))
+            spec = clips.ClipSpec(scene, encoding, "low", options.frames, options.size)
             source = folder / "clip.mcap"
-            write_mcap(source, images, encoding, compression="none")
+            write_mcap(source, clips.make(spec), encoding, compression="none")
             for purpose in PURPOSES:
                 dataset = folder / f"{purpose}"
                 begun = cpu_seconds()

@@ -43,6 +43,7 @@ from loader_readers import (
     CODECS,
     OURS,
     PATTERNS,
+    STILLS,
     WINDOW,
     Peer,
     Size,
@@ -52,7 +53,6 @@ from loader_readers import (
     grid,
     peers_for,
     versions,
-    ways,
 )
 from measure import cpu_seconds, isolated, parse_size, parser_of, print_machine, print_table
 
@@ -89,7 +89,8 @@ def main() -> None:
     )
     options.folder.mkdir(parents=True, exist_ok=True)
     store = Store(options.folder, options.frames, options.size, options.stills)
-    stored = [store.stored(name) for name in options.way or ways(options.codec, options.gop)]
+    videos = [f"{codec}-{gop}" for codec in options.codec for gop in options.gop]
+    stored = [store.stored(name) for name in options.way or [*videos, "lerobot", *STILLS]]
     cells: Cells = defaultdict(Cell)
     for number in range(options.rounds):
         for one in stored:
@@ -288,15 +289,9 @@ def report(cells: Cells, sizes: Mapping[str, float], patterns: Sequence[str]) ->
     print(f"\nOther ways to store the same frames, {best}:")
     header = ("stored as", "kB a frame", "pattern", "read by", "")
     print_table(header, _others(cells, sizes, videos))
-    print(f"\nAll readers, {best}:")
-    readers = list(dict.fromkeys(peer for way, _, peer in cells if way in videos))
-    print_table(("codec", "GOP", "pattern", *readers), _all(cells, videos, patterns, readers))
-    failures = {
-        f"- {peer}, {way}: {text}"
-        for (way, _, peer), cell in cells.items()
-        for text in cell.failures
-    }
-    print("\n".join(["", *sorted(failures)]))
+    for (way, pattern, peer), cell in cells.items():
+        for text in cell.failures:
+            print(f"- {peer}, {way}, {pattern}: {text}")
 
 
 def _against_best(
@@ -330,16 +325,6 @@ def _others(
     for (way, pattern, peer), cell in cells.items():
         if way not in videos:
             yield way, f"{sizes[way] / 1000:.1f}", PATTERNS[pattern], peer, cell
-
-
-def _all(
-    cells: Cells, ways: Sequence[str], patterns: Sequence[str], readers: Sequence[str]
-) -> Iterator[tuple[object, ...]]:
-    for way in ways:
-        codec, _, gop = way.partition("-")
-        for pattern in patterns:
-            found = (cells.get((way, pattern, peer), "") for peer in readers)
-            yield codec, gop, PATTERNS[pattern], *found
 
 
 # ---------------------------------------------------------------- a drawing

@@ -38,15 +38,13 @@ from typing import Any, Protocol
 import av
 import numpy as np
 import xxhash
-from mcap.reader import make_reader
 from numpy.typing import NDArray
 from PIL import Image
-from rosbags.typesys import Stores, get_typestore
 
 import mp4ds
 from clips import SCENES, SEED, ClipSpec, Sensor, data_folder, expose, rgb_frames
 from measure import size_of
-from recordings import HERTZ, IMAGE, TOPIC, write_mcap
+from recordings import HERTZ, TOPIC, write_mcap
 
 Pixels = NDArray[Any]
 
@@ -173,12 +171,9 @@ class Stored:
 
     def _in_order(self) -> Iterator[Pixels]:
         if self.is_stills:
-            for number in range(self.frames):
-                with Image.open(self.still(number)) as image:
-                    yield np.asarray(image)
+            yield from PilStills(self).in_order()
         elif self.dataset:
-            with mp4ds.open(self.dataset) as opened:
-                yield from (frame.data for frame in opened[TOPIC])
+            yield from Mp4ds(self).in_order()
         else:
             with av.open(os.fspath(self.path)) as container:
                 for frame in container.decode(video=0):
@@ -248,14 +243,6 @@ class Store:
             part.rename(path)
         return path
 
-    def recorded(self) -> Iterator[Pixels]:
-        """The frames of the recording."""
-        store = get_typestore(Stores.ROS2_HUMBLE)
-        with self.recording.open("rb") as stream:
-            for _, _, message in make_reader(stream).iter_messages(topics=[TOPIC]):
-                image: Any = store.deserialize_cdr(message.data, IMAGE)
-                yield image.data.reshape(image.height, image.width, 3)
-
     def _dataset(self, name: str) -> Path:
         path = self.folder / name
         if not path.exists():
@@ -274,7 +261,7 @@ class Store:
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
             part = path.with_suffix(".part.mp4")
-            write_lerobot_video(part, self.recorded())
+            write_lerobot_video(part, moving(self.frames, self.size))
             part.rename(path)
         return path
 
@@ -285,7 +272,7 @@ class Store:
             part.mkdir(exist_ok=True)
             step = self.frames // self.stills
             options: dict[str, Any] = {"quality": JPEG_QUALITY} if kind == "jpeg" else {}
-            chosen = islice(self.recorded(), 0, step * self.stills, step)
+            chosen = islice(moving(self.frames, self.size), 0, step * self.stills, step)
             for number, frame in enumerate(chosen):
                 image = Image.fromarray(frame)
                 image.save(part / f"{number:06}{STILLS[kind]}", **options)
@@ -304,11 +291,6 @@ def write_lerobot_video(path: Path, frames: Iterable[Pixels]) -> None:
                 stream.height, stream.width = frame.shape[:2]
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
-
-
-def ways(codecs: Iterable[str], gops: Iterable[int]) -> list[str]:
-    """Names of all ways to store the clip, LeRobot's and the stills included."""
-    return [*(f"{codec}-{gop}" for codec in codecs for gop in gops), "lerobot", *STILLS]
 
 
 # ---------------------------------------------------------------- readers

@@ -10,7 +10,7 @@ byte for byte.
   by itself, by trial; named by layout and codec. ``video`` is its video alone.
 - MCAP, zstd MCAP: the recording, its messages verbatim.
 - PNG: of the pictures as they look to a program that knows pixel formats and nothing of mp4ds: a
-  mosaic is grey as it stands, 16SC1 is offset by 32768, YUV is planes, a float's four bytes are
+  mosaic is grey as it stands, YUV is planes, a float's four bytes are
   four grey pictures in one. By Pillow with its defaults; rgb of 16 bits by ffmpeg.
 """
 
@@ -38,7 +38,7 @@ from measure import parse_size, parser_of, print_machine, print_table, size_of
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import bind
 from mp4ds.records import Message
-from recordings import CHUNK_BYTES, IMAGE, TOPIC, times, write_mcap
+from recordings import CHUNK_BYTES, HERTZ, IMAGE, TOPIC, times, write_mcap
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ def measure(spec: clips.ClipSpec, folder: Path) -> Result:
 def check(clip: NDArray[Any], dataset: Path, name: str) -> None:
     """Every image comes back with the bytes of its pixels, so that one NaN is not another."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    stamps = (stamp for stamp, _ in times(30))
+    stamps = (stamp for stamp, _ in times(HERTZ))
     missing = dict(zip(stamps, clip, strict=False))
     with mp4ds.open(dataset) as opened:
         found = {frame.stamp_ns: frame.data for stream in opened.streams for frame in stream}

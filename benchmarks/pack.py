@@ -85,8 +85,8 @@ def main() -> None:
 
 def compare_cpu(spec: clips.ClipSpec, folder: Path, rounds: int, jobs: int) -> None:
     """CPU time of pack against the bare encoder's."""
-    clip = clips.load(spec, folder)
-    frames = folder / f"{spec.name}.npy"
+    clip, frames = clips.load(spec), folder / "clip.npy"
+    np.save(frames, clip)
     sources = {
         "MCAP, chunks not compressed": folder / "none.mcap",
         "MCAP, zstd chunks": folder / "zstd.mcap",

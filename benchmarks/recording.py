@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 import xxhash
 from rosbags.rosbag1 import Reader
 
@@ -46,7 +47,6 @@ OTHERS = "/rosout.*|/clock"
 STEADY = (2, "640x480", 30, 200, 30)
 OVERLOAD = (4, "2448x2048", 15, 0, 0)
 NS = 10**9
-_TICKS = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass
@@ -66,17 +66,12 @@ class Cost:
     @classmethod
     def of(cls, pid: int) -> Cost:
         """Of a process that runs."""
-        place = Path("/proc", str(pid))
-        fields = (place / "stat").read_text().rpartition(")")[2].split()
-        told = dict(
-            line.split(":", 1)
-            for name in ("io", "status")
-            for line in (place / name).read_text().splitlines()
-        )
+        process = psutil.Process(pid)
+        status = Path("/proc", str(pid), "status").read_text()
         return cls(
-            (int(fields[11]) + int(fields[12])) / _TICKS,
-            int(told["write_bytes"]),
-            1024 * int(told["VmHWM"].split()[0]),
+            sum(process.cpu_times()[:2]),
+            process.io_counters().write_bytes,
+            1024 * int(status.partition("VmHWM:")[2].split()[0]),
         )
 
 

@@ -321,7 +321,8 @@ def given(folder: Path, scratch: Path, python: str) -> Iterator[list[object]]:
             continue
         copy = Path(shutil.copy(path, scratch / path.name))
         ours, theirs = compare(copy, None, python)
-        yield [path.name, 1, "-", shown(ours), shown(theirs), verdict(ours, theirs)]
+        fewer = f"fewer in {int(ours[0] < theirs[0])}"
+        yield [path.name, 1, "-", shown(ours), shown(theirs), fewer]
         copy.unlink()
 
 
@@ -343,11 +344,6 @@ def made(scratch: Path, places: int, python: str) -> Iterator[list[object]]:
             total = places * sum(original.values())
             yield [f"{name}, {what}", places, total, ours, theirs, f"fewer in {fewer}"]
         whole.unlink()
-
-
-def verdict(ours: tuple[int, int], theirs: tuple[int, int]) -> str:
-    """In how many files mp4ds got fewer."""
-    return f"fewer in {int(ours[0] < theirs[0])}"
 
 
 def main() -> None:

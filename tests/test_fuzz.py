@@ -17,8 +17,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import fuzz
-import fuzz_kinds
-import fuzz_records
+import fuzz_changes
 import fuzz_rules
 from mp4ds import Mp4dsError
 from mp4ds.bags.formats import open_sources
@@ -57,10 +56,10 @@ def test_what_is_changed_keeps_to_the_rules(kinds: dict[str, Any], tmp_path: Pat
 def test_good_ones_are_packed_or_valid(
     kinds: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    changes = [name for name in vars(fuzz_kinds) if name.startswith("changed_")]
+    changes = [name for name in vars(fuzz_rules) if name.startswith("changed_")]
     for name in (*changes, "damaged"):
-        monkeypatch.setattr(fuzz_kinds, name, lambda data, *_: data)
-    monkeypatch.setattr(fuzz_kinds, "changed_dataset", lambda good, *_: good.files)
+        monkeypatch.setattr(fuzz_rules, name, lambda data, *_: data)
+    monkeypatch.setattr(fuzz_rules, "changed_dataset", lambda good, *_: good.files)
     for name, kind in kinds.items():
         result, text = fuzz.try_input(kind, "0", tmp_path)
         assert result in ("packed", "valid", "read"), f"{name}: {text}"
@@ -128,7 +127,7 @@ def test_a_connection_that_is_defined_anew_is_salvaged_as_two(tmp_path: Path) ->
 
     records = [message(1), connection(b"/b"), message(2), connection(b"/b"), message(3)]
     path, out = tmp_path / "drive.bag", tmp_path / "out"
-    path.write_bytes(fuzz_records.build_bag([(b"lz4", records)], [connection(b"/a")]))
+    path.write_bytes(fuzz_changes.build_bag([(b"lz4", records)], [connection(b"/a")]))
     out.mkdir()
     keys = fuzz_rules.read(path, salvage=True)
     assert [key[0][0] for key in keys] == ["/a", "/b", "/b"]
