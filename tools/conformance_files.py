@@ -85,18 +85,21 @@ def plain(document: Document) -> bytes:
     return yamlio.dump(document).rsplit(b"checksum: ", 1)[0]
 
 
+def _holder(document: Document, place: str) -> tuple[Any, Any]:
+    """The map or list that holds a place, and its key or number there."""
+    target: Any = document
+    *parents, last = (int(key) if key.isdigit() else key for key in place.split("."))
+    for key in parents:
+        target = target[key]
+    return target, last
+
+
 def setting(place: str, value: Any) -> Edit:
     """Sets what is at a place such as ``headers.0.frame_id``."""
 
     def edit(document: Document) -> None:
-        *parents, last = place.split(".")
-        target: Any = document
-        for key in parents:
-            target = target[int(key)] if isinstance(target, list) else target[key]
-        if isinstance(target, list):
-            target[int(last)] = value
-        else:
-            target[last] = value
+        holder, key = _holder(document, place)
+        holder[key] = value
 
     return edit
 
@@ -106,11 +109,8 @@ def without(*places: str) -> Edit:
 
     def edit(document: Document) -> None:
         for place in places:
-            *parents, last = place.split(".")
-            target: Any = document
-            for key in parents:
-                target = target[int(key)] if isinstance(target, list) else target[key]
-            target.pop(last, None)
+            holder, key = _holder(document, place)
+            holder.pop(key, None)
 
     return edit
 
@@ -155,17 +155,8 @@ def not_lossless(document: Document) -> None:
 def _two_headers(document: Document) -> None:
     """What YAML 1.1 takes for booleans, numbers, times and dates are strings."""
     names = [
-        "yes",
-        "010",
-        "1_000",
-        "12:30:00",
-        "2024-01-01",
-        ".5",
-        "0x10",
-        "True",
-        "NULL",
-        "=",
-        "<<",
+        *("yes", "010", "1_000", "12:30:00", "2024-01-01", ".5"),
+        *("0x10", "True", "NULL", "=", "<<"),
     ]
     document["headers"] = [{"frame_id": name} for name in names]
     document["columns"]["variant"] = column(10, -3, "0*3")
