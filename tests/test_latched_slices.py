@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 import mp4ds
 from mp4ds.bags import latched
 from mp4ds.bags.formats import open_reader, open_writer
-from mp4ds.bags.slices import SliceReader
 from mp4ds.cli import app_for
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.options import Slice
@@ -155,14 +154,15 @@ def test_only_latched_topics_are_read_before_the_start(
     source = made("bag", tmp_path)
     with open_reader(source) as reader:
         asked: list[Excerpt] = []
-        records = reader.records
+        records = reader._records
 
         def noted(excerpt: Excerpt) -> Any:
             asked.append(excerpt)
             return records(excerpt)
 
-        monkeypatch.setattr(reader, "records", noted)
-        found: list[Record] = [*SliceReader(reader, Slice(str(FIRST), latched=True)).records()]
+        monkeypatch.setattr(reader, "_records", noted)
+        latched.take_slice(reader, Slice(str(FIRST), latched=True))
+        found: list[Record] = [*reader.records()]
     assert len(found) > 2
     before, after = asked
     assert (before.topics, before.end, before.others) == ({"/tf_static"}, FIRST, False)

@@ -102,7 +102,7 @@ class CombinedReader(BagReader):
         """Bytes of the parts that were read, and of those being read."""
         return self._done + sum(part.position for part in self._active)
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Those of all parts, merged; only the parts that an excerpt needs are opened."""
         self._done = 0
         self._skipped.clear()
@@ -142,7 +142,7 @@ class CombinedReader(BagReader):
         del number
         return part.records(excerpt)
 
-    def stats(self) -> Mapping[int, ChannelStats]:
+    def _stats(self) -> Mapping[int, ChannelStats]:
         """Those of all parts; empty if they are unknown for one of them."""
         total = {channel.id: _NO_STATS for channel in self.channels}
         for number in range(len(self.spans)):
@@ -155,7 +155,7 @@ class CombinedReader(BagReader):
                     total[shared] = total[shared].plus(stats.get(channel.id, _NO_STATS))
         return total
 
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
+    def _times(self) -> Mapping[int, NDArray[np.int64]]:
         """Those of all parts."""
         found: dict[int, list[NDArray[np.int64]]] = {}
         for number in range(len(self.spans)):
@@ -166,7 +166,7 @@ class CombinedReader(BagReader):
                     found.setdefault(shared, []).append(times.get(channel.id, _NO_TIMES))
         return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
 
-    def first(self, channel: Channel) -> Message | None:
+    def _first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None."""
         best: Message | None = None
         for number, (start, _) in enumerate(self.spans):

@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
+from mp4ds.bags.protocols import BagReader, RecordingSlice, in_span, stats_of
 from mp4ds.bags.rosbag2_metadata import native_qos
-from mp4ds.errors import Refused
+from mp4ds.errors import Refused, SourceError
 from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.transforms import transform_parser
 from mp4ds.messages.wire import WireError
-from mp4ds.records import QOS_KEY, Channel, Message, Record
+from mp4ds.options import Slice
+from mp4ds.records import QOS_KEY, Channel, Excerpt, Message, Record
 
 _QOS = """\
 - history: 1
@@ -168,19 +170,6 @@ def _is_tf_static(channel: Channel) -> bool:
     return channel.topic.rpartition("/")[2] == _TF_STATIC
 
 
-def begun_by(latched: Sequence[Message], records: Iterable[Record]) -> Iterator[Record]:
-    """Records with latched messages before the first message.
-
-    What is not a message comes first: it may tell about those that follow.
-    """
-    for record in records:
-        if latched and isinstance(record, Message):
-            yield from latched
-            latched = ()
-        yield record
-    yield from latched
-
-
 Read = Callable[[frozenset[str], int], Iterable[Record]]
 """Yields the earlier messages of some topics, of each video at least so many of the last."""
 
@@ -220,3 +209,35 @@ def latched_before(
             left_out[own[largest].topic] = None
     found = sorted((pair for one in kept.values() for pair in one), key=lambda pair: pair[0])
     return [message for _, message in found], [*left_out]
+
+
+def take_slice(reader: BagReader, asked: Slice) -> None:
+    """Let a reader give a slice of its recording, with latched messages if requested.
+
+    Raises:
+        OptionError: It is empty, or a time is not valid.
+        SourceError: The recording is damaged, or without messages.
+    """
+    known = [item for item in reader.stats().values() if item.count]
+    if not known or not reader.is_indexed:
+        known = [item for item in stats_of(reader.times()).values() if item.count]
+    if not known:
+        raise SourceError(reader.path, "has no messages to take a slice of")
+    first, last = min(item.start for item in known), max(item.end for item in known)
+    first = max(first, reader.begin or first)
+    span = Excerpt(*asked.times(first, last, reader.path))
+    latched: tuple[Sequence[Message], Sequence[str]] = (), ()
+    if asked.latched and span.start is not None:
+        before = Excerpt(end=span.start, others=False)
+        times = reader.times()
+        sent = [
+            channel
+            for channel in reader.channels
+            if channel.id in times and len(in_span(times[channel.id], before))
+        ]
+
+        def read(topics: frozenset[str], _: int) -> Iterable[Record]:
+            return reader.records(replace(before, topics=topics))
+
+        latched = latched_before(sent, read)
+    reader.slice = RecordingSlice(span, *latched)

@@ -295,7 +295,7 @@ class McapReader(BagReader):
         """Whether the summary lists all channels, schemas and chunks, and how many messages."""
         return self._found_between is not None
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Read everything once, or a part of it."""
         return self._one_pass(lambda stream: self._read(stream, excerpt))
 
@@ -401,11 +401,11 @@ class McapReader(BagReader):
             message.channel, message.log_time, message.publish_time, message.sequence, data
         )
 
-    def stats(self) -> Mapping[int, ChannelStats]:
+    def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts from the statistics record, spans from the chunks that hold the channel."""
         return self._summary.stats() if self._summary else {}
 
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
+    def _times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times by channel id. See `BagReader.times`.
 
         Times past the year 2262 do not fit and are clamped.
@@ -421,14 +421,14 @@ class McapReader(BagReader):
             indexed = sum(len(piece) for found in pieces.values() for piece in found)
             if self._summary.covers(indexed):
                 return {key: sorted_times(np.concatenate(found)) for key, found in pieces.items()}
-        return super().times()
+        return super()._times()
 
     @cached_property
     def _first_messages(self) -> Mapping[int, Message]:
         found = self._first_by_index()
         return first_of(self.records()) if found is None else found
 
-    def first(self, channel: Channel) -> Message | None:
+    def _first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None; read once for all channels."""
         return self._first_messages.get(channel.id)
 

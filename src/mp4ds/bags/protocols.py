@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -31,11 +31,30 @@ Format = Literal["bag", "rosbag2", "mcap"]
 _Reader = TypeVar("_Reader", bound="BagReader")
 
 
+@dataclass(frozen=True, slots=True)
+class RecordingSlice:
+    """What a reader gives of its recording.
+
+    Attributes:
+        span: Its log times.
+        latched: Messages of latched topics from before it, which come first.
+        left_out: Latched topics whose messages from before it are too large to be included.
+    """
+
+    span: Excerpt = EVERYTHING
+    latched: Sequence[Message] = ()
+    left_out: Sequence[str] = ()
+
+
+_WHOLE = RecordingSlice()
+
+
 class BagReader(ABC):
     """One recording, opened for reading. A context manager; the file is never changed.
 
-    A reader has at least `channels` and `records`, from which everything else follows; it overrides
-    what its index makes faster.
+    A reader has at least `channels` and `_records`, from which everything else follows; it
+    overrides what its index makes faster. Where it has a slice, `records`, `times`, `stats` and
+    `first` are those of the slice; everything else is that of the whole recording.
 
     Attributes:
         format: ``bag``, ``rosbag2`` or ``mcap``.
@@ -44,6 +63,8 @@ class BagReader(ABC):
         library: The MCAP header's library string; empty for other formats.
         files: All files of the recording, in reading order.
         tables: Small tables of a database, verbatim: a name -> content; empty for other formats.
+        begin: Log time from which slices are counted, ns; None for that of the first message.
+        slice: What is given of it; all, unless it was set.
     """
 
     format: Format
@@ -52,6 +73,8 @@ class BagReader(ABC):
     profile: str = ""
     library: str = ""
     tables: Mapping[str, str] = MappingProxyType({})
+    begin: int | None = None
+    slice: RecordingSlice = _WHOLE
 
     @property
     @abstractmethod
@@ -97,7 +120,6 @@ class BagReader(ABC):
         """Whether an excerpt can be read, in log-time order, without reading the rest."""
         return False
 
-    @abstractmethod
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Read everything once, or a part of it.
 
@@ -117,14 +139,21 @@ class BagReader(ABC):
         Raises:
             SourceError: The file is damaged; names the file and, if known, the topic.
         """
+        records = self._records(excerpt.within(self.slice.span))
+        latched = [message for message in self.slice.latched if excerpt.has(message)]
+        return begun_by(latched, records) if latched else records
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times of every message, nanoseconds, sorted, by channel id."""
-        return times_of(self.records())
+        return self._times() if self.slice is _WHOLE else self._sliced_times
 
     def stats(self) -> Mapping[int, ChannelStats]:
         """Counts and time spans by channel id, as far as known without reading messages."""
-        return stats_of(self.times()) if self.is_indexed else {}
+        return self._stats() if self.slice is _WHOLE else BagReader._stats(self)
+
+    def first(self, channel: Channel) -> Message | None:
+        """The channel's first message by log time, or None."""
+        return self._first(channel) if self.slice is _WHOLE else BagReader._first(self, channel)
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -132,8 +161,20 @@ class BagReader(ABC):
         known = [one for one in self.stats().values() if one.count]
         return (min(one.start for one in known), max(one.end for one in known)) if known else None
 
-    def first(self, channel: Channel) -> Message | None:
-        """The channel's first message by log time, or None."""
+    @abstractmethod
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
+        """`records` of the whole recording."""
+
+    def _times(self) -> Mapping[int, NDArray[np.int64]]:
+        """`times` of the whole recording."""
+        return times_of(self._records(EVERYTHING))
+
+    def _stats(self) -> Mapping[int, ChannelStats]:
+        """`stats` of the whole recording."""
+        return stats_of(self.times()) if self.is_indexed else {}
+
+    def _first(self, channel: Channel) -> Message | None:
+        """`first` of the whole recording."""
         if not self.is_indexed:
             return self._first_messages.get(channel.id)
         times = self.times().get(channel.id)
@@ -146,6 +187,15 @@ class BagReader(ABC):
     @cached_property
     def _first_messages(self) -> Mapping[int, Message]:
         return first_of(self.records())
+
+    @cached_property
+    def _sliced_times(self) -> Mapping[int, NDArray[np.int64]]:
+        early = times_of(self.slice.latched)
+        found = {
+            key: np.concatenate([early.get(key, times[:0]), in_span(times, self.slice.span)])
+            for key, times in self._times().items()
+        }
+        return {key: times for key, times in found.items() if len(times)}
 
     def close(self) -> None:  # noqa: B027 - most readers have nothing open between two records
         """Close what is open."""
@@ -209,6 +259,19 @@ def write_record(writer: BagWriter, record: Record) -> None:
         writer.add_attachment(record)
     else:
         writer.add_metadata(record)
+
+
+def begun_by(latched: Sequence[Message], records: Iterable[Record]) -> Iterator[Record]:
+    """Records with latched messages before the first message.
+
+    What is not a message comes first: it may tell about those that follow.
+    """
+    for record in records:
+        if latched and isinstance(record, Message):
+            yield from latched
+            latched = ()
+        yield record
+    yield from latched
 
 
 # ---------------------------------------------------------------- ordering
@@ -340,3 +403,10 @@ def first_of(records: Iterable[Record]) -> dict[int, Message]:
 def with_own_payload(message: Message) -> Message:
     """A message with a copied payload, to keep: a view would keep the whole chunk in memory."""
     return replace(message, data=bytes(message.data))
+
+
+def in_span(times: NDArray[np.int64], span: Excerpt) -> NDArray[np.int64]:
+    """The part of sorted log times, nanoseconds, within the span of an excerpt; a view."""
+    first = 0 if span.start is None else int(np.searchsorted(times, span.start))
+    end = len(times) if span.end is None else int(np.searchsorted(times, span.end))
+    return times[first:end]

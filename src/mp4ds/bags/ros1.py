@@ -105,7 +105,7 @@ class Ros1Reader(BagReader):
         """All connections, in the order of the bag's index."""
         return list(self._bag.channels.values())
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Messages in log-time order, from the chunks that hold them."""
         self.position = 0
         visited: set[int] = set()
@@ -156,11 +156,11 @@ class Ros1Reader(BagReader):
         unpacked = self._chunks[number] = self._bag.content(number)
         return unpacked
 
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
+    def _times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times from the index."""
         return {key: index.times for key, index in self._index.items()}
 
-    def first(self, channel: Channel) -> Message | None:
+    def _first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None."""
         index = self._index[channel.id]
         if not len(index.times):

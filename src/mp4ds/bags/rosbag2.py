@@ -198,11 +198,11 @@ class Rosbag2Reader(CombinedReader):
             starts.append(span[0] if span else min(starts, default=_NEVER))
         return [(start, _NEVER) for start in reversed(starts)]
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """The metadata record, then the records of all files, merged."""
         if excerpt.others:
             yield self._metadata_record()
-        yield from super().records(excerpt)
+        yield from super()._records(excerpt)
         self._done += sum(file.stat().st_size for file in self._head)
         self._declare_listed()
 
@@ -225,9 +225,9 @@ class Rosbag2Reader(CombinedReader):
             yield MetadataRecord(TABLES_RECORD, part.tables)
         yield from part.records(excerpt)
 
-    def stats(self) -> Mapping[int, ChannelStats]:
+    def _stats(self) -> Mapping[int, ChannelStats]:
         """Those of all files; empty if one of them must be decompressed first."""
-        return {} if None in self._readers else super().stats()
+        return {} if None in self._readers else super()._stats()
 
     def close(self) -> None:
         """Close the files, and remove those that were decompressed."""

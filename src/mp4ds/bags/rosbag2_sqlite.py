@@ -328,7 +328,7 @@ class SqliteReader(BagReader):
             first, last = tables.select(f"SELECT {', '.join(ends)}").fetchone()
         return (first, last) if isinstance(first, int) and isinstance(last, int) else None
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Message]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Message]:
         """Read all messages or an excerpt by log time, ties by row id."""
         if excerpt == EVERYTHING:
             yield from self._all_records()
@@ -415,7 +415,7 @@ class SqliteReader(BagReader):
             error = OversizeError(f"it has {size} bytes", most)
             raise unreadable(self._shown, f": {place}", error, SALVAGE_REMEDY)
 
-    def stats(self) -> Mapping[int, ChannelStats]:
+    def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans by channel id."""
         stats = {channel_id: ChannelStats(0, 0, 0) for channel_id in self._channels}
         with self._opened() as tables:
@@ -427,7 +427,7 @@ class SqliteReader(BagReader):
                     stats[topic_id] = ChannelStats(count, start, end)
         return stats
 
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
+    def _times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times by channel id, nanoseconds, sorted."""
         times: dict[int, array[int]] = {}
         with self._opened() as tables:
@@ -437,7 +437,7 @@ class SqliteReader(BagReader):
                 times.setdefault(topic_id, array("q")).append(timestamp)
         return {key: np.sort(np.array(values, np.int64)) for key, values in times.items()}
 
-    def first(self, channel: Channel) -> Message | None:
+    def _first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None."""
         with self._opened() as tables:
             row = tables.select(

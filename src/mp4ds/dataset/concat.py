@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.combined import bounded
 from mp4ds.bags.mcap_write import McapWriter
-from mp4ds.bags.protocols import write_record
-from mp4ds.bags.slices import in_span
+from mp4ds.bags.protocols import in_span, write_record
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, within
 from mp4ds.dataset.segments import Cut, JoinedStream, copy_file

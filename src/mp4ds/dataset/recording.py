@@ -30,7 +30,7 @@ class DatasetReader(BagReader):
 
     Attributes:
         manifest: Of the dataset.
-        slice_start: See `Dataset.slice_start`.
+        begin: Where the slice that it holds was cut, after which its own slices are counted.
 
     Raises:
         FormatError: A file breaks a rule of the format.
@@ -46,7 +46,7 @@ class DatasetReader(BagReader):
         self.format = self.manifest.format
         self.profile = self.manifest.recording_profile
         self.library = self.manifest.library
-        self.slice_start = self._dataset.slice_start
+        self.begin = self._dataset.slice_start
         names = [MANIFEST_NAME, *(entry.name for entry in self.manifest.files)]
         self.files = [self.path / name for name in names]
         self._read = 0
@@ -72,15 +72,15 @@ class DatasetReader(BagReader):
         """Whether the messages of each channel are in the order of their log times."""
         return self._dataset.is_in_time
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Its records, decoded; without those that an excerpt lacks."""
         self._read = 0
         with advising(COPY_AGAIN):
-            for record in self._records(excerpt):
+            for record in self._decoded(excerpt):
                 yield record
                 self._read += isinstance(record, Message)
 
-    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
+    def _decoded(self, excerpt: Excerpt) -> Iterator[Record]:
         start, end = excerpt.start, excerpt.end
         if (start is None and end is None) or not self.is_indexed:
             records = self._dataset.records(topics=self._topics(excerpt))
@@ -101,17 +101,17 @@ class DatasetReader(BagReader):
             channel.topic for channel in self.channels if excerpt.has_topic(channel.topic)
         )
 
-    @cached_property
     def _times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Log times by channel id, nanoseconds, from the sidecars."""
+        return self._recorded_times
+
+    @cached_property
+    def _recorded_times(self) -> Mapping[int, NDArray[np.int64]]:
         return self._dataset.times()
 
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Log times by channel id, nanoseconds, from the sidecars."""
-        return self._times
-
-    def stats(self) -> Mapping[int, ChannelStats]:
+    def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans of the log times, whether they are in order or not."""
-        return stats_of(self._times)
+        return stats_of(self._recorded_times)
 
     def close(self) -> None:
         """Close the dataset."""

@@ -31,7 +31,7 @@ from mp4ds.format.manifest import Manifest
 from mp4ds.format.models import StreamSidecar
 from mp4ds.format.sidecars import MANIFEST_NAME, dump_document
 from mp4ds.packing.engine import Engine, Outcome
-from mp4ds.packing.job import Job, Task, span_of, with_latched
+from mp4ds.packing.job import Job, Task, with_latched
 from mp4ds.packing.manifest import (
     RECORD_NAME,
     Origin,
@@ -300,7 +300,7 @@ class Coordinator:
                 _check_counts(reader, parts, facts, selected)
                 digests = job.digests(reader, partial(_digest, run.place))
                 job.check_sources(reader.files)
-                origin = Origin.of(reader.files, digests, job.about, span_of(reader))
+                origin = Origin.of(reader.files, digests, job.about, reader.slice.span)
                 losses = [item.to_record() for one in manifests for item in one.losses]
                 left_out = [topic for one in manifests for topic in one.topics_left_out]
                 changes = origin.fields(reader, losses, left_out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -10,8 +11,8 @@ from typing import Any
 
 from mp4ds._version import __version__
 from mp4ds.bags.formats import RECORDING_SUFFIXES, open_reader, open_sources
+from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import BagReader
-from mp4ds.bags.slices import SliceReader
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.files.sources import SourceState, source_digest, source_name, source_size
 from mp4ds.files.urls import location, spelled
@@ -25,7 +26,7 @@ from mp4ds.packing.packer import Exact, PartSettings
 from mp4ds.packing.survey import Survey
 from mp4ds.packing.tracks import StreamSettings
 from mp4ds.plan import Selection, parse_purpose, parse_quality
-from mp4ds.records import EVERYTHING, Excerpt
+from mp4ds.records import Excerpt
 from mp4ds.registry import plugin
 from mp4ds.video.encoder import tool_versions
 
@@ -314,13 +315,13 @@ def open_recording(
         OptionError: The options do not apply to it.
     """
     reader = _open_whole(paths, salvage, images)
-    if not asked:
-        return reader
-    try:
-        return SliceReader(reader, asked, getattr(reader, "slice_start", None))
-    except BaseException:
-        reader.__exit__()
-        raise
+    if asked:
+        try:
+            take_slice(reader, asked)
+        except BaseException:
+            reader.close()
+            raise
+    return reader
 
 
 def _open_whole(paths: Sequence[Path], salvage: bool, images: ImageFolder | None) -> BagReader:
@@ -396,17 +397,11 @@ def is_hashed(path: Path, asked: Slice) -> bool:
     return not asked or path.name == MANIFEST_NAME
 
 
-def span_of(reader: BagReader) -> Excerpt:
-    """The part of a recording that is read."""
-    return reader.excerpt if isinstance(reader, SliceReader) else EVERYTHING
-
-
 def with_latched(summary: PackSummary, reader: BagReader) -> PackSummary:
     """The summary of what was read, with the latched messages from before a slice."""
-    if not isinstance(reader, SliceReader):
-        return summary
-    too_large = [topic for topic in reader.latched_left_out if topic not in summary.left_out]
-    packed = {topic: n for topic, n in reader.latched.items() if topic not in summary.left_out}
+    too_large = [topic for topic in reader.slice.left_out if topic not in summary.left_out]
+    latched = Counter(message.channel.topic for message in reader.slice.latched)
+    packed = {topic: n for topic, n in latched.items() if topic not in summary.left_out}
     return replace(summary, latched=packed, latched_left_out=too_large)
 
 

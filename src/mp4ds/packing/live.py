@@ -199,7 +199,7 @@ class LiveRecording(BagReader):
         self.channels: list[Channel] = []
         self._others = others
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """What it holds besides messages, which come to `LivePacker`."""
         del excerpt
         return iter(self._others)

@@ -45,7 +45,6 @@ from mp4ds.packing.job import (
     dataset_at,
     open_recording,
     outcome_options,
-    span_of,
     with_latched,
 )
 from mp4ds.packing.manifest import (
@@ -204,7 +203,7 @@ def pack_in_one_pass(
     with unchanged(job.sources), SourceHasher(reader.files) as hasher:
         part = Packer(reader, folder, job.settings(task, exact), progress).run()
         digests = job.digests(reader, partial(_digest, reader) if job.slice else hasher.digest)
-    origin = Origin.of(reader.files, digests, job.about, span_of(reader))
+    origin = Origin.of(reader.files, digests, job.about, reader.slice.span)
     write_manifest(part, reader, origin, job.options["quality"])
     progress(part, done=True)
     return with_latched(summarize(part, target, None if job.slice else total, origin), reader)
@@ -425,7 +424,7 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
         raise TargetExistsError(target) from None
     folder = dataset_at(source)
     with open_recording([source], images=options.images, asked=options.slice) as reader:
-        span = span_of(reader)
+        span = reader.slice.span
         sizes = sorted(map(source_size, reader.files))
     if folder:
         due = [item.within(span) for item in load_manifest(folder / MANIFEST_NAME).sources]

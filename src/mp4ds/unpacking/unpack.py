@@ -14,9 +14,7 @@ from pathlib import Path
 from mp4ds.bags.combined import bounded
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.formats import open_writer, recording_names
-from mp4ds.bags.latched import begun_by
-from mp4ds.bags.protocols import BagWriter
-from mp4ds.bags.slices import in_span
+from mp4ds.bags.protocols import BagWriter, begun_by, in_span
 from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage

@@ -376,7 +376,7 @@ class FileSalvage(BagReader):
         """Messages lost in the last pass, if the file states how many there were."""
         return None
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Everything readable, of which all but the excerpt is dropped."""
         self.losses = []
         log = LossLog(self._shown.name)

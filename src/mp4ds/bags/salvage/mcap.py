@@ -496,7 +496,7 @@ class McapSalvage(FileSalvage):
         """Earliest and latest log time from the summary, ns; None if unknown."""
         return self._summary.chunks.span()
 
-    def stats(self) -> Mapping[int, ChannelStats]:
+    def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the summary, including lost messages; otherwise empty."""
         return self._summary.stats()
 

@@ -317,7 +317,7 @@ class Ros1Salvage(FileSalvage):
         """Connections of the bag's index, then those found while reading."""
         return list(self._channels.values())
 
-    def stats(self) -> Mapping[int, ChannelStats]:
+    def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the bag's index, including lost messages; otherwise empty."""
         return self._index.stats(self._channels)
 

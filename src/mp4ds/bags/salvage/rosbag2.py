@@ -33,8 +33,8 @@ class Rosbag2Salvage(Rosbag2Reader):
 
     is_indexed = False
     # by reading everything, which no damage stops
-    times = BagReader.times
-    first = BagReader.first
+    _times = BagReader._times
+    _first = BagReader._first
 
     def __init__(self, path: Path, *, is_alone: bool = True) -> None:
         self._is_alone = is_alone
@@ -131,13 +131,13 @@ class Rosbag2Salvage(Rosbag2Reader):
         """Files that cannot be read, and what was lost of the others by the last `records`."""
         return bounded([*self._of_files, *super().losses])
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """The metadata record, then everything readable, of which all but the excerpt is dropped.
 
         Raises:
             SourceError: Nothing can be read.
         """
-        yield from super().records(excerpt)
+        yield from super()._records(excerpt)
         if self._is_alone and self.losses and not self.channels:
             problem = f"holds no readable message: {self.losses[-1].problem}"
             raise SourceError(self.path, problem)

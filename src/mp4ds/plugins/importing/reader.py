@@ -238,7 +238,7 @@ class ImagesReader(BagReader):
         """All channels."""
         return [track.channel for track in self._tracks]
 
-    def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Attachments, then messages by log time."""
         self.position = 0
         if excerpt.others:
@@ -277,7 +277,7 @@ class ImagesReader(BagReader):
                 writer.writerow((csv_cell(track.channel.topic), stamp, name))
         return text.getvalue().encode(errors="backslashreplace")
 
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
+    def _times(self) -> Mapping[int, NDArray[np.int64]]:
         """The stamps of each channel."""
         return {track.channel.id: track.stamps for track in self._tracks}
 
