@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -125,6 +125,13 @@ _SALVAGERS = {
 }
 
 
+_WRITERS = {
+    "bag": "ros1_write:Ros1Writer",
+    "mcap": "mcap_write:McapWriter",
+    "rosbag2": "rosbag2_write:Rosbag2Writer",
+}
+
+
 def _class(name: str) -> Any:
     module, _, found = name.partition(":")
     return getattr(import_module(f"mp4ds.bags.{module}"), found)
@@ -240,17 +247,14 @@ def limits_of(
         target: ``bag``, ``rosbag2`` or ``mcap``.
         storage: ``sqlite3`` or ``mcap``, for ``rosbag2``.
     """
-    if target == "bag":
-        from mp4ds.bags import ros1_write
-
-        return ros1_write.check_channel, ros1_write.check_message
-    if target == "rosbag2" and storage == "sqlite3":
-        from mp4ds.bags import rosbag2_write
-
-        return rosbag2_write.check_channel, rosbag2_write.check_message
-    from mp4ds.bags.mcap_write import check_message
-
-    return lambda _: None, check_message
+    is_sqlite = target == "rosbag2" and storage == "sqlite3"
+    name = (
+        "rosbag2_write:SqliteWriter"
+        if is_sqlite
+        else _WRITERS["bag" if target == "bag" else "mcap"]
+    )
+    writer: type[BagWriter] = _class(name)
+    return writer.check_channel, writer.check_message
 
 
 def open_writer(
@@ -270,16 +274,12 @@ def open_writer(
         OptionError: The target is unknown.
         OSError: It cannot be written.
     """
-    if target == "bag":
-        from mp4ds.bags.ros1_write import Ros1Writer
-
-        return Ros1Writer(path)
-    if target == "rosbag2":
-        from mp4ds.bags.rosbag2_write import Rosbag2Writer
-
-        return Rosbag2Writer(path, storage=storage, name=name)
-    if target == "mcap":
-        from mp4ds.bags.mcap_write import McapWriter
-
-        return McapWriter(path, profile=profile, library=library)
-    raise OptionError(f"`to` {target!r} is not known. Use bag, rosbag2, mcap or images.")
+    options: Mapping[str, Mapping[str, str]] = {
+        "bag": {},
+        "rosbag2": {"storage": storage, "name": name},
+        "mcap": {"profile": profile, "library": library},
+    }
+    if target not in options:
+        raise OptionError(f"`to` {target!r} is not known. Use bag, rosbag2, mcap or images.")
+    writer: BagWriter = _class(_WRITERS[target])(path, **options[target])
+    return writer

@@ -254,7 +254,7 @@ class McapSummary:
     """A summary section.
 
     Attributes:
-        offset: Byte offset of its first record.
+        offset: Byte offset of its first record; 0 if there is none.
         schemas: Schema records by id.
         channels: Channel records by id.
         statistics: The statistics record, if there is one.
@@ -262,12 +262,31 @@ class McapSummary:
         private: How many records of each private opcode it holds.
     """
 
-    offset: int
+    offset: int = 0
     schemas: dict[int, mcap_records.Schema] = field(default_factory=dict)
     channels: dict[int, mcap_records.Channel] = field(default_factory=dict)
     statistics: mcap_records.Statistics | None = None
     chunks: ChunkTable = field(default_factory=ChunkTable)
     private: Counter[int] = field(default_factory=Counter)
+
+    def add(self, opcode: int, body: bytes) -> None:
+        """Add a record.
+
+        Raises:
+            DamageError: It is damaged.
+        """
+        if opcode == Opcode.CHUNK_INDEX:
+            self.chunks.add(body)
+        elif opcode == Opcode.SCHEMA:
+            schema = parse(mcap_records.Schema, body)
+            self.schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = parse(mcap_records.Channel, body)
+            self.channels[channel.id] = channel
+        elif opcode == Opcode.STATISTICS:
+            self.statistics = parse(mcap_records.Statistics, body)
+        elif opcode >= PRIVATE_OPCODE:
+            self.private[opcode] += 1
 
     def span(self) -> tuple[int, int] | None:
         """The earliest and latest log time stated anywhere; None without messages."""
@@ -391,24 +410,9 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
             break
         if opcode not in OF_SUMMARY and opcode < PRIVATE_OPCODE:
             return None  # bytes between records of the data do not make a complete file
-        _add(summary, opcode, body)
+        summary.add(opcode, body)
     summary.chunks.finish()
     return summary
-
-
-def _add(summary: McapSummary, opcode: int, body: bytes) -> None:
-    if opcode == Opcode.CHUNK_INDEX:
-        summary.chunks.add(body)
-    elif opcode == Opcode.SCHEMA:
-        schema = parse(mcap_records.Schema, body)
-        summary.schemas[schema.id] = schema
-    elif opcode == Opcode.CHANNEL:
-        channel = parse(mcap_records.Channel, body)
-        summary.channels[channel.id] = channel
-    elif opcode == Opcode.STATISTICS:
-        summary.statistics = parse(mcap_records.Statistics, body)
-    elif opcode >= PRIVATE_OPCODE:
-        summary.private[opcode] += 1
 
 
 # ---------------------------------------------------------------- between the chunks

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from mp4ds._version import __version__
 from mp4ds.bags.files import most_unpacked
+from mp4ds.bags.protocols import BagWriter
 from mp4ds.errors import ConversionError, Mp4dsError, OptionError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
 
@@ -27,21 +28,8 @@ _COMPRESSIONS = {
 }
 
 
-def check_message(message: Message) -> None:
-    """Refuse a message that MCAP cannot hold.
-
-    Raises:
-        ConversionError: A time is negative or beyond 64 bits, or the sequence number beyond 32.
-    """
-    times = message.log_time, message.publish_time
-    if not (min(times) >= 0 and max(times) < 2**64 and 0 <= message.sequence < 2**32):
-        raise ConversionError(
-            message.channel.topic, "has a time or sequence number that MCAP cannot hold"
-        )
-
-
-class McapWriter:
-    """Writes an MCAP file with chunks, indexes and checksums. See `BagWriter`.
+class McapWriter(BagWriter):
+    """Writes an MCAP file with chunks, indexes and checksums.
 
     Memory is bounded by one chunk, or by one message if that is larger.
 
@@ -73,6 +61,7 @@ class McapWriter:
             raise OptionError(
                 f"compression {compression!r} is not known. Use {', '.join(_COMPRESSIONS)}."
             )
+        super().__init__()
         self.path = path
         self._channel_ids: dict[int, int] = {}
         self._schema_ids: dict[Schema, int] = {}
@@ -88,13 +77,21 @@ class McapWriter:
                 )
             self._writer.start(profile=profile, library=library or f"mp4ds {__version__}")
         except BaseException:
-            self._abandon()
+            self.abandon()
             raise
 
-    @property
-    def omitted(self) -> Mapping[str, int]:
-        """Nothing: MCAP holds everything."""
-        return {}
+    @staticmethod
+    def check_message(message: Message) -> None:
+        """Refuse a message that MCAP cannot hold.
+
+        Raises:
+            ConversionError: A time is negative or beyond 64 bits, or the sequence number beyond 32.
+        """
+        times = message.log_time, message.publish_time
+        if not (min(times) >= 0 and max(times) < 2**64 and 0 <= message.sequence < 2**32):
+            raise ConversionError(
+                message.channel.topic, "has a time or sequence number that MCAP cannot hold"
+            )
 
     def add_schema(self, schema: Schema) -> None:
         """Write a definition, whether a channel refers to it or not."""
@@ -110,7 +107,7 @@ class McapWriter:
         return self._schema_ids[schema]
 
     def add_channel(self, channel: Channel) -> None:
-        """Declare a channel. See `BagWriter.add_channel`."""
+        """Declare a channel, with its schema."""
         if channel.id in self._channel_ids:
             return
         if len(self._channel_ids) >= MAX_CHANNELS:
@@ -127,7 +124,7 @@ class McapWriter:
             message: The message.
             compress: Whether there is time to compress the chunk that it ends, if it is large.
         """
-        check_message(message)
+        self.check_message(message)
         is_large = 2 * len(message.data) > most_unpacked(0)
         if not compress or (is_large and self._compresses_too_well(message.data)):
             with self._uncompressed():
@@ -177,21 +174,13 @@ class McapWriter:
         """Append a metadata record."""
         self._writer.add_metadata(record.name, dict(record.metadata))
 
-    def __enter__(self) -> McapWriter:
-        return self
+    def finish(self) -> None:
+        """Write the last chunk and the summary, and close the file."""
+        self._writer.finish()
+        self._file.close()
 
-    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
-        if exc_type is not None:
-            self._abandon()
-            return
-        try:
-            self._writer.finish()
-            self._file.close()
-        except BaseException:
-            self._abandon()
-            raise
-
-    def _abandon(self) -> None:
+    def abandon(self) -> None:
+        """Close the file as it is."""
         with suppress(OSError):
             self._file.close()
 

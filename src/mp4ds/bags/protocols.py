@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import heapq
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, NamedTuple, Protocol, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from mp4ds.records import (
 
 Format = Literal["bag", "rosbag2", "mcap"]
 _Reader = TypeVar("_Reader", bound="BagReader")
+_Writer = TypeVar("_Writer", bound="BagWriter")
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,47 +209,89 @@ class BagReader(ABC):
         self.close()
 
 
-class BagWriter(Protocol):
+class BagWriter(ABC):
     """One recording, opened for writing under a temporary name by the caller.
 
     A context manager: leaving it normally completes the file; an exception abandons it, and the
-    caller removes what is left.
+    caller removes what is left. What the format cannot hold is counted.
     """
 
     format: str
 
+    def __init__(self) -> None:
+        self._omitted: Counter[str] = Counter()
+
+    @property
+    def omitted(self) -> Mapping[str, int]:
+        """What was left out because the format cannot hold it: a phrase -> how many."""
+        return dict(self._omitted)
+
+    @staticmethod
+    def check_channel(channel: Channel) -> None:
+        """Refuse a channel that the format cannot hold.
+
+        Raises:
+            ConversionError: Says why, and what to do.
+        """
+        del channel
+
+    @staticmethod
+    def check_message(message: Message) -> None:
+        """Refuse a message that the format cannot hold.
+
+        Raises:
+            ConversionError: Says why, and what to do.
+        """
+        del message
+
+    @abstractmethod
     def add_channel(self, channel: Channel) -> None:
         """Declare a channel; required before its messages.
 
         Raises:
             ConversionError: The format cannot hold the channel.
         """
-        ...
+
+    @abstractmethod
+    def write(self, message: Message) -> None:
+        """Append a message, payload verbatim.
+
+        Raises:
+            ConversionError: The format cannot hold the message.
+        """
 
     def add_schema(self, schema: Schema) -> None:
-        """Keep a definition that no channel refers to, or count it in `omitted`."""
-        ...
-
-    def write(self, message: Message) -> None:
-        """Append a message, payload verbatim."""
-        ...
+        """Keep a definition that no channel refers to."""
+        del schema
+        self._omitted["definitions that no topic uses"] += 1
 
     def add_attachment(self, attachment: Attachment) -> None:
-        """Append an attachment; formats without attachments count it in `omitted`."""
-        ...
+        """Append an attachment."""
+        del attachment
+        self._omitted["attachments"] += 1
 
     def add_metadata(self, record: MetadataRecord) -> None:
-        """Append a metadata record; formats without them count it in `omitted`."""
-        ...
+        """Append a metadata record."""
+        del record
+        self._omitted["metadata records"] += 1
 
-    @property
-    def omitted(self) -> Mapping[str, int]:
-        """What was left out because the format cannot hold it: a phrase -> how many."""
-        ...
+    @abstractmethod
+    def finish(self) -> None:
+        """Complete and close the file."""
 
-    def __enter__(self) -> BagWriter: ...
+    @abstractmethod
+    def abandon(self) -> None:
+        """Close the file as it is."""
 
-    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None: ...
+    def __enter__(self: _Writer) -> _Writer:
+        return self
+
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
+        try:
+            if exc_type is None:
+                self.finish()
+        finally:
+            self.abandon()
 
 
 def write_record(writer: BagWriter, record: Record) -> None:

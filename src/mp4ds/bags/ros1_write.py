@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bz2
 import struct
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from io import BytesIO
@@ -13,9 +12,10 @@ from typing import Literal
 
 import lz4.frame
 
+from mp4ds.bags.protocols import BagWriter
 from mp4ds.bags.ros1_records import MAGIC, MAX_TIME, Op, join_header, make_header
 from mp4ds.errors import ConversionError, OptionError, TargetExistsError
-from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
+from mp4ds.records import Channel, Message
 
 _MAX_PAYLOAD = 2**32 - 2**24  # lengths are uint32; leaves room for the rest of the chunk
 _CHUNK_BYTES = 2**20
@@ -25,40 +25,8 @@ _ENTRY = struct.Struct("<III")  # seconds, nanoseconds, offset in the chunk
 _MESSAGE_HEAD = struct.Struct("<II3sBI5sII5sIII")  # op, conn, time, and the payload's length
 
 
-def check_channel(channel: Channel) -> None:
-    """Refuse a channel that a bag cannot hold.
-
-    Raises:
-        ConversionError: It is not a ROS 1 channel.
-    """
-    if channel.message_encoding != "ros1":
-        raise ConversionError(
-            channel.topic,
-            f"its messages are {channel.message_encoding or 'in an unknown encoding'}, and a ROS "
-            "1 bag can only hold ROS 1 messages",
-            "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is.",
-        )
-
-
-def check_message(message: Message) -> None:
-    """Refuse a message that a bag cannot hold.
-
-    Raises:
-        ConversionError: It is too long, or its time is outside the range of ROS 1.
-    """
-    topic = message.channel.topic
-    if not 0 <= message.log_time < MAX_TIME:
-        raise ConversionError(
-            topic,
-            f"has a log time of {message.log_time} ns, and ROS 1 can hold 0 to 2^32 seconds",
-            "Unpack to mcap, which keeps it as it is.",
-        )
-    if len(message.data) > _MAX_PAYLOAD:
-        raise ConversionError(topic, "has a message too large for a ROS 1 bag")
-
-
-class Ros1Writer:
-    """Writes a ROS 1 bag. See `BagWriter`.
+class Ros1Writer(BagWriter):
+    """Writes a ROS 1 bag.
 
     Args:
         path: The file, which must not exist.
@@ -77,52 +45,65 @@ class Ros1Writer:
             raise OptionError(f"compression {compression!r} is not known. Use none, bz2 or lz4.")
         if path.exists():
             raise TargetExistsError(path)
+        super().__init__()
         self._numbers: dict[int, int] = {}
-        self._omitted: Counter[str] = Counter()
         self._bag = _BagFile(path, compression)
 
-    @property
-    def omitted(self) -> Mapping[str, int]:
-        """What a bag cannot hold. See `BagWriter.omitted`."""
-        return dict(self._omitted)
+    @staticmethod
+    def check_channel(channel: Channel) -> None:
+        """Refuse a channel that a bag cannot hold.
+
+        Raises:
+            ConversionError: It is not a ROS 1 channel.
+        """
+        if channel.message_encoding != "ros1":
+            raise ConversionError(
+                channel.topic,
+                f"its messages are {channel.message_encoding or 'in an unknown encoding'}, and a "
+                "ROS 1 bag can only hold ROS 1 messages",
+                "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is.",
+            )
+
+    @staticmethod
+    def check_message(message: Message) -> None:
+        """Refuse a message that a bag cannot hold.
+
+        Raises:
+            ConversionError: It is too long, or its time is outside the range of ROS 1.
+        """
+        topic = message.channel.topic
+        if not 0 <= message.log_time < MAX_TIME:
+            raise ConversionError(
+                topic,
+                f"has a log time of {message.log_time} ns, and ROS 1 can hold 0 to 2^32 seconds",
+                "Unpack to mcap, which keeps it as it is.",
+            )
+        if len(message.data) > _MAX_PAYLOAD:
+            raise ConversionError(topic, "has a message too large for a ROS 1 bag")
 
     def add_channel(self, channel: Channel) -> None:
-        """Declare a channel. See `BagWriter.add_channel`."""
-        check_channel(channel)
+        """Declare a channel, which gets a connection."""
+        self.check_channel(channel)
         if channel.id not in self._numbers:
             self._numbers[channel.id] = self._bag.connect(*make_header(channel))
 
-    def add_schema(self, schema: Schema) -> None:
-        """Count a definition that no channel refers to as omitted."""
-        self._omitted["definitions that no topic uses"] += 1
-
     def write(self, message: Message) -> None:
         """Append a message, payload verbatim."""
-        check_message(message)
+        self.check_message(message)
         if message.publish_time != message.log_time:
             self._omitted["publish times that differ from the log time"] += 1
         if message.sequence:
             self._omitted["sequence numbers of messages"] += 1
         self._bag.append(self._numbers[message.channel.id], message.log_time, message.data)
 
-    def add_attachment(self, attachment: Attachment) -> None:
-        """Count an attachment as omitted."""
-        self._omitted["attachments"] += 1
+    def finish(self) -> None:
+        """Write the last chunk and the index, and close the file."""
+        self._bag.finish()
 
-    def add_metadata(self, record: MetadataRecord) -> None:
-        """Count a metadata record as omitted."""
-        self._omitted["metadata records"] += 1
-
-    def __enter__(self) -> Ros1Writer:
-        return self
-
-    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
-        try:
-            if exc_type is None:
-                self._bag.finish()
-        finally:
-            with suppress(OSError):
-                self._bag.file.close()
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        with suppress(OSError):
+            self._bag.file.close()
 
 
 class _BagFile:

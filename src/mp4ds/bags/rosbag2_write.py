@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import sqlite3
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.protocols import BagWriter
 from mp4ds.bags.rosbag2_metadata import (
     METADATA_FILE,
     NATIVE_QOS_VERSION,
@@ -56,15 +56,6 @@ CREATE TABLE message_definitions(
 """
 
 
-def check_channel(channel: Channel) -> None:
-    """Refuse a channel that the tables cannot hold.
-
-    Raises:
-        ConversionError: It has no schema.
-    """
-    _schema_of(channel)
-
-
 def _schema_of(channel: Channel) -> Schema:
     if channel.schema is None:
         raise ConversionError(
@@ -75,21 +66,7 @@ def _schema_of(channel: Channel) -> Schema:
     return channel.schema
 
 
-def check_message(message: Message) -> None:
-    """Refuse a message that the tables cannot hold.
-
-    Raises:
-        ConversionError: Its log time is negative or beyond 63 bits.
-    """
-    if not 0 <= message.log_time <= _MAX_TIME:
-        raise ConversionError(
-            message.channel.topic,
-            f"has the log time {message.log_time}, which rosbag2 cannot store",
-            "Unpack to mcap instead.",
-        )
-
-
-class SqliteWriter:
+class SqliteWriter(BagWriter):
     """Writes one ``.db3`` file.
 
     Args:
@@ -100,12 +77,12 @@ class SqliteWriter:
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self.path = path
         self._topics: dict[tuple[str, str, str, str, str], int] = {}
         self._row_of: dict[int, int] = {}
         self._definitions: dict[tuple[str, str], Schema] = {}
         self._keys: set[str] = set()
-        self._left_out: Counter[str] = Counter()
         with self._disk_errors():
             self._connection = sqlite3.connect(path, isolation_level=None)
         try:
@@ -130,10 +107,28 @@ class SqliteWriter:
             code = next((c for word, c in _DISK_ERRORS.items() if word in text), errno.EIO)
             raise OSError(code, f"{os.strerror(code)} (sqlite3: {text})", str(self.path)) from error
 
-    @property
-    def omitted(self) -> Mapping[str, int]:
-        """What the tables cannot hold: a phrase -> how many."""
-        return self._left_out
+    @staticmethod
+    def check_channel(channel: Channel) -> None:
+        """Refuse a channel that the tables cannot hold.
+
+        Raises:
+            ConversionError: It has no schema.
+        """
+        _schema_of(channel)
+
+    @staticmethod
+    def check_message(message: Message) -> None:
+        """Refuse a message that the tables cannot hold.
+
+        Raises:
+            ConversionError: Its log time is negative or beyond 63 bits.
+        """
+        if not 0 <= message.log_time <= _MAX_TIME:
+            raise ConversionError(
+                message.channel.topic,
+                f"has the log time {message.log_time}, which rosbag2 cannot store",
+                "Unpack to mcap instead.",
+            )
 
     def add_channel(self, channel: Channel) -> None:
         """Add a topic; channels with identical rows share one."""
@@ -143,9 +138,7 @@ class SqliteWriter:
         self._keys |= channel.metadata.keys()
         others = len(channel.metadata.keys() - {QOS_KEY, HASH_KEY})
         if others:
-            self._left_out["channel metadata entries (sqlite3 storage keeps QoS and hash)"] += (
-                others
-            )
+            self._omitted["channel metadata entries (sqlite3 storage keeps QoS and hash)"] += others
         key = (channel.topic, channel.type_name, channel.message_encoding, qos, type_hash)
         self._row_of[channel.id] = self._topics.setdefault(key, len(self._topics) + 1)
 
@@ -157,15 +150,15 @@ class SqliteWriter:
         if not schema.encoding and not schema.data:
             return
         if self._definitions.setdefault((schema.name, type_hash), schema) != schema:
-            self._left_out["message definitions (sqlite3 storage keeps one per type)"] += 1
+            self._omitted["message definitions (sqlite3 storage keeps one per type)"] += 1
 
     def write(self, message: Message) -> None:
         """Append a message, payload verbatim."""
-        check_message(message)
+        self.check_message(message)
         if message.publish_time != message.log_time:
-            self._left_out["publish times (sqlite3 storage keeps only one time)"] += 1
+            self._omitted["publish times (sqlite3 storage keeps only one time)"] += 1
         if message.sequence:
-            self._left_out["sequence numbers (sqlite3 storage keeps none)"] += 1
+            self._omitted["sequence numbers (sqlite3 storage keeps none)"] += 1
         row = self._row_of[message.channel.id], message.log_time, message.data
         try:
             with self._disk_errors():
@@ -220,14 +213,25 @@ class SqliteWriter:
             ),
         )
 
-    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
-        try:
-            if exc_type is None:
-                with self._disk_errors():
-                    self._connection.execute("COMMIT")
-        finally:
-            with suppress(sqlite3.Error):
-                self._connection.close()
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Count an attachment."""
+        self._omitted["attachments (sqlite3 storage cannot hold any)"] += 1
+
+    def add_metadata(self, record: MetadataRecord) -> None:
+        """Count a metadata record."""
+        if record.name != _MCAP_RECORD:  # there is a table for that
+            self._omitted["metadata records (sqlite3 storage cannot hold any)"] += 1
+
+    def finish(self) -> None:
+        """Commit, and close the file."""
+        with self._disk_errors():
+            self._connection.execute("COMMIT")
+        self._connection.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        with suppress(sqlite3.Error):
+            self._connection.close()
 
 
 def _text_or_blob(data: bytes) -> str | bytes:
@@ -256,8 +260,8 @@ class _Topic:
     count: int = 0
 
 
-class Rosbag2Writer:
-    """Writes a rosbag2 folder. See `BagWriter`.
+class Rosbag2Writer(BagWriter):
+    """Writes a rosbag2 folder.
 
     Given the metadata record ``mp4ds:rosbag2`` of a recording, its version, distribution and
     custom data are kept.
@@ -287,6 +291,7 @@ class Rosbag2Writer:
     ) -> None:
         if storage not in _SUFFIXES:
             raise OptionError(f"storage {storage!r} is not known. Use {', '.join(_SUFFIXES)}.")
+        super().__init__()
         self._folder = folder
         self._storage = storage
         self._name = name or folder.name
@@ -297,7 +302,6 @@ class Rosbag2Writer:
         self._source_has_record = False
         self._topics: dict[tuple[str, str, str, str, str], _Topic] = {}
         self._topic_of: dict[int, _Topic] = {}
-        self._left_out: Counter[str] = Counter()
         self._start = _EMPTY_START
         self._end = 0
         folder.mkdir()
@@ -311,10 +315,10 @@ class Rosbag2Writer:
     @property
     def omitted(self) -> Mapping[str, int]:
         """What the storage cannot hold: a phrase -> how many."""
-        return dict(self._left_out + Counter(self._writer.omitted))
+        return self._writer.omitted
 
     def add_channel(self, channel: Channel) -> None:
-        """Declare a channel. See `BagWriter.add_channel`."""
+        """Declare a channel, which is a topic."""
         if channel.id in self._topic_of:
             return
         self._writer.add_channel(channel)
@@ -339,11 +343,8 @@ class Rosbag2Writer:
         self._end = max(self._end, message.log_time)
 
     def add_attachment(self, attachment: Attachment) -> None:
-        """Append an attachment; sqlite3 storage counts it in `omitted`."""
-        if isinstance(self._writer, McapWriter):
-            self._writer.add_attachment(attachment)
-        else:
-            self._left_out["attachments (sqlite3 storage cannot hold any)"] += 1
+        """Append an attachment, if the storage can hold it."""
+        self._writer.add_attachment(attachment)
 
     def add_metadata(self, record: MetadataRecord) -> None:
         """Take over the metadata of the source recording, or append a metadata record."""
@@ -357,11 +358,8 @@ class Rosbag2Writer:
     def _add_other_metadata(self, record: MetadataRecord) -> None:
         if record.name == _MCAP_RECORD and not self._source_is_whole:
             self._source = _parsed(record.metadata.get("serialized_metadata", "")) or self._source
-        if isinstance(self._writer, McapWriter):
-            self._source_has_record |= record.name == _MCAP_RECORD
-            self._writer.add_metadata(record)
-        elif record.name != _MCAP_RECORD:  # sqlite3 has its own table for that
-            self._left_out["metadata records (sqlite3 storage cannot hold any)"] += 1
+        self._source_has_record |= record.name == _MCAP_RECORD
+        self._writer.add_metadata(record)
 
     def _take_source(self, content: Mapping[str, str]) -> None:
         self._take_distro(content)
@@ -435,28 +433,20 @@ class Rosbag2Writer:
             type_hash=topic.type_hash if found[0].type_hash is None else found[0].type_hash,
         )
 
-    def _finish(self) -> None:
+    def finish(self) -> None:
+        """Complete the storage, and write metadata.yaml."""
         info = self._info()
         inside = dump_yaml(info)
         if isinstance(self._writer, SqliteWriter):
             self._writer.add_bag_info(info["version"], inside, self._ros_distro)
         elif not self._source_has_record:
             self._writer.add_metadata(MetadataRecord(_MCAP_RECORD, {"serialized_metadata": inside}))
-        self._writer.__exit__(None)
+        self._writer.finish()
         (self._folder / METADATA_FILE).write_bytes(dump_bag_info(info).encode())
 
-    def __enter__(self) -> Rosbag2Writer:
-        return self
-
-    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
-        if exc_type is not None:
-            self._writer.__exit__(exc_type)
-            return
-        try:
-            self._finish()
-        except BaseException as error:
-            self._writer.__exit__(type(error))
-            raise
+    def abandon(self) -> None:
+        """Close the storage as it is."""
+        self._writer.abandon()
 
 
 def _parsed(text: str) -> BagInfo | None:

@@ -76,7 +76,7 @@ class McapPass:
         self._scan = Scan(window, self._framing, self._lose)
         self._schemas = set[int]()
         if summary.is_verified:
-            self._schemas.update(schema.id for schema in summary.schemas)
+            self._schemas.update(summary.schemas)
         self._undefined: dict[int, int] = {}
         self._plain: _Plain | None = None
         self.offset = 0
@@ -227,10 +227,10 @@ class McapPass:
         channels = self._declared.channels
         if channel_id not in channels and channel_id in self._summary.doubtful:
             record = self._summary.doubtful[channel_id]
-            for schema in self._summary.schemas:
-                if schema.id == record.schema_id and schema.id not in self._schemas:
-                    self._schemas.add(schema.id)
-                    self._declared.add_schema(schema)
+            schema = self._summary.schemas.get(record.schema_id)
+            if schema is not None and schema.id not in self._schemas:
+                self._schemas.add(schema.id)
+                self._declared.add_schema(schema)
             self._declared.add_channel(record)
         return channels.get(channel_id)
 
@@ -317,7 +317,7 @@ class McapPass:
             self._tally.listed(channel_id, listed)
 
     def _lose(self, offset: int, size: int, problem: str) -> None:
-        if self._summary.offset is not None and offset >= self._summary.offset:
+        if 0 < self._summary.offset <= offset:
             self._log.lost(offset, size, problem).add(0, ())
         else:
             self._tally.lost(offset, size, problem)
@@ -443,17 +443,11 @@ class McapSalvage(FileSalvage):
         self._read_header()
         if not self._summary.is_verified:
             return
-        schemas = {schema.id for schema in self._summary.schemas}
-        for schema in self._summary.schemas:
-            self._declare(lambda: self._declared.add_schema(schema))  # noqa: B023
-        for channel in self._summary.channels:
-            if not channel.schema_id or channel.schema_id in schemas:
-                self._declare(lambda: self._declared.add_channel(channel))  # noqa: B023
-
-    @staticmethod
-    def _declare(declare: Callable[[], None]) -> None:
-        with contextlib.suppress(DamageError):  # it is reported when it is read
-            declare()
+        for schema in self._summary.schemas.values():
+            self._declared.add_schema(schema)
+        for channel in self._summary.channels.values():
+            if not channel.schema_id or channel.schema_id in self._summary.schemas:
+                self._declared.add_channel(channel)
 
     def _read_header(self) -> None:
         with self._window() as window:
@@ -494,7 +488,7 @@ class McapSalvage(FileSalvage):
     @property
     def span(self) -> tuple[int, int] | None:
         """Earliest and latest log time from the summary, ns; None if unknown."""
-        return self._summary.chunks.span()
+        return self._summary.span()
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the summary, including lost messages; otherwise empty."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap import records as mcap_records
@@ -14,16 +14,14 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mp4ds.bags.files import DamageError
-from mp4ds.bags.mcap_index import ChunkTable
+from mp4ds.bags.mcap_index import ChunkTable, McapSummary
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
     MAGIC,
     OF_SUMMARY,
     PRIVATE_OPCODE,
-    parse,
 )
 from mp4ds.bags.salvage.scan import RecordFrame, Scan, Window
-from mp4ds.records import ChannelStats
 
 _FRAME = struct.Struct("<BQ")
 _HEAD = _FRAME.size
@@ -218,71 +216,29 @@ _LONGEST_OF = _table(
 _MAX_SEARCHED = 256 * 2**20
 
 
-class SalvagedSummary:
-    """A summary section. What depends on its being complete is dropped if it is not.
+@dataclass
+class SalvagedSummary(McapSummary):
+    """The readable part of a summary section.
 
     Attributes:
-        offset: Byte where it begins, None if there is none.
-        schemas: Schema records, in their order.
-        channels: Channel records, in their order.
-        statistics: The statistics record, if there is one.
-        chunks: The chunks that it lists.
         is_verified: Whether it matches its checksum, if it has one.
+        is_whole: Whether all of it could be read.
     """
 
-    def __init__(self) -> None:
-        self.offset: int | None = None
-        self.schemas: list[mcap_records.Schema] = []
-        self.channels: list[mcap_records.Channel] = []
-        self.statistics: mcap_records.Statistics | None = None
-        self.chunks = ChunkTable()
-        self.is_verified = True
-        self._is_whole = True
+    is_verified: bool = True
+    is_whole: bool = True
 
     @property
     def doubtful(self) -> dict[int, mcap_records.Channel]:
         """Channels by id, if the summary does not match its checksum."""
-        return {} if self.is_verified else {channel.id: channel for channel in self.channels}
-
-    def add(self, opcode: int, body: bytes) -> None:
-        """Add a record."""
-        takers: dict[int, Callable[[], Any]] = {
-            Opcode.CHUNK_INDEX: lambda: self.chunks.add(body),
-            Opcode.SCHEMA: lambda: self.schemas.append(parse(mcap_records.Schema, body)),
-            Opcode.CHANNEL: lambda: self.channels.append(parse(mcap_records.Channel, body)),
-            Opcode.STATISTICS: lambda: self._count(parse(mcap_records.Statistics, body)),
-        }
-        try:
-            takers.get(opcode, lambda: None)()
-        except DamageError:
-            self.damaged()
-
-    def _count(self, statistics: mcap_records.Statistics) -> None:
-        self.statistics = statistics
-
-    def damaged(self) -> None:
-        """Note that part of it cannot be read."""
-        self._is_whole = False
+        return {} if self.is_verified else self.channels
 
     def finish(self) -> None:
-        """Finish after everything was added."""
-        if not self._is_whole or not self.is_verified:
+        """Finish after everything was added, and drop what depends on its being complete."""
+        if not self.is_whole or not self.is_verified:
             self.chunks = ChunkTable()
             self.statistics = None
         self.chunks.finish()
-
-    def stats(self) -> dict[int, ChannelStats]:
-        """Counts and spans by channel id; empty if unknown."""
-        if self.statistics is None:
-            return {}
-        whole = self.statistics.message_start_time, self.statistics.message_end_time
-        spans = self.chunks.spans()
-        counts = self.statistics.channel_message_counts
-        found = {channel.id: ChannelStats(0, 0, 0) for channel in self.channels}
-        for channel_id, count in counts.items():
-            span = spans.get(channel_id, whole) if count else (0, 0)
-            found[channel_id] = ChannelStats(count, *span)
-        return found
 
 
 def read_summary(path: Path) -> SalvagedSummary:
@@ -321,7 +277,11 @@ def _read_from(path: Path, start: int, summary: SalvagedSummary) -> None:
         if not is_there and (window.left or 0) > _MAX_SEARCHED:
             return  # the rest may be anything
         summary.offset = start
-        scan = Scan(window, framing, lambda *_: summary.damaged())
+
+        def lose(*_: object) -> None:
+            summary.is_whole = False
+
+        scan = Scan(window, framing, lose)
         while frame := scan.next():
             if frame.kind == Opcode.FOOTER:
                 return
@@ -329,5 +289,8 @@ def _read_from(path: Path, start: int, summary: SalvagedSummary) -> None:
                 break
             body = scan.body(frame)
             if body is not None:
-                summary.add(frame.kind, body)
-        summary.damaged()
+                try:
+                    summary.add(frame.kind, body)
+                except DamageError:
+                    summary.is_whole = False
+        summary.is_whole = False
