@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ MessageSource = Callable[[Channel, Choice], Iterator[tuple[int, Message]]]
 """Yields the wanted messages of a channel, each with its ordinal."""
 
 T = TypeVar("T")
+_RecordT = TypeVar("_RecordT", bound=Record)
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,19 @@ class Ahead(Protocol):
 def when_asked(items: Iterator[T], /) -> Iterator[T]:
     """Prefetches nothing."""
     return items
+
+
+def by_time(*records: Iterator[_RecordT]) -> Iterator[_RecordT]:
+    """Merge records that are in the order of their log times; what has none comes first."""
+    return _merged(records, lambda record: getattr(record, "log_time", 0))
+
+
+def _merged(parts: Sequence[Iterator[T]], key: Callable[[T], int]) -> Iterator[T]:
+    with ExitStack() as stack:
+        for part in parts:
+            # the files of the others are open still when one fails
+            stack.callback(getattr(part, "close", lambda: None))
+        yield from heapq.merge(*parts, key=key)
 
 
 @dataclass(frozen=True)
@@ -218,7 +233,7 @@ class ChannelGroup:
         return ""
 
     def _placed(self, reading: Reading) -> Iterator[tuple[int, Message]]:
-        return heapq.merge(*self._read(reading), key=lambda pair: pair[0])
+        return _merged(self._read(reading), lambda pair: pair[0])
 
     def _read(self, reading: Reading) -> list[Iterator[tuple[int, Message]]]:
         sources = [reading.sources.get(part.key, part.source) for part in self.parts]

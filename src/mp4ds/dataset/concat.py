@@ -5,7 +5,6 @@ A copy or a slice is made in the same way: of one dataset, of which a span and t
 
 from __future__ import annotations
 
-import heapq
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from mp4ds.bags.combined import bounded
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.bags.protocols import in_span, write_record
+from mp4ds.dataset.channels import by_time
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, within
 from mp4ds.dataset.segments import Cut, JoinedStream, copy_file
@@ -238,7 +238,7 @@ class _Part:
         topics = {item.topic for item in self.dataset.channels if self.selected(item.topic)}
         recorded = self.dataset.recorded_messages(replace(self.span, topics=frozenset(topics)))
         orphans = [self._orphans(cut) for cut in self.cuts if not len(cut.images)]
-        found = heapq.merge(recorded, *orphans, key=_time_of)
+        found = by_time(recorded, *orphans)
         return chain(self.latched, found)
 
     def _orphans(self, cut: Cut) -> Iterator[Message]:
@@ -443,12 +443,8 @@ class _Concat:
                 for message in self._parts[number].verbatim_messages():
                     yield message.of_channel(self._channels[number, message.channel.id])
 
-        return heapq.merge(*map(messages, chains), key=_time_of)
+        return by_time(*map(messages, chains))
 
 
 def _identity_of(channel: ChannelModel) -> _Identity:
     return channel.to_record(0).identity
-
-
-def _time_of(message: Message) -> int:
-    return message.log_time

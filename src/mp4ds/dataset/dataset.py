@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import shlex
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -22,6 +21,7 @@ from mp4ds.dataset.channels import (
     MessageSource,
     PartKey,
     Reading,
+    by_time,
     channel_groups,
     log_times,
     when_asked,
@@ -441,7 +441,7 @@ class Dataset:
                 ids |= group.recorded_ids
         found = self._file.in_time(Excerpt(topics=wanted))
         recorded = (message for message in found if message.channel.id in ids)
-        return heapq.merge(recorded, *calibrations, key=_time_of)
+        return by_time(recorded, *calibrations)
 
     def sync(
         self,
@@ -513,9 +513,9 @@ class Dataset:
         if is_span:
             recorded = ahead(self.recorded_messages(span))
             parts = [part for group in groups for part in group.parts_of(reading)]
-            return heapq.merge(recorded, *parts, key=_time_of)
+            return by_time(recorded, *parts)
         channels = (self._group_messages(group, reading) for group in groups)
-        return heapq.merge(ahead(self._verbatim_records(topics)), *channels, key=_time_of)
+        return by_time(ahead(self._verbatim_records(topics)), *channels)
 
     def before(self, time_ns: int, topics: Collection[str], frames: int) -> Iterator[Message]:
         """Messages of some topics before a log time, in its order; of a video the last few.
@@ -530,7 +530,7 @@ class Dataset:
         groups = [group for group in self._groups if group.channel.topic in wanted]
         recorded = self.recorded_messages(Excerpt(end=time_ns, topics=wanted))
         parts = [part for group in groups for part in group.parts_of(reading)]
-        return heapq.merge(recorded, *parts, key=_time_of)
+        return by_time(recorded, *parts)
 
     def times(self) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame."""
@@ -622,10 +622,6 @@ class Dataset:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _time_of(record: Record) -> int:
-    return getattr(record, "log_time", 0)
 
 
 class _VideoDataset(Dataset):
