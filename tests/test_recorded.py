@@ -18,7 +18,7 @@ from rosbags.highlevel import AnyReader
 import mp4ds
 from conftest import real
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
-from mp4ds.bags.decoding import decoder_of
+from mp4ds.bags.convert import decoder_of
 from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel, Schema
 from scenes import image_ros1, raw_scene

@@ -102,7 +102,7 @@ class CombinedReader(BagReader):
         """Bytes of the parts that were read, and of those being read."""
         return self._done + sum(part.position for part in self._active)
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Those of all parts, merged; only the parts that an excerpt needs are opened."""
         self._done = 0
         self._skipped.clear()

@@ -295,7 +295,7 @@ class McapReader(BagReader):
         """Whether the summary lists all channels, schemas and chunks, and how many messages."""
         return self._found_between is not None
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Read everything once, or a part of it."""
         return self._one_pass(lambda stream: self._read(stream, excerpt))
 

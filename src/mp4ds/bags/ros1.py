@@ -36,7 +36,7 @@ from mp4ds.bags.ros1_records import (
     unpack_chunk,
 )
 from mp4ds.files.urls import expect
-from mp4ds.records import EVERYTHING, Channel, Excerpt, Message, Record
+from mp4ds.records import Channel, Excerpt, Message, Record
 
 CACHED_CHUNKS = 8
 CACHED_BYTES = 64 * 2**20
@@ -105,7 +105,7 @@ class Ros1Reader(BagReader):
         """All connections, in the order of the bag's index."""
         return list(self._bag.channels.values())
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Messages in log-time order, from the chunks that hold them."""
         self.position = 0
         visited: set[int] = set()

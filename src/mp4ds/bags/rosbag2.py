@@ -35,7 +35,6 @@ from mp4ds.bags.rosbag2_sqlite import SqliteReader
 from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.files.urls import remote
 from mp4ds.records import (
-    EVERYTHING,
     QOS_KEY,
     Channel,
     ChannelStats,
@@ -198,7 +197,7 @@ class Rosbag2Reader(CombinedReader):
             starts.append(span[0] if span else min(starts, default=_NEVER))
         return [(start, _NEVER) for start in reversed(starts)]
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """The metadata record, then the records of all files, merged."""
         if excerpt.others:
             yield self._metadata_record()

@@ -328,7 +328,7 @@ class SqliteReader(BagReader):
             first, last = tables.select(f"SELECT {', '.join(ends)}").fetchone()
         return (first, last) if isinstance(first, int) and isinstance(last, int) else None
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Message]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Message]:
         """Read all messages or an excerpt by log time, ties by row id."""
         if excerpt == EVERYTHING:
             yield from self._all_records()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -24,7 +24,7 @@ from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores import empty
 
 from mp4ds.errors import OptionError, Refused
-from mp4ds.records import Channel, Schema
+from mp4ds.records import Schema
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
@@ -287,6 +287,12 @@ def ros2_store(distribution: str) -> Stores:
     return known[distribution]
 
 
+def name_of(schema: Schema) -> str:
+    """The type's name as ROS 2 spells it."""
+    name: str = normalize_msgtype(schema.name)
+    return name
+
+
 def types_of(schema: Schema, world: World) -> Typesdict:
     """The type of a schema and everything it refers to; missing ones are taken from the standard.
 
@@ -344,7 +350,8 @@ def closure(types: Typesdict, root: str, standard: Typesdict) -> Typesdict:
             raise Refused(f"no definition of type {name} is known")
         if name not in found:
             found[name] = types[name] if name in types else standard[name]
-            todo += [part for _, desc in found[name][1] if (part := _shape(desc)[3])]
+            shapes = (field_shape(desc) for _, desc in found[name][1])
+            todo += [shape.message for shape in shapes if shape.message]
     return found
 
 
@@ -365,11 +372,11 @@ def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str
     if len(left_fields) != len(right_fields):
         return False
     for (_, left_desc), (_, right_desc) in zip(left_fields, right_fields, strict=True):
-        *left_shape, left_part = _shape(left_desc)
-        *right_shape, right_part = _shape(right_desc)
-        if left_shape != right_shape or bool(left_part) != bool(right_part):
+        left_shape, right_shape = field_shape(left_desc), field_shape(right_desc)
+        if left_shape.on_wire != right_shape.on_wire:
             return False
-        if left_part and not same_wire(left, left_part, right, right_part):
+        part = left_shape.message
+        if part and not same_wire(left, part, right, right_shape.message):
             return False
     return True
 
@@ -392,6 +399,12 @@ class FieldShape:
     length: int | None
     bound: int | None
 
+    @property
+    def on_wire(self) -> tuple[object, ...]:
+        """What determines its bytes, except for the message type; bounds do not."""
+        base = _BYTES.get(self.base, self.base)
+        return base, bool(self.message), self.length, self.bound is None
+
 
 def field_shape(desc: FieldDesc) -> FieldShape:
     """The shape of a field of `fields_of`."""
@@ -405,19 +418,6 @@ def field_shape(desc: FieldDesc) -> FieldShape:
     if desc[0] == Nodetype.BASE:
         return FieldShape(str(desc[1][0]), "", int(desc[1][1] or 0), length, bound)
     raise Refused("it holds arrays of arrays")
-
-
-def _shape(desc: FieldDesc) -> tuple[int, int, str, str]:
-    """Kind, array length, base type and name of a message type; bounds are ignored."""
-    kind, count = Nodetype.BASE, 0
-    if desc[0] == Nodetype.ARRAY or desc[0] == Nodetype.SEQUENCE:
-        kind = desc[0]
-        count = desc[1][1] if kind == Nodetype.ARRAY else 0
-        desc = desc[1][0]
-    if desc[0] == Nodetype.NAME:
-        return kind, count, "", str(desc[1])
-    base = str(desc[1][0])
-    return kind, count, _BYTES.get(base, base), ""
 
 
 def translate(types: Typesdict, root: str, new_root: str, world: World) -> Typesdict:
@@ -461,91 +461,3 @@ def make_store(types: Typesdict, world: World) -> Typestore:
     """A type store of definitions with a world's header."""
     own = {name: found for name, found in types.items() if name not in (*BUILTIN, HEADER)}
     return BoundedStore({HEADER: world.standard[HEADER], **own})
-
-
-# ---------------------------------------------------------------- stamps
-
-NS = 1_000_000_000
-_DISTRIBUTION = "humble"
-_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_POSE = 7 * 8  # bytes: a translation and a quaternion of doubles
-_ENCAPSULATION = 4
-
-
-class HeaderStamps:
-    """The stamps in messages of one channel: of their header, or of their transforms' headers.
-
-    Args:
-        channel: Any; without ROS or a header, there are no stamps.
-    """
-
-    def __init__(self, channel: Channel) -> None:
-        self._is_ros1 = channel.message_encoding == "ros1"
-        self._places = self._find(channel)
-
-    @property
-    def has_any(self) -> bool:
-        """Whether messages of the channel have stamps."""
-        return self._places is not None
-
-    def moved(self, payload: bytes | memoryview, move: Callable[[int], int]) -> bytes | bytearray:
-        """A copy of a message with changed stamps.
-
-        Args:
-            payload: Of the channel.
-            move: Maps a stamp to its new value, nanoseconds. Zero stays zero.
-
-        Raises:
-            ValueError: It is not of the channel's type, or a stamp is out of range.
-        """
-        made = bytearray(payload)
-        if self._places is None:
-            return made
-        order = "<" if self._is_ros1 or made[1:2] != b"\0" else ">"
-        code = struct.Struct(f"{order}{'I' if self._is_ros1 else 'i'}I")
-        try:
-            for place in self._places(made, order):
-                seconds, nanoseconds = code.unpack_from(made, place)
-                if seconds or nanoseconds:
-                    code.pack_into(made, place, *divmod(move(seconds * NS + nanoseconds), NS))
-        except struct.error as error:
-            raise ValueError(str(error)) from None
-        return made
-
-    def _find(self, channel: Channel) -> Callable[[bytearray, str], Iterator[int]] | None:
-        schema = channel.schema
-        if channel.message_encoding not in ("ros1", "cdr") or schema is None or not schema.name:
-            return None
-        name = normalize_msgtype(schema.name)
-        if name in _TRANSFORMS:
-            return self._of_transforms
-        world = ros1_world() if self._is_ros1 else ros2_world(_DISTRIBUTION)
-        try:
-            fields = fields_of(types_of(schema, world), name)
-        except Refused:
-            return None
-        if fields and fields[0][1] == (Nodetype.NAME, HEADER):
-            return self._of_header
-        return None
-
-    def _of_header(self, _: bytearray, __: str) -> Iterator[int]:
-        yield 4  # after the sequence number of ROS 1, or the encapsulation of CDR
-
-    def _of_transforms(self, data: bytearray, order: str) -> Iterator[int]:
-        number = struct.Struct(f"{order}I")
-        start = 0 if self._is_ros1 else _ENCAPSULATION
-        (count,) = number.unpack_from(data, start)
-        place = start + 4
-        for _ in range(count):
-            place = self._aligned(place, 4) + (4 if self._is_ros1 else 0)
-            yield place
-            place += 8
-            for _name in ("frame_id", "child_frame_id"):
-                place = self._aligned(place, 4)
-                place += 4 + number.unpack_from(data, place)[0]
-            place = self._aligned(place, 8) + _POSE
-
-    def _aligned(self, place: int, size: int) -> int:
-        if self._is_ros1:
-            return place
-        return place + -(place - _ENCAPSULATION) % size

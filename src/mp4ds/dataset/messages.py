@@ -278,7 +278,7 @@ class _Topic:
     @cached_property
     def _decoder(self) -> Callable[[memoryview], Any]:
         # rosbags is slow to import, and not everyone decodes messages
-        from mp4ds.bags.decoding import decoder_of
+        from mp4ds.bags.convert import decoder_of
 
         return decoder_of(self._channel)
 

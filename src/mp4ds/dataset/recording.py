@@ -14,7 +14,7 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import advising
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_manifest
-from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record, Schema
+from mp4ds.records import Channel, ChannelStats, Excerpt, Message, Record, Schema
 
 _BEST_JPEG = 100
 
@@ -72,7 +72,7 @@ class DatasetReader(BagReader):
         """Whether the messages of each channel are in the order of their log times."""
         return self._dataset.is_in_time
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Its records, decoded; without those that an excerpt lacks."""
         self._read = 0
         with advising(COPY_AGAIN):

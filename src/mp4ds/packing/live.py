@@ -22,7 +22,7 @@ from mp4ds.packing.engine import Workers
 from mp4ds.packing.journal import Journal
 from mp4ds.packing.manifest import PartRecord
 from mp4ds.packing.packer import TOO_LATE, Packer, PartSettings
-from mp4ds.records import EVERYTHING, Channel, Excerpt, Message, Record
+from mp4ds.records import Channel, Excerpt, Message, Record
 from mp4ds.times import INT64_MAX
 
 LATE_S = 0.5
@@ -199,7 +199,7 @@ class LiveRecording(BagReader):
         self.channels: list[Channel] = []
         self._others = others
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """What it holds besides messages, which come to `LivePacker`."""
         del excerpt
         return iter(self._others)

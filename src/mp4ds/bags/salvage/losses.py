@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mp4ds.bags.combined import MORE_LOSSES
 from mp4ds.bags.protocols import BagReader
-from mp4ds.records import EVERYTHING, MAX_LOSSES, MAX_LOST_TOPICS, Excerpt, Loss, Message, Record
+from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Excerpt, Loss, Message, Record
 
 
 @dataclass(eq=False)
@@ -376,7 +376,7 @@ class FileSalvage(BagReader):
         """Messages lost in the last pass, if the file states how many there were."""
         return None
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Everything readable, of which all but the excerpt is dropped."""
         self.losses = []
         log = LossLog(self._shown.name)

@@ -2,19 +2,215 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import sqlite3
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mp4ds.bags.combined import bounded
-from mp4ds.bags.files import ZSTD_MAGIC, decompress_file
+from mp4ds.bags.files import (
+    ZSTD_MAGIC,
+    DamageError,
+    OversizeError,
+    decompress_file,
+    most_held,
+)
 from mp4ds.bags.protocols import BagReader
 from mp4ds.bags.rosbag2 import STORAGE_NAME, Decompress, Rosbag2Reader, unlisted_storage
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, BagInfo, read_bag_info
+from mp4ds.bags.rosbag2_sqlite import SqliteReader, Tables, open_tables
+from mp4ds.bags.salvage.losses import FileSalvage, LossLog
 from mp4ds.bags.salvage.mcap import McapSalvage
-from mp4ds.bags.salvage.sqlite import SqliteSalvage
-from mp4ds.errors import SourceError, SourceNotFoundError
-from mp4ds.records import EVERYTHING, Excerpt, Loss, Message, Record
+from mp4ds.bags.salvage.scan import lost_by
+from mp4ds.errors import Refused, SourceError, SourceNotFoundError
+from mp4ds.records import Channel, Excerpt, Loss, Message, Record, Schema
+
+_RECOVER = (
+    "Its tables may be found page by page: `sqlite3 FILE .recover | sqlite3 NEW.db3`, then give "
+    "NEW.db3"
+)
+_UNFINISHED = "It was not closed properly: open and close it once with the sqlite3 tool"
+_LEAST_ROW = 8  # bytes of a row in the table of messages
+_MORE = "; `.recover` of the sqlite3 tool may find more"
+
+
+class SqliteSalvage(FileSalvage):
+    """Reads what sqlite3 can read of one ``.db3`` file.
+
+    The files are neither changed nor copied. Messages come by log time; 24 bytes of each are held
+    in memory.
+
+    Args:
+        path: The database.
+        shown: Its name in errors and tables, where it is a decompressed copy.
+        message_decompress: Decompresses the payload of a message; raises `DamageError` if it
+            cannot.
+        expected: Expected number of messages, if known from elsewhere.
+
+    Attributes:
+        tables: Content of the small tables by ``db3:<file>:<column>``, verbatim.
+
+    Raises:
+        SourceError: sqlite3 cannot open it, or its topics are damaged.
+    """
+
+    format = "rosbag2"
+    profile = "ros2"
+    has_all_channels = True
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        shown: Path | None = None,
+        message_decompress: Callable[[bytes], bytes] | None = None,
+        expected: int | None = None,
+    ) -> None:
+        super().__init__(path, shown=shown, is_alone=False)
+        self._decompress = message_decompress
+        self._expected = expected
+        self._lost = 0
+        try:
+            self._small = SqliteReader(path, shown=shown, damaged=True)
+        except SourceError as error:
+            remedy = _UNFINISHED if Path(f"{path}-journal").exists() else _RECOVER
+            raise SourceError(self._shown, error.problem, remedy) from None
+        self._channels = {channel.id: channel for channel in self._small.channels}
+        self.tables: Mapping[str, str] = self._small.tables
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """All topics, in the order of their ids."""
+        return list(self._channels.values())
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """Message definitions that no topic refers to."""
+        return self._small.unused_schemas
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """Earliest and latest log time, ns, if sqlite3 can find them; otherwise None."""
+        try:
+            return self._small.span
+        except SourceError:
+            return None
+
+    def _pass(self, log: LossLog) -> Iterator[Record]:
+        given = self._lost = 0
+        size = self._shown.stat().st_size
+        with open_tables(self.path, self._shown, damaged=True) as tables:
+            most_rows = self.path.stat().st_size // _LEAST_ROW
+            keys, times, problem = _index(tables, most_rows, self._expected)
+            for read, row in enumerate(np.lexsort((keys, times)).tolist(), 1):
+                message = self._message(tables, int(keys[row]), log)
+                if message is not None:
+                    given += 1
+                    log.gave(message.log_time)
+                    yield message
+                self.position = size * read // len(keys)
+        # rosbag2 numbers its messages from 1 without gaps
+        expected = self._expected or (int(keys.max(initial=0)) if problem else 0)
+        missing = expected - given - self._lost
+        if problem or missing > 0:
+            problem = f"the table of messages: {problem}" if problem else "messages without a row"
+            log.lost(None, None, problem + _MORE).add(max(0, missing), ())
+        self.position = size
+
+    def _message(self, tables: Tables, key: int, log: LossLog) -> Message | None:
+        """A message; None if it is lost, which is recorded."""
+        topics: list[str] = []
+        try:
+            topic_id, time = _first(tables, "topic_id, timestamp", key)
+            channel = self._channels.get(topic_id) if isinstance(topic_id, int) else None
+            if channel is None:
+                raise Refused(f"messages of topic id {topic_id}, which has no row")
+            topics.append(channel.topic)
+            if not isinstance(time, int) or time < 0:
+                raise Refused(f"messages of {channel.topic} with a time before 1970")
+            (size,) = _first(tables, "length(data)", key)
+            if self.path != self._shown and isinstance(size, int) and size > (most := most_held()):
+                raise Refused(f"messages of {channel.topic} {lost_by(OversizeError('', most))}")
+            (data,) = _first(tables, "data", key)
+            if not isinstance(data, bytes):
+                raise Refused(f"messages of {channel.topic} without a payload")
+            return Message(channel, time, time, 0, self._decompressed(data, channel.topic))
+        except Refused as lost:
+            problem = str(lost)
+        except (sqlite3.Error, SourceError):
+            _raise_if_interrupted(tables)
+            of = f" of {topics[0]}" if topics else ""
+            problem = f"messages{of} with damaged or missing pages"
+        log.lost_of_kind(problem, None, problem).add(1, topics)
+        self._lost += 1
+        return None
+
+    def _decompressed(self, data: bytes, topic: str) -> bytes:
+        try:
+            return self._decompress(data) if self._decompress else data
+        except DamageError as error:
+            raise Refused(f"messages of {topic} {lost_by(error)}") from None
+
+
+def _first(tables: Tables, columns: str, key: int) -> tuple[object, ...]:
+    row = next(tables.rows(f"SELECT {columns} FROM messages WHERE id = ?", (key,)), None)
+    if row is None:
+        raise Refused("messages whose rows cannot be found by their key")
+    return row
+
+
+def _index(
+    tables: Tables, most: int, expected: int | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64], str]:
+    """Keys and log times of the rows that can be read, and what damage ended reading in order.
+
+    Each row that was not reached is then looked for by its key.
+
+    Args:
+        tables: Of the file.
+        most: Rows that the file can hold.
+        expected: Expected number of messages, if known from elsewhere.
+    """
+    keys, times = array("q"), array("q")
+
+    def read(query: str, values: Sequence[int] = ()) -> str:
+        try:
+            for key, time in tables.select(query, values):
+                keys.append(key)
+                times.append(time if isinstance(time, int) else -1)
+        except sqlite3.Error as error:
+            _raise_if_interrupted(tables)
+            return str(error)
+        return ""
+
+    query = "SELECT id, timestamp FROM messages NOT INDEXED"
+    problem = read(f"{query} ORDER BY id")
+    if problem:
+        try:
+            (last,) = tables.select("SELECT MAX(id) FROM messages").fetchone()
+        except sqlite3.Error:
+            _raise_if_interrupted(tables)
+            last = None
+        reached = set(keys)
+        for key in range(1, min(last or expected or 0, most) + 1):
+            if key not in reached:
+                read(f"{query} WHERE id = ?", (key,))
+    # a page that is damaged may repeat keys: the first one counts, as for sqlite3
+    found, first = np.unique(np.array(keys, np.int64), return_index=True)
+    return found, np.array(times, np.int64)[first], problem
+
+
+def _raise_if_interrupted(tables: Tables) -> None:
+    """Raise what a signal's handler raised, which sqlite3 hides; not that a budget is used up."""
+    if tables.raised and not isinstance(tables.raised, SourceError):
+        raise tables.raised
+
+
+# ---------------------------------------------------------------- the recording
 
 
 class Rosbag2Salvage(Rosbag2Reader):
@@ -131,7 +327,7 @@ class Rosbag2Salvage(Rosbag2Reader):
         """Files that cannot be read, and what was lost of the others by the last `records`."""
         return bounded([*self._of_files, *super().losses])
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """The metadata record, then everything readable, of which all but the excerpt is dropped.
 
         Raises:

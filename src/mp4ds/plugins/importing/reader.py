@@ -25,7 +25,6 @@ from mp4ds.messages.transforms import Transform
 from mp4ds.messages.wire import NS, CodedFields, Fields, ImageFields, PrimitiveWriter, Slots
 from mp4ds.plugins.importing.scene import Scene, SceneCamera, SensorTable
 from mp4ds.records import (
-    EVERYTHING,
     Attachment,
     Channel,
     Excerpt,
@@ -238,7 +237,7 @@ class ImagesReader(BagReader):
         """All channels."""
         return [track.channel for track in self._tracks]
 
-    def _records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Attachments, then messages by log time."""
         self.position = 0
         if excerpt.others:

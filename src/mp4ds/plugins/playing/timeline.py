@@ -17,12 +17,12 @@ import numpy as np
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import Kept, has_late, kept_depth
-from mp4ds.bags.types import HeaderStamps
 from mp4ds.dataset.channels import Ahead
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, everything
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.plan import Selection
+from mp4ds.plugins.playing.stamps import HeaderStamps
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import Reduction
