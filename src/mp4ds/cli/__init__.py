@@ -26,7 +26,10 @@ COMMANDS = {
         "unpacking",
         "Turn a dataset back into a recording: a bag, rosbag2, MCAP or images.",
     ),
-    "import": ("packing", "Make a dataset from images, or from a video made by the paper's tool."),
+    "import": (
+        "importing",
+        "Make a dataset from images, or from a video made by the paper's tool.",
+    ),
     "export": (
         "unpacking",
         "Export a dataset to another tool's format, keeping what that format supports.",
@@ -52,12 +55,12 @@ COMMANDS = {
         "Compare encoder settings on clips of a recording: quality, size and time.",
     ),
     "validate": (
-        "inspect",
+        "validate",
         "Check datasets and list every problem; exits with 1 if there are any.",
     ),
-    "info": ("inspect", "Show what is in a recording or a dataset."),
+    "info": ("info", "Show what is in a recording or a dataset."),
     "demo": (
-        "inspect",
+        "demo",
         "Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf.",
     ),
 }

@@ -1,24 +1,21 @@
-"""``mp4ds pack`` and ``mp4ds import``: commands that make datasets."""
+"""``mp4ds pack``, also known as ``mp4ds repack``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Annotated, Optional
 
 import typer
 
-from mp4ds.cli.options import Command, ForceFlag, JsonFlag, parse_share, quietable, takes
+from mp4ds.cli.options import JsonFlag, parse_share, takes
 from mp4ds.cli.output import print_json, print_pack, print_speeds, say
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import pack_progress
 from mp4ds.errors import OptionError
 from mp4ds.files.urls import remote
-from mp4ds.packing.options import ImageFolder, PackOptions, PackSummary
-
-_ONLY_OF_RECORDINGS = (
-    *("topics", "exclude", "camera_info", "window", "cluster", "join", "keep_going", "salvage"),
-)
+from mp4ds.packing.options import PackOptions, PackSummary
+from mp4ds.packing.pack import pack as run
+from mp4ds.packing.pack import pack_each, pack_share
 
 
 @takes(PackOptions, without=("images",))
@@ -52,9 +49,6 @@ def pack(
     Lossless by default: `mp4ds unpack` restores every message exactly. To resume a long pack that
     was interrupted, run the same command again. Repacking a dataset keeps exact what was exact.
     """
-    from mp4ds.packing.pack import pack as run
-    from mp4ds.packing.pack import pack_each, pack_share
-
     summaries: list[PackSummary] = []
     with told_errors(as_json), pack_progress(as_json, whole=not shard) as progress:
         chosen = options()
@@ -73,7 +67,7 @@ def pack(
     for summary in summaries:
         print_pack(summary)
         if chosen.purpose is not None and not remote(summary.dataset):
-            from mp4ds.plugins.info import reading_speeds
+            from mp4ds.plugins.info import reading_speeds  # not for every short pack
 
             with told_errors(as_json):
                 print_speeds(reading_speeds(summary.dataset))
@@ -82,69 +76,3 @@ def pack(
 
 
 repack = pack
-
-# ---------------------------------------------------------------- import
-
-imports = typer.Typer(
-    name="import",
-    help="Make a dataset from images, or from a video made by the paper's tool.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
-
-_Output = Annotated[
-    str, typer.Option("--output", "-o", metavar="DATASET", help="Folder to create.")
-]
-
-
-@imports.command(cls=Command)
-@quietable
-@takes(ImageFolder, PackOptions, without=("images", *_ONLY_OF_RECORDINGS))
-def images(
-    images_as: Callable[[], ImageFolder],
-    options: Callable[[], PackOptions],
-    folder: Annotated[
-        str, typer.Argument(metavar="FOLDER", help="Folder of images, plain or in a known layout.")
-    ],
-    output: _Output,
-    as_json: JsonFlag = False,
-) -> None:
-    """Make a dataset from a folder of timestamped images.
-
-    EuRoC and TUM RGB-D folders are imported with all their cameras. Lossless by default. To
-    resume a long import that was interrupted, run the same command again.
-    """
-    from mp4ds.packing.pack import pack as run
-
-    with told_errors(as_json), pack_progress(as_json) as progress:
-        chosen = replace(options(), images=images_as())
-        summary = run(folder, output, chosen, progress=progress)
-    if as_json:
-        print_json(summary)
-    else:
-        print_pack(summary)
-
-
-@imports.command("ros-mp4", cls=Command)
-@quietable
-def ros_mp4(
-    video: Annotated[str, typer.Argument(metavar="VIDEO", help="The mp4 file.")],
-    sidecar: Annotated[
-        str, typer.Argument(metavar="YAML", help="The YAML file that belongs to it.")
-    ],
-    output: _Output,
-    force: ForceFlag = False,
-    as_json: JsonFlag = False,
-) -> None:
-    """Convert an mp4 and YAML made by the tool published with the paper.
-
-    The video is not re-encoded: its packets are copied.
-    """
-    from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
-
-    with told_errors(as_json):
-        summary = import_ros_mp4(video, sidecar, output, force=force)
-    if as_json:
-        print_json(summary)
-    else:
-        print_pack(summary)

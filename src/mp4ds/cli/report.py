@@ -23,8 +23,10 @@ from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, counted, path_text, size_text
+from mp4ds.plugins.reporting.overview import reports
 from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary
 from mp4ds.plugins.reporting.report import report as run_report
+from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.plugins.reporting.stills import StillOptions
 from mp4ds.plugins.reporting.stills import frames as run_frames
 
@@ -81,8 +83,6 @@ def _reports(
     as_json: bool,
 ) -> None:
     """Make the reports of several datasets, and the page that leads to them."""
-    from mp4ds.plugins.reporting.overview import reports
-
     folder = options.output
     if folder is None and len(datasets) == 1 and Path(datasets[0]).is_dir():
         folder = Path(datasets[0])
@@ -113,8 +113,6 @@ _PLAYS = {"video": "its own video", "proxy": "a proxy", "nothing": "nothing"}
 
 
 def _serve(summary: ReportSummary, port: int, as_json: bool) -> None:
-    from mp4ds.plugins.reporting.server import ReportServer
-
     with ReportServer(summary.files, summary.start, port=port) as server:
         told = sys.stderr if as_json else sys.stdout
         with printed():

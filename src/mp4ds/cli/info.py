@@ -1,64 +1,26 @@
-"""``mp4ds info``, ``validate`` and ``demo``; calibrations as Python code."""
+"""``mp4ds info``; calibrations as Python code."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import Annotated, Optional
 
 import typer
 
-from mp4ds.cli.options import DatasetsArgument, ForceFlag, JobsOption, JsonFlag, cores
-from mp4ds.cli.output import (
-    print_info,
-    print_json,
-    print_overview,
-    print_speeds,
-    print_validation,
-    say,
-)
+from mp4ds.cli.options import JsonFlag
+from mp4ds.cli.output import print_info, print_json, print_overview, print_speeds, say
 from mp4ds.cli.process import told_errors
 from mp4ds.cli.progress import progress_of
-from mp4ds.errors import OptionError, counted, path_text
+from mp4ds.dataset.collections import datasets_in
+from mp4ds.errors import OptionError, SourceError, counted, path_text
+from mp4ds.files.outputs import digest_file
+from mp4ds.files.urls import location
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.options import Slice
-
-if TYPE_CHECKING:
-    from mp4ds.dataset.checks import Problem
-    from mp4ds.plugins.info import CameraCalibrations, Intrinsics, ListedCalibration
-
-
-def validate(
-    paths: DatasetsArgument,
-    deep: Annotated[
-        bool,
-        typer.Option(
-            "--deep", help="Also hash and decode every file and check every message's digest."
-        ),
-    ] = False,
-    jobs: JobsOption = None,
-    as_json: JsonFlag = False,
-) -> None:
-    """Check datasets and list every problem; exits with 1 if there are any."""
-    from mp4ds.dataset.checks import validate as run
-    from mp4ds.dataset.collections import datasets_in, each
-
-    found: dict[Path, list[Problem]] = {}
-    with told_errors(as_json), progress_of("validating", as_json) as tell:
-        where = datasets_in(paths)
-        if len(where) == 1:
-            found[where[0]] = run(where[0], deep=deep, progress=tell)
-        else:
-            for path, problems in each(partial(run, deep=deep), where, cores(jobs)):
-                found[path] = problems
-                if tell:
-                    tell(f"{len(found)} of {len(where)} datasets", len(found) / len(where))
-    if as_json:
-        told = [{"path": path, "deep": deep, "problems": item} for path, item in found.items()]
-        print_json(told[0] if len(told) == 1 else told)
-    else:
-        print_validation(found, deep=deep)
-    raise typer.Exit(1 if any(found.values()) else 0)
+from mp4ds.plugins import info as facts
+from mp4ds.plugins.reporting.card import card as card_of
+from mp4ds.plugins.reporting.overview import brief
 
 
 def info(
@@ -126,10 +88,8 @@ def info(
     elif len(found) > 1:
         _print_overview(found, as_json)
     else:
-        from mp4ds.plugins.info import info as run
-
         with told_errors(as_json):
-            result = run(found[0], asked)
+            result = facts.info(found[0], asked)
         if as_json:
             print_json(result)
         else:
@@ -138,10 +98,6 @@ def info(
 
 def _found(paths: Sequence[str]) -> list[Path]:
     """What to show: one recording, or datasets."""
-    from mp4ds.dataset.collections import datasets_in
-    from mp4ds.errors import SourceError
-    from mp4ds.files.urls import location
-
     try:
         return datasets_in(paths)
     except SourceError:
@@ -152,9 +108,6 @@ def _found(paths: Sequence[str]) -> list[Path]:
 
 def _print_checksums(path: Path, as_json: bool) -> None:
     """Print the hashes of a dataset's files from its manifest, and that of the manifest itself."""
-    from mp4ds.files.outputs import digest_file
-    from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
-
     with told_errors(as_json):
         if not (path / MANIFEST_NAME).is_file():
             raise OptionError(f"{path} is not a dataset; only datasets have checksums.")
@@ -168,10 +121,8 @@ def _print_checksums(path: Path, as_json: bool) -> None:
 
 
 def _print_card(found: Sequence[Path], as_json: bool) -> None:
-    from mp4ds.plugins.reporting.card import card
-
     with told_errors(as_json):
-        text = card(found)
+        text = card_of(found)
     if as_json:
         print_json({"card": text})
         return
@@ -180,8 +131,6 @@ def _print_card(found: Sequence[Path], as_json: bool) -> None:
 
 
 def _print_overview(found: Sequence[Path], as_json: bool) -> None:
-    from mp4ds.plugins.reporting.overview import brief
-
     with told_errors(as_json), progress_of("reading", as_json) as tell:
         rows = []
         for number, path in enumerate(found):
@@ -195,10 +144,8 @@ def _print_overview(found: Sequence[Path], as_json: bool) -> None:
 
 
 def _print_intrinsics(path: str, as_json: bool) -> None:
-    from mp4ds.plugins.info import intrinsics as run
-
     with told_errors(as_json), progress_of("reading", as_json):
-        result = run(path)
+        result = facts.intrinsics(path)
     if as_json:
         print_json(result)
     else:
@@ -206,36 +153,12 @@ def _print_intrinsics(path: str, as_json: bool) -> None:
 
 
 def _print_speeds(path: str, as_json: bool) -> None:
-    from mp4ds.plugins.info import reading_speeds
-
     with told_errors(as_json), progress_of("reading", as_json):
-        speeds = reading_speeds(path)
+        speeds = facts.reading_speeds(path)
     if as_json:
         print_json(speeds)
     else:
         print_speeds(speeds)
-
-
-def demo(
-    output: Annotated[
-        Path,
-        typer.Argument(help="What to write: .mcap, .bag (ROS 1), or no suffix for rosbag2."),
-    ] = Path("demo.mcap"),
-    seconds: Annotated[
-        float, typer.Option("--seconds", min=0.1, max=3600.0, help="Length of the recording.")
-    ] = 3.0,
-    force: ForceFlag = False,
-    as_json: JsonFlag = False,
-) -> None:
-    """Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf."""
-    from mp4ds.plugins.demo import demo as run
-
-    with told_errors(as_json):
-        messages = run(output, seconds=seconds, force=force)
-    if as_json:
-        print_json({"output": output, "messages": messages})
-    else:
-        say(f"{path_text(output)}: {counted(messages, 'message')}")
 
 
 # ---------------------------------------------------------------- calibrations
@@ -247,7 +170,7 @@ _MODELS = {
 }
 
 
-def print_intrinsics(result: Intrinsics) -> None:
+def print_intrinsics(result: facts.Intrinsics) -> None:
     """Print the calibrations of all cameras, one after another, and the static transforms."""
     say(f"# {path_text(result.path)}: {result.kind}, {counted(len(result.cameras), 'camera')}")
     say("import numpy as np")
@@ -257,7 +180,7 @@ def print_intrinsics(result: Intrinsics) -> None:
         _print_transforms(result)
 
 
-def _print_camera(camera: CameraCalibrations) -> None:
+def _print_camera(camera: facts.CameraCalibrations) -> None:
     say("")
     sizes = ", ".join(f"{width}x{height}" for width, height in camera.sizes) or "size not known"
     if camera.topic:
@@ -272,7 +195,9 @@ def _print_camera(camera: CameraCalibrations) -> None:
         say(f"# ... and {camera.more} more calibration changes")
 
 
-def _print_calibration(camera: CameraCalibrations, calibration: ListedCalibration) -> None:
+def _print_calibration(
+    camera: facts.CameraCalibrations, calibration: facts.ListedCalibration
+) -> None:
     since = (
         f"from message {calibration.message} at {calibration.log_time} ns"
         if calibration.message is not None
@@ -307,7 +232,7 @@ def _print_matrix(name: str, rows: Sequence[Sequence[float]]) -> None:
         say(line)
 
 
-def _print_transforms(result: Intrinsics) -> None:
+def _print_transforms(result: facts.Intrinsics) -> None:
     say("")
     say("# static transforms: a point p of the child is rotation * p + translation in the parent;")
     say("# (parent, child, translation x y z in metres, rotation x y z w)")
