@@ -1,13 +1,12 @@
-"""The table of recording formats, and digests of recordings."""
+"""The table of recording formats."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from mp4ds.bags.combined import MultiReader
 from mp4ds.bags.protocols import BagReader, BagWriter
@@ -15,102 +14,11 @@ from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.outputs import begins_with
 from mp4ds.files.sources import (
     HOW_TO_OPEN,
-    is_folder,
     refuse_unfinished,
-    source_digest,
-    source_size,
     video_at,
 )
 from mp4ds.files.urls import remote
 from mp4ds.records import Channel, Message
-
-_BLOCK = 2**20
-
-
-class SourceHasher:
-    """SHA-256 of the source files, computed just behind the reader.
-
-    The bytes are still in the system's cache then, so the disk is read once. A folder is hashed
-    when the reader is past its bytes. A context manager.
-
-    Args:
-        files: All files, in reading order.
-    """
-
-    def __init__(self, files: Sequence[Path]) -> None:
-        self._files = list(files)
-        self._sizes = {path: source_size(path) for path in files if is_folder(path)}
-        self._position = 0
-        self._number = 0
-        self._offset = 0
-        self._hash = hashlib.sha256()
-        self._stream: BinaryIO | None = None  # kept open, since another file may get the name
-        self._digests: list[tuple[int, str]] = []
-
-    def advance(self, position: int | None) -> None:
-        """Hash up to a position in all files, None for the end.
-
-        Raises:
-            SourceError: A file cannot be read.
-        """
-        while self._number < len(self._files) and (position is None or self._position < position):
-            path = self._files[self._number]
-            end = self._position + self._sizes.get(path, 0)
-            if position is not None and position < end:
-                return
-            try:
-                if path in self._sizes:
-                    self._finish(*source_digest(path))
-                    self._position = end
-                    continue
-                if self._stream is None:
-                    self._stream = path.open("rb")
-                at_end = self._hash_file(self._stream, position)
-            except OSError as error:
-                raise SourceError(path, f"cannot be read: {error.strerror}") from None
-            if at_end:
-                self._finish(self._offset, self._hash.hexdigest())
-
-    def digest(self, number: int) -> tuple[int, str]:
-        """Size in bytes and SHA-256 of a file by its number; reads all files to the end first.
-
-        Raises:
-            SourceError: It cannot be read.
-        """
-        if number >= len(self._digests):
-            self.advance(None)
-        return self._digests[number]
-
-    def _hash_file(self, stream: BinaryIO, position: int | None) -> bool:
-        while position is None or self._position < position:
-            block = stream.read(_BLOCK)
-            if not block:
-                return True
-            self._hash.update(block)
-            self._offset += len(block)
-            self._position += len(block)
-        return False
-
-    def _finish(self, size: int, sha256: str) -> None:
-        self._digests.append((size, sha256))
-        self._hash = hashlib.sha256()
-        self._offset = 0
-        self._number += 1
-        self._close()
-
-    def _close(self) -> None:
-        if self._stream:
-            self._stream.close()
-        self._stream = None
-
-    def __enter__(self) -> SourceHasher:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
-
-# ---------------------------------------------------------------- formats
 
 # by name: each imports its library, and a recording has one format
 _READERS = {

@@ -21,7 +21,6 @@ from mp4ds.bags.mcap_index import (
     ChunkEntry,
     McapSummary,
     look_between,
-    read_frames,
     read_summary,
 )
 from mp4ds.bags.mcap_records import (
@@ -54,21 +53,6 @@ from mp4ds.records import (
     Record,
     Schema,
 )
-
-_OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
-
-
-def read_others(stream: RecordStream, declared: Declared) -> Iterator[Record]:
-    """The attachments and metadata records of a file, skipping everything else.
-
-    Raises:
-        SourceError: The file is damaged or cut short.
-    """
-    for opcode, place in read_frames(stream):
-        if opcode in _OTHERS:
-            yield _other_at(stream, place, declared)
-        elif opcode >= PRIVATE_OPCODE:
-            declared.skip(opcode)
 
 
 def _other_at(stream: RecordStream, place: int, declared: Declared) -> Attachment | MetadataRecord:
@@ -317,10 +301,8 @@ class McapReader(BagReader):
     def _read(self, stream: RecordStream, excerpt: Excerpt) -> Iterator[Record]:
         if self._between and self._summary and self._needs_chunks_alone(self._summary, excerpt):
             yield from self._read_chunks(stream, excerpt, self._summary, self._between)
-        elif excerpt.has_messages or stream.size is None:
+        else:
             yield from filter(excerpt.has, self._read_through(stream, self._hold_back()))
-        elif excerpt.others:
-            yield from read_others(stream, self._declared)
 
     @staticmethod
     def _needs_chunks_alone(summary: McapSummary, excerpt: Excerpt) -> bool:

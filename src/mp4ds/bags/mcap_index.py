@@ -484,31 +484,3 @@ def read_frame(stream: RecordStream, place: int) -> tuple[int, int]:
     if length > MAX_RECORD_BYTES:
         raise DamageError(f"it says it has {length} bytes")
     return opcode, place + _FRAME.size + length
-
-
-def read_frames(stream: RecordStream) -> Iterator[tuple[int, int]]:
-    """Walk all records of a file up to its footer, seeking over their bodies.
-
-    Args:
-        stream: A stream of known size; it may be moved between the frames.
-
-    Yields:
-        Opcode and byte offset of each.
-
-    Raises:
-        SourceError: The file is damaged or cut short.
-    """
-    place = len(MAGIC)
-    while True:
-        try:
-            opcode, following = read_frame(stream, place)
-        except DamageError as error:
-            raise stream.damaged(error) from None
-        if stream.size is not None and following > stream.size:
-            raise stream.cut_short()
-        if opcode == Opcode.FOOTER:
-            break
-        yield opcode, place
-        place = following
-    stream.seek(following)
-    stream.read_magic()

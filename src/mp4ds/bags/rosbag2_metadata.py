@@ -65,7 +65,18 @@ class TopicMetadata:
     serialization_format: str
     qos: str | None
     type_hash: str | None
-    count: int
+    count: int = 0
+
+    @classmethod
+    def of(cls, channel: Channel) -> TopicMetadata:
+        """The topic that a channel is; channels that do not differ in this are one."""
+        return cls(
+            channel.topic,
+            channel.type_name,
+            channel.message_encoding,
+            channel.metadata.get(QOS_KEY, ""),
+            channel.metadata.get(HASH_KEY, ""),
+        )
 
     def to_channel(self, channel_id: int) -> Channel:
         """The channel of a topic that is not in the storage."""

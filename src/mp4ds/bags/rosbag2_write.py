@@ -7,7 +7,7 @@ import os
 import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from mp4ds.bags.rosbag2_metadata import (
     RECORD,
     TABLES_RECORD,
     BagInfo,
+    TopicMetadata,
     dump_bag_info,
     dump_yaml,
     has_numeric_qos,
@@ -79,7 +80,7 @@ class SqliteWriter(BagWriter):
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.path = path
-        self._topics: dict[tuple[str, str, str, str, str], int] = {}
+        self._topics: dict[TopicMetadata, int] = {}
         self._row_of: dict[int, int] = {}
         self._definitions: dict[tuple[str, str], Schema] = {}
         self._keys: set[str] = set()
@@ -133,14 +134,13 @@ class SqliteWriter(BagWriter):
     def add_channel(self, channel: Channel) -> None:
         """Add a topic; channels with identical rows share one."""
         schema = _schema_of(channel)
-        qos, type_hash = channel.metadata.get(QOS_KEY, ""), channel.metadata.get(HASH_KEY, "")
-        self._add_definition(schema, type_hash)
+        self._add_definition(schema, channel.metadata.get(HASH_KEY, ""))
         self._keys |= channel.metadata.keys()
         others = len(channel.metadata.keys() - {QOS_KEY, HASH_KEY})
         if others:
             self._omitted["channel metadata entries (sqlite3 storage keeps QoS and hash)"] += others
-        key = (channel.topic, channel.type_name, channel.message_encoding, qos, type_hash)
-        self._row_of[channel.id] = self._topics.setdefault(key, len(self._topics) + 1)
+        topic = TopicMetadata.of(channel)
+        self._row_of[channel.id] = self._topics.setdefault(topic, len(self._topics) + 1)
 
     def add_schema(self, schema: Schema) -> None:
         """Keep a definition that no topic refers to."""
@@ -191,7 +191,7 @@ class SqliteWriter(BagWriter):
         self._connection.execute(_TOPICS % "".join(f", {name} TEXT NOT NULL" for name in names))
         self._connection.executemany(
             f"INSERT INTO topics VALUES (?{', ?' * columns})",
-            ((row, *key[:columns]) for key, row in self._topics.items()),
+            ((row, *astuple(topic)[:columns]) for topic, row in self._topics.items()),
         )
 
     def _write_about(self, schema: int, version: int, text: str, ros_distro: str) -> None:
@@ -248,18 +248,6 @@ _SUFFIXES = {"sqlite3": "db3", "mcap": "mcap"}
 _MCAP_RECORD = "rosbag2"
 
 
-@dataclass
-class _Topic:
-    """A topic as metadata.yaml lists it, with its messages counted."""
-
-    name: str
-    type_name: str
-    serialization_format: str
-    qos: str
-    type_hash: str
-    count: int = 0
-
-
 class Rosbag2Writer(BagWriter):
     """Writes a rosbag2 folder.
 
@@ -300,8 +288,8 @@ class Rosbag2Writer(BagWriter):
         self._source_distro = ""
         self._source_is_whole = False
         self._source_has_record = False
-        self._topics: dict[tuple[str, str, str, str, str], _Topic] = {}
-        self._topic_of: dict[int, _Topic] = {}
+        self._topic_of: dict[int, TopicMetadata] = {}
+        self._counts: dict[TopicMetadata, int] = {}
         self._start = _EMPTY_START
         self._end = 0
         folder.mkdir()
@@ -322,14 +310,8 @@ class Rosbag2Writer(BagWriter):
         if channel.id in self._topic_of:
             return
         self._writer.add_channel(channel)
-        key = (
-            channel.topic,
-            channel.type_name,
-            channel.message_encoding,
-            channel.metadata.get(QOS_KEY, ""),
-            channel.metadata.get(HASH_KEY, ""),
-        )
-        self._topic_of[channel.id] = self._topics.setdefault(key, _Topic(*key))
+        topic = self._topic_of[channel.id] = TopicMetadata.of(channel)
+        self._counts.setdefault(topic, 0)
 
     def add_schema(self, schema: Schema) -> None:
         """Keep a definition that no channel refers to."""
@@ -338,7 +320,7 @@ class Rosbag2Writer(BagWriter):
     def write(self, message: Message) -> None:
         """Append a message, payload verbatim."""
         self._writer.write(message)
-        self._topic_of[message.channel.id].count += 1
+        self._counts[self._topic_of[message.channel.id]] += 1
         self._start = min(self._start, message.log_time)
         self._end = max(self._end, message.log_time)
 
@@ -378,13 +360,13 @@ class Rosbag2Writer(BagWriter):
     def _version(self) -> int:
         if self._source:
             return self._source.version
-        old_style = any(has_numeric_qos(topic.qos) for topic in self._topics.values())
+        old_style = any(has_numeric_qos(topic.qos or "") for topic in self._counts)
         return NATIVE_QOS_VERSION - 1 if old_style else NEWEST_VERSION
 
     def _info(self) -> dict[str, Any]:
         """The content of metadata.yaml in the layout of its version."""
         version = self._version()
-        count = sum(topic.count for topic in self._topics.values())
+        count = sum(self._counts.values())
         span = {
             "duration": {"nanoseconds": max(0, self._end - self._start)},
             "starting_time": {"nanoseconds_since_epoch": self._start},
@@ -396,7 +378,8 @@ class Rosbag2Writer(BagWriter):
             **span,
             "message_count": count,
             "topics_with_message_count": [
-                _topic_entry(self._as_listed(topic), version) for topic in self._topics.values()
+                _topic_entry(self._as_listed(topic), count, version)
+                for topic, count in self._counts.items()
             ],
         }
         if version >= 3:
@@ -417,7 +400,7 @@ class Rosbag2Writer(BagWriter):
             info["ros_distro"] = self._ros_distro
         return info
 
-    def _as_listed(self, topic: _Topic) -> _Topic:
+    def _as_listed(self, topic: TopicMetadata) -> TopicMetadata:
         """The topic as listed in the source's metadata.yaml, which may differ from its files."""
         found = [
             listed
@@ -456,16 +439,16 @@ def _parsed(text: str) -> BagInfo | None:
         return None  # none, or edited by hand: a plain one is written
 
 
-def _topic_entry(topic: _Topic, version: int) -> dict[str, Any]:
+def _topic_entry(topic: TopicMetadata, count: int, version: int) -> dict[str, Any]:
     metadata: dict[str, Any] = {
         "name": topic.name,
         "type": topic.type_name,
         "serialization_format": topic.serialization_format,
     }
     if version >= NATIVE_QOS_VERSION:
-        metadata["offered_qos_profiles"] = native_qos(topic.qos)
+        metadata["offered_qos_profiles"] = native_qos(topic.qos or "")
     elif version >= 4:
         metadata["offered_qos_profiles"] = topic.qos
     if version >= 7:
         metadata["type_description_hash"] = topic.type_hash
-    return {"topic_metadata": metadata, "message_count": topic.count}
+    return {"topic_metadata": metadata, "message_count": count}

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import xxhash
 
@@ -22,6 +23,7 @@ from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location, remote, spelled
 
 _SAMPLE = 2**16
+_BLOCK = 2**20
 _SIDES = ("-wal", "-journal")
 """Files that sqlite keeps next to a database in use: its latest changes."""
 
@@ -266,3 +268,86 @@ def _differ(before: tuple[int, int, int], now: tuple[int, int, int]) -> bool:
     """Whether a name now belongs to a different file."""
     # a network file system may renumber the same file, and a new link changes its time
     return before[:2] != now[:2] and before[2] != now[2]
+
+
+class SourceHasher:
+    """SHA-256 of the source files, computed just behind the reader.
+
+    The bytes are still in the system's cache then, so the disk is read once. A folder is hashed
+    when the reader is past its bytes. A context manager.
+
+    Args:
+        files: All files, in reading order.
+    """
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        self._files = list(files)
+        self._sizes = {path: source_size(path) for path in files if is_folder(path)}
+        self._position = 0
+        self._number = 0
+        self._offset = 0
+        self._hash = hashlib.sha256()
+        self._stream: BinaryIO | None = None  # kept open, since another file may get the name
+        self._digests: list[tuple[int, str]] = []
+
+    def advance(self, position: int | None) -> None:
+        """Hash up to a position in all files, None for the end.
+
+        Raises:
+            SourceError: A file cannot be read.
+        """
+        while self._number < len(self._files) and (position is None or self._position < position):
+            path = self._files[self._number]
+            end = self._position + self._sizes.get(path, 0)
+            if position is not None and position < end:
+                return
+            try:
+                if path in self._sizes:
+                    self._finish(*source_digest(path))
+                    self._position = end
+                    continue
+                if self._stream is None:
+                    self._stream = path.open("rb")
+                at_end = self._hash_file(self._stream, position)
+            except OSError as error:
+                raise SourceError(path, f"cannot be read: {error.strerror}") from None
+            if at_end:
+                self._finish(self._offset, self._hash.hexdigest())
+
+    def digest(self, number: int) -> tuple[int, str]:
+        """Size in bytes and SHA-256 of a file by its number; reads all files to the end first.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        if number >= len(self._digests):
+            self.advance(None)
+        return self._digests[number]
+
+    def _hash_file(self, stream: BinaryIO, position: int | None) -> bool:
+        while position is None or self._position < position:
+            block = stream.read(_BLOCK)
+            if not block:
+                return True
+            self._hash.update(block)
+            self._offset += len(block)
+            self._position += len(block)
+        return False
+
+    def _finish(self, size: int, sha256: str) -> None:
+        self._digests.append((size, sha256))
+        self._hash = hashlib.sha256()
+        self._offset = 0
+        self._number += 1
+        self._close()
+
+    def _close(self) -> None:
+        if self._stream:
+            self._stream.close()
+        self._stream = None
+
+    def __enter__(self) -> SourceHasher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()

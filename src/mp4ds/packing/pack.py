@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mp4ds import errors
-from mp4ds.bags.formats import SourceHasher
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import (
     FormatError,
@@ -29,6 +28,7 @@ from mp4ds.errors import (
 )
 from mp4ds.files.outputs import check_target, digest_file, staged
 from mp4ds.files.sources import (
+    SourceHasher,
     is_unfinished,
     salvage_command,
     source_digest,
