@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import mp4ds
-from mp4ds.bags.latched import LATCHED_QOS, Kept, kept_depth
+from mp4ds.bags.latched import LATCHED_QOS, LatchedMessages, latched_depth
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from mp4ds.plugins.publishing.ros2_writers import offered_qos
 from mp4ds.records import Channel
@@ -29,7 +29,7 @@ STRING = "std_msgs/msg/String"
 
 def late(channel: Channel, *payloads: bytes) -> list[bytes]:
     """What is kept of messages for those that come after them."""
-    kept = Kept[bytes](channel)
+    kept = LatchedMessages[bytes](channel)
     for payload in payloads:
         kept.add(payload, payload)
     return list(kept)
@@ -84,7 +84,7 @@ def test_a_message_of_tf_static_that_does_not_parse_is_kept() -> None:
     ids=lambda value: str(value) if isinstance(value, int) else value.topic,
 )
 def test_as_many_are_offered_as_all_publishers_kept(channel: Channel, depth: int) -> None:
-    assert kept_depth(channel) == depth
+    assert latched_depth(channel) == depth
     offered = offered_qos(channel, {})
     assert (offered.durability, offered.depth) == ("transient_local", depth)
     if depth < 100:

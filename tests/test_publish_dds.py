@@ -18,7 +18,7 @@ pytest.importorskip("cyclonedds")
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import LATCHED_QOS
-from mp4ds.bags.types import ros2_world
+from mp4ds.bags.types import ros2_version
 from mp4ds.errors import ConversionError, OptionError, PublishError
 from mp4ds.plugins.publishing.dds import DdsPublisher
 from mp4ds.plugins.publishing.dds_domain import dds_name, dds_topic, message_type
@@ -29,7 +29,7 @@ from waiting import WATCHDOG_S
 
 STRING = "std_msgs/msg/String"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
-WORLD = ros2_world("jazzy")
+VERSION = ros2_version("jazzy")
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_topics_without_the_prefix_of_ros(side: Side) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_definition_may_be_missing_for_standard_types(kind: str) -> None:
-    made = message_type(channel("/a", kind, encoding=""), WORLD)
+    made = message_type(channel("/a", kind, encoding=""), VERSION)
     assert made.is_real
     assert made.type_hash == STORE.hash_rihs01(kind)
 
@@ -204,7 +204,7 @@ def test_no_thread_is_left(side: Side) -> None:
     ],
 )
 def test_types_of_every_kind_of_field_are_announced(definition: str) -> None:
-    made = message_type(custom(definition), WORLD)
+    made = message_type(custom(definition), VERSION)
     assert made.is_real
     assert made.type_hash.startswith("RIHS01_")
     assert made.is_empty == (not definition)
@@ -215,7 +215,7 @@ def test_definitions_in_idl_are_announced() -> None:
         "=" * 80 + "\nIDL: pkg/msg/Own\nmodule pkg { module msg { struct Own "
         "{ uint32 number; sequence<double> values; }; }; };\n"
     )
-    made = message_type(custom(text, "ros2idl"), WORLD)
+    made = message_type(custom(text, "ros2idl"), VERSION)
     assert made.is_real
     assert [*made.writes.__annotations__] == ["number", "values"]
 
@@ -242,7 +242,7 @@ def test_messages_of_a_type_that_dds_cannot_have_are_published(
     side: Side, recorded: Channel
 ) -> None:
     heard = threading.Semaphore(0)
-    assert not message_type(recorded, WORLD).is_real
+    assert not message_type(recorded, VERSION).is_real
     with side.open() as listener, side.open() as publisher:
         listener.listen("/own", lambda _: heard.release())
         publisher.advertise(recorded)

@@ -21,16 +21,16 @@ from mp4ds.bags.types import (
     BUILTIN,
     HEADER,
     MAX_TAIL,
-    World,
+    RosVersion,
     by_library,
     field_shape,
     fields_of,
     has_empty_items,
     incomprehensible,
     make_store,
-    ros1_world,
+    ros1_version,
     ros2_store,
-    ros2_world,
+    ros2_version,
     same_wire,
     sizes_of,
     translate,
@@ -121,15 +121,15 @@ class Converter:
 
     # standard types take a while to load, and most recordings are in their target already
     @cached_property
-    def _ros1(self) -> World:
-        return ros1_world()
+    def _ros1(self) -> RosVersion:
+        return ros1_version()
 
     @cached_property
-    def _ros2(self) -> World:
-        return ros2_world(self._distribution)
+    def _ros2(self) -> RosVersion:
+        return ros2_version(self._distribution)
 
     @property
-    def _source(self) -> World:
+    def _source(self) -> RosVersion:
         return self._ros1 if self._to == "ros2" else self._ros2
 
     @property
@@ -415,12 +415,12 @@ def _ros(channel: Channel) -> Decoder:
     if schema is None or not schema.name:
         raise _undecodable(channel, "its message type is not known")
     is_ros1 = channel.message_encoding == "ros1"
-    world = ros1_world() if is_ros1 else ros2_world(_DISTRIBUTION)
+    version = ros1_version() if is_ros1 else ros2_version(_DISTRIBUTION)
     try:
-        types = types_of(schema, world)
+        types = types_of(schema, version)
         if has_empty_items(types, sizes_of(types)):
             raise _undecodable(channel, f"{schema.name} has arrays of a type without fields")
-        store = make_store(types, world)
+        store = make_store(types, version)
         # compiled now, to fail before any message
         definition = store.get_msgdef(normalize_msgtype(schema.name))
     except Refused as reason:

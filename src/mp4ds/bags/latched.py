@@ -66,7 +66,7 @@ def has_late(channel: Channel) -> bool:
     return is_latched(channel) or _is_tf_static(channel)
 
 
-def kept_depth(channel: Channel) -> int:
+def latched_depth(channel: Channel) -> int:
     """How many messages of a latched channel late subscribers get.
 
     A ROS 1 channel has one publisher, which latches one message. rosbag2 merges all publishers of a
@@ -96,7 +96,7 @@ def is_ros1(channel: Channel) -> bool:
     return channel.metadata.get("latching", "").lower() in ("1", "true")
 
 
-class Kept(Generic[_Item]):
+class LatchedMessages(Generic[_Item]):
     """The messages of a latched channel that are kept for late subscribers, oldest first.
 
     For /tf_static, these are the newest transforms of each child frame, as each of many publishers
@@ -110,7 +110,7 @@ class Kept(Generic[_Item]):
     """
 
     def __init__(self, channel: Channel) -> None:
-        self._depth = kept_depth(channel)
+        self._depth = latched_depth(channel)
         self._children = None if is_ros1(channel) else _parser(channel)
         self._kept: list[tuple[bytes | memoryview, frozenset[str] | None, _Item]] = []
         self.size = 0
@@ -191,11 +191,11 @@ def latched_before(
     own = {item.id: item for item in channels if has_late(item) and not is_camera(item)}
     if not own:
         return (), ()
-    kept = {key: Kept[tuple[int, Message]](channel) for key, channel in own.items()}
+    kept = {key: LatchedMessages[tuple[int, Message]](channel) for key, channel in own.items()}
     topics = frozenset(channel.topic for channel in own.values())
     left_out: dict[str, None] = {}
     size = 0
-    for number, message in enumerate(read(topics, max(map(kept_depth, own.values())))):
+    for number, message in enumerate(read(topics, max(map(latched_depth, own.values())))):
         if not isinstance(message, Message) or message.channel.id not in kept:
             continue
         data = bytes(message.data)  # a view would keep a whole chunk

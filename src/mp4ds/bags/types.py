@@ -237,7 +237,7 @@ _RULER = "=" * 80
 
 
 @dataclass(frozen=True, slots=True)
-class World:
+class RosVersion:
     """ROS 1 or ROS 2.
 
     Attributes:
@@ -253,15 +253,15 @@ class World:
     standard: Typesdict
 
 
-def ros1_world() -> World:
+def ros1_version() -> RosVersion:
     """ROS 1 with the types of Noetic; rosbags has all except tf2's."""
     tf2 = "tf2_msgs/msg/TFMessage"
     standard = {tf2: get_typestore(Stores.ROS2_HUMBLE).fielddefs[tf2]}
     standard.update(get_typestore(Stores.ROS1_NOETIC).fielddefs)
-    return World("ROS 1", "ros1", "ros1msg", standard)
+    return RosVersion("ROS 1", "ros1", "ros1msg", standard)
 
 
-def ros2_world(distribution: str) -> World:
+def ros2_version(distribution: str) -> RosVersion:
     """ROS 2 with the types of a distribution, such as ``humble``.
 
     Raises:
@@ -271,7 +271,7 @@ def ros2_world(distribution: str) -> World:
     # including later types: a recording without definitions may have them
     latest = get_typestore(Stores.LATEST).fielddefs
     standard = {**latest, **get_typestore(store).fielddefs}
-    return World("ROS 2", "cdr", "ros2msg", standard)
+    return RosVersion("ROS 2", "cdr", "ros2msg", standard)
 
 
 def ros2_store(distribution: str) -> Stores:
@@ -293,7 +293,7 @@ def name_of(schema: Schema) -> str:
     return name
 
 
-def types_of(schema: Schema, world: World) -> Typesdict:
+def types_of(schema: Schema, version: RosVersion) -> Typesdict:
     """The type of a schema and everything it refers to; missing ones are taken from the standard.
 
     Raises:
@@ -303,14 +303,14 @@ def types_of(schema: Schema, world: World) -> Typesdict:
     problem = incomprehensible(schema.name)
     name = by_library(problem, normalize_msgtype, schema.name)
     found = _parse(schema, name, problem)
-    if not fields_of(found, name) and name in world.standard:
+    if not fields_of(found, name) and name in version.standard:
         found.pop(name, None)  # the definition is empty, but perhaps not the type
-    # Time, duration and header are the world's own, whatever their definitions are called.
+    # Time, duration and header are each ROS's own, whatever their definitions are called.
     for builtin in (*BUILTIN, HEADER):
         found.pop(builtin, None)
-    if name not in found and name not in world.standard:
+    if name not in found and name not in version.standard:
         raise Refused(f"no definition of type {schema.name} is known")
-    types = closure(found, name, world.standard)
+    types = closure(found, name, version.standard)
     sizes_of(types)  # refuses definitions that no message can match
     return types
 
@@ -420,20 +420,20 @@ def field_shape(desc: FieldDesc) -> FieldShape:
     raise Refused("it holds arrays of arrays")
 
 
-def translate(types: Typesdict, root: str, new_root: str, world: World) -> Typesdict:
-    """Definitions for another world; standard ones where they serialise identically.
+def translate(types: Typesdict, root: str, new_root: str, version: RosVersion) -> Typesdict:
+    """Definitions for the other ROS; standard ones where they serialise identically.
 
     Args:
         types: The definitions, complete.
         root: The type to translate.
-        new_root: Its name in the other world.
-        world: The other world.
+        new_root: Its name in the other ROS.
+        version: The other ROS.
     """
     chosen: Typesdict = {}
     for name in types:
         new_name = new_root if name == root else name
-        if new_name in world.standard and same_wire(types, name, world.standard, new_name):
-            chosen.update(closure({}, new_name, world.standard))
+        if new_name in version.standard and same_wire(types, name, version.standard, new_name):
+            chosen.update(closure({}, new_name, version.standard))
         else:
             constants, fields = types[name]
             # ROS 1 cannot write bounds; ROS 1 definitions have none to lose.
@@ -457,7 +457,7 @@ def _unbounded(desc: FieldDesc) -> FieldDesc:
     return (desc[0], (part, count if desc[0] == Nodetype.ARRAY else 0))
 
 
-def make_store(types: Typesdict, world: World) -> Typestore:
-    """A type store of definitions with a world's header."""
+def make_store(types: Typesdict, version: RosVersion) -> Typestore:
+    """A type store of definitions with the header of a ROS."""
     own = {name: found for name, found in types.items() if name not in (*BUILTIN, HEADER)}
-    return BoundedStore({HEADER: world.standard[HEADER], **own})
+    return BoundedStore({HEADER: version.standard[HEADER], **own})

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from mp4ds.bags.convert import Converter
-from mp4ds.bags.types import World, make_store, ros1_world, ros2_world, types_of
+from mp4ds.bags.types import RosVersion, make_store, ros1_version, ros2_version, types_of
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.serializations import plain_message
 from mp4ds.messages.wire import NS, Fields, PrimitiveWriter, Slots, WireError
@@ -172,7 +172,7 @@ class Types:
     def __init__(self, encoding: str, kind: str) -> None:
         self.encoding = encoding
         self._kind = kind
-        self._worlds = {"ros1": ros1_world(), "cdr": ros2_world(_DISTRIBUTION)}
+        self._versions = {"ros1": ros1_version(), "cdr": ros2_version(_DISTRIBUTION)}
         self._converter = Converter({"ros1": "ros1", "cdr": "ros2"}[encoding])
 
     @property
@@ -203,7 +203,7 @@ class Types:
             topic: Of the channel to make.
         """
         encoding = source.message_encoding
-        if encoding not in self._worlds:
+        if encoding not in self._versions:
             encoding = self.encoding
         schema, digest = self._defined(encoding)
         kept = {key: value for key, value in source.metadata.items() if _is_kept(key)}
@@ -225,10 +225,10 @@ class Types:
 
     def _defined(self, encoding: str) -> tuple[Schema, str]:
         """The type's definition, and its md5sum or hash."""
-        name, world = _TYPES[self._kind], self._worlds[encoding]
+        name, version = _TYPES[self._kind], self._versions[encoding]
         text = _DEFINITIONS.get((self._kind, encoding), "")
-        schema = Schema(name, world.schema_encoding if text else "", text.encode())
-        return _generated(schema, world)
+        schema = Schema(name, version.schema_encoding if text else "", text.encode())
+        return _generated(schema, version)
 
     def message(
         self,
@@ -268,15 +268,15 @@ def _is_kept(key: str) -> bool:
     return plain not in (*_OF_TYPE, HASH_KEY) and key != "topic;base64"
 
 
-def _generated(schema: Schema, world: World) -> tuple[Schema, str]:
-    store = make_store(types_of(schema, world), world)
-    if world.encoding == "ros1":
+def _generated(schema: Schema, version: RosVersion) -> tuple[Schema, str]:
+    store = make_store(types_of(schema, version), version)
+    if version.encoding == "ros1":
         text, digest = store.generate_msgdef(schema.name, 1)
         name = schema.name.replace("/msg/", "/")  # as ROS 1 spells it
     else:
         text, digest = store.generate_msgdef(schema.name, 2)[0], store.hash_rihs01(schema.name)
         name = schema.name
-    return Schema(name, world.schema_encoding, text.encode()), digest
+    return Schema(name, version.schema_encoding, text.encode()), digest
 
 
 def _wrapped(stamp: int, *, signed: bool) -> int:

@@ -11,8 +11,8 @@ from mp4ds.bags.types import (
     field_shape,
     fields_of,
     name_of,
-    ros1_world,
-    ros2_world,
+    ros1_version,
+    ros2_version,
     types_of,
 )
 from mp4ds.errors import Refused
@@ -72,9 +72,9 @@ class HeaderStamps:
         name = name_of(schema)
         if name in _TRANSFORMS:
             return self._of_transforms
-        world = ros1_world() if self._is_ros1 else ros2_world(_DISTRIBUTION)
+        version = ros1_version() if self._is_ros1 else ros2_version(_DISTRIBUTION)
         try:
-            fields = fields_of(types_of(schema, world), name)
+            fields = fields_of(types_of(schema, version), name)
         except Refused:
             return None
         if fields and field_shape(fields[0][1]) == FieldShape("", HEADER, 0, None, None):

@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from mp4ds.bags.convert import Converter
-from mp4ds.bags.latched import Kept, has_late, kept_depth
+from mp4ds.bags.latched import LatchedMessages, has_late, latched_depth
 from mp4ds.dataset.channels import Ahead
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import DecodedColumns, everything
@@ -601,9 +601,9 @@ class _Part:
     def latched(self, time_ns: int) -> Iterator[Due]:
         """The latched messages of each channel at a time."""
         channels = [item for item in self._dataset.channels if item.topic in self._topics]
-        kept = {item.id: Kept[Message](item) for item in filter(has_late, channels)}
+        kept = {item.id: LatchedMessages[Message](item) for item in filter(has_late, channels)}
         topics = {item.topic for item in channels if item.id in kept}
-        most = max((kept_depth(item) for item in channels if item.id in kept), default=1)
+        most = max((latched_depth(item) for item in channels if item.id in kept), default=1)
         for message in self._dataset.before(time_ns, topics, most) if topics else ():
             if message.channel.id in kept:
                 kept[message.channel.id].add(message.data, message)

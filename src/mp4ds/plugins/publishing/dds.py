@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from mp4ds.bags.types import World, make_store, ros2_world, types_of
+from mp4ds.bags.types import RosVersion, make_store, ros2_version, types_of
 from mp4ds.errors import ConversionError, OptionError, PublishError
 from mp4ds.plugins.publishing.dds_domain import (
     DdsListener,
@@ -205,7 +205,7 @@ def serve(
     node: str,
     services: Sequence[Service],
     controls: Any,
-    world: World,
+    version: RosVersion,
 ) -> list[Any]:
     """Offer services.
 
@@ -215,13 +215,15 @@ def serve(
         node: Name of the node that they belong to.
         services: The services.
         controls: The player or recorder that they control.
-        world: The types of ROS 2.
+        version: The types of ROS 2.
 
     Returns:
         Objects to keep while the services are offered.
     """
     return [
-        _Server(participant, listener, f"/{node}/{service.name}", service, controls, number, world)
+        _Server(
+            participant, listener, f"/{node}/{service.name}", service, controls, number, version
+        )
         for number, service in enumerate(services, 1)
     ]
 
@@ -235,7 +237,7 @@ class _Server:
         service: Service,
         controls: Any,
         number: int,
-        world: World,
+        version: RosVersion,
     ) -> None:
         from cyclonedds.pub import DataWriter
         from cyclonedds.sub import DataReader
@@ -243,8 +245,10 @@ class _Server:
 
         self._service = service
         self._controls = controls
-        request, request_hash = message_class(f"{service.kind}_Request", service.request, world)
-        self._reply, reply_hash = message_class(f"{service.kind}_Response", service.response, world)
+        request, request_hash = message_class(f"{service.kind}_Request", service.request, version)
+        self._reply, reply_hash = message_class(
+            f"{service.kind}_Response", service.response, version
+        )
         # lets clients match the reader and the writer of a service
         own = f"serviceid={_identity(participant, number)};"
         self._reader = DataReader(
@@ -283,32 +287,32 @@ class _Server:
         return {_client_of(writer.get_matched_subscription_data(reader)) for reader in readers}
 
 
-def message_class(kind: str, definition: str, world: World) -> tuple[Any, str]:
+def message_class(kind: str, definition: str, version: RosVersion) -> tuple[Any, str]:
     """The class of a request or response with the service header, and its type hash.
 
     Args:
         kind: Its type, such as ``Seek_Request``.
         definition: Its fields, as in a message definition.
-        world: The types of ROS 2.
+        version: The types of ROS 2.
     """
     name = f"rosbag2_interfaces/srv/{kind}"
-    types, type_hash = service_types(name, definition, world)
+    types, type_hash = service_types(name, definition, version)
     return make_struct(types, name, has_fields=True), type_hash
 
 
-def service_types(name: str, definition: str, world: World) -> tuple[Types, str]:
+def service_types(name: str, definition: str, version: RosVersion) -> tuple[Types, str]:
     """The types of a request or response with what goes before it, and its type hash.
 
     Args:
         name: Its type, such as ``rosbag2_interfaces/srv/Seek_Request``.
         definition: Its fields, as of a message.
-        world: The types of ROS 2.
+        version: The types of ROS 2.
     """
     short = name.replace("/srv/", "/msg/")  # as definitions of messages are parsed
-    types = types_of(Schema(short, "ros2msg", definition.encode()), world)
+    types = types_of(Schema(short, "ros2msg", definition.encode()), version)
     types[name] = types.pop(short)
-    type_hash = make_store(types, world).hash_rihs01(name)
-    whole = types_of(Schema(short, "ros2msg", (_HEADER + definition).encode()), world)
+    type_hash = make_store(types, version).hash_rihs01(name)
+    whole = types_of(Schema(short, "ros2msg", (_HEADER + definition).encode()), version)
     whole[name] = whole.pop(short)
     return whole, type_hash
 
@@ -370,7 +374,7 @@ class DdsPublisher:
         self._node = names.of_node(node)
         self._clock_topic = names.renamed(CLOCK)
         self._parting_s = parting_s
-        self._types: World = ros2_world(_DISTRIBUTION)
+        self._types: RosVersion = ros2_version(_DISTRIBUTION)
         self._participant = open_participant(self._domain)
         self._listener = DdsListener(self._participant)
         self._writers: Writers[DdsWriter] = Writers(overrides)

@@ -12,12 +12,12 @@ from operator import getitem
 from typing import Any
 
 from mp4ds.bags.types import (
-    World,
+    RosVersion,
     by_library,
     field_shape,
     incomprehensible,
     make_store,
-    ros2_world,
+    ros2_version,
     types_of,
 )
 from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
@@ -177,7 +177,7 @@ def opaque_type(name: str) -> Any:
     return as_is(make_idl_struct(short, name, {}, dataclassify=False))
 
 
-def message_type(channel: Channel, world: World) -> DdsType:
+def message_type(channel: Channel, version: RosVersion) -> DdsType:
     """How messages of a channel are written.
 
     Raises:
@@ -189,8 +189,8 @@ def message_type(channel: Channel, world: World) -> DdsType:
         raise ConversionError(channel.topic, problem, "Leave the topic out.")
     type_hash = _metadata_hash(channel)
     try:
-        types = _known_types(channel, world)
-        type_hash = type_hash or _computed_hash(types, name, world)
+        types = _known_types(channel, version)
+        type_hash = type_hash or _computed_hash(types, name, version)
         real = as_is(make_struct(types, name))
     except Refused:
         return DdsType(opaque_type(dds_name(name)), type_hash, False, False)
@@ -203,8 +203,10 @@ def recorded_hash(channel: Channel) -> str:
     if recorded := _metadata_hash(channel):
         return recorded
     try:
-        world = ros2_world("jazzy")
-        return _computed_hash(_known_types(channel, world), _full_name(channel.type_name), world)
+        version = ros2_version("jazzy")
+        return _computed_hash(
+            _known_types(channel, version), _full_name(channel.type_name), version
+        )
     except (Refused, KeyError):
         return ""
 
@@ -214,8 +216,8 @@ def _metadata_hash(channel: Channel) -> str:
     return recorded if _HASH.fullmatch(recorded) else ""
 
 
-def _computed_hash(types: Types, name: str, world: World) -> str:
-    hashed = make_store(types, world).hash_rihs01
+def _computed_hash(types: Types, name: str, version: RosVersion) -> str:
+    hashed = make_store(types, version).hash_rihs01
     return by_library(incomprehensible(name), hashed, name)
 
 
@@ -225,17 +227,17 @@ def _full_name(name: str) -> str:
     return f"{rooms[0]}/msg/{rooms[1]}" if len(rooms) == 2 else name
 
 
-def _known_types(channel: Channel, world: World) -> Types:
+def _known_types(channel: Channel, version: RosVersion) -> Types:
     if channel.schema is None:
         raise Refused(_NO_DDS_TYPE)
     return {
-        name: (constants, fields or [_filler(world)])
-        for name, (constants, fields) in types_of(channel.schema, world).items()
+        name: (constants, fields or [_filler(version)])
+        for name, (constants, fields) in types_of(channel.schema, version).items()
     }
 
 
-def _filler(world: World) -> Any:
-    return world.standard["std_msgs/msg/Empty"][1][0]
+def _filler(version: RosVersion) -> Any:
+    return version.standard["std_msgs/msg/Empty"][1][0]
 
 
 def make_struct(types: Types, name: str, *, has_fields: bool = False) -> Any:

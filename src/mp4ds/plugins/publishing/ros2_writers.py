@@ -11,7 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import yaml
 
-from mp4ds.bags.latched import PLAYER_DEPTH, kept_depth
+from mp4ds.bags.latched import PLAYER_DEPTH, latched_depth
 from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.plugins.publishing.publisher import Controls
@@ -256,7 +256,7 @@ def offered_qos(channel: Channel, overrides: Mapping[str, Qos]) -> Qos:
     profiles = recorded_qos(channel.metadata.get(QOS_KEY, ""))
     if len({_as_subscribers_see(profile) for profile in profiles}) != 1:
         return Qos()
-    depth = kept_depth(channel) if profiles[0].is_latched else PLAYER_DEPTH
+    depth = latched_depth(channel) if profiles[0].is_latched else PLAYER_DEPTH
     return replace(profiles[0], history="keep_last", depth=depth)
 
 

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from mp4ds.bags.protocols import Format
-from mp4ds.bags.types import ros2_world
+from mp4ds.bags.types import ros2_version
 from mp4ds.errors import OptionError, Refused
 from mp4ds.plugins.publishing.dds import dds_qos, serve
 from mp4ds.plugins.publishing.dds_domain import (
@@ -118,14 +118,14 @@ class DdsSource:
 
     def serve(self, controls: RecorderControls) -> None:
         """See `Source.serve`."""
-        world = ros2_world(DISTRIBUTION)
+        version = ros2_version(DISTRIBUTION)
         self._services = serve(
             self._participant,
             self._listener,
             self._options.names.of_node(self._options.node),
             RECORDER_SERVICES,
             controls,
-            world,
+            version,
         )
 
     def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
@@ -206,12 +206,12 @@ class DdsSource:
         """Ask the nodes in a publisher's process for the definition of its type."""
         from cyclonedds.core import DDSException
 
-        world = ros2_world(DISTRIBUTION)
+        version = ros2_version(DISTRIBUTION)
         for node in self._nodes[endpoint.participant_key]:
             if not topic.definition and not self._ended.is_set():
                 with suppress(DDSException, Refused):  # the same as no answer
                     topic.definition = ask_for_definition(
-                        self._participant, node, type_name, type_hash, world
+                        self._participant, node, type_name, type_hash, version
                     )
 
     def _subscribe(self, name: str, topic: _Topic, take: Callable[[Message], None]) -> None:

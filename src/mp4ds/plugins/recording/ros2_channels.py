@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from mp4ds.bags.rosbag2_metadata import dump_yaml
-from mp4ds.bags.types import World, by_library, make_store, ros2_world, types_of
+from mp4ds.bags.types import RosVersion, by_library, make_store, ros2_version, types_of
 from mp4ds.errors import Refused
 from mp4ds.plugins.publishing.names import SERVICE_EVENTS
 from mp4ds.plugins.publishing.ros2_writers import (
@@ -141,8 +141,8 @@ RECORDER_SERVICES = (
 
 
 @cache
-def _world() -> World:
-    return ros2_world(DISTRIBUTION)
+def _version() -> RosVersion:
+    return ros2_version(DISTRIBUTION)
 
 
 def standard_definition(type_name: str, type_hash: str) -> str:
@@ -152,7 +152,7 @@ def standard_definition(type_name: str, type_hash: str) -> str:
         type_name: Such as ``sensor_msgs/msg/Image``.
         type_hash: As announced by the publisher; empty if it announced none.
     """
-    if type_name not in _world().standard:
+    if type_name not in _version().standard:
         return ""
     return _proven(Schema(type_name, _ENCODING, b""), type_hash)
 
@@ -160,7 +160,7 @@ def standard_definition(type_name: str, type_hash: str) -> str:
 def _proven(schema: Schema, type_hash: str) -> str:
     """A definition with those of its parts; empty if its hash is not the one announced."""
     try:
-        store: Any = make_store(types_of(schema, _world()), _world())
+        store: Any = make_store(types_of(schema, _version()), _version())
         if type_hash and by_library("", store.hash_rihs01, schema.name) != type_hash:
             return ""
         text: str = by_library("", store.generate_msgdef, schema.name)[0]

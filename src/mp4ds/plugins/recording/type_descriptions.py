@@ -6,7 +6,7 @@ import secrets
 import time
 from typing import Any
 
-from mp4ds.bags.types import World, by_library, make_store
+from mp4ds.bags.types import RosVersion, by_library, make_store
 from mp4ds.plugins.publishing.dds import dds_qos, service_types
 from mp4ds.plugins.publishing.dds_domain import as_is, make_struct
 from mp4ds.plugins.publishing.ros2_writers import Qos
@@ -28,7 +28,7 @@ _WAIT_S = 0.01
 
 
 def ask_for_definition(
-    participant: Any, node: str, type_name: str, type_hash: str, world: World
+    participant: Any, node: str, type_name: str, type_hash: str, version: RosVersion
 ) -> str:
     """The definition of a type, from the `get_type_description` service of a node.
 
@@ -37,7 +37,7 @@ def ask_for_definition(
         node: Full name of the node without the leading slash, such as ``robot/camera``.
         type_name: Such as ``sensor_msgs/msg/Image``.
         type_hash: As announced by the publisher, which the definition must have.
-        world: The types of ROS 2.
+        version: The types of ROS 2.
 
     Returns:
         The text, with the definitions of its parts; empty if no reply comes in time, or the one
@@ -48,8 +48,8 @@ def ask_for_definition(
     from cyclonedds.topic import Topic
 
     guid = secrets.randbits(63)
-    types, _ = service_types(f"{_SERVICE}_Request", _REQUEST, world)
-    replies, _ = service_types(f"{_SERVICE}_Response", _RESPONSE, world)
+    types, _ = service_types(f"{_SERVICE}_Request", _REQUEST, version)
+    replies, _ = service_types(f"{_SERVICE}_Response", _RESPONSE, version)
     kind = as_is(make_struct(types, f"{_SERVICE}_Request"))
     reply_kind = as_is(make_struct(replies, f"{_SERVICE}_Response"))
     name = f"{node}/get_type_description"
@@ -62,7 +62,7 @@ def ask_for_definition(
         if time.monotonic() > end:
             return ""
         time.sleep(_WAIT_S)
-    store: Any = make_store(types, world)
+    store: Any = make_store(types, version)
     request = store.types[f"{_SERVICE}_Request"](
         client_guid=guid,
         sequence_number=1,
@@ -71,7 +71,7 @@ def ask_for_definition(
         include_type_sources=True,
     )
     writer.write(kind(bytes(store.serialize_cdr(request, f"{_SERVICE}_Request"))))
-    parse: Any = make_store(replies, world).deserialize_cdr
+    parse: Any = make_store(replies, version).deserialize_cdr
     while time.monotonic() < end:
         for sample in reader.take(1):
             if sample.sample_info.valid_data:
