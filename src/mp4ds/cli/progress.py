@@ -363,7 +363,7 @@ def pack_progress(as_json: bool, *, whole: bool = True) -> Iterator[Take]:
 
     Args:
         as_json: By events for programs.
-        whole: Whether this run is to do all of the job; no time left is told of a share of it.
+        whole: Whether this run is to do all of the job; of a share, the time left is not shown.
 
     Yields:
         What takes the progress, several times a second.
@@ -486,7 +486,7 @@ def told_by(teller: ProgressWriter, *, tick_seconds: float) -> Iterator[Take]:
 # ---------------------------------------------------------------- other commands
 
 _LINE_PAUSE = 10.0  # seconds
-_SURE_SECONDS = 2.0  # from when on the time left is told
+_SURE_SECONDS = 2.0  # from when on the time left is shown
 
 
 class Telling(Protocol):
@@ -500,7 +500,7 @@ class Telling(Protocol):
 def progress_of(doing: str, as_json: bool) -> Iterator[Telling | None]:
     """Tell of the progress of a command while the context lasts.
 
-    On a terminal a bar with percent and time left, once a share is told; else a line every 10 s.
+    On a terminal a bar with percent and time left, once a share is known; else a line every 10 s.
 
     Args:
         doing: Such as ``validating``.

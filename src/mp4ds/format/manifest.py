@@ -188,7 +188,7 @@ class About(Model):
 
     @property
     def lines(self) -> list[str]:
-        """What is told, a line for each key."""
+        """A line for each key that is given."""
         authors = (
             ", ".join(filter(None, (author.name, author.affiliation, author.orcid)))
             for author in self.authors

@@ -55,7 +55,7 @@ from mp4ds.video.references import (
 SCORE_STEPS = {"vmaf": 100, "psnr": 100, "ssim": 10_000}
 """Metric -> how many steps of the column of scores are 1."""
 
-_DIGITS = 4  # after the point of what is told of all scores
+_DIGITS = 4  # after the decimal point of figures for all frames
 _ROUNDED = 2 * 10.0**-_DIGITS
 
 Score = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
@@ -125,7 +125,7 @@ class Quality(Model):
 
     @classmethod
     def joined(cls, parts: Sequence[tuple[Quality, int]]) -> Quality:
-        """What holds of consecutive videos together.
+        """The scores of consecutive videos together.
 
         Args:
             parts: Of each what holds of it, and its frames; at least one, all of one target.
@@ -144,7 +144,7 @@ class Quality(Model):
         )
 
     def of(self, numbers: NDArray[np.int64], frames: int) -> Quality:
-        """What holds of some frames; what is told of windows stays that of the whole.
+        """The scores of some frames; figures of windows stay those of the whole video.
 
         Args:
             numbers: Of the frames, at least one.
@@ -166,7 +166,7 @@ class Quality(Model):
         """The score of each frame, shape (frames,).
 
         Raises:
-            ValueError: There are not that many, or they do not come to what is told of them.
+            ValueError: There are not that many, or they do not add up to the stated figures.
         """
         steps = self.scores.decode(frames)
         for name, due in zip(("mean", "p5", "min"), _told(steps, self.metric), strict=True):

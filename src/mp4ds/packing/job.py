@@ -205,7 +205,7 @@ class Job:
 
     @property
     def about(self) -> About | None:
-        """What is told of the recording."""
+        """The description of the recording, if there is one."""
         told = self.options["about"]
         return None if told is None else About.model_validate(told)
 

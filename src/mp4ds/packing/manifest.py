@@ -251,7 +251,7 @@ class Origin:
             files: The files of recordings, and of datasets that are repacked, each of which
                 begins with its manifest.
             digests: Name, size in bytes and SHA-256 of each; None for those read in part.
-            about: What is told of the recording; None for what the datasets tell, if it is one
+            about: Description of the recording; None for that of the datasets, if it is one
                 thing.
             span: What was packed of them.
 
