@@ -354,15 +354,43 @@ def test_the_recipes_of_fast_forms_are_made_again(form: str) -> None:
 def test_lossy_videos_for_a_purpose(tmp_path: Path) -> None:
     paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("rgb8", frames=3))
     found = {}
-    for purpose in (None, "archive", "training"):
+    for purpose in (None, "archive", "training", "speed"):
         mp4ds.pack(paths, tmp_path / f"{purpose}", PackOptions(quality="visual", purpose=purpose))
         with mp4ds.open(tmp_path / f"{purpose}") as dataset:
             options = dataset.streams[0].sidecar.video.options
             found[purpose] = options["preset"], options["g"]
-    assert found == {None: ("7", "30"), "archive": ("4", "120"), "training": ("4", "15")}
+    assert found == {
+        None: ("7", "30"),
+        "archive": ("4", "120"),
+        "training": ("4", "15"),
+        "speed": ("11", "30"),
+    }
 
 
-@pytest.mark.parametrize("text", ["", "speed", "training=", "training=x", "archive=3"])
+@pytest.mark.parametrize(
+    ("encoding", "codec"), [("bayer_rggb8", "h264"), ("rgb8", "h264"), ("16UC1", "ffv1")]
+)
+def test_packing_at_speed(
+    encoding: str, codec: str, tmp_path: Path, compare: Callable[..., list[str]]
+) -> None:
+    """Nothing is tried: parts of any length and rate get the same videos, which are exact."""
+    found = []
+    for number, made in enumerate((source_scene(encoding, frames=9), source_scene(encoding))):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        paths = SOURCES["mcap-ros2-none"](folder, made)
+        mp4ds.pack(paths, folder / "dataset", PackOptions(purpose="speed", gop=5))
+        assert mp4ds.validate(folder / "dataset", deep=True) == []
+        assert compare(paths, unpacked(folder, "mcap")) == []
+        with mp4ds.open(folder / "dataset") as dataset:
+            (video,) = (stream.sidecar.video for stream in dataset.streams)
+        found.append(video.model_dump(exclude={"size", "sha256", "index"}))
+    assert found[0] == found[1]
+    assert (found[0]["codec"], found[0]["options"]["g"]) == (codec, "5")
+    assert codec == "ffv1" or found[0]["options"]["preset"] == "ultrafast"
+
+
+@pytest.mark.parametrize("text", ["", "fast", "training=", "training=x", "archive=3"])
 def test_a_purpose_that_is_none(text: str, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="`purpose`"):
         mp4ds.pack(tmp_path / "no.bag", tmp_path / "dataset", PackOptions(purpose=text))

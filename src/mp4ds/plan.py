@@ -114,7 +114,7 @@ def parse_quality(text: str) -> QualitySetting:
     )
 
 
-TRAINING, ARCHIVE = "training", "archive"
+TRAINING, ARCHIVE, SPEED = "training", "archive", "speed"
 _LARGER = 15  # percent that faster reading may cost
 
 
@@ -123,7 +123,7 @@ class Purpose:
     """What a dataset is for.
 
     Attributes:
-        name: ``archive`` or ``training``.
+        name: ``archive``, ``training`` or ``speed``.
         larger: For training, share by which lossless videos may be larger than the smallest.
     """
 
@@ -135,23 +135,28 @@ class Purpose:
         """Whether fast reading matters."""
         return self.name == TRAINING
 
+    @property
+    def is_speed(self) -> bool:
+        """Whether fast packing matters; what is packed in parts then fits together untried."""
+        return self.name == SPEED
+
 
 def parse_purpose(text: str | None) -> Purpose | None:
-    """Parse ``archive``, ``training`` or ``training=PERCENT``; None is none.
+    """Parse ``archive``, ``training``, ``training=PERCENT`` or ``speed``; None is none.
 
     Raises:
         OptionError: Anything else.
     """
     if text is None:
         return None
-    match = re.fullmatch(rf"{ARCHIVE}|{TRAINING}(?:=([0-9]{{1,4}}))?", text)
+    match = re.fullmatch(rf"{ARCHIVE}|{SPEED}|{TRAINING}(?:=([0-9]{{1,4}}))?", text)
     if not match:
         raise OptionError(
-            f"`purpose` {text!r} is not known. Use archive, training, or training=PERCENT: how "
-            f"much larger lossless videos may be, {_LARGER} by default."
+            f"`purpose` {text!r} is not known. Use archive, speed, training, or training=PERCENT: "
+            f"how much larger lossless videos may be, {_LARGER} by default."
         )
-    if text == ARCHIVE:
-        return Purpose(ARCHIVE)
+    if text in (ARCHIVE, SPEED):
+        return Purpose(text)
     return Purpose(TRAINING, int(match[1] or _LARGER) / 100)
 
 

@@ -90,8 +90,8 @@ class PackOptions(SliceOptions):
         metavar="IMAGE=INFO",
     )
     purpose: str | None = option(
-        "archive: smallest files. training: fastest random access, with lossless videos up to 15 "
-        "% larger; training=N: up to N %.",
+        "archive: smallest files. speed: fastest packing, as while recording. training: fastest "
+        "random access, with lossless videos up to 15 % larger; training=N: up to N %.",
         None,
         "--for",
         metavar="PURPOSE",
@@ -145,7 +145,7 @@ class PackOptions(SliceOptions):
         from mp4ds.video.codecs import ARCHIVE_GOP, LOSSLESS_GOP, LOSSY_GOP, LOSSY_TRAINING_GOP
 
         purpose = parse_purpose(self.purpose)
-        if purpose is None:
+        if purpose is None or purpose.is_speed:
             return self.gop or (LOSSLESS_GOP if self.setting.lossless else LOSSY_GOP)
         if self.gop is not None:
             raise OptionError(

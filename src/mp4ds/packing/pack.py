@@ -59,9 +59,9 @@ from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.planning import Resources, plan_job
 from mp4ds.packing.workplace import Workplace
-from mp4ds.plan import LOSSLESS, parse_quality
+from mp4ds.plan import LOSSLESS, parse_purpose, parse_quality
 from mp4ds.registry import plugin
-from mp4ds.video.codecs import check_codec
+from mp4ds.video.codecs import DEFAULT_LOSSY, check_codec, fastest_preset
 
 if TYPE_CHECKING:
     from mp4ds.packing.engine import Engine
@@ -472,12 +472,11 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
             "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
             "any lossless video of its pixels."
         )
-    codec = check_codec(
-        options.codec,
-        options.preset,
-        lossless=quality.lossless,
-        crf=quality.crf,
-    )
+    purpose = parse_purpose(options.purpose)
+    preset = options.preset
+    if purpose is not None and purpose.is_speed and quality.crf is not None:
+        preset = preset or fastest_preset(options.codec or DEFAULT_LOSSY)
+    codec = check_codec(options.codec, preset, lossless=quality.lossless, crf=quality.crf)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         from mp4ds.video.libvmaf import find_ffmpeg
 

@@ -146,7 +146,8 @@ class CameraRouter:
     def _state_of(self, channel: Channel) -> _CameraChannel:
         if channel.identity not in self._channels:
             settings = self._settings
-            looker = Looker(channel, transcode=settings.transcode, is_live=settings.is_live)
+            is_live = self._journal is not None
+            looker = Looker(channel, transcode=settings.transcode, is_live=is_live)
             state = self._channels[channel.identity] = _CameraChannel(looker)
             decisions = self._survey.decisions.get(channel.id) if self._survey else None
             if decisions is not None:
@@ -185,7 +186,8 @@ class CameraRouter:
         return _Route(plans, refusal="" if plans else reason)
 
     def _rate(self, channel: Channel) -> float | None:
-        return rate_of(self._reader, channel)
+        # measured in each part of a recording by itself, it would make their videos differ
+        return None if self._settings.is_fast else rate_of(self._reader, channel)
 
     def _write(self, state: _CameraChannel, item: _Item, workers: Workers) -> None:
         route = state.routes[item.seen.key]

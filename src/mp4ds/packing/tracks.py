@@ -15,7 +15,16 @@ from mp4ds.messages.encodings import ENCODINGS, Parameters
 from mp4ds.messages.layouts import Layout, bind, layout_for
 from mp4ds.packing.look import CameraMessage, StreamKey
 from mp4ds.plan import MAX_GOP, Purpose, QualitySetting, QualityTarget, visual_setting
-from mp4ds.video.codecs import AV1, PURPOSE_PRESET, Recipe, lossless_codecs, recipe_for, remade
+from mp4ds.video.codecs import (
+    AV1,
+    DEFAULT_LOSSY,
+    PURPOSE_PRESET,
+    Recipe,
+    fastest_preset,
+    lossless_codecs,
+    recipe_for,
+    remade,
+)
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketWriter
 from mp4ds.video.trial import choose
@@ -33,8 +42,6 @@ class StreamSettings:
         threads: Threads of each encoder.
         transcode: Whether JPEG topics are re-encoded.
         purpose: What the dataset is for; None for nothing in particular.
-        is_live: Whether it is encoded while it is recorded: with the fastest settings, untried,
-            into files of which a power cut leaves all but the end.
     """
 
     quality: QualitySetting
@@ -44,7 +51,11 @@ class StreamSettings:
     threads: int
     transcode: bool = False
     purpose: Purpose | None = None
-    is_live: bool = False
+
+    @property
+    def is_fast(self) -> bool:
+        """Whether to encode in the least time, with nothing tried."""
+        return self.purpose is not None and self.purpose.is_speed
 
 
 OnPacket = Callable[[str, bytes], None]
@@ -381,7 +392,7 @@ _NEGLIGIBLE = 1 / 50
 
 def needs_trial(seen: CameraMessage, settings: StreamSettings) -> bool:
     """Whether `plan_tracks` benefits from having several messages."""
-    if seen.pixels is None or settings.is_live:
+    if seen.pixels is None or settings.is_fast:
         return False
     if settings.quality.target is not None:
         return True
@@ -425,8 +436,8 @@ def plan_tracks(
         if target is None:
             return [plan]
         return _target_plans(plan, target, samples, runs, settings, rate)
-    if settings.is_live:
-        return _live_plans(samples[0], settings)
+    if settings.is_fast:
+        return _fast_plans(samples[0], settings)
     return _lossless_plans(samples, settings)
 
 
@@ -439,9 +450,11 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
     quality = settings.quality
     layout = layout_for(ENCODINGS[key.encoding], lossless=False)
     crf, preset = quality.crf, settings.preset
+    if settings.is_fast and quality.target is None:
+        preset = preset or fastest_preset(settings.codec or DEFAULT_LOSSY)
     if crf is None:  # the search for a score starts there
         crf, table_preset = visual_setting(rate)
-        if settings.codec in (None, *AV1) and not settings.is_live:
+        if settings.codec in (None, *AV1):
             usual = PURPOSE_PRESET if settings.purpose else str(table_preset)
             preset = preset or (_SCORE_PRESET if quality.target else usual)
     recipe = recipe_for(
@@ -451,7 +464,6 @@ def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) ->
         crf=crf,
         preset=preset,
         varied=quality.target is not None,
-        live=settings.is_live,
     )
     return PicturePlan(layout, recipe, str(quality), exact=False)
 
@@ -523,14 +535,15 @@ def _lossless_plans(
     return [plan, PicturePlan(general, recipe, "lossless", exact=True)]
 
 
-def _live_plans(seen: CameraMessage, settings: StreamSettings) -> list[TrackPlan]:
+def _fast_plans(seen: CameraMessage, settings: StreamSettings) -> list[TrackPlan]:
     """Without loss, by what encodes in the least time (spec/notes.md)."""
     layout = layout_for(ENCODINGS[seen.key.encoding], lossless=True)
     able = lossless_codecs(layout.pixel_format)
     codec, preset = settings.codec, settings.preset
-    if codec not in able:  # of those that are, H.264 has the fastest presets
+    if codec is None or codec not in able:  # of those that are, H.264 has the fastest presets
         codec, preset = ("h264" if "h264" in able else able[0]), None
-    recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset, live=True)
+    preset = preset or fastest_preset(codec)
+    recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset)
     return [PicturePlan(layout, recipe, "lossless", exact=True)]
 
 

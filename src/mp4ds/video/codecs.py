@@ -195,16 +195,6 @@ _LOSSLESS: dict[str, dict[str, _Coding]] = {
     },
     **{planar: {"h264": _x264_lossless(planar), "ffv1": _ffv1_8bit(planar)} for planar in _YUV},
 }
-# encodes 640x480 at more than 100 MB/s, five times as fast as what pack uses and 15 % larger
-_LIVE_PRESETS = MappingProxyType(
-    {
-        **dict.fromkeys(("libx264", "libx264rgb", "libx265"), "ultrafast"),
-        "libsvtav1": "11",
-    }
-)
-_LOW_DELAY = (
-    "hierarchical-levels=2:lookahead=0"  # 12 frames; without any, videos were three times as large
-)
 _X26X_PRESETS = (
     *("ultrafast", "superfast", "veryfast", "faster", "fast"),
     *("medium", "slow", "slower", "veryslow"),
@@ -249,7 +239,9 @@ _LOSSY: Mapping[str, _Lossy] = {
         _X26X_PRESETS, 51,
     ),
 }  # fmt: skip
-_DEFAULT_LOSSY = "av1"
+DEFAULT_LOSSY = "av1"
+"""The lossy codec if none is asked for."""
+
 _PRESETS: Mapping[str, Sequence[str]] = {
     "ffv1": (),
     **{name: found.presets for name, found in _LOSSY.items()},
@@ -278,6 +270,12 @@ def codecs_to_try(pixel_format: str) -> Sequence[str]:
 def codec_name(name: str) -> str:
     """A codec as the registry names it: H.265 is also called HEVC."""
     return f"h265{name[4:]}" if name.startswith("hevc") else name
+
+
+def fastest_preset(codec: str) -> str | None:
+    """The preset of an encoder that takes the least time; None for one without presets."""
+    name = codec_name(codec)
+    return str(_AV1_FAST) if name in AV1 else next(iter(_PRESETS.get(name, ())), None)
 
 
 def check_codec(
@@ -309,7 +307,7 @@ def check_codec(
             raise OptionError(f"`codec` {codec!r} is not one that mp4ds can encode. Use {known}.")
         kind = "lossless" if lossless else "lossy"
         raise OptionError(f"`codec` {codec!r} does not support {kind} packing. Use {known}.")
-    name = codec or (lossless_codecs("gray")[0] if lossless else _DEFAULT_LOSSY)
+    name = codec or (lossless_codecs("gray")[0] if lossless else DEFAULT_LOSSY)
     if preset is not None and preset not in _PRESETS[name]:
         known = ", ".join(_PRESETS[name])
         raise OptionError(
@@ -342,7 +340,6 @@ def recipe_for(
     preset: str | None = None,
     varied: bool = False,
     fast: bool = False,
-    live: bool = False,
 ) -> Recipe:
     """The recipe for pictures of a pixel format.
 
@@ -355,7 +352,6 @@ def recipe_for(
         preset: The encoder's preset, or None for the default; encoders without ignore it.
         varied: Whether videos with several crf will be joined into one.
         fast: For a lossless recipe, the variant that decodes faster and is larger.
-        live: By default, the fastest preset; few frames wait for later ones.
 
     Raises:
         OptionError: The codec is unknown or cannot do it; names those that can.
@@ -371,7 +367,7 @@ def recipe_for(
             )
         options = dict(coding.options)
     else:
-        name = codec or _DEFAULT_LOSSY
+        name = codec or DEFAULT_LOSSY
         coding, options = _lossy(name, crf)
         if pixel_format in _YUV:
             options = _sited_left(options)
@@ -379,13 +375,9 @@ def recipe_for(
             parameters = options.get("x264-params")
             options["x264-params"] = ":".join(filter(None, (parameters, _SAME_HEADERS)))
     if coding.default_preset:
-        usual = _LIVE_PRESETS.get(coding.encoder) if live else None
-        options["preset"] = preset or usual or coding.default_preset
-    if coding.tuning and preset is None and not live:
+        options["preset"] = preset or coding.default_preset
+    if coding.tuning and preset is None:
         options["x264-params"] = coding.tuning
-    if live and coding.encoder == "libsvtav1":
-        given = options.get("svtav1-params")
-        options["svtav1-params"] = f"{given}:{_LOW_DELAY}" if given else _LOW_DELAY
     if fast:
         if coding.fast is None or not lossless:
             raise OptionError(f"codec {name} has no faster form for {pixel_format} pictures")

@@ -33,7 +33,7 @@ from mp4ds.packing.options import PackSummary
 from mp4ds.packing.packer import PartSettings
 from mp4ds.packing.planning import available_cores
 from mp4ds.packing.tracks import StreamSettings
-from mp4ds.plan import LOSSLESS, MAX_GOP, Selection, parse_quality
+from mp4ds.plan import LOSSLESS, MAX_GOP, SPEED, Purpose, Selection, parse_quality
 from mp4ds.plugins.playing.timeline import quick_switches
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import sourced
@@ -319,7 +319,7 @@ def _settings(options: RecordOptions) -> StreamSettings:
         preset=options.preset,
         gop=options.gop or (LOSSLESS_GOP if quality.lossless else LOSSY_GOP),
         threads=1 if quality.lossless else available_cores(),
-        is_live=True,
+        purpose=Purpose(SPEED),
     )
 
 
