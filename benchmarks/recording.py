@@ -9,7 +9,7 @@ node that publishes, and ROS's own recorder. Sections:
   there, with the bytes, stamps and connection headers of ``rosbag record``; what both cost.
 - overload: four cameras of 2448x2048 at 15 Hz, which no two cores can encode, from a publisher
   that waits for its subscribers: what of that which ``rosbag record`` kept is not there, and how
-  much memory it took.
+  much memory it took. What waits to be packed at the end is packed then.
 - kills: N times ``kill -9`` at a random moment: seconds between the last message that is there and
   the end, and whether all before are those that ``rosbag record`` has.
 """
@@ -51,7 +51,7 @@ NS = 10**9
 
 @dataclass
 class Cost:
-    """What a process has cost so far.
+    """What a process and its children have cost so far.
 
     Attributes:
         cpu: Seconds, user and system.
@@ -65,13 +65,14 @@ class Cost:
 
     @classmethod
     def of(cls, pid: int) -> Cost:
-        """Of a process that runs."""
+        """Of a process that runs, and those that it has started."""
         process = psutil.Process(pid)
         status = Path("/proc", str(pid), "status").read_text()
+        inner = [cls.of(child.pid) for child in process.children()]
         return cls(
-            sum(process.cpu_times()[:2]),
-            process.io_counters().write_bytes,
-            1024 * int(status.partition("VmHWM:")[2].split()[0]),
+            sum(process.cpu_times()[:2]) + sum(one.cpu for one in inner),
+            process.io_counters().write_bytes + sum(one.written for one in inner),
+            1024 * int(status.partition("VmHWM:")[2].split()[0]) + sum(one.peak for one in inner),
         )
 
 
@@ -152,8 +153,15 @@ def beside(core: Core, folder: Path, seconds: float, *robot: Any) -> None:
     source.wait()
     elapsed = time.monotonic() - begun
     after = {name: Cost.of(one.pid) for name, one in recorders.items()}
-    codes = {name: end(one) for name, one in recorders.items()}
     print(f"- published for {elapsed:.1f} s")
+    for path in sorted(folder.glob("live.recording/*")):
+        size = path.stat().st_size if path.is_file() else 0
+        print(f"- on disk at the end: {path.name}, {size / 1e6:.0f} MB")
+    codes = {}
+    for name, one in recorders.items():
+        begun = time.monotonic()
+        codes[name] = end(one)
+        print(f"- {name} took {time.monotonic() - begun:.1f} s to finish")
     for line in (core.folder / "python.log").read_text().splitlines():
         if "dropped" in line:
             print(f"- {line}")
@@ -214,7 +222,7 @@ def kills(core: Core, folder: Path, count: int) -> None:
         dataset.parent.mkdir()
         recorder = core.start(*ours(dataset))
         unfinished = dataset.with_name(f"{dataset.name}.recording")
-        wait_until(lambda path=unfinished: any(path.glob("cam*.mp4")) if path.exists() else False)
+        wait_until(lambda path=unfinished: _size(path) > 1_000_000)
         time.sleep(chance.uniform(1.0, 6.0))
         killed = time.time_ns()
         recorder.kill()
@@ -242,6 +250,10 @@ def kills(core: Core, folder: Path, count: int) -> None:
     ]
     print_table(("topic", "kills", "most seconds lost", "median"), rows)
     print(f"\ntopics of which something before the last message differs: {wrong}")
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.glob("*"))
 
 
 SECTIONS = ("steady", "overload", "kills")

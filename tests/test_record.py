@@ -1,4 +1,4 @@
-"""`mp4ds record` of recordings that are played: what comes, what is late, what a cut leaves."""
+"""`mp4ds record` of recordings that are played: what comes, how it is cut, what a kill leaves."""
 
 from __future__ import annotations
 
@@ -17,22 +17,24 @@ from typing import Any
 import pytest
 
 import mp4ds
-from commands import call
+from commands import call, tree
 from mp4ds.bags.formats import open_sources
+from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError
-from mp4ds.files.sources import JOURNAL_NAME
-from mp4ds.packing import live
+from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.packer import TOO_LATE
-from mp4ds.packing.recovery import CUT_OFF
 from mp4ds.plugins.publishing.names import NodeNames
+from mp4ds.plugins.recording import spool
+from mp4ds.plugins.recording.packing import PackingError, PackingProcess
 from mp4ds.plugins.recording.record import (
     Recorder,
     RecordOptions,
+    RecordProgress,
     open_recorder,
 )
 from mp4ds.plugins.recording.source import SourceOptions, Wanted
+from mp4ds.plugins.recording.spool import MessageBuffer
 from mp4ds.records import Message
 from record_scenes import PlayedSource, recorded
 from scenes import Scene, scene
@@ -40,13 +42,14 @@ from sources import SOURCES
 from waiting import WATCHDOG_S, until
 
 Compare = Callable[..., list[str]]
+SALVAGE = PackOptions(salvage=True)
 HERE = Path(__file__).parent
 
 
 @pytest.fixture(autouse=True)
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine, too, each image is encoded."""
-    monkeypatch.setattr(live, "LATE_S", WATCHDOG_S)
+def pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even a short recording is cut into several pieces."""
+    monkeypatch.setattr(spool, "WINDOW_NS", 300_000_000)
 
 
 def write(folder: Path, source: str = "bag-none", of: Scene | None = None) -> list[Path]:
@@ -269,13 +272,7 @@ def test_datasets_of_a_length(tmp_path: Path, compare: Compare) -> None:
 
 def test_datasets_of_a_size(tmp_path: Path, compare: Compare) -> None:
     paths = write(tmp_path, of=scene("mono8", frames=60, width=320, height=240))
-
-    def wait(number: int) -> None:
-        if number == 200:
-            until(lambda: (tmp_path / "live_1.recording").exists())
-
-    source = PlayedSource(paths, before=wait)
-    summary = recorded(source, tmp_path / "live", max_size=500_000)
+    summary = recorded(PlayedSource(paths), tmp_path / "live", max_size=500_000)
     made = [item.dataset for item in summary.datasets]
     assert len(made) > 1
     mp4ds.pack(made, tmp_path / "whole")
@@ -298,7 +295,6 @@ def test_pauses_and_splits_on_demand(tmp_path: Path) -> None:
                 recorder.resume()
             elif number == 3 * total // 4:
                 recorder.split()
-                until(lambda: (tmp_path / "live_1.recording").exists())
 
         summary = recorder.run()
     assert [item.dataset.name for item in summary.datasets] == ["live", "live_1"]
@@ -309,49 +305,89 @@ def test_pauses_and_splits_on_demand(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- too much
 
 
-def test_what_cannot_be_encoded_in_time(
+def test_packing_that_is_too_slow(
     tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Images are kept as they came while their encoder is late, and packed later."""
-    paths = write(tmp_path)
-    late = iter([False] * 10 + [True] * 15 + [False] * 1000)
-    monkeypatch.setattr(live.PromptWorkers, "is_late", lambda self, key: next(late))
-    summary = recorded(PlayedSource(paths), tmp_path / "live")
-    (made,) = summary.datasets
-    assert reasons(made, "/cam/image_raw") == {TOO_LATE: 15}
+    """The spool keeps what is not packed yet, beyond what the buffer holds; nothing is dropped."""
+    paths = write(tmp_path, of=scene("bayer_rggb8", frames=60, width=320, height=240))
+    is_received = threading.Event()
+    pack = PackingProcess.pack
+
+    def slow(self: PackingProcess, folder: Path, number: int) -> None:
+        assert is_received.wait(WATCHDOG_S)
+        pack(self, folder, number)
+
+    def watch(progress: RecordProgress) -> None:
+        seen.append(progress)
+        if progress.state == "finishing" and not progress.waiting_bytes:
+            is_received.set()
+
+    seen: list[RecordProgress] = []
+    monkeypatch.setattr(PackingProcess, "pack", slow)
+    # as fast as the spool takes it
+    source = PlayedSource(paths, before=lambda number: until(lambda: room(recorder)))
+
+    def room(recorder: Recorder) -> bool:
+        return recorder._buffer.bytes < 500_000
+
+    options = RecordOptions(all=True, buffer=1)
+    opened = open_recorder((), tmp_path / "live", options, source=source, progress=watch)
+    with opened as recorder:
+        source.stop = recorder.stop
+        summary = recorder.run()
+    assert max(progress.spool_bytes for progress in seen) > 3_000_000
+    assert not summary.dropped
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
     assert compare(paths, again(tmp_path / "live", tmp_path)) == []
-    packed = mp4ds.pack(tmp_path / "live", tmp_path / "later", PackOptions(quality="lossless"))
-    assert reasons(packed, "/cam/image_raw") == {}
-    assert compare(paths, again(tmp_path / "later", tmp_path)) == []
 
 
-def test_encoders_that_are_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "LATE_S", 0.1)
-    workers, gate, begun = live.PromptWorkers(), threading.Event(), threading.Event()
-    with workers:
-        assert workers.age(1) == 0.0
-        workers.submit(1, lambda: begun.set() or (gate.wait() and None))  # type: ignore[func-returns-value]
-        begun.wait()
-        assert not workers.is_late(2)
-        until(lambda: workers.is_late(1))
-        gate.set()
-        until(lambda: not workers.age(1))
+def test_packing_that_fails(
+    tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recording goes on, what was recorded stays, and the command that packs it is named."""
+    paths = write(tmp_path)
+    pack = PackingProcess.pack
+
+    def fail(self: PackingProcess, folder: Path, number: int) -> None:
+        if number == 1:
+            raise PackingError("the encoder is out of order")
+        pack(self, folder, number)
+
+    monkeypatch.setattr(PackingProcess, "pack", fail)
+    with pytest.raises(RecordError, match=r"out of order.*--salvage .*live\.recording"):
+        recorded(PlayedSource(paths), tmp_path / "live")
+    assert not (tmp_path / "live").exists()
+    names = {path.name for path in (tmp_path / "live.recording").iterdir()}
+    assert {"000000", "000001.mcap", "000002.mcap"} < names
+    summary = mp4ds.pack(tmp_path / "live.recording", tmp_path / "live", SALVAGE)
+    assert not summary.losses
+    assert compare(paths, again(tmp_path / "live", tmp_path)) == []
+
+
+def test_a_packing_process_that_dies(
+    tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = write(tmp_path)
+    monkeypatch.setattr(PackingProcess, "_ARGUMENTS", ("-c", "raise SystemExit(7)"))
+    with pytest.raises(RecordError, match="ended with code 7"):
+        recorded(PlayedSource(paths), tmp_path / "live")
+    mp4ds.pack(tmp_path / "live.recording", tmp_path / "live", SALVAGE)
+    assert compare(paths, again(tmp_path / "live", tmp_path)) == []
 
 
 def test_a_buffer_that_is_full(tmp_path: Path) -> None:
     message = next(iter(messages(write(tmp_path))))
-    intake = live.Intake(3 * len(message.data))
+    buffer = MessageBuffer(3 * len(message.data))
     for number in range(5):
-        intake.put(replace(message, sequence=number))
-    assert intake.dropped == {message.channel.topic: 2}
-    intake.close()
-    intake.put(message)
-    found = [intake.take(0.0) for _ in range(3)]
+        buffer.put(replace(message, sequence=number))
+    assert buffer.dropped == {message.channel.topic: 2}
+    buffer.close()
+    buffer.put(message)
+    found = [buffer.take(0.0) for _ in range(3)]
     assert [item.sequence for item in found if item] == [2, 3, 4]
     with pytest.raises(EOFError):
-        intake.take(0.0)
-    assert intake.received == {message.channel.topic: 5}
+        buffer.take(0.0)
+    assert buffer.received == {message.channel.topic: 5}
 
 
 @pytest.mark.parametrize("field", ["log_time", "publish_time"])
@@ -397,31 +433,42 @@ def messages(paths: list[Path]) -> Iterator[Message]:
 def test_a_disk_that_is_full(
     tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """What was written before is kept."""
     paths = write(tmp_path)
+    due = next(iter(messages(paths)))
 
-    def refuse(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+    def refuse(self: McapWriter, message: Message) -> None:
+        if message.log_time - due.log_time > 700_000_000:
+            raise OSError(28, "No space left on device")
+        write_message(self, message)
 
-    monkeypatch.setattr("mp4ds.plugins.recording.record.write_manifest", refuse)
+    write_message = McapWriter.write
+    monkeypatch.setattr(McapWriter, "write", refuse)
     with pytest.raises(RecordError, match=r"No space left.*--salvage .*live\.recording"):
         recorded(PlayedSource(paths), tmp_path / "live")
+    monkeypatch.undo()
     assert not (tmp_path / "live").exists()
-    mp4ds.pack(tmp_path / "live.recording", tmp_path / "live", PackOptions(salvage=True))
-    assert compare(paths, again(tmp_path / "live", tmp_path)) == []
+    mp4ds.pack(tmp_path / "live.recording", tmp_path / "live", SALVAGE)
+    found = assert_prefix(paths, tmp_path / "live", tmp_path)
+    assert 10 < found["/cam/image_raw"] < 40
 
 
 # ---------------------------------------------------------------- power cuts
 
 
 @pytest.fixture
-def cut_off(tmp_path: Path) -> tuple[list[Path], Path]:
+def killed(tmp_path: Path) -> tuple[list[Path], Path]:
     """A recording, and a folder in which it was being recorded when the recorder was killed."""
     paths = write(tmp_path, of=scene("bayer_rggb8", frames=400, width=64, height=48))
     folder = tmp_path / "live.recording"
     command = [sys.executable, str(HERE / "record_scenes.py"), str(paths[0]), folder.stem, "2"]
     process = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.DEVNULL)
-    video = folder / "cam_image_raw.mp4"
-    until(lambda: video.exists() and video.stat().st_size > 40_000, process)
+
+    def is_half_packed() -> bool:
+        last = max(folder.glob("*.mcap"), default=None)
+        return (folder / "000001").is_dir() and last is not None and last.stat().st_size > 40_000
+
+    until(is_half_packed, process)
     process.send_signal(signal.SIGKILL)
     process.wait()
     return paths, folder
@@ -443,8 +490,8 @@ def assert_prefix(paths: list[Path], dataset: Path, folder: Path) -> dict[str, i
     return {topic: len(there) for topic, there in found.items()}
 
 
-def test_a_recorder_that_is_killed(cut_off: tuple[list[Path], Path], tmp_path: Path) -> None:
-    paths, folder = cut_off
+def test_a_recorder_that_is_killed(killed: tuple[list[Path], Path], tmp_path: Path) -> None:
+    paths, folder = killed
     with pytest.raises(OptionError, match="--salvage"):
         mp4ds.pack(folder, tmp_path / "salvaged", PackOptions(quality="visual"))
     for wrong in (mp4ds.validate, mp4ds.open, partial(mp4ds.pack, dataset=tmp_path / "no")):
@@ -454,29 +501,29 @@ def test_a_recorder_that_is_killed(cut_off: tuple[list[Path], Path], tmp_path: P
         open_sources([folder])
     with pytest.raises(SourceError, match="pack --salvage"):
         datasets_in(folder)
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    summary = mp4ds.pack(folder, tmp_path / "salvaged", PackOptions(salvage=True))
-    assert summary.losses[-1].problem == CUT_OFF
+    before = tree(folder)
+    summary = mp4ds.pack(folder, tmp_path / "salvaged", SALVAGE)
+    assert [loss.problem for loss in summary.losses] == ["the file ends before its footer"]
     found = assert_prefix(paths, tmp_path / "salvaged", tmp_path)
-    assert found["/cam/image_raw"] > 5
-    assert found["/cam/camera_info"] >= found["/cam/image_raw"]
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert found["/cam/image_raw"] > 20
+    assert tree(folder) == before
+    with mp4ds.open(tmp_path / "salvaged") as dataset:
+        assert len(dataset.streams) == 1
 
 
-def test_files_that_are_torn(cut_off: tuple[list[Path], Path], tmp_path: Path) -> None:
-    """Whatever of the files' ends reached the disk, what comes back is what was recorded."""
-    paths, folder = cut_off
-    names = ("cam_image_raw.mp4", "messages.mcap", JOURNAL_NAME)
-    for number, name in enumerate(names * 3):
-        torn = tmp_path / f"torn{number}.recording"
-        shutil.copytree(folder, torn)
-        data = (torn / name).read_bytes()
-        cut = max(len(data) // 2, len(data) - 1 - 977 * (number + 1) ** 2)
+def test_a_spool_that_is_torn(killed: tuple[list[Path], Path], tmp_path: Path) -> None:
+    """However much of its last piece reached the disk, what comes back is what was recorded."""
+    paths, folder = killed
+    last = max(folder.glob("*.mcap"))
+    data = last.read_bytes()
+    for number, cut in enumerate((0, 1, 30, len(data) // 2, len(data) - 5000, len(data) - 1)):
         for kind, rest in (("cut", b""), ("zeros", bytes(len(data) - cut))):
-            (torn / name).write_bytes(data[:cut] + rest)
+            last.write_bytes(data[:cut] + rest)
             made = tmp_path / f"made{number}{kind}"
-            mp4ds.pack(torn, made, PackOptions(salvage=True))
+            summary = mp4ds.pack(folder, made, SALVAGE)
+            assert last.name in {loss.file for loss in summary.losses}
             found = assert_prefix(paths, made, tmp_path)
+            assert found["/cam/image_raw"] > 10
             assert set(found) <= {message.channel.topic for message in messages(paths)}
 
 
@@ -486,24 +533,11 @@ def test_a_recording_that_is_being_made_is_left_alone(tmp_path: Path) -> None:
     def look(number: int) -> None:
         if number == 30:
             folder = tmp_path / "live.recording"
-            until(lambda: (folder / JOURNAL_NAME).exists())
+            until(lambda: (folder / RECORDING_NAME).exists())
             with pytest.raises(SourceError, match="is being recorded"):
-                mp4ds.pack(folder, tmp_path / "early", PackOptions(salvage=True))
+                mp4ds.pack(folder, tmp_path / "early", SALVAGE)
             seen.append(number)
 
     recorded(PlayedSource(write(tmp_path), before=look), tmp_path / "live")
     assert seen == [30]
     assert not (tmp_path / "early").exists()
-
-
-def test_a_folder_that_is_damaged(cut_off: tuple[list[Path], Path], tmp_path: Path) -> None:
-    _, folder = cut_off
-    journal = folder / JOURNAL_NAME
-    data = journal.read_bytes()
-    journal.write_bytes(b"x" + data[1:])
-    with pytest.raises(SourceError, match="damaged at its beginning"):
-        mp4ds.pack(folder, tmp_path / "made", PackOptions(salvage=True))
-    journal.write_bytes(data[: data.index(b"\n") + 1])
-    summary = mp4ds.pack(folder, tmp_path / "made", PackOptions(salvage=True))
-    assert all("image" not in item.topic or not item.frames for item in summary.topics)
-    assert mp4ds.validate(tmp_path / "made", deep=True) == []

@@ -15,10 +15,10 @@ from xml.etree import ElementTree
 
 import pytest
 import typer
+from mp4ds.packing.journal import JOURNAL_NAME
 
 import mp4ds
 from mp4ds.cli import app_for
-from mp4ds.packing.journal import JOURNAL_NAME
 from mp4ds.plugins.recording.record import UNFINISHED
 from player_scenes import make_drive
 from roscore import RECORD, Core, python, wait_until

@@ -273,8 +273,8 @@ class RecordError(Mp4dsError, OSError):
 
     def __init__(self, folder: Path, target: Path, cause: BaseException) -> None:
         super().__init__(
-            f"{path_text(folder)}: could not be written: {reason_of(cause)}. It holds what was "
-            "recorded before. Make room, then run: mp4ds pack --salvage "
+            f"{path_text(folder)}: the recording could not be completed: {reason_of(cause)}. It "
+            "holds what was recorded. When that is solved, run: mp4ds pack --salvage "
             f"{shlex.quote(path_text(folder))} -o {shlex.quote(path_text(target))}"
         )
 

@@ -30,10 +30,11 @@ from mp4ds.bags.files import (
 )
 from mp4ds.errors import SourceError
 from mp4ds.files.urls import expect
-from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Schema
+from mp4ds.records import Attachment, Channel, Loss, Message, MetadataRecord, Schema
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 4 * 2**30
+_RECORD_HEAD = struct.Struct("<BQ")  # kind, and bytes that follow
 FOOTER_BYTES = 9 + 20 + len(MAGIC)
 PRIVATE_OPCODE = 0x80
 OF_SUMMARY = frozenset(
@@ -396,3 +397,39 @@ class Declared:
 
 def _schema(record: mcap_records.Schema) -> Schema:
     return Schema(record.name, record.encoding, record.data)
+
+
+def copy_verified(piece: Path, copy: Path) -> list[Loss]:
+    """Copy what a recorder wrote, as far as it is certainly that: a power cut may leave zeros.
+
+    Salvage keeps what it can of a chunk that does not match its checksum. Of a recorder's own
+    chunks, half a second each, none is worth an image that is not the camera's.
+
+    Args:
+        piece: A file of `McapWriter`, perhaps incomplete.
+        copy: The file to make.
+
+    Returns:
+        What was left out.
+    """
+    losses: list[Loss] = []
+    end = piece.stat().st_size
+    with piece.open("rb") as source, copy.open("wb") as target:
+        target.write(source.read(len(MAGIC)))
+        while head := source.read(_RECORD_HEAD.size):
+            offset = source.tell() - len(head)
+            kind, size = _RECORD_HEAD.unpack(head.ljust(_RECORD_HEAD.size, b"\0"))
+            is_whole = kind != 0 and size <= min(MAX_RECORD_BYTES, end - source.tell())
+            body = source.read(size) if is_whole else b""
+            if not is_whole:
+                losses.append(Loss(piece.name, offset, end - offset, "it ends within a record"))
+                break
+            try:
+                if kind == Opcode.CHUNK:
+                    unpack_chunk(memoryview(body))
+            except DamageError:
+                problem = "a chunk does not match its checksum"
+                losses.append(Loss(piece.name, offset, len(head) + size, problem))
+                continue
+            target.write(head + body)
+    return losses

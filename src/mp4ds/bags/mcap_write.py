@@ -63,6 +63,7 @@ class McapWriter(BagWriter):
             )
         super().__init__()
         self.path = path
+        self._compresses = compression != "none"
         self._channel_ids: dict[int, int] = {}
         self._schema_ids: dict[Schema, int] = {}
         self._file = path.open("wb")
@@ -117,16 +118,11 @@ class McapWriter(BagWriter):
             channel.topic, channel.message_encoding, schema_id, dict(channel.metadata)
         )
 
-    def write(self, message: Message, *, compress: bool = True) -> None:
-        """Append a message, payload verbatim.
-
-        Args:
-            message: The message.
-            compress: Whether there is time to compress the chunk that it ends, if it is large.
-        """
+    def write(self, message: Message) -> None:
+        """Append a message, payload verbatim."""
         self.check_message(message)
-        is_large = 2 * len(message.data) > most_unpacked(0)
-        if not compress or (is_large and self._compresses_too_well(message.data)):
+        is_large = self._compresses and 2 * len(message.data) > most_unpacked(0)
+        if is_large and self._compresses_too_well(message.data):
             with self._uncompressed():
                 self._add(message)
         else:

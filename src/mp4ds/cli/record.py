@@ -77,8 +77,8 @@ def record(
 ) -> None:
     """Record topics of a live robot, ROS 1 or ROS 2, into a dataset.
 
-    Ctrl-C ends the recording. It is lossless by default, with the fastest encoder settings. Images
-    that cannot be encoded in time are stored as received. Keys: space pauses and resumes, q ends.
+    Ctrl-C ends the recording. It is lossless by default, with the fastest encoder settings. What
+    cannot be packed in time waits on disk. Keys: space pauses and resumes, q ends.
     """
     with told_errors(as_json), ExitStack() as stack:
         if ros1 and ros2:
@@ -139,10 +139,6 @@ def record_progress(*, is_quiet: bool) -> Iterator[Callable[[RecordProgress], No
         for topic, item in state.topics.items():
             for count, what in (
                 (item.dropped, "dropping messages: the buffer is full (--buffsize enlarges it)"),
-                (
-                    item.verbatim,
-                    "images arrive faster than they can be encoded: storing them as received",
-                ),
                 (item.lost, "the middleware is losing messages"),
                 (item.untimed, f"leaving out messages: {_UNTIMED}"),
             ):
@@ -178,6 +174,8 @@ def _line(state: RecordProgress) -> str:
         f"{rate / 1e6:.1f} MB/s received",
         f"{state.bytes_written / 1e6:.1f} MB written",
     ]
+    if state.spool_bytes >= 1e6:
+        parts.append(f"{state.spool_bytes / 1e6:.0f} MB to pack")
     if state.waiting_bytes >= 1e6:
         parts.append(f"{state.waiting_bytes / 1e6:.0f} MB buffered")
     return " · ".join(parts)
@@ -188,20 +186,18 @@ def _table(state: RecordProgress) -> Table:
     from rich.text import Text
 
     table = Table(title=_line(state), title_justify="left", box=None, pad_edge=False)
-    for name in ("topic", "messages", "Hz", "MB/s", "verbatim", "lost"):
+    for name in ("topic", "messages", "Hz", "MB/s", "lost"):
         table.add_column(
             name, justify="left" if name == "topic" else "right", no_wrap=True, overflow="ellipsis"
         )
     busiest = sorted(state.topics.items(), key=lambda item: -item[1].bytes_per_s)
     for topic, item in busiest[:_SHOWN]:
         gone = item.dropped + item.lost + item.untimed
-        share = f"{100 * item.verbatim / item.messages:.0f} %" if item.verbatim else ""
         table.add_row(
             Text(topic),
             str(item.messages),
             f"{item.hz:.1f}",
             f"{item.bytes_per_s / 1e6:.2f}",
-            share,
             str(gone) if gone else "",
         )
     if len(busiest) > _SHOWN:

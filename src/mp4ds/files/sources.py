@@ -46,7 +46,7 @@ HOW_TO_OPEN = (
 """Advice for a video given instead of a recording or dataset."""
 
 
-JOURNAL_NAME = "journal.jsonl"
+RECORDING_NAME = "recording.json"
 """File of a folder in which a recording is being made, or was when it was cut off."""
 
 
@@ -56,7 +56,7 @@ UNFINISHED = ".recording"
 
 def is_unfinished(folder: Path) -> bool:
     """Whether a folder holds a recording that is being made, or was cut off."""
-    return not remote(folder) and (folder / JOURNAL_NAME).is_file()
+    return not remote(folder) and (folder / RECORDING_NAME).is_file()
 
 
 def salvage_command(folder: Path) -> str:

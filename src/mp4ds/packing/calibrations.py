@@ -12,7 +12,6 @@ from mp4ds.errors import OptionError, Refused
 from mp4ds.format.models import CameraInfo
 from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
-from mp4ds.packing.journal import Journal
 from mp4ds.packing.look import CameraMessage
 from mp4ds.packing.options import TopicSummary
 from mp4ds.plan import INFO_NAMES, TRANSPORTS
@@ -398,7 +397,6 @@ class Calibrations:
         surveyed: Pairs already found by stamps, by id; None to compare stamps here.
         topic_of: The summary of a channel's topic.
         keep: Stores messages that belong to no stream.
-        journal: Where calibrations are noted; None: nowhere. Channels may appear later then.
 
     Raises:
         OptionError: A chosen pair is not possible.
@@ -412,17 +410,15 @@ class Calibrations:
         *,
         topic_of: Callable[[Channel], TopicSummary],
         keep: Callable[[Message], None],
-        journal: Journal | None = None,
     ) -> None:
         self._topic_of = topic_of
         self._keep = keep
-        self._journal = journal
         self._channels = {channel.id: channel for channel in channels}
         self._pairs = pair_camera_infos(channels, chosen=choose_pairs(chosen, channels))
         self._by_stamp = None
         if surveyed is not None:
             self._pairs.update(surveyed)
-        elif journal or unpaired_infos(channels, self._pairs):
+        elif unpaired_infos(channels, self._pairs):
             self._by_stamp = StampPairing()
         self._forms: dict[int, MessageSplitter] = {}
         self._infos: dict[int, _InfoChannel | None] = {}
@@ -432,8 +428,6 @@ class Calibrations:
     def take(self, message: Message) -> None:
         """Add a calibration to its stream, or keep it if it belongs to none."""
         channel = message.channel
-        if self._journal is not None:
-            self._journal.calibration(message)
         self._meet(channel)
         # its position among those of all channels with the same identity
         ordinal = self._counts[channel.identity]
@@ -508,10 +502,7 @@ class Calibrations:
         except Refused:
             return  # it is kept verbatim when it is taken or given up
         if len(state.pending) % INFO_WINDOW == 0:
-            found = self._by_stamp.decide(self._pairs, final=False)
-            if found and self._journal is not None:
-                self._journal.pairs(found)
-            self._pairs.update(found)
+            self._pairs.update(self._by_stamp.decide(self._pairs, final=False))
             self._settle()
 
     def _settle(self) -> None:

@@ -68,7 +68,7 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
             for problem in validate(folder, deep=True):
                 raise FormatError(problem.code, dataset.path, f"is damaged: {problem}")
         with Dataset(folder) as made:
-            topics = _topics(made)
+            topics = topic_summaries(made)
             early = dict(made.latched_before) if options.slice else {}
         return PackSummary(
             dataset=target,
@@ -84,7 +84,8 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
         )
 
 
-def _topics(dataset: Dataset) -> list[TopicSummary]:
+def topic_summaries(dataset: Dataset) -> list[TopicSummary]:
+    """What is in a dataset, by topic; the bytes of the recorded messages are not known."""
     times = dataset.times()
     found: dict[str, TopicSummary] = {}
     for channel in dataset.channels:

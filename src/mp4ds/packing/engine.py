@@ -119,11 +119,6 @@ class Workers:
             except queue.Full:
                 continue
 
-    def is_late(self, key: int) -> bool:
-        """Whether jobs of a key wait for longer than they may; nobody is in a hurry here."""
-        del key
-        return False
-
     def _run(self, jobs: queue.Queue[Callable[[], None] | None]) -> None:
         while (job := jobs.get()) is not None:
             if self._stopped.is_set():

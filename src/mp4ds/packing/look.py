@@ -93,17 +93,15 @@ class Looker:
     Args:
         channel: The channel.
         transcode: Decode JPEG files instead of taking them as packets.
-        is_live: Leave what takes long to be taken apart.
     """
 
-    def __init__(self, channel: Channel, *, transcode: bool = False, is_live: bool = False) -> None:
+    def __init__(self, channel: Channel, *, transcode: bool = False) -> None:
         self._is_packets = _holds_packets(channel)
         self._forms = MessageSplitter(channel)
         self._parsers: dict[str, PictureParser] = {}
         self._png: png.PngRecipe | None = None
         self._png_refusals = 0
         self._transcode = transcode
-        self._is_live = is_live
 
     def look(self, message: Message) -> CameraMessage:
         """What a message holds.
@@ -173,8 +171,6 @@ class Looker:
     @contextmanager
     def _png_trial(self) -> Iterator[None]:
         """Give up on a topic whose files cannot be rebuilt: trying is costly."""
-        if self._is_live:
-            raise Refused("PNG and RVL files are stored as they are while recording")
         if self._png_refusals == _MAX_PNG_REFUSALS:
             raise Refused("PNG files of its topic do not rebuild")
         try:
@@ -209,6 +205,14 @@ def depends_on_others(channel: Channel, message: Message) -> bool:
         return packet_codec(fields.format) != "mjpeg"
     except Refused:
         return _holds_packets(channel)
+
+
+def begins_anew(message: Message) -> bool:
+    """Whether a stream may begin with a message of a camera channel."""
+    try:
+        return Looker(message.channel).look(message).keyframe
+    except Refused:
+        return False
 
 
 def _holds_packets(channel: Channel) -> bool:

@@ -58,8 +58,9 @@ from mp4ds.packing.manifest import (
 from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.planning import Resources, plan_job
+from mp4ds.packing.spool import recover
 from mp4ds.packing.workplace import Workplace
-from mp4ds.plan import LOSSLESS, parse_purpose, parse_quality
+from mp4ds.plan import LOSSLESS, SPEED, QualitySetting, parse_quality
 from mp4ds.registry import plugin
 from mp4ds.video.codecs import DEFAULT_LOSSY, check_codec, fastest_preset
 
@@ -274,8 +275,6 @@ def _pack(
 
 def _recovered(paths: Sequence[Path], target: Path, options: PackOptions) -> PackSummary:
     """The dataset of a recording that was cut off while `mp4ds record` made it."""
-    from mp4ds.packing.recovery import recover
-
     folder = next(filter(is_unfinished, paths))
     usual = replace(_USUAL, salvage=True, force=options.force, about=options.about)
     if len(paths) > 1 or replace(options, quality=None) != usual:
@@ -284,7 +283,7 @@ def _recovered(paths: Sequence[Path], target: Path, options: PackOptions) -> Pac
             f"pack that: {salvage_command(folder)}"
         )
     about = load_about(options.about) if options.about is not None else None
-    return recover(folder, target, force=options.force, about=about)
+    return recover(folder, target, pack, force=options.force, about=about)
 
 
 def _copied(
@@ -472,11 +471,7 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
             "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
             "any lossless video of its pixels."
         )
-    purpose = parse_purpose(options.purpose)
-    preset = options.preset
-    if purpose is not None and purpose.is_speed and quality.crf is not None:
-        preset = preset or fastest_preset(options.codec or DEFAULT_LOSSY)
-    codec = check_codec(options.codec, preset, lossless=quality.lossless, crf=quality.crf)
+    codec = checked_codec(quality, options.codec, options.preset, options.purpose)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         from mp4ds.video.libvmaf import find_ffmpeg
 
@@ -485,6 +480,25 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
     chosen = replace(options, quality=str(quality), codec=codec, transcode=transcode, images=images)
     chosen.group_frames  # noqa: B018 - refuses a purpose that is none
     return chosen
+
+
+def checked_codec(
+    quality: QualitySetting, codec: str | None, preset: str | None, purpose: str | None
+) -> str | None:
+    """The codec by its usual name; None for the default.
+
+    Args:
+        quality: What it has to do.
+        codec: As given by the user.
+        preset: The encoder's preset.
+        purpose: What the dataset is for.
+
+    Raises:
+        OptionError: It cannot do that, or has no such preset.
+    """
+    if purpose == SPEED and quality.crf is not None:
+        preset = preset or fastest_preset(codec or DEFAULT_LOSSY)
+    return check_codec(codec, preset, lossless=quality.lossless, crf=quality.crf)
 
 
 def _quality_of(paths: Sequence[Path]) -> str:

@@ -15,7 +15,6 @@ from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
 from mp4ds.packing.calibrations import Calibrations
 from mp4ds.packing.engine import Workers
-from mp4ds.packing.journal import Journal
 from mp4ds.packing.look import CameraMessage, Looker, StreamKey
 from mp4ds.packing.manifest import PartRecord, PartStream, declare_rest
 from mp4ds.packing.options import TopicSummary
@@ -28,7 +27,6 @@ from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message, Rec
 Exact = Mapping[tuple[int, StreamKey], str]
 """Channel id and key of streams that no longer need to reach a score -> why."""
 
-TOO_LATE = "recorded faster than it could be encoded"
 NOT_SURVEYED = (
     "images of its size or encoding were not in the parts of the recording that were surveyed"
 )
@@ -86,9 +84,8 @@ class CameraRouter:
         calibrations: Notified of new streams.
         survey: Earlier decisions; None to decide here.
         topic_of: The summary of a channel's topic.
-        keep: Stores what no stream can carry exactly, with the reason.
+        keep: Stores what no stream can carry exactly.
         exact: Streams that must be lossless although a score is asked for, and why.
-        journal: Where to note what is done; None: nowhere.
     """
 
     def __init__(
@@ -100,14 +97,12 @@ class CameraRouter:
         survey: Survey | None,
         *,
         topic_of: Callable[[Channel], TopicSummary],
-        keep: Callable[[Message, str], None],
+        keep: Callable[[Message], None],
         exact: Exact,
-        journal: Journal | None = None,
     ) -> None:
         self._reader = reader
         self._folder = folder
         self._settings = settings
-        self._journal = journal
         self._calibrations = calibrations
         self._survey = survey
         self._topic_of = topic_of
@@ -128,7 +123,7 @@ class CameraRouter:
             seen = state.looker.look(message)
         except Refused as reason:
             self._settle(state, workers)
-            self._keep_verbatim(message, ordinal, number, str(reason))
+            self._keep_verbatim(message, number, str(reason))
             return
         self._calibrations.saw(channel, seen)
         item = _Item(message, ordinal, number, seen)
@@ -145,9 +140,7 @@ class CameraRouter:
 
     def _state_of(self, channel: Channel) -> _CameraChannel:
         if channel.identity not in self._channels:
-            settings = self._settings
-            is_live = self._journal is not None
-            looker = Looker(channel, transcode=settings.transcode, is_live=is_live)
+            looker = Looker(channel, transcode=self._settings.transcode)
             state = self._channels[channel.identity] = _CameraChannel(looker)
             decisions = self._survey.decisions.get(channel.id) if self._survey else None
             if decisions is not None:
@@ -195,8 +188,6 @@ class CameraRouter:
         for stream in self._candidates(state, route, item):
             number = self._streams.index(stream)
             try:
-                if workers.is_late(number):
-                    raise Refused(TOO_LATE)
                 job = stream.accept(item.message, item.seen, item.ordinal)
             except Refused as refusal:
                 reason = str(refusal)
@@ -207,7 +198,7 @@ class CameraRouter:
             workers.submit(number, job)
             return
         state.looker.leave_out(item.seen)
-        self._keep_verbatim(item.message, item.ordinal, item.number, route.refusal or reason)
+        self._keep_verbatim(item.message, item.number, route.refusal or reason)
 
     def _candidates(
         self, state: _CameraChannel, route: _Route, item: _Item
@@ -242,7 +233,6 @@ class CameraRouter:
             plan=plan,
             settings=self._settings,
             rate=self._rate(channel),
-            journal=self._journal,
         )
         self._streams.append(stream)
         if renamed:
@@ -251,11 +241,9 @@ class CameraRouter:
             self._topic_of(channel).notes.append(stream.note)
         return stream
 
-    def _keep_verbatim(self, message: Message, ordinal: int, number: int, reason: str) -> None:
-        if self._journal is not None:
-            self._journal.verbatim(message.channel, ordinal, reason)
+    def _keep_verbatim(self, message: Message, number: int, reason: str) -> None:
         self._topic_of(message.channel).count_verbatim(reason, number)
-        self._keep(message, reason)
+        self._keep(message)
 
     def finish(self) -> list[PartStream]:
         """Complete all videos and write their sidecars; all jobs must have run."""
@@ -329,7 +317,6 @@ class Packer:
         folder: The folder to fill, empty.
         settings: How.
         progress: Called after each record with what was packed so far.
-        journal: Where to note what is done; None: nowhere.
     """
 
     _verbatim: McapWriter  # messages.mcap, open while `run` reads
@@ -340,15 +327,12 @@ class Packer:
         folder: Path,
         settings: PartSettings,
         progress: Callable[[PartRecord], None] | None = None,
-        journal: Journal | None = None,
     ) -> None:
         self._reader = reader
         self._settings = settings
-        self._journal = journal
         self._progress = progress
         self._transforms = TransformCollector()
         self._part = PartRecord(folder)
-        self._noted: set[int] = set()  # channels that the journal has
         survey = settings.survey
         self._calibrations = Calibrations(
             [channel for channel in reader.channels if settings.selected(channel.topic)],
@@ -356,7 +340,6 @@ class Packer:
             survey.pairs if survey else None,
             topic_of=self._part.topic,
             keep=self._keep,
-            journal=journal,
         )
         self._cameras = CameraRouter(
             reader,
@@ -367,7 +350,6 @@ class Packer:
             topic_of=self._part.topic,
             keep=self._keep,
             exact=settings.exact,
-            journal=journal,
         )
 
     def run(self) -> PartRecord:
@@ -420,9 +402,6 @@ class Packer:
         if not self._settings.selected(channel.topic):
             part.left_out[channel.topic] = None
             return
-        if self._journal is not None and channel.id not in self._noted:
-            self._noted.add(channel.id)
-            self._journal.channel(channel)
         topic = part.topic(channel)
         topic.messages += 1
         topic.raw_bytes += len(record.data)
@@ -435,7 +414,6 @@ class Packer:
         else:
             self._keep(record)
 
-    def _keep(self, message: Message, reason: str = "") -> None:
-        del reason
+    def _keep(self, message: Message) -> None:
         self._verbatim.add_channel(message.channel)
         self._verbatim.write(message)

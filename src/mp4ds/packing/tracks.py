@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -56,10 +56,6 @@ class StreamSettings:
     def is_fast(self) -> bool:
         """Whether to encode in the least time, with nothing tried."""
         return self.purpose is not None and self.purpose.is_speed
-
-
-OnPacket = Callable[[str, bytes], None]
-"""Told of a codec and a packet."""
 
 
 class Track(Protocol):
@@ -130,7 +126,6 @@ class TrackPlan(Protocol):
         seen: CameraMessage,
         settings: StreamSettings,
         rate: float | None,
-        on_packet: OnPacket | None = None,
     ) -> Track:
         """Begin the file.
 
@@ -139,7 +134,6 @@ class TrackPlan(Protocol):
             seen: The first message.
             settings: How to encode.
             rate: Frames per second, where known.
-            on_packet: Called with the codec and each packet, of live streams.
 
         Raises:
             Refused: The encoder does not support such pictures.
@@ -170,10 +164,9 @@ class PicturePlan:
         seen: CameraMessage,
         settings: StreamSettings,
         rate: float | None,
-        on_packet: OnPacket | None = None,
     ) -> Track:
         """See `TrackPlan.open`."""
-        return _PictureTrack(self, path, seen.key, settings, rate, on_packet)
+        return _PictureTrack(self, path, seen.key, settings, rate)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,7 +181,6 @@ class TargetPlan(PicturePlan):
         seen: CameraMessage,
         settings: StreamSettings,
         rate: float | None,
-        on_packet: OnPacket | None = None,
     ) -> Track:
         """See `TrackPlan.open`."""
         from mp4ds.packing.target import TargetTrack
@@ -215,7 +207,6 @@ class _PictureTrack:
         key: StreamKey,
         settings: StreamSettings,
         rate: float | None,
-        on_packet: OnPacket | None,
     ) -> None:
         self._layout = layout = plan.layout
         self.note = plan.note
@@ -232,7 +223,6 @@ class _PictureTrack:
                     gop=plan.gop or settings.gop,
                     threads=settings.threads,
                     rate=rate,
-                    on_packet=on_packet and partial(on_packet, recipe.codec),
                 )
             except EncoderRefusedError as error:
                 path.unlink(missing_ok=True)
@@ -309,10 +299,9 @@ class PacketPlan:
         seen: CameraMessage,
         settings: StreamSettings,
         rate: float | None,
-        on_packet: OnPacket | None = None,
     ) -> Track:
         """See `TrackPlan.open`."""
-        return _PacketTrack(path, seen, rate, self.note, on_packet)
+        return _PacketTrack(path, seen, rate, self.note)
 
 
 class _PacketTrack:
@@ -324,7 +313,6 @@ class _PacketTrack:
         seen: CameraMessage,
         rate: float | None,
         note: str,
-        on_packet: OnPacket | None,
     ) -> None:
         self.note = note
         self._key = seen.key
@@ -336,7 +324,6 @@ class _PacketTrack:
             height=seen.key.height,
             parameters=seen.parameters,
             rate=rate,
-            on_packet=on_packet and partial(on_packet, seen.key.codec),
         )
 
     def refuses(self, seen: CameraMessage) -> str | None:

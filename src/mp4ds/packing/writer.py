@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import base64
 from array import array
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import xxhash
 
 from mp4ds.dataset.rebuild import ColumnsWriter, HeaderTable, digests_model
 from mp4ds.errors import OutOfReachError, Refused
-from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, Columns, exceeds_padding
+from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, exceeds_padding
 from mp4ds.format.models import (
     CameraInfo,
     ChannelModel,
@@ -27,7 +26,6 @@ from mp4ds.format.models import (
 from mp4ds.format.sidecars import dump_document
 from mp4ds.messages.png import PngRecipe, zlib_fingerprint
 from mp4ds.messages.wire import CodedFields
-from mp4ds.packing.journal import Journal, StreamNote
 from mp4ds.packing.look import CameraMessage
 from mp4ds.packing.tracks import StreamSettings, TrackPlan
 from mp4ds.records import Channel, Message
@@ -50,7 +48,6 @@ class StreamWriter:
         plan: How the video is made.
         settings: How to encode.
         rate: Frames per second, where known.
-        journal: Where to note what the sidecar will say; None: nowhere.
 
     Raises:
         Refused: The encoder does not take such pictures.
@@ -66,7 +63,6 @@ class StreamWriter:
         plan: TrackPlan,
         settings: StreamSettings,
         rate: float | None,
-        journal: Journal | None = None,
     ) -> None:
         self.channel = channel
         self.camera_info: CameraInfo | None = None
@@ -77,21 +73,8 @@ class StreamWriter:
         self._heads = HeaderTable[Header](seen.form)
         self._digests = array("Q")
         self._clock = PresentationClock()
-        noted = partial(journal.packet, stem) if journal is not None else None
-        self._track = plan.open(self.video_path, seen, settings, rate, noted)
-        self._note = StreamNote(
-            stem,
-            channel.id,
-            seen.key,
-            plan.profile,
-            plan.exact,
-            has_seq=seen.parts.seq is not None,
-            has_pts=seen.parts.pts is not None,
-            video={},
-        )
-        self._journal = journal
-        if journal is not None:
-            journal.stream(self._note._replace(video=self._track.describe()))
+        self._track = plan.open(self.video_path, seen, settings, rate)
+        self._key = seen.key
 
     @property
     def note(self) -> str:
@@ -133,15 +116,8 @@ class StreamWriter:
         tick = self._clock.tick(parts.stamp, message.log_time)
 
         def write() -> None:
-            digest = 0
             if self._plan.exact:
-                digest = xxhash.xxh64_intdigest(message.data)
-                self._digests.append(digest)
-            if self._journal is not None:
-                times = message.log_time, message.publish_time, message.sequence
-                own = parts.stamp, parts.seq or 0, parts.pts or 0
-                made = variant, ordinal, tick, len(message.data), digest
-                self._journal.frame(self.video_path.stem, (*times, *own, *made))
+                self._digests.append(xxhash.xxh64_intdigest(message.data))
             try:
                 self._track.write(seen, tick)
             except Refused as reason:
@@ -163,21 +139,34 @@ class StreamWriter:
             self._track.close()
         except Refused as reason:
             raise self._out_of_reach(reason) from None
-        sidecar = stream_sidecar(
-            self._note._replace(video=self._track.describe()),
-            self.channel,
-            self.video_path,
+        key, made = self._key, self._track.describe()
+        video = {**made, **video_facts(self.video_path, made["codec"])}
+        sidecar = StreamSidecar(
+            mp4ds=FORMAT_VERSION,
+            kind="stream",
+            profile=self._plan.profile,
+            frames=self.frames,
+            channel=ChannelModel.from_record(self.channel),
+            wire=key.wire,
+            body=key.body,
+            image=Image(
+                encoding=key.encoding,
+                width=key.width,
+                height=key.height,
+                step=key.step,
+                is_bigendian=key.is_bigendian,
+            ),
             headers=self._heads.items,
+            video=VideoModel.model_validate(video),
             camera_info=self.camera_info,
             columns=self._columns.to_model(),
-            frames=self.frames,
-            digests=self._digests,
+            digests=digests_model(self._digests) if self._plan.exact else None,
         )
         self.sidecar_path.write_bytes(dump_document(sidecar))
         return sidecar
 
     def _out_of_reach(self, reason: Refused) -> OutOfReachError:
-        stream = (self.channel.id, self._note.key)
+        stream = (self.channel.id, self._key)
         return OutOfReachError(self.channel.topic, stream, str(reason))
 
     def _header(self, seen: CameraMessage, template: str | None) -> Header:
@@ -190,7 +179,7 @@ class StreamWriter:
         padding = None if wrap.padding is None else base64.b64encode(wrap.padding).decode()
         if exceeds_padding((padding, *(head.padding for head in self._heads.items))):
             raise Refused("too much padding between rows, different in each image")
-        header = Header(
+        return Header(
             frame_id=seen.parts.frame_id,
             format=fields.format if isinstance(fields, CodedFields) else None,
             template=template,
@@ -199,63 +188,10 @@ class StreamWriter:
             png=_png_file(wrap.png) if wrap.png else None,
             padding=padding,
         )
-        if self._journal is not None:
-            self._journal.header(self.video_path.stem, header)
-        return header
 
     def abandon(self) -> None:
         """Stop writing; the caller removes the files."""
         self._track.abandon()
-
-
-def stream_sidecar(
-    note: StreamNote,
-    channel: Channel,
-    video: Path,
-    *,
-    headers: Sequence[Header],
-    camera_info: CameraInfo | None,
-    columns: Columns,
-    frames: int,
-    digests: Iterable[int],
-) -> StreamSidecar:
-    """The sidecar of a stream whose video is finished.
-
-    Args:
-        note: How it was made.
-        channel: Of its messages.
-        video: The file.
-        headers: Those of its messages.
-        camera_info: The calibrations of its camera.
-        columns: What differs between messages, one row for each frame.
-        frames: How many there are.
-        digests: Of the messages, where they come back to the byte.
-
-    Raises:
-        OSError: The video cannot be read.
-    """
-    key = note.key
-    return StreamSidecar(
-        mp4ds=FORMAT_VERSION,
-        kind="stream",
-        profile=note.profile,
-        frames=frames,
-        channel=ChannelModel.from_record(channel),
-        wire=key.wire,
-        body=key.body,
-        image=Image(
-            encoding=key.encoding,
-            width=key.width,
-            height=key.height,
-            step=key.step,
-            is_bigendian=key.is_bigendian,
-        ),
-        headers=list(headers),
-        video=VideoModel.model_validate({**note.video, **video_facts(video, note.video["codec"])}),
-        camera_info=camera_info,
-        columns=columns,
-        digests=digests_model(digests) if note.exact else None,
-    )
 
 
 def _png_file(recipe: PngRecipe) -> PngFile:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
@@ -78,8 +78,6 @@ class VideoEncoder:
         gop: Maximum distance of key frames, in frames.
         threads: Threads of the encoder.
         rate: Frames per second, if known; a hint for the encoder's look-ahead.
-        on_packet: Called with each packet before it is written. What was written can then be read
-            at any time; see `new_mp4`.
 
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
@@ -96,11 +94,9 @@ class VideoEncoder:
         gop: int,
         threads: int,
         rate: float | None,
-        on_packet: Callable[[bytes], None] | None = None,
     ) -> None:
         self.recipe = recipe
         self.frames = 0
-        self._on_packet = on_packet
         self._picture_format = picture_format
         # a camera's own YUV keeps its range
         self._converter = PictureConverter(
@@ -108,7 +104,7 @@ class VideoEncoder:
         )
         self.width, self.height = coded_size(recipe, width, height)
         self.options = {**_options(recipe, self.width, self.height), "g": str(gop)}
-        self._container = new_mp4(path, is_durable=on_packet is not None)
+        self._container = new_mp4(path)
         try:
             self._open_stream(threads, rate)
         except MemoryError:  # which FFmpegError may be, too: no fault of the pictures
@@ -160,8 +156,6 @@ class VideoEncoder:
 
     def _mux(self, packets: Sequence[Any]) -> None:
         for packet in packets:
-            if self._on_packet is not None:
-                self._on_packet(bytes(packet))
             self._container.mux(packet)
 
     def _encoded(self, frame: av.VideoFrame | None) -> Sequence[Any]:

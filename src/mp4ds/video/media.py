@@ -202,25 +202,16 @@ class _Source:
             raise
 
 
-_FRAGMENT_US = 500_000
-
-
-def new_mp4(path: Path, *, is_durable: bool = False) -> Any:
+def new_mp4(path: Path) -> Any:
     """An mp4 to write to, its times in ticks of the track.
 
     Args:
         path: The file to make, when the first packet comes.
-        is_durable: Whether what was written can be read before the file is complete: it consists of
-            fragments of half a second, until it is closed and becomes an ordinary mp4.
     """
     options = {
         "video_track_timescale": str(TIMESCALE),
         "movie_timescale": str(TIMESCALE),
         "avoid_negative_ts": "disabled",  # an edit list hides what comes before 0
     }
-    if is_durable:
-        options["movflags"] = "+hybrid_fragmented+delay_moov"
-        options["frag_duration"] = str(_FRAGMENT_US)
-        options["flush_packets"] = "1"
     # ffmpeg takes a relative name with a colon for an address
     return av.open(str(path.absolute()), "w", format="mp4", options=options)

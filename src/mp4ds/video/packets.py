@@ -5,14 +5,13 @@ from __future__ import annotations
 import io
 import struct
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
-import xxhash
 from av.error import FFmpegError
 
 from mp4ds.errors import Refused, SegmentsDifferError, VideoError
@@ -43,8 +42,6 @@ class PacketWriter:
         parameters: Parameter sets or sequence header, as in `PictureParser.parameters`; used if the
             first body has none.
         rate: Frames per second, if known: it gives the last frame its duration.
-        on_packet: Called with each packet before it is written. What was written can then be read
-            at any time; see `new_mp4`.
 
     Raises:
         ValueError: The codec is another one; lists those.
@@ -59,9 +56,7 @@ class PacketWriter:
         height: int,
         parameters: bytes = b"",
         rate: float | None = None,
-        on_packet: Callable[[bytes], None] | None = None,
     ) -> None:
-        self._on_packet = on_packet
         if codec not in PACKET_CODECS:
             raise ValueError(f"codec {codec!r} is not one of {', '.join(PACKET_CODECS)}")
         self.codec = codec
@@ -105,8 +100,6 @@ class PacketWriter:
         packet.pts = packet.dts = tick
         packet.duration = round(TIMESCALE / self._rate)
         packet.is_keyframe = keyframe
-        if self._on_packet is not None:
-            self._on_packet(plain)
         self._container.mux(packet)
         self._ticks.append(tick)
         self._sizes.append(len(plain))
@@ -123,7 +116,7 @@ class PacketWriter:
         """
         plain = plain_body(self.codec, body)
         if self.codec in ("mjpeg", "png"):
-            self._container = new_mp4(self._path, is_durable=self._on_packet is not None)
+            self._container = new_mp4(self._path)
             self._stream = self._container.add_mux_stream(
                 self.codec, rate=self._rate, width=self.width, height=self.height
             )
@@ -133,7 +126,7 @@ class PacketWriter:
                 context = template.codec_context
                 if (context.width, context.height) != (self.width, self.height):
                     raise Refused("its first picture cannot be decoded")
-                self._container = new_mp4(self._path, is_durable=self._on_packet is not None)
+                self._container = new_mp4(self._path)
                 self._stream = self._container.add_stream_from_template(template, opaque=True)
         self._stream.time_base = _TIME_BASE
 
@@ -381,71 +374,6 @@ def cut_segment(
     except BaseException:
         target.unlink(missing_ok=True)
         raise
-
-
-def packet_digest(codec: str, packet: bytes, *, is_stored: bool) -> int:
-    """XXH64 of a packet, the same before it is written into an mp4 and when it is read from there.
-
-    Args:
-        codec: Name in the registry.
-        packet: The packet.
-        is_stored: Whether it is as an mp4 holds it.
-
-    Raises:
-        Refused: It is damaged.
-    """
-    if codec in _UNITS:
-        units = nal.split_length_prefixed(packet) if is_stored else nal.split(packet)[0]
-        packet = nal.join_plain(units)
-    elif codec == "av1":
-        packet = packet.removeprefix(av1.DELIMITER)
-    return xxhash.xxh64_intdigest(packet)
-
-
-def copy_fragments(
-    source: Path, codec: str, ticks: Sequence[int], digests: Sequence[int], target: Path
-) -> int:
-    """Write what is there of a durable video that was cut off into an ordinary one.
-
-    Args:
-        source: A file of which `new_mp4` says that it is durable.
-        codec: Name in the registry.
-        ticks: Presentation times of the frames that are wanted, in ticks of 1 / `TIMESCALE` s.
-        digests: Of their packets; see `packet_digest`.
-        target: The file to make, if any of these is there.
-
-    Returns:
-        How many of them are there, from the first on.
-
-    Raises:
-        VideoError: The result would not hold every packet as it was.
-        OSError: The disk refused.
-    """
-    try:
-        entry = read_sample_entry(source)
-        media = Media(source)
-    except VideoError:  # not one fragment is there
-        return 0
-    written = _Written(codec)
-    with closing(media), closing(new_mp4(target)) as container:
-        stream = _new_stream(container, media.track, entry)
-        duration = max(1, ticks[1] - ticks[0]) if len(ticks) > 1 else TIMESCALE // 30
-        with suppress(FFmpegError, Refused):  # at its torn end
-            packets = media.container.demux(media.track)
-            for tick, digest, packet in zip(ticks, digests, packets, strict=False):
-                data, is_key = bytes(packet), packet.is_keyframe
-                is_whole = packet_digest(codec, data, is_stored=True) == digest
-                if packet.pts != tick or not is_whole:
-                    break
-                container.mux(_packet_at(data, stream, tick, duration, is_key=is_key))
-                written.add(tick, len(data), is_key=is_key)
-        if written.ticks:
-            _finish(container, target)
-    if not written.ticks:
-        target.unlink(missing_ok=True)
-        return 0
-    written.check(target, entry)
-    return len(written.ticks)
 
 
 def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> int:

@@ -1,49 +1,41 @@
-"""A live robot -> datasets: messages are encoded and written to disk as they arrive."""
+"""A live robot -> datasets: messages are written to disk as they arrive, and packed beside."""
 
 from __future__ import annotations
 
 import os
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
 from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetError, WriteError
-from mp4ds.files.outputs import check_target, move_into_place, sync, work_folder
-from mp4ds.files.sources import JOURNAL_NAME, UNFINISHED, is_unfinished, salvage_command
-from mp4ds.format.manifest import About
+from mp4ds.files.outputs import check_target, sync
+from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.options import Options, argument, force, option, parse_size
-from mp4ds.packing.journal import Journal
-from mp4ds.packing.live import Intake, LivePacker, LiveRecording
-from mp4ds.packing.manifest import (
-    Origin,
-    PartRecord,
-    dataset_files,
-    folder_size,
-    summarize,
-    write_manifest,
-)
+from mp4ds.packing.manifest import dataset_files, folder_size
 from mp4ds.packing.options import PackSummary
-from mp4ds.packing.packer import PartSettings
-from mp4ds.packing.planning import available_cores
-from mp4ds.packing.tracks import StreamSettings
-from mp4ds.plan import LOSSLESS, MAX_GOP, SPEED, Purpose, Selection, parse_quality
+from mp4ds.packing.pack import checked_codec
+from mp4ds.packing.spool import SpoolFolder, SpoolSettings, summary_of
+from mp4ds.plan import LOSSLESS, MAX_GOP, SPEED, parse_quality
 from mp4ds.plugins.playing.timeline import quick_switches
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import sourced
+from mp4ds.plugins.recording.packing import PackingError, PackingProcess
 from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
+from mp4ds.plugins.recording.spool import MessageBuffer, SpoolWriter
 from mp4ds.records import Message, MetadataRecord
 from mp4ds.times import INT64_MAX
-from mp4ds.video.codecs import LOSSLESS_GOP, LOSSY_GOP, check_codec
 
 _NS = 1_000_000_000
 _REPORT_S = 0.2
+_FLUSH_S = 0.5
 _LAST_NS = {"ros1": 2**32 * _NS - 1, "ros2": INT64_MAX}
 """The latest time that a bag or rosbag2 can hold."""
 
@@ -150,7 +142,6 @@ class TopicProgress:
         messages: Messages received.
         hz: Messages per second, recently.
         bytes_per_s: Bytes per second, recently.
-        verbatim: Camera messages stored as received, not encoded.
         dropped: Messages dropped because the buffer was full.
         lost: Messages lost, as reported by the middleware.
         untimed: Messages left out because their log time is negative or too large.
@@ -159,7 +150,6 @@ class TopicProgress:
     messages: int
     hz: float
     bytes_per_s: float
-    verbatim: int
     dropped: int
     lost: int
     untimed: int
@@ -175,7 +165,8 @@ class RecordProgress:
         state: ``recording``, ``paused``, ``finishing`` or ``waiting for /clock``.
         topics: State of each topic, by name.
         waiting_bytes: Bytes of buffered messages.
-        bytes_written: Bytes of this dataset so far.
+        spool_bytes: Bytes of messages on disk that are not packed yet.
+        bytes_written: Bytes of this dataset so far, including these.
         warnings: Warnings so far, each a sentence.
     """
 
@@ -184,6 +175,7 @@ class RecordProgress:
     state: str
     topics: Mapping[str, TopicProgress]
     waiting_bytes: int
+    spool_bytes: int
     bytes_written: int
     warnings: Sequence[str]
 
@@ -273,8 +265,7 @@ def open_recorder(
         exclude_regex=chosen.exclude_regex,
         names=names,
     )
-    settings = _settings(chosen)
-    about = load_about(chosen.about) if chosen.about is not None else None
+    _check(chosen)
     others = _bag_info(chosen.custom_data) if kind == "ros2" else []
     if source is None:
         source = open_source(
@@ -298,10 +289,15 @@ def open_recorder(
             else Path(f"{datetime.now():mp4ds_%Y_%m_%d-%H_%M_%S}")
         )
         made = target.absolute()
-        yield Recorder(made, chosen, settings, wanted, source, about, others, progress)
+        yield Recorder(made, chosen, wanted, source, others, progress)
 
 
-def _settings(options: RecordOptions) -> StreamSettings:
+def _check(options: RecordOptions) -> None:
+    """Refuse options that make no sense, before anything is recorded.
+
+    Raises:
+        OptionError: One of them is wrong.
+    """
     quality = parse_quality(options.quality)
     if quality.target is not None:
         raise OptionError(
@@ -311,16 +307,9 @@ def _settings(options: RecordOptions) -> StreamSettings:
     for name, seconds in (("duration", options.duration), ("max_duration", options.max_duration)):
         if seconds is not None and not 0 <= seconds < 1e9:
             raise OptionError(f"`{name}` {seconds:g} is not a number of seconds, 0 or more.")
-    return StreamSettings(
-        quality=quality,
-        codec=check_codec(
-            options.codec, options.preset, lossless=quality.lossless, crf=quality.crf
-        ),
-        preset=options.preset,
-        gop=options.gop or (LOSSLESS_GOP if quality.lossless else LOSSY_GOP),
-        threads=1 if quality.lossless else available_cores(),
-        purpose=Purpose(SPEED),
-    )
+    if options.about is not None:
+        load_about(options.about)
+    checked_codec(quality, options.codec, options.preset, SPEED)
 
 
 def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:
@@ -345,14 +334,15 @@ def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:
 class Recorder:
     """Records until it is stopped; see `open_recorder`.
 
+    A thread of its own writes messages into a spool; pieces of it that are complete are packed,
+    one after another, by another process.
+
     Args:
         target: The dataset, an absolute path.
         options: How to record.
-        settings: How to encode.
         wanted: Which topics to record.
         source: Where messages come from.
-        about: Description of the recording.
-        others: What it holds besides messages.
+        others: What the recording holds besides messages.
         progress: Called a few times a second.
     """
 
@@ -360,38 +350,37 @@ class Recorder:
         self,
         target: Path,
         options: RecordOptions,
-        settings: StreamSettings,
         wanted: Wanted,
         source: Source,
-        about: About | None,
         others: Sequence[MetadataRecord],
         progress: Callable[[RecordProgress], None] | None,
     ) -> None:
         self._target = target
         self._options = options
-        self._settings = settings
         self._wanted = wanted
         self._source = source
-        self._about = about
         self._others = others
         self._progress = progress
-        self._intake = Intake(options.buffer * 10**6, _LAST_NS[source.profile])
+        self._buffer = MessageBuffer(options.buffer * 10**6, _LAST_NS[source.profile])
+        self._packing = _Packing()
         self._changed = threading.Event()
         self._is_stopped = False
         self._is_paused = options.start_paused
+        self._is_split_asked = False
         self._splits: list[_Split] = []
         self._rates: dict[str, tuple[float, int, int, float, float]] = {}
+        self._error: Exception | None = None
         self.address = source.address
 
     @property
     def received(self) -> int:
         """Number of messages received so far."""
-        return sum(self._intake.received.values())
+        return sum(self._buffer.received.values())
 
     @property
     def unfinished(self) -> list[Path]:
         """Folders of recordings that are not datasets yet."""
-        return [split.folder for split in self._splits if split.folder.is_dir()]
+        return [split.folder.path for split in self._splits if split.folder.path.is_dir()]
 
     # ------------------------------------------------------------ controls
 
@@ -413,9 +402,8 @@ class Recorder:
         self._is_paused = not self._is_paused
 
     def split(self) -> None:
-        """Start a new dataset."""
-        if self._splits:
-            self._splits[-1].is_asked = True
+        """Start a new dataset, with the next message."""
+        self._is_split_asked = True
 
     def stop(self) -> None:
         """Stop; `run` then completes the dataset and returns."""
@@ -430,52 +418,61 @@ class Recorder:
         Raises:
             Mp4dsError: As for `record`.
         """
-        with quick_switches():
-            return self._run()
+        try:
+            with quick_switches(), self._packing:
+                return self._run()
+        finally:
+            for split in self._splits:
+                split.lock.close()
 
     def _run(self) -> RecordSummary:
         summary = RecordSummary()
         self._warn_of_unfinished()
         begun = time.monotonic()
         self._begin_split()
+        writer = threading.Thread(target=self._write, name="spool", daemon=True)
+        writer.start()
         try:
             self._source.serve(self)
             self._source.start(self._wanted, self._take)
             while not self._is_stopped:
                 self._changed.wait(_REPORT_S)
                 self._changed.clear()
-                if self._source.state.waiting_for:
+                clock = self._source.state.waiting_for
+                if clock:
                     begun = time.monotonic()
-                self._go_on(begun)
+                if self._options.duration and time.monotonic() - begun >= self._options.duration:
+                    self._is_stopped = True
+                state = f"waiting for {clock}" if clock else "recording"
+                self._report(begun, "paused" if self._is_paused else state)
         finally:
             self._source.close()
-            self._intake.close()
-            self._drain(begun)
-            for split in self._splits:
-                self._finish(split, begun)
+            self._buffer.close()
+            self._drain(writer, begun)
+        for split in self._splits:
+            if error := split.error or (self._error if split.made is None else None):
+                raise split.failure(error)
+        if self._error is not None:
+            raise self._error
         summary.datasets = [split.made for split in self._splits if split.made]
         summary.seconds = time.monotonic() - begun
-        summary.dropped = dict(self._intake.dropped)
+        summary.dropped = dict(self._buffer.dropped)
         summary.lost = dict(self._source.state.lost)
-        summary.untimed = dict(self._intake.untimed)
+        summary.untimed = dict(self._buffer.untimed)
         summary.warnings = list(self._source.state.warnings)
         return summary
 
     def _take(self, message: Message) -> None:
         if not self._is_paused:
-            self._intake.put(message)
+            self._buffer.put(message)
 
-    def _go_on(self, begun: float) -> None:
-        current = self._splits[-1]
-        if current.error is not None:
-            self._is_stopped = True
-        elif current.is_read:
-            self._begin_split()
-        if self._options.duration and time.monotonic() - begun >= self._options.duration:
-            self._is_stopped = True
-        clock = self._source.state.waiting_for
-        state = f"waiting for {clock}" if clock else "recording"
-        self._report(begun, "paused" if self._is_paused else state)
+    def _drain(self, writer: threading.Thread, begun: float) -> None:
+        """Write what is still buffered, and pack what is not packed."""
+        while writer.is_alive():
+            writer.join(_REPORT_S)
+            self._report(begun, "finishing")
+        while not self._packing.wait(_REPORT_S):
+            self._report(begun, "finishing")
 
     def _begin_split(self) -> None:
         number = len(self._splits)
@@ -483,36 +480,48 @@ class Recorder:
         target = self._target
         if is_numbered:
             target = target.with_name(f"{target.name}_{number}")
-        self._splits.append(_Split(self, target, is_spare=number > 0, tell=self._changed.set))
+        split = _Split(target, self._options, self._source, self._others, self._packing)
+        self._splits.append(split)
+        self._is_split_asked = False
 
-    def _drain(self, begun: float) -> None:
-        """Write what is still buffered, into further datasets where the current one is complete."""
+    def _write(self) -> None:
+        """Write buffered messages into the spool, until the buffer is closed."""
+        with ThreadPoolExecutor(1) as disk:
+            try:
+                self._write_all(disk)
+            except Exception as error:  # it is raised by `run`
+                self._error = error
+                self._splits[-1].spool.abandon()
+                self.stop()
+
+    def _write_all(self, disk: ThreadPoolExecutor) -> None:
+        syncing: Future[None] | None = None
+        next_flush = time.monotonic() + _FLUSH_S
         while True:
-            split = self._splits[-1]
-            while not split.is_read and not split.join(_REPORT_S):
-                self._report(begun, "finishing")
-            if split.error is not None or not self._intake.waiting_bytes:
+            try:
+                message = self._buffer.take(max(0.0, next_flush - time.monotonic()))
+            except EOFError:
+                self._splits[-1].close()
                 return
-            self._begin_split()
-
-    def _finish(self, split: _Split, begun: float) -> None:
-        """Wait until a dataset is complete.
-
-        Raises:
-            Mp4dsError: It could not be made.
-        """
-        while not split.join(_REPORT_S):
-            self._report(begun, "finishing")
-        split.raise_error()
+            if message is not None:
+                if self._is_split_asked or self._splits[-1].is_full:
+                    self._splits[-1].close()
+                    self._begin_split()
+                self._splits[-1].spool.write(message)
+            if time.monotonic() >= next_flush:
+                spool = self._splits[-1].spool
+                spool.flush()
+                if syncing is None or syncing.done():
+                    syncing = disk.submit(_sync, spool.paths)
+                next_flush = time.monotonic() + _FLUSH_S
 
     def _report(self, begun: float, state: str) -> None:
         if self._progress is None:
             return
         split, now = self._splits[-1], time.monotonic()
-        verbatim = split.verbatim
         topics = {
-            topic: self._topic(topic, now, verbatim.get(topic, 0))
-            for topic in sorted({*self._source.state.topics, *self._intake.received})
+            topic: self._topic(topic, now)
+            for topic in sorted({*self._source.state.topics, *self._buffer.received})
         }
         self._progress(
             RecordProgress(
@@ -520,14 +529,15 @@ class Recorder:
                 seconds=now - begun,
                 state=state,
                 topics=topics,
-                waiting_bytes=self._intake.waiting_bytes,
+                waiting_bytes=self._buffer.bytes,
+                spool_bytes=sum(split.spool_bytes for split in self._splits),
                 bytes_written=split.size,
                 warnings=list(self._source.state.warnings),
             )
         )
 
-    def _topic(self, topic: str, now: float, verbatim: int) -> TopicProgress:
-        count, size = self._intake.received[topic], self._intake.received_bytes[topic]
+    def _topic(self, topic: str, now: float) -> TopicProgress:
+        count, size = self._buffer.received[topic], self._buffer.received_bytes[topic]
         then, its_count, its_size, hz, rate = self._rates.get(topic, (now, count, size, 0.0, 0.0))
         if now - then >= 1.0 or topic not in self._rates:
             elapsed = max(now - then, _REPORT_S)
@@ -537,10 +547,9 @@ class Recorder:
             messages=count,
             hz=hz,
             bytes_per_s=rate,
-            verbatim=verbatim,
-            dropped=self._intake.dropped[topic],
+            dropped=self._buffer.dropped[topic],
             lost=self._source.state.lost[topic],
-            untimed=self._intake.untimed[topic],
+            untimed=self._buffer.untimed[topic],
         )
 
     def _warn_of_unfinished(self) -> None:
@@ -553,123 +562,159 @@ class Recorder:
                 )
 
 
+def _sync(paths: Sequence[Path]) -> None:
+    for path in paths:
+        with suppress(OSError):  # what the disk refuses, its writer is told, too
+            sync(path)
+
+
+class _Packing:
+    """Jobs for the process that packs, one after another. A context manager."""
+
+    def __init__(self) -> None:
+        self.process = PackingProcess()
+        self._thread = ThreadPoolExecutor(1, "packing")
+        self._jobs: list[Future[None]] = []
+
+    def submit(self, job: Callable[[], None]) -> None:
+        """Run a job after all earlier ones."""
+        self._jobs.append(self._thread.submit(job))
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until all jobs have run; returns whether they have."""
+        return not wait(self._jobs, seconds).not_done
+
+    def __enter__(self) -> _Packing:
+        return self
+
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
+        if exc_type is not None:
+            self._thread.shutdown(wait=False, cancel_futures=True)
+            self.process.kill()
+        self._thread.shutdown()
+        self.process.close()
+
+
 class _Split:
-    """One dataset of a recording, made in its own thread."""
+    """One dataset of a recording.
+
+    Args:
+        target: Where to make it.
+        options: How to record.
+        source: Where messages come from.
+        others: What the recording holds besides messages.
+        packing: Packs the pieces of its spool, and joins the parts.
+
+    Raises:
+        TargetError: It cannot be made there.
+        WriteError: The disk refused.
+    """
 
     def __init__(
-        self, recorder: Recorder, target: Path, *, is_spare: bool, tell: Callable[[], None]
+        self,
+        target: Path,
+        options: RecordOptions,
+        source: Source,
+        others: Sequence[MetadataRecord],
+        packing: _Packing,
     ) -> None:
-        options, source = recorder._options, recorder._source
         self.target = target
         self.made: PackSummary | None = None
-        self.error: BaseException | None = None
-        self.is_read = False
-        self.is_asked = False
-        self._is_spare = is_spare  # not made if no message is left for it
-        self._tell = tell
-        self._force = options.force
-        self._about = recorder._about
+        self.error: Exception | None = None
+        self.folder = SpoolFolder(target.with_name(target.name + UNFINISHED))
+        self._options = options
+        self._source = source
+        self._packing = packing
         self._most_ns = round((options.max_duration or 0) * _NS)
-        self._most_bytes = options.max_size
-        self._next_look = 0.0
-        self.folder = target.with_name(target.name + UNFINISHED)
+        self._parts = 0
+        self._packed_bytes = 0  # of messages
+        self._parts_bytes = 0
         check_target(target, force=options.force, owned=dataset_files)
+        settings = SpoolSettings(
+            format=source.format,
+            profile=source.profile,
+            quality=options.quality,
+            codec=options.codec,
+            preset=options.preset,
+            gop=options.gop,
+        )
         try:
-            self.folder.mkdir()
+            self.lock = self.folder.begin(settings)
+            self.spool = SpoolWriter(self.folder, source.profile, others, self._on_closed)
         except FileExistsError:
             raise TargetError(
-                self.folder,
+                self.folder.path,
                 "already exists: a recording of this name was not finished",
-                f"Choose another name, or recover that one first: {salvage_command(self.folder)}",
+                "Choose another name, or recover that one first: "
+                f"{salvage_command(self.folder.path)}",
             ) from None
         except OSError as error:
             raise WriteError(target, error) from None
-        facts = {"format": source.format, "profile": source.profile}
-        self._profile = str(recorder._settings.quality)
-        self._journal = Journal(self.folder, {**facts, "quality": self._profile})
-        self._recording = LiveRecording(target, source.format, source.profile, recorder._others)
-        self._packer = LivePacker(
-            self._recording,
-            self.folder,
-            PartSettings(recorder._settings, selected=Selection()),
-            self._journal,
-            intake=recorder._intake,
-            announced=lambda: [*filter(None, list(source.state.topics.values()))],
-            is_over=self._is_over,
-            on_read=self._on_read,
-        )
-        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
-        self._thread.start()
+
+    @property
+    def spool_bytes(self) -> int:
+        """Bytes of messages that are not packed yet."""
+        return self.spool.bytes - self._packed_bytes
 
     @property
     def size(self) -> int:
-        """Bytes of its files so far."""
-        with suppress(OSError):
-            return folder_size(self.folder)
-        return 0
+        """Bytes so far."""
+        return self.spool_bytes + self._parts_bytes
 
     @property
-    def verbatim(self) -> Counter[str]:
-        """Camera messages stored as received, by topic."""
-        topics = list(self._packer.part.topics.values())
-        return Counter({t.topic: sum(count for count, _ in t.verbatim.values()) for t in topics})
-
-    def _is_over(self, part: PartRecord) -> bool:
-        if self.error is not None or self.is_asked:
+    def is_full(self) -> bool:
+        """Whether the next message belongs into another dataset."""
+        span = self.spool.span
+        if self._most_ns and span and span[1] - span[0] >= self._most_ns:
             return True
-        if self._most_ns and part.span and part.span[1] - part.span[0] >= self._most_ns:
-            return True
-        if self._most_bytes and time.monotonic() >= self._next_look:
-            self._next_look = time.monotonic() + _REPORT_S
-            return self.size >= self._most_bytes
-        return False
+        return self._options.max_size is not None and self.size >= self._options.max_size
 
-    def _on_read(self) -> None:
-        self.is_read = True
-        self._tell()
+    def _on_closed(self, number: int, size: int) -> None:
+        self._packing.submit(partial(self._pack, number, size))
 
-    def _run(self) -> None:
-        try:
-            part = self._packer.run()
-            if self._is_spare and not part.span:
-                for path in (part.messages_path, self._journal.path):
-                    path.unlink()
-                with suppress(OSError):  # somebody else put a file there
-                    self.folder.rmdir()
-                return
-            origin = Origin(about=self._about)
-            write_manifest(part, self._recording, origin, self._profile)
-            self.made = summarize(part, self.target, None, origin)
-            self._journal.close()
-            (self.folder / JOURNAL_NAME).unlink()
-            sync(self.folder)
-            with work_folder(self.target.parent, f".{self.target.name}.") as old:
-                move_into_place(
-                    self.folder,
-                    self.target,
-                    old / self.target.name,
-                    force=self._force,
-                    owned=dataset_files,
+    def _pack(self, number: int, size: int) -> None:
+        if self.error is None:  # otherwise it is kept as it is
+            try:
+                self._packing.process.pack(self.folder.path, number)
+                self._parts_bytes += folder_size(self.folder.part(number))
+                self._packed_bytes += size
+                self._parts += 1
+            except (PackingError, OSError) as error:
+                self.error = error
+                self._source.state.warn(
+                    f"{self.folder.path}: no more is packed, what comes is still recorded: {error}"
                 )
-        except BaseException as error:
-            self.error = error
-        finally:
-            self._journal.close()
-            self._tell()
 
-    def join(self, seconds: float) -> bool:
-        """Wait until it is complete; returns whether it is."""
-        self._thread.join(seconds)
-        return not self._thread.is_alive()
-
-    def raise_error(self) -> None:
-        """Raise the error it failed with, if any.
+    def close(self) -> None:
+        """Complete the spool, and have the dataset made when all of it is packed.
 
         Raises:
-            RecordError: The disk is full, or failed.
+            OSError: The disk refused.
         """
-        if self.error is None:
+        self.spool.close(filter(None, list(self._source.state.topics.values())))
+        self._packing.submit(self._join)
+
+    def _join(self) -> None:
+        if self.error is not None:
             return
-        if isinstance(self.error, OSError) and not isinstance(self.error, Mp4dsError):
-            raise RecordError(self.folder, self.target, self.error) from self.error
-        raise self.error
+        options, count = self._options, self._parts
+        try:
+            self._packing.process.join(
+                self.folder.path, count, self.target, force=options.force, about=options.about
+            )
+            self.made = self._summary()
+            self.lock.close()
+            self.folder.remove(count)
+        except (Mp4dsError, OSError) as error:
+            self.error = error
+
+    def _summary(self) -> PackSummary:
+        made, raw = summary_of(self.target), self.spool.raw_bytes
+        topics = [replace(topic, raw_bytes=raw[topic.topic]) for topic in made.topics]
+        return replace(made, topics=topics, source_bytes=raw.total(), is_copy=False)
+
+    def failure(self, error: Exception) -> Exception:
+        """What to raise because of an error; what was recorded stays where it is."""
+        if isinstance(error, Mp4dsError) and not isinstance(error, PackingError):
+            return error
+        return RecordError(self.folder.path, self.target, error)

@@ -1,0 +1,333 @@
+"""The folder of a recording that is being made, or was when the recorder stopped.
+
+What arrives is in a spool: MCAP files ``000000.mcap``, ``000001.mcap`` and so on, its pieces. Each
+is packed into a part ``000000``, an ordinary dataset, and then removed. ``recording.json`` says
+how, and is locked by the recorder. In the end, the parts are joined.
+"""
+
+from __future__ import annotations
+
+import re
+import stat
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import IO, Annotated
+
+from pydantic import Field
+
+from mp4ds.bags.combined import bounded
+from mp4ds.bags.mcap_records import copy_verified
+from mp4ds.bags.protocols import Format
+from mp4ds.dataset.checks import validate
+from mp4ds.dataset.concat import concat
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.errors import FormatError, Refused, SourceError
+from mp4ds.files.outputs import check_target, is_mine, lock, staged, work_folder
+from mp4ds.files.sources import RECORDING_NAME
+from mp4ds.format.fields import MESSAGES_NAME, Model, Profile
+from mp4ds.format.manifest import About, LossEntry
+from mp4ds.packing.copying import topic_summaries
+from mp4ds.packing.manifest import dataset_files, folder_size
+from mp4ds.packing.options import PackOptions, PackSummary
+from mp4ds.plan import MAX_GOP, SPEED
+from mp4ds.records import Loss
+
+_NAME = re.compile(r"([0-9]{6})(\.mcap)?")
+_ONE_PASS = 10_000_000  # frames of a window: a piece is not divided again
+_MOST_BYTES = 2**16
+
+
+class SpoolSettings(Model):
+    """How the pieces of a spool are packed: all of them alike, so that parts fit together."""
+
+    format: Format
+    profile: Annotated[str, Field(pattern="^ros[12]$")]
+    quality: Profile
+    codec: str | None
+    preset: str | None
+    gop: Annotated[int, Field(ge=1, le=MAX_GOP)] | None
+
+    def options(self, *, salvage: bool = False) -> PackOptions:
+        """The options of a pack."""
+        return PackOptions(
+            quality=self.quality,
+            codec=self.codec,
+            preset=self.preset,
+            gop=self.gop,
+            purpose=SPEED,
+            window=_ONE_PASS,
+            salvage=salvage,
+        )
+
+
+PackPiece = Callable[[Path, Path, PackOptions], object]
+"""Packs a recording into a dataset; see `mp4ds.pack`."""
+
+
+class SpoolFolder:
+    """See the module.
+
+    Args:
+        path: The folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._settings_path = path / RECORDING_NAME
+
+    def begin(self, settings: SpoolSettings) -> IO[bytes]:
+        """Make the folder, which must not exist.
+
+        Returns:
+            What locks it: nobody takes it for one that was left while this is open.
+
+        Raises:
+            FileExistsError: It exists.
+            OSError: It cannot be written.
+        """
+        self.path.mkdir()
+        file = self._settings_path.open("xb")
+        lock(file)
+        file.write(settings.model_dump_json(indent=1).encode() + b"\n")
+        file.flush()
+        return file
+
+    def locked(self) -> IO[bytes]:
+        """Lock it while what is returned is open.
+
+        Raises:
+            SourceError: It is being recorded.
+        """
+        file = self._settings_path.open("r+b")
+        try:
+            lock(file)
+        except BlockingIOError:
+            file.close()
+            raise SourceError(
+                self.path, "is being recorded", "Wait, or stop the recorder."
+            ) from None
+        return file
+
+    def settings(self) -> SpoolSettings:
+        """How its pieces are packed.
+
+        Raises:
+            SourceError: It does not say so.
+        """
+        try:
+            with self._settings_path.open("rb") as file:
+                return SpoolSettings.model_validate_json(file.read(_MOST_BYTES))
+        except ValueError:
+            raise SourceError(
+                self._settings_path,
+                "is damaged, or of another version of mp4ds",
+                "Use the version that made the recording.",
+            ) from None
+
+    def piece(self, number: int) -> Path:
+        """Where a piece is, as long as it is not packed."""
+        return self.path / f"{number:06}.mcap"
+
+    def part(self, number: int) -> Path:
+        """Where the part of a piece is."""
+        return self.path / f"{number:06}"
+
+    def pack(self, number: int, pack: PackPiece) -> None:
+        """Make the part of a piece, which is then removed.
+
+        Raises:
+            Mp4dsError: It could not be packed; it is still there.
+        """
+        pack(self.piece(number), self.part(number), self.settings().options())
+        self.piece(number).unlink()
+
+    def join(self, count: int, target: Path, *, force: bool, about: About | None) -> PackSummary:
+        """Make the dataset of all parts.
+
+        Raises:
+            Mp4dsError: It could not be made; the parts are still there.
+        """
+        parts = [self.part(number) for number in range(count)]
+        return _joined(parts, self.settings(), target, force=force, about=about)
+
+    def remove(self, count: int) -> None:
+        """Remove the folder with all parts; files that somebody else put there stay."""
+        for number in range(count):
+            part = self.part(number)
+            for name in dataset_files(part) or ():
+                (part / name).unlink(missing_ok=True)
+            _remove_empty(part)
+        self._settings_path.unlink()
+        _remove_empty(self.path)
+
+
+def _remove_empty(folder: Path) -> None:
+    if not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def _joined(
+    parts: Sequence[Path],
+    settings: SpoolSettings,
+    target: Path,
+    *,
+    force: bool,
+    about: About | None,
+    losses: Sequence[Loss] = (),
+    is_foreign: bool = False,
+) -> PackSummary:
+    """Join parts, perhaps from somebody else; the spool is no source of the dataset."""
+    with (
+        staged(target, force=force, owned=dataset_files, sources=parts) as made,
+        ExitStack() as stack,
+    ):
+        made.mkdir()
+        datasets = [stack.enter_context(Dataset(part)) for part in parts]
+        manifests = [one.manifest for one in datasets if one.manifest]
+        known = [entry.to_record() for one in manifests for entry in one.losses]
+        changes = {
+            "about": about,
+            "format": settings.format,
+            "library": "",
+            "sources": [],
+            "losses": list(map(LossEntry.from_record, bounded([*losses, *known]))),
+        }
+        try:
+            concat(datasets, made, changes=changes)
+        except Refused as reason:
+            raise SourceError(parts[0].parent, f"cannot be joined: {reason}") from None
+        for problem in validate(made) if is_foreign else ():
+            raise FormatError(problem.code, parts[0].parent, str(problem))
+        return replace(summary_of(made), dataset=target)
+
+
+def summary_of(path: Path) -> PackSummary:
+    """What is in the dataset of a recording; the bytes of what was recorded are not known."""
+    with Dataset(path) as dataset:
+        topics = {topic.topic: topic for topic in topic_summaries(dataset)}
+        manifest = dataset.manifest
+    for item in manifest.verbatim if manifest else ():
+        topics[item.topic].verbatim[item.reason] = (item.messages, item.first)
+    return PackSummary(
+        dataset=path,
+        topics=list(topics.values()),
+        source_bytes=0,
+        dataset_bytes=folder_size(path),
+        messages_bytes=(path / MESSAGES_NAME).stat().st_size,
+        left_out=[],
+        skipped={},
+        losses=[entry.to_record() for entry in manifest.losses] if manifest else [],
+        is_copy=True,
+    )
+
+
+# ---------------------------------------------------------------- recovery
+
+
+def recover(
+    path: Path, target: Path, pack: PackPiece, *, force: bool, about: About | None
+) -> PackSummary:
+    """Make the dataset of a recording that was cut off: pack what is left, and join all.
+
+    The folder may come from anybody: names and values are checked, and what belongs to another
+    user is not read.
+
+    Args:
+        path: Where the recording was made; it stays as it is.
+        target: The dataset.
+        pack: Packs a piece.
+        force: Replace an existing dataset.
+        about: Description of the recording.
+
+    Raises:
+        SourceError: It is being recorded, is damaged, or belongs to another user.
+        TargetError: The dataset may not be written there.
+        WriteError: The disk refused.
+    """
+    check_target(target, force=force, owned=dataset_files, sources=[path])
+    _check_owner(path, path.absolute().parent)
+    folder = SpoolFolder(path)
+    found = _found(path)
+    with folder.locked(), work_folder(target.parent, f".{target.name}.") as place:
+        settings = folder.settings()
+        parts, losses = [], _gaps(found)
+        for number, is_packed in found.items():
+            piece, part = folder.piece(number), folder.part(number)
+            if not is_packed:
+                part, copy = place / part.name, place / piece.name
+                losses += copy_verified(piece, copy)
+                try:
+                    pack(copy, part, settings.options(salvage=True))
+                except SourceError as error:  # not a record of it is left
+                    losses.append(Loss(piece.name, 0, piece.stat().st_size, error.problem))
+                    continue
+                finally:
+                    copy.unlink()
+            parts.append(part)
+        if not parts:
+            raise SourceError(path, "holds no messages that can be read")
+        return _joined(
+            parts,
+            settings,
+            target,
+            force=force,
+            about=about,
+            losses=losses,
+            is_foreign=True,
+        )
+
+
+def _gaps(found: Mapping[int, bool]) -> list[Loss]:
+    """What is missing between pieces that are there, which no recorder leaves."""
+    losses = []
+    for before, after in pairwise([-1, *found]):
+        if after > before + 1:
+            missing = f"pieces {before + 1} to {after - 1} of the recording are missing"
+            losses.append(Loss(f"{before + 1:06}.mcap", None, None, missing))
+    return losses
+
+
+def _found(path: Path) -> Mapping[int, bool]:
+    """The numbers of pieces and parts in a folder, and whether a piece is packed.
+
+    Raises:
+        SourceError: One of them, or a file of a part, is not an ordinary one of this user.
+    """
+    found: dict[int, bool] = {}
+    _check(path / RECORDING_NAME)
+    for entry in sorted(path.iterdir()):
+        if match := _NAME.fullmatch(entry.name):
+            number, is_part = int(match[1]), not match[2]
+            _check(entry, is_folder=is_part)
+            for inner in entry.iterdir() if is_part else ():
+                _check(inner)
+            found[number] = found.get(number, False) or is_part
+    return found
+
+
+def _check(path: Path, *, is_folder: bool = False) -> None:
+    """Refuse what a recorder of this user has not made.
+
+    Raises:
+        SourceError: Says why.
+    """
+    found = path.lstat()
+    if not (stat.S_ISDIR if is_folder else stat.S_ISREG)(found.st_mode):
+        kind = "folder" if is_folder else "file"
+        problem = "is a symbolic link" if path.is_symlink() else f"is not a regular {kind}"
+        raise SourceError(path, problem, f"Put the recorder's own {kind} in its place.")
+    _check_owner(path, path.parent)
+
+
+def _check_owner(path: Path, beside: Path) -> None:
+    """Refuse what belongs to another user.
+
+    Raises:
+        SourceError: It does.
+    """
+    if not is_mine(path.lstat(), beside):
+        remedy = "If you trust it, salvage a copy of the folder that you own."
+        raise SourceError(path, "belongs to another user", remedy)

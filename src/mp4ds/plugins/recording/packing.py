@@ -1,0 +1,163 @@
+"""A process of low priority that packs what is recorded while the recording goes on.
+
+``python -m mp4ds.plugins.recording.packing`` takes an order from each line of its standard input,
+and answers with a line. If the input ends in the middle of an order, its recorder was killed.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+from mp4ds.errors import Mp4dsError, sentence_of
+from mp4ds.format.sidecars import load_about
+from mp4ds.packing.engine import give_back
+from mp4ds.packing.pack import pack
+from mp4ds.packing.spool import SpoolFolder
+
+_NICE = 10
+
+
+class PackingError(Mp4dsError):
+    """A piece could not be packed, or parts could not be joined; all are still there."""
+
+
+class PackingProcess:
+    """Carries out orders, one at a time, in a process of low priority."""
+
+    _ARGUMENTS = ("-m", "mp4ds.plugins.recording.packing")
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+
+    def pack(self, folder: Path, number: int) -> None:
+        """See `SpoolFolder.pack`.
+
+        Raises:
+            PackingError: It failed.
+        """
+        self._order("pack", str(folder), number)
+
+    def join(
+        self, folder: Path, count: int, target: Path, *, force: bool, about: str | None
+    ) -> None:
+        """See `SpoolFolder.join`.
+
+        Args:
+            folder: The folder.
+            count: How many parts there are.
+            target: The dataset.
+            force: Replace an existing one.
+            about: A file that describes the recording.
+
+        Raises:
+            PackingError: It failed.
+        """
+        self._order("join", str(folder), count, str(target), force, about)
+
+    def _order(self, *order: Any) -> None:
+        if self._process is None:
+            self._process = subprocess.Popen(
+                [sys.executable, *self._ARGUMENTS],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                start_new_session=True,  # Ctrl-C is for the recorder
+            )
+        answer = ""
+        with suppress(OSError):  # it has died, as its answer shows
+            _pipe(self._process.stdin).write(json.dumps(order) + "\n")
+            _pipe(self._process.stdin).flush()
+            answer = _pipe(self._process.stdout).readline()
+        if not answer:
+            raise PackingError(f"the process that packs ended with code {self.close()}")
+        if problem := json.loads(answer):
+            raise PackingError(problem)
+
+    def kill(self) -> None:
+        """End it in the middle of an order."""
+        if self._process is not None:
+            self._process.kill()
+
+    def close(self) -> int:
+        """End it; returns its exit code."""
+        process, self._process = self._process, None
+        if process is None:
+            return 0
+        with suppress(OSError):  # where it has died before it read all
+            _pipe(process.stdin).close()
+        _pipe(process.stdout).close()
+        return process.wait()
+
+
+def _pipe(pipe: IO[str] | None) -> IO[str]:
+    if pipe is None:
+        raise OSError("no pipe")
+    return pipe
+
+
+# ---------------------------------------------------------------- the process
+
+
+class _Orders:
+    """Orders from standard input."""
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._is_busy = False
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        # unbuffered: Python could not end while another thread waits within a buffer
+        for line in io.FileIO(sys.stdin.fileno(), closefd=False):
+            self._queue.put(line)
+        if self._is_busy:
+            os._exit(1)
+        self._queue.put(None)
+
+    def __iter__(self) -> Iterator[list[Any]]:
+        while (line := self._queue.get()) is not None:
+            self._is_busy = True
+            yield json.loads(line)
+            self._is_busy = False
+
+
+def _carry_out(kind: str, folder: str, number: int, *rest: Any) -> str:
+    """Carry out an order; returns the sentence of its error, empty if there is none."""
+    spool = SpoolFolder(Path(folder))
+    try:
+        if kind == "pack":
+            spool.pack(number, pack)
+        else:
+            target, force, about = rest
+            told = load_about(about) if about is not None else None
+            spool.join(number, Path(target), force=force, about=told)
+    except Mp4dsError as error:
+        return str(error)
+    except OSError as error:
+        return sentence_of(error)
+    return ""
+
+
+def _main() -> None:
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    for order in _Orders():
+        problem = _carry_out(*order)
+        give_back()
+        sys.stdout.write(json.dumps(problem) + "\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    with suppress(BrokenPipeError):
+        _main()
