@@ -9,17 +9,20 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import pytest
 import typer
-from mp4ds.packing.journal import JOURNAL_NAME
 
 import mp4ds
+from mp4ds.bags.formats import open_sources
 from mp4ds.cli import app_for
+from mp4ds.errors import SourceError
 from mp4ds.plugins.recording.record import UNFINISHED
+from mp4ds.records import Message
 from player_scenes import make_drive
 from roscore import RECORD, Core, python, wait_until
 from roscore import _core as _core
@@ -191,9 +194,18 @@ def payloads(recording: Path) -> dict[str, list[bytes]]:
 
 
 def noted(folder: Path) -> int:
-    """Images that a recorder has taken."""
-    journal = folder.with_name(folder.name + UNFINISHED) / JOURNAL_NAME
-    return len(re.findall(r'^\w+ \["(?:frame|verbatim)"', journal.read_text(), re.M))
+    """Images that a recorder has written."""
+    count = 0
+    for path in folder.with_name(folder.name + UNFINISHED).glob("*.mcap"):
+        if path.with_suffix("").exists():  # packed, and counted there
+            continue
+        with suppress(SourceError), open_sources([path], salvage=True) as reader:
+            found = (record for record in reader.records() if isinstance(record, Message))
+            count += sum(message.channel.type_name == "sensor_msgs/Image" for message in found)
+    for path in folder.with_name(folder.name + UNFINISHED).glob("??????"):
+        with mp4ds.open(path) as dataset:
+            count += sum(map(len, dataset.streams))
+    return count
 
 
 def test_roslaunch(roscore: Core, workspace: Workspace, drive: Path, tmp_path: Path) -> None:

@@ -432,4 +432,7 @@ def copy_verified(piece: Path, copy: Path) -> list[Loss]:
                 losses.append(Loss(piece.name, offset, len(head) + size, problem))
                 continue
             target.write(head + body)
+            if kind == Opcode.FOOTER:
+                target.write(source.read(len(MAGIC)))
+                break
     return losses

@@ -269,15 +269,13 @@ def recover(
             parts.append(part)
         if not parts:
             raise SourceError(path, "holds no messages that can be read")
-        return _joined(
-            parts,
-            settings,
-            target,
-            force=force,
-            about=about,
-            losses=losses,
-            is_foreign=True,
-        )
+        try:
+            return _joined(
+                parts, settings, target, force=force, about=about, losses=losses, is_foreign=True
+            )
+        except FormatError as error:
+            remedy = "Move that part out of the folder to recover the others."
+            raise SourceError(path, f"has a damaged part: {error}", remedy) from None
 
 
 def _gaps(found: Mapping[int, bool]) -> list[Loss]:
