@@ -18,7 +18,8 @@ from typing import Any
 
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.protocols import Format
-from mp4ds.plugins.recording.record import RecordOptions, RecordSummary, open_recorder
+from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.recording.record import RecordSummary, open_recorder
 from mp4ds.plugins.recording.source import RecorderControls, SourceState, Wanted
 from mp4ds.records import Message
 

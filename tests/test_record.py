@@ -26,10 +26,10 @@ from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.recording import spool
+from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.packing import PackingError, PackingProcess
 from mp4ds.plugins.recording.record import (
     Recorder,
-    RecordOptions,
     RecordProgress,
     open_recorder,
 )

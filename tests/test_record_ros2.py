@@ -21,7 +21,8 @@ from mp4ds.errors import OptionError
 from mp4ds.packing import live
 from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.publishing.ros2_writers import Qos, recorded_qos
-from mp4ds.plugins.recording.record import RecordOptions, open_recorder
+from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.recording.record import open_recorder
 from mp4ds.plugins.recording.ros2_channels import (
     asked_qos,
     installed_definition,

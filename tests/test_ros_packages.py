@@ -21,7 +21,7 @@ import mp4ds
 from mp4ds.bags.formats import open_sources
 from mp4ds.cli import app_for
 from mp4ds.errors import SourceError
-from mp4ds.plugins.recording.record import UNFINISHED
+from mp4ds.files.sources import UNFINISHED
 from mp4ds.records import Message
 from player_scenes import make_drive
 from roscore import RECORD, Core, python, wait_until

@@ -69,7 +69,8 @@ if TYPE_CHECKING:
     from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
     from mp4ds.plugins.playing.play import PlayOptions, play
     from mp4ds.plugins.playing.player import PlaySummary
-    from mp4ds.plugins.recording.record import RecordOptions, RecordSummary, record
+    from mp4ds.plugins.recording.options import RecordOptions
+    from mp4ds.plugins.recording.record import RecordSummary, record
     from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary, report
     from mp4ds.times import Sync
     from mp4ds.unpacking.options import UnpackOptions, UnpackSummary
@@ -113,7 +114,8 @@ _HOMES = {
         "play",
     ),
     "plugins.playing.player": ("PlaySummary",),
-    "plugins.recording.record": ("RecordOptions", "RecordSummary", "record"),
+    "plugins.recording.options": ("RecordOptions",),
+    "plugins.recording.record": ("RecordSummary", "record"),
     "plugins.reporting.report": ("ReportOptions", "ReportSummary", "report"),
     "times": ("Sync",),
     "unpacking.options": ("UnpackOptions", "UnpackSummary"),

@@ -17,7 +17,8 @@ from mp4ds.cli.process import caught_signals, told_errors
 from mp4ds.cli.record_words import spelled
 from mp4ds.errors import OptionError, counted, path_text
 from mp4ds.files.sources import salvage_command
-from mp4ds.plugins.recording.record import RecordOptions, open_recorder
+from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.recording.record import open_recorder
 
 if TYPE_CHECKING:
     from rich.table import Table

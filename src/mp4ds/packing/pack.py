@@ -58,7 +58,6 @@ from mp4ds.packing.manifest import (
 from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.planning import Resources, plan_job
-from mp4ds.packing.spool import recover
 from mp4ds.packing.workplace import Workplace
 from mp4ds.plan import LOSSLESS, SPEED, QualitySetting, parse_quality
 from mp4ds.registry import plugin
@@ -275,6 +274,8 @@ def _pack(
 
 def _recovered(paths: Sequence[Path], target: Path, options: PackOptions) -> PackSummary:
     """The dataset of a recording that was cut off while `mp4ds record` made it."""
+    from mp4ds.packing.spool import recover
+
     folder = next(filter(is_unfinished, paths))
     usual = replace(_USUAL, salvage=True, force=options.force, about=options.about)
     if len(paths) > 1 or replace(options, quality=None) != usual:

@@ -14,9 +14,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Annotated
-
-from pydantic import Field
+from typing import IO
 
 from mp4ds.bags.combined import bounded
 from mp4ds.bags.mcap_records import copy_verified
@@ -44,11 +42,11 @@ class SpoolSettings(Model):
     """How the pieces of a spool are packed: all of them alike, so that parts fit together."""
 
     format: Format
-    profile: Annotated[str, Field(pattern="^ros[12]$")]
+    profile: str
     quality: Profile
     codec: str | None
     preset: str | None
-    gop: Annotated[int, Field(ge=1, le=MAX_GOP)] | None
+    gop: int | None
 
     def options(self, *, salvage: bool = False) -> PackOptions:
         """The options of a pack."""
@@ -119,7 +117,12 @@ class SpoolFolder:
         """
         try:
             with self._settings_path.open("rb") as file:
-                return SpoolSettings.model_validate_json(file.read(_MOST_BYTES))
+                settings = SpoolSettings.model_validate_json(file.read(_MOST_BYTES))
+            if settings.profile not in ("ros1", "ros2"):
+                raise ValueError(settings.profile)
+            if settings.gop is not None and not 1 <= settings.gop <= MAX_GOP:
+                raise ValueError(settings.gop)
+            return settings
         except ValueError:
             raise SourceError(
                 self._settings_path,

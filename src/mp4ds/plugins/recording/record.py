@@ -6,132 +6,40 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
-from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetError, WriteError
-from mp4ds.files.outputs import check_target, sync
+from mp4ds.errors import OptionError
+from mp4ds.files.outputs import sync
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
-from mp4ds.options import Options, argument, force, option, parse_size
-from mp4ds.packing.manifest import dataset_files, folder_size
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.pack import checked_codec
-from mp4ds.packing.spool import SpoolFolder, SpoolSettings, summary_of
-from mp4ds.plan import LOSSLESS, MAX_GOP, SPEED, parse_quality
+from mp4ds.plan import SPEED, parse_quality
 from mp4ds.plugins.playing.timeline import quick_switches
-from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import sourced
-from mp4ds.plugins.recording.packing import PackingError, PackingProcess
+from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
-from mp4ds.plugins.recording.spool import MessageBuffer, SpoolWriter
+from mp4ds.plugins.recording.splits import Packing, Split
+from mp4ds.plugins.recording.spool import MessageBuffer
 from mp4ds.records import Message, MetadataRecord
 from mp4ds.times import INT64_MAX
 
 _NS = 1_000_000_000
 _REPORT_S = 0.2
 _FLUSH_S = 0.5
+_BEHIND = 1 / 8
+"""Of the buffer: with so much in it, nothing is synced, which would hold up writing."""
+
 _LAST_NS = {"ros1": 2**32 * _NS - 1, "ros2": INT64_MAX}
 """The latest time that a bag or rosbag2 can hold."""
 
 _NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
 """Node names of ROS's own recorders."""
-
-
-@dataclass(frozen=True)
-class RecordOptions(Options):
-    """How to record."""
-
-    to: str | None = option("ros1 or ros2; default: the one that is sourced.")
-    all: bool = option(
-        "Record all topics, including new ones, and all service events (ROS 2).", False, "-a"
-    )
-    all_topics: bool = option("Record all topics, but no service events.", False)
-    all_services: bool = option("Record all service events (ROS 2).", False)
-    topic_types: Sequence[str] = option(
-        "Record topics of this type; repeatable.", (), metavar="TYPE"
-    )
-    regex: str = option("Record topics whose name matches a regular expression.", "", "-e")
-    exclude: Sequence[str] = option(
-        "Leave out topics that match; repeatable.", (), "--exclude", metavar="GLOB"
-    )
-    exclude_topic_types: Sequence[str] = option(
-        "Leave out topics of this type; repeatable.", (), metavar="TYPE"
-    )
-    exclude_regex: str = option(
-        "Leave out topics whose name matches a regular expression.", "", "--exclude-regex", "-x"
-    )
-    duration: float | None = option("Stop after N seconds.", None, "--duration")
-    max_duration: float | None = option(
-        "Start a new dataset after this many seconds; 0: never.",
-        None,
-        "--max-bag-duration",
-        "-d",
-        metavar="SECONDS",
-    )
-    max_size: int | None = option(
-        "Start a new dataset at this size, such as 4G.",
-        None,
-        "--max-size",
-        metavar="SIZE",
-        parse=parse_size,
-    )
-    buffer: int = option(
-        "Buffer size in MB; when the buffer is full, the oldest messages are dropped and counted.",
-        256,
-        "--buffsize",
-        "-b",
-        least=1,
-        most=1_000_000,
-    )
-    quality: str = option("lossless, visual or crf=N.", LOSSLESS)
-    codec: str | None = option("As in pack; default: the fastest to encode.")
-    preset: str | None = option("Encoder preset; default: the fastest.")
-    gop: int | None = option(
-        "Maximum key frame interval in frames; default: 10, or 30 if lossy.",
-        least=1,
-        most=MAX_GOP,
-    )
-    start_paused: bool = option("Start paused.", False, "--start-paused", "--pause")
-    use_sim_time: bool = option("Take log times from /clock, and wait for it.", False)
-    node: str | None = option(
-        "Node name; default: that of ROS's own recorder.", None, "--node-name"
-    )
-    discover: bool = option("Keep looking for new topics.", True, "--discovery/--no-discovery")
-    polling_interval: float = option(
-        "Milliseconds between two checks for new topics.", 100.0, "--polling-interval", "-p"
-    )
-    hidden: bool = option("Include hidden topics (ROS 2).", False, "--include-hidden-topics")
-    unpublished: bool = option(
-        "Include topics without a publisher (ROS 2, with rclpy).",
-        False,
-        "--include-unpublished-topics",
-    )
-    ignore_leaf: bool = option(
-        "Leave out topics without a subscriber (ROS 2).", False, "--ignore-leaf-topics"
-    )
-    qos_overrides: Path | None = option(
-        "QoS profiles to subscribe with, by topic (ROS 2).",
-        None,
-        "--qos-profile-overrides-path",
-        metavar="YAML",
-    )
-    custom_data: Sequence[str] = option(
-        "Entry for custom_data of the rosbag2 metadata (ROS 2); repeatable.",
-        (),
-        metavar="KEY=VALUE",
-    )
-    about: str | None = option(
-        "YAML file with title, description, authors, license, doi, links or keywords.",
-        metavar="FILE",
-    )
-    force: bool = force()
-    names: NodeNames = argument("Name, namespace and remappings of the node.", PLAIN)
 
 
 @dataclass(frozen=True)
@@ -362,12 +270,12 @@ class Recorder:
         self._others = others
         self._progress = progress
         self._buffer = MessageBuffer(options.buffer * 10**6, _LAST_NS[source.profile])
-        self._packing = _Packing()
+        self._packing = Packing()
         self._changed = threading.Event()
         self._is_stopped = False
         self._is_paused = options.start_paused
         self._is_split_asked = False
-        self._splits: list[_Split] = []
+        self._splits: list[Split] = []
         self._rates: dict[str, tuple[float, int, int, float, float]] = {}
         self._error: Exception | None = None
         self.address = source.address
@@ -480,7 +388,7 @@ class Recorder:
         target = self._target
         if is_numbered:
             target = target.with_name(f"{target.name}_{number}")
-        split = _Split(target, self._options, self._source, self._others, self._packing)
+        split = Split(target, self._options, self._source, self._others, self._packing)
         self._splits.append(split)
         self._is_split_asked = False
 
@@ -511,7 +419,8 @@ class Recorder:
             if time.monotonic() >= next_flush:
                 spool = self._splits[-1].spool
                 spool.flush()
-                if syncing is None or syncing.done():
+                is_behind = self._buffer.bytes > self._options.buffer * 10**6 * _BEHIND
+                if not is_behind and (syncing is None or syncing.done()):
                     syncing = disk.submit(_sync, spool.paths)
                 next_flush = time.monotonic() + _FLUSH_S
 
@@ -566,155 +475,3 @@ def _sync(paths: Sequence[Path]) -> None:
     for path in paths:
         with suppress(OSError):  # what the disk refuses, its writer is told, too
             sync(path)
-
-
-class _Packing:
-    """Jobs for the process that packs, one after another. A context manager."""
-
-    def __init__(self) -> None:
-        self.process = PackingProcess()
-        self._thread = ThreadPoolExecutor(1, "packing")
-        self._jobs: list[Future[None]] = []
-
-    def submit(self, job: Callable[[], None]) -> None:
-        """Run a job after all earlier ones."""
-        self._jobs.append(self._thread.submit(job))
-
-    def wait(self, seconds: float) -> bool:
-        """Wait until all jobs have run; returns whether they have."""
-        return not wait(self._jobs, seconds).not_done
-
-    def __enter__(self) -> _Packing:
-        return self
-
-    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
-        if exc_type is not None:
-            self._thread.shutdown(wait=False, cancel_futures=True)
-            self.process.kill()
-        self._thread.shutdown()
-        self.process.close()
-
-
-class _Split:
-    """One dataset of a recording.
-
-    Args:
-        target: Where to make it.
-        options: How to record.
-        source: Where messages come from.
-        others: What the recording holds besides messages.
-        packing: Packs the pieces of its spool, and joins the parts.
-
-    Raises:
-        TargetError: It cannot be made there.
-        WriteError: The disk refused.
-    """
-
-    def __init__(
-        self,
-        target: Path,
-        options: RecordOptions,
-        source: Source,
-        others: Sequence[MetadataRecord],
-        packing: _Packing,
-    ) -> None:
-        self.target = target
-        self.made: PackSummary | None = None
-        self.error: Exception | None = None
-        self.folder = SpoolFolder(target.with_name(target.name + UNFINISHED))
-        self._options = options
-        self._source = source
-        self._packing = packing
-        self._most_ns = round((options.max_duration or 0) * _NS)
-        self._parts = 0
-        self._packed_bytes = 0  # of messages
-        self._parts_bytes = 0
-        check_target(target, force=options.force, owned=dataset_files)
-        settings = SpoolSettings(
-            format=source.format,
-            profile=source.profile,
-            quality=options.quality,
-            codec=options.codec,
-            preset=options.preset,
-            gop=options.gop,
-        )
-        try:
-            self.lock = self.folder.begin(settings)
-            self.spool = SpoolWriter(self.folder, source.profile, others, self._on_closed)
-        except FileExistsError:
-            raise TargetError(
-                self.folder.path,
-                "already exists: a recording of this name was not finished",
-                "Choose another name, or recover that one first: "
-                f"{salvage_command(self.folder.path)}",
-            ) from None
-        except OSError as error:
-            raise WriteError(target, error) from None
-
-    @property
-    def spool_bytes(self) -> int:
-        """Bytes of messages that are not packed yet."""
-        return self.spool.bytes - self._packed_bytes
-
-    @property
-    def size(self) -> int:
-        """Bytes so far."""
-        return self.spool_bytes + self._parts_bytes
-
-    @property
-    def is_full(self) -> bool:
-        """Whether the next message belongs into another dataset."""
-        span = self.spool.span
-        if self._most_ns and span and span[1] - span[0] >= self._most_ns:
-            return True
-        return self._options.max_size is not None and self.size >= self._options.max_size
-
-    def _on_closed(self, number: int, size: int) -> None:
-        self._packing.submit(partial(self._pack, number, size))
-
-    def _pack(self, number: int, size: int) -> None:
-        if self.error is None:  # otherwise it is kept as it is
-            try:
-                self._packing.process.pack(self.folder.path, number)
-                self._parts_bytes += folder_size(self.folder.part(number))
-                self._packed_bytes += size
-                self._parts += 1
-            except (PackingError, OSError) as error:
-                self.error = error
-                self._source.state.warn(
-                    f"{self.folder.path}: no more is packed, what comes is still recorded: {error}"
-                )
-
-    def close(self) -> None:
-        """Complete the spool, and have the dataset made when all of it is packed.
-
-        Raises:
-            OSError: The disk refused.
-        """
-        self.spool.close(filter(None, list(self._source.state.topics.values())))
-        self._packing.submit(self._join)
-
-    def _join(self) -> None:
-        if self.error is not None:
-            return
-        options, count = self._options, self._parts
-        try:
-            self._packing.process.join(
-                self.folder.path, count, self.target, force=options.force, about=options.about
-            )
-            self.made = self._summary()
-            self.lock.close()
-            self.folder.remove(count)
-        except (Mp4dsError, OSError) as error:
-            self.error = error
-
-    def _summary(self) -> PackSummary:
-        made, raw = summary_of(self.target), self.spool.raw_bytes
-        topics = [replace(topic, raw_bytes=raw[topic.topic]) for topic in made.topics]
-        return replace(made, topics=topics, source_bytes=raw.total(), is_copy=False)
-
-    def failure(self, error: Exception) -> Exception:
-        """What to raise because of an error; what was recorded stays where it is."""
-        if isinstance(error, Mp4dsError) and not isinstance(error, PackingError):
-            return error
-        return RecordError(self.folder.path, self.target, error)
