@@ -242,7 +242,10 @@ def kills(core: Core, folder: Path, count: int) -> None:
         for topic, there in found.items():
             first, last = there[0][0], there[-1][0]
             expected = [item for item in due[topic] if first <= item[0] <= last]
-            wrong += there != expected
+            if there != expected:
+                wrong += 1
+                missing, other = len({*expected} - {*there}), len({*there} - {*expected})
+                print(f"- {topic}: {missing} of {len(expected)} missing, {other} not in rosbag")
             lost[topic].append((killed - last) / NS)
     rows = [
         (topic, len(times), f"{max(times):.2f}", f"{sorted(times)[len(times) // 2]:.2f}")
