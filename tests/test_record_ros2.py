@@ -18,7 +18,6 @@ import mp4ds
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.rosbag2_metadata import read_bag_info
 from mp4ds.errors import OptionError
-from mp4ds.packing import live
 from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.publishing.ros2_writers import Qos, recorded_qos
 from mp4ds.plugins.recording.options import RecordOptions
@@ -35,7 +34,6 @@ from mp4ds.plugins.recording.source import SourceOptions, Wanted, open_source
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
 from ros2_sides import SIDES, STORE, Side, channel, message, padded, until
 from scenes import scene
-from waiting import WATCHDOG_S
 
 STRING, IMAGE, TF = "std_msgs/msg/String", "sensor_msgs/msg/Image", "tf2_msgs/msg/TFMessage"
 LATCHED = "- {history: 1, depth: 5, reliability: 1, durability: 1}"
@@ -105,7 +103,6 @@ def ends_with(heard: Heard, topic: str, payload: bytes) -> bool:
 def test_a_recording_is_a_rosbag2(
     side: Side, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "LATE_S", WATCHDOG_S)  # on a busy machine, too, each is encoded
     recorded = channel("/cam/image_raw", IMAGE)
     drive = scene("mono8", frames=30, with_info=False).messages
     images = [one.payload("cdr") for one in drive if one.topic == "/cam/image_raw"]
