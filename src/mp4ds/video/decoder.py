@@ -94,6 +94,7 @@ class JpegDecoder:
 # ---------------------------------------------------------------- decoder
 
 _MOST_THREADS = 16  # that ffmpeg chooses of itself
+_ERRORS = (FFmpegError, OSError, ValueError)  # PyAV has the last for a codec without a decoder
 
 
 class VideoDecoder:
@@ -297,7 +298,7 @@ class VideoDecoder:
             for frame in self._frames_from_here():
                 yield frame
                 number += 1
-        except (FFmpegError, OSError) as error:
+        except _ERRORS as error:
             raise_if_scarce(error)
             problem = f"cannot be decoded: {reason_of(error)}"
             raise VideoError("decode-failed", self._path, problem, frame=number) from None
@@ -317,7 +318,7 @@ class VideoDecoder:
                     raise_if_scarce(error)
                     continue
                 yield from (frame for frame in frames if not frame.is_corrupt)
-        except (FFmpegError, OSError) as error:
+        except _ERRORS as error:
             raise_if_scarce(error)  # what comes after that is not there
 
     def close(self) -> None:
