@@ -20,10 +20,12 @@ import mp4ds
 from commands import call, tree
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.packing.options import PackOptions
+from mp4ds.packing.spool import SpoolFolder
 from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.recording import spool
 from mp4ds.plugins.recording.options import RecordOptions
@@ -35,7 +37,7 @@ from mp4ds.plugins.recording.record import (
 )
 from mp4ds.plugins.recording.source import SourceOptions, Wanted
 from mp4ds.plugins.recording.spool import MessageBuffer
-from mp4ds.records import Message
+from mp4ds.records import Channel, Message, Schema
 from record_scenes import PlayedSource, recorded
 from scenes import Scene, scene
 from sources import SOURCES
@@ -541,3 +543,16 @@ def test_a_recording_that_is_being_made_is_left_alone(tmp_path: Path) -> None:
     recorded(PlayedSource(write(tmp_path), before=look), tmp_path / "live")
     assert seen == [30]
     assert not (tmp_path / "early").exists()
+
+
+def test_a_piece_is_written_before_the_next_one_begins(tmp_path: Path) -> None:
+    """Or a recorder that is killed would leave a gap."""
+    folder = SpoolFolder(tmp_path / "drive.recording")
+    folder.path.mkdir()
+    writer = spool.SpoolWriter(folder, "ros1", [], lambda *_: None)
+    channel = Channel(1, "/a", "ros1", Schema("std_msgs/String", "ros1msg", b"string data"), {})
+    for time in (0, 1, 2, spool.WINDOW_NS):
+        writer.write(Message(channel, time, time, 0, bytes(5)))
+    salvaged = McapSalvage(folder.piece(0))
+    assert [m.log_time for m in salvaged.records() if isinstance(m, Message)] == [0, 1, 2]
+    writer.abandon()

@@ -168,6 +168,7 @@ class SpoolWriter:
         if self.span is None:
             newest.start = time
         elif abs(time - newest.start) >= WINDOW_NS:
+            self.flush()  # or a kill would leave a gap before what the new piece already has
             self._begin(time)
         start, end = self.span or (time, time)
         self.span = min(start, time), max(end, time)
