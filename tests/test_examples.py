@@ -90,6 +90,7 @@ def test_public_data(kind: str, demo_dataset: Path, tmp_path: Path) -> None:
     assert any(re.match(r"[1-9]\d* messages held", result) for result in told.values())
 
 
+@pytest.mark.slow  # .ci/run runs it with the lowest versions of what it needs
 def test_quickstart(tmp_path: Path) -> None:
     """The README's first command, but for the installation, which CI does in a fresh clone."""
     script = (ROOT / "examples/quickstart.sh").read_text()

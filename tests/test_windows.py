@@ -58,7 +58,7 @@ def compare_packs(
     assert compare(paths, unpacked(folder, own_target(source))) == []
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_every_encoding(
     encoding: str, tmp_path: Path, compare: Compare, engine: InlineEngine
@@ -68,7 +68,7 @@ def test_every_encoding(
     compare_packs(tmp_path, source, recorded, compare, engine)
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("source", SOURCES)
 def test_every_source(source: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
     recorded = scene("bayer_gbrg8", frames=10)
@@ -80,7 +80,7 @@ def test_every_source(source: str, tmp_path: Path, compare: Compare, engine: Inl
     assert leftovers(tmp_path) == []
 
 
-@pytest.mark.one_in(10)
+@pytest.mark.one_in(20)
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
 @pytest.mark.parametrize("name", CODED)
 def test_coded_images(
@@ -93,7 +93,7 @@ def test_coded_images(
     assert compare(paths, unpacked(tmp_path, own_target(source))) == []
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("trait", TRAITS)
 def test_odd_messages(trait: str, tmp_path: Path, compare: Compare, engine: InlineEngine) -> None:
     (tmp_path / "source").mkdir()
@@ -103,7 +103,7 @@ def test_odd_messages(trait: str, tmp_path: Path, compare: Compare, engine: Inli
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("source", list(FOXGLOVE_SOURCES)[::2])
 @pytest.mark.parametrize("name", ["raw-rgb8", "raw-padded", "jpeg-cut-one", "video-h264-mid-gop"])
 def test_foxglove_messages(
@@ -116,6 +116,7 @@ def test_foxglove_messages(
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("codec", ["av1", "av1-10bit", "h264", "h265"])
 def test_a_lossy_profile(
     codec: str, tmp_path: Path, compare: Compare, engine: InlineEngine
