@@ -17,6 +17,7 @@ import pytest
 
 import mp4ds
 from in_parts import InlineEngine, facts, leftovers
+from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.errors import (
     FormatError,
     OptionError,
@@ -28,6 +29,7 @@ from mp4ds.errors import (
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_each, pack_share
 from mp4ds.plugins.demo import demo
+from mp4ds.records import ChannelStats
 from round_trips import Compare, unpacked
 from sources import SOURCES, scene
 from waiting import until
@@ -389,3 +391,23 @@ def test_killed_at_random_moments_it_ends_as_if_it_had_not_been(
     assert leftovers(tmp_path) == []
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     assert compare([long_bag], unpacked(tmp_path, "bag")) == []
+
+
+def test_messages_are_counted_by_channel(
+    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An index that gives one publisher's message to another of the same topic is wrong, too."""
+    use(monkeypatch, InlineEngine())
+    true = Ros1Reader.stats
+
+    def stats(reader: Ros1Reader) -> dict[int, ChannelStats]:
+        found = dict(true(reader))
+        more, less = [item.id for item in reader.channels if item.topic == "/chatter"][:2]
+        found[more] = replace(found[more], count=found[more].count + 1)
+        found[less] = replace(found[less], count=found[less].count - 1)
+        return found
+
+    monkeypatch.setattr(Ros1Reader, "stats", stats)
+    with pytest.raises(SourceError, match=r"its index lists \d messages on /chatter, but \d were"):
+        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
+    assert not (tmp_path / "dataset").exists()

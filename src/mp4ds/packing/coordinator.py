@@ -359,26 +359,29 @@ def _check_counts(
         FormatError: The facts of a part are not those of its dataset.
         SourceError: The recording's index is wrong.
     """
-    found = Counter[str]()
+    found = Counter[tuple[object, ...]]()  # by channel: those of one topic may make up for it
     for part, told in zip(parts, facts, strict=True):
         own = Counter[str]()
         counts = part.counts()
         for channel in part.channels:
-            own[channel.topic] += counts.get(channel.id, 0)
+            count = counts.get(channel.id, 0)
+            own[channel.topic] += count
+            found[channel.identity] += count
         if +own != +Counter({topic.topic: topic.messages for topic in told.topics}):
             (part.path / RECORD_NAME).unlink()
             raise FormatError("file-missing", part.path, "was damaged after it was made")
-        found += own
-    due = Counter[str]()
+    stats = reader.stats()
+    due = Counter[tuple[object, ...]]()  # equal channels of a recording are one of a part
     for channel in reader.channels:
-        if selected(channel.topic) and channel.id in reader.stats():
-            due[channel.topic] += reader.stats()[channel.id].count
-    for topic, count in due.items():
-        if found[topic] != count:
+        if selected(channel.topic) and channel.id in stats:
+            due[channel.identity] += stats[channel.id].count
+    for channel in reader.channels:
+        key = channel.identity
+        if key in due and found[key] != due[key]:
             raise SourceError(
                 reader.path,
-                f"is damaged: its index lists {count} messages on {topic}, but {found[topic]} were "
-                "found",
+                f"is damaged: its index lists {due[key]} messages on {channel.topic}, but "
+                f"{found[key]} were found",
             )
 
 
