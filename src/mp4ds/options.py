@@ -152,7 +152,7 @@ def time_of(text: str, start_ns: int, option: str) -> int:
         option: The option's name, for errors.
 
     Raises:
-        OptionError: It is none of these.
+        OptionError: It is not written in any of these ways.
     """
     clean = text.strip()
     if clean.isascii() and (match := _NUMBER.fullmatch(clean)):

@@ -171,6 +171,13 @@ MAX_LOST_TOPICS = 64
 """Topics that one loss names; the last name then says how many more there are."""
 
 
+MAX_REASONS = 10
+"""Reasons for which messages of one topic are stored verbatim that are told apart."""
+
+OTHER_REASONS = "other reasons"
+"""What those beyond the limit are called."""
+
+
 @dataclass(frozen=True, slots=True)
 class Loss:
     """A part of a recording that could not be read.

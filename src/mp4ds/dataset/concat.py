@@ -47,12 +47,14 @@ from mp4ds.format.models import (
 from mp4ds.format.sidecars import MANIFEST_NAME, dump_document, verify_file
 from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.plan import FileNames
-from mp4ds.records import EVERYTHING, Channel, Excerpt, Message
-
-MAX_REASONS = 10
-"""Reasons for which messages of one topic are stored verbatim that are told apart."""
-
-OTHER_REASONS = "other reasons"
+from mp4ds.records import (
+    EVERYTHING,
+    MAX_REASONS,
+    OTHER_REASONS,
+    Channel,
+    Excerpt,
+    Message,
+)
 
 Integers = NDArray[np.int64]
 _Identity = tuple[object, ...]
@@ -197,7 +199,7 @@ class _Part:
         own = [item.topic for item in self.dataset.channels if not self.selected(item.topic)]
         return [*self.manifest.topics_left_out, *own]
 
-    @property
+    @cached_property
     def range(self) -> tuple[int, int] | None:
         """Log times of the first and the last message copied, ns."""
         times = [in_span(one, self.span) for one in self.times.values()]
@@ -413,7 +415,7 @@ class _Concat:
         collector = TransformCollector()
         with McapWriter(path, profile=part.dataset.profile) as writer:
             others = (part.dataset.other_records() for part in self._parts)
-            for record in chain(*others, self._recorded_messages()):
+            for record in chain(chain.from_iterable(others), self._recorded_messages()):
                 write_record(writer, record)
                 if isinstance(record, Message):
                     collector.add(record.channel, record.data)

@@ -173,6 +173,8 @@ class JoinedStream:
             VideoError: Its video is damaged.
         """
         sidecar, info = cut.stream.sidecar, cut.stream.sidecar.camera_info
+        if sidecar.channel != self.cuts[0].stream.sidecar.channel:
+            return False  # most often: the rest takes longer to compare
         if cut.dataset is self.cuts[-1].dataset or _common(sidecar) != self._identity:
             return False
         if cut.stream.hidden_frames or self.cuts[0].stream.hidden_frames:

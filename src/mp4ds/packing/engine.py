@@ -358,16 +358,17 @@ def _close(worker: _Worker) -> None:
 # ---------------------------------------------------------------- in such a process
 
 
-class _Orders:
-    """The tasks of this process: the first, then one for each line of its standard input.
+class Orders:
+    """The tasks of this process: the first, if given, then one for each line of standard input.
 
     If the input ends during a task, nobody waits for its result: the process exits.
     """
 
-    def __init__(self, first: list[str]) -> None:
-        self._queue: queue.SimpleQueue[list[str] | None] = queue.SimpleQueue()
-        self._queue.put(first)
-        self._busy = True
+    def __init__(self, *first: list[str]) -> None:
+        self._queue: queue.SimpleQueue[list[Any] | None] = queue.SimpleQueue()
+        for task in first:
+            self._queue.put(task)
+        self._busy = bool(first)
         threading.Thread(target=self._watch, daemon=True).start()
 
     def _watch(self) -> None:
@@ -378,7 +379,7 @@ class _Orders:
         if self._busy:
             os._exit(1)
 
-    def __iter__(self) -> Iterator[list[str]]:
+    def __iter__(self) -> Iterator[list[Any]]:
         while True:
             self._busy = False
             task = self._queue.get()
@@ -388,8 +389,8 @@ class _Orders:
             yield task
 
 
-def tell(values: dict[str, Any]) -> None:
-    """Report to the `ProcessEngine` that started this process."""
+def tell(values: Any) -> None:
+    """Report to the process that started this one, in a line of JSON."""
     sys.stdout.write(json.dumps(values) + "\n")
     sys.stdout.flush()
 
@@ -403,7 +404,7 @@ def serve(outcome_of: Callable[..., dict[str, Any]]) -> None:
     """
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     with suppress(BrokenPipeError):
-        for task in _Orders(sys.argv[1:]):
+        for task in Orders(sys.argv[1:]):
             outcome = outcome_of(*task)
             tell(outcome)
             if not outcome.get("ready"):

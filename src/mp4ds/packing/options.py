@@ -22,7 +22,7 @@ from mp4ds.options import (
     topics,
 )
 from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, parse_purpose, parse_quality
-from mp4ds.records import Loss
+from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,6 @@ class ImageFolder(Options):
 
 
 # ---------------------------------------------------------------- pack
-
-_MAX_REASONS = 10
-_OTHER = "other reasons"
 
 
 @dataclass(frozen=True)
@@ -223,8 +220,8 @@ class TopicSummary:
 
     def count_verbatim(self, reason: str, number: int) -> None:
         """Count one more message stored verbatim, the topic's message of that number."""
-        if reason not in self.verbatim and len(self.verbatim) >= _MAX_REASONS:
-            reason = _OTHER
+        if reason not in self.verbatim and len(self.verbatim) >= MAX_REASONS:
+            reason = OTHER_REASONS
         count, first = self.verbatim.get(reason, (0, number))
         self.verbatim[reason] = (count + 1, first)
 
@@ -239,8 +236,8 @@ class TopicSummary:
         self.frames += later.frames
         self.raw_bytes += later.raw_bytes
         for reason, (count, number) in later.verbatim.items():
-            if reason not in self.verbatim and len(self.verbatim) >= _MAX_REASONS:
-                reason = _OTHER
+            if reason not in self.verbatim and len(self.verbatim) >= MAX_REASONS:
+                reason = OTHER_REASONS
             known, first = self.verbatim.get(reason, (0, before + number))
             self.verbatim[reason] = (known + count, first)
         self.notes.extend(note for note in later.notes if note not in self.notes)

@@ -510,7 +510,7 @@ class ClusterEngine:
             runs.
 
     Raises:
-        OptionError: The address is none of these, or a package is missing.
+        OptionError: The address has none of these forms, or a package is missing.
     """
 
     def __init__(self, function: Callable[..., None], address: str | Connection) -> None:

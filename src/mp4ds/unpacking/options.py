@@ -21,14 +21,13 @@ from mp4ds.options import (
     start,
     topics,
 )
-from mp4ds.plan import Selection
 from mp4ds.records import Loss
-from mp4ds.unpacking.pictures import Reduction
+from mp4ds.unpacking.pictures import ReductionOptions
 from mp4ds.unpacking.republish import Republished
 
 
 @dataclass(frozen=True)
-class UnpackOptions(SliceOptions):
+class UnpackOptions(SliceOptions, ReductionOptions):
     """How to unpack."""
 
     storage: str | None = option(
@@ -57,20 +56,6 @@ class UnpackOptions(SliceOptions):
     )
     salvage: bool = option("Restore what can be read of a damaged dataset.", False)
     force: bool = force()
-
-    @property
-    def reduction(self) -> Reduction:
-        """How to reduce images.
-
-        Raises:
-            OptionError: The size, number or rate is not valid.
-        """
-        return Reduction(self.resize, self.every, self.max_rate)
-
-    @property
-    def selected(self) -> Selection:
-        """Which topics."""
-        return Selection(self.topics, self.exclude)
 
 
 @dataclass(frozen=True)

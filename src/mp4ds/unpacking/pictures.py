@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -29,6 +29,7 @@ from mp4ds.messages.depth import (
 )
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
+from mp4ds.plan import Selection
 from mp4ds.times import intervals, usual_interval
 from mp4ds.unpacking.types import VideoFields, type_of
 from mp4ds.video.images import ImageFile
@@ -100,6 +101,30 @@ class Reduction:
             chosen = np.flatnonzero(is_kept)
             is_kept[chosen] = at_most(self.max_rate, times_of(columns)[chosen])
         return is_kept
+
+
+class ReductionOptions:
+    """What options of several commands have in common: they choose topics and reduce images."""
+
+    resize: float | tuple[int, int] | None
+    every: int
+    max_rate: float | None
+    topics: Sequence[str]
+    exclude: Sequence[str]
+
+    @property
+    def reduction(self) -> Reduction:
+        """How to reduce images.
+
+        Raises:
+            OptionError: The size, number or rate is not valid.
+        """
+        return Reduction(self.resize, self.every, self.max_rate)
+
+    @property
+    def selected(self) -> Selection:
+        """Which topics, by globs."""
+        return Selection(self.topics, self.exclude)
 
 
 def _check_size(resize: Any) -> None:

@@ -87,7 +87,7 @@ def open_cameras(place: Path, fps: float) -> Iterator[tuple[list[Camera], dict[s
         Its cameras, and the topics of those whose images no encoder takes, with the reason.
 
     Raises:
-        SourceError: It is none of these.
+        SourceError: It is not a recording, a dataset or such a folder.
         FormatError: It is a dataset, and breaks a rule of the format.
     """
     if not place.exists():

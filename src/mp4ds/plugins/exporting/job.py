@@ -32,10 +32,9 @@ from mp4ds.options import (
     start,
     topics,
 )
-from mp4ds.plan import Selection
 from mp4ds.records import Channel
 from mp4ds.times import intervals, synchronize, usual_interval
-from mp4ds.unpacking.pictures import Reduction, is_inverse_depth, times_of
+from mp4ds.unpacking.pictures import ReductionOptions, is_inverse_depth, times_of
 from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
 
@@ -54,7 +53,7 @@ def _nanoseconds(milliseconds: str) -> int:
 
 
 @dataclass(frozen=True)
-class ExportOptions(SliceOptions):
+class ExportOptions(SliceOptions, ReductionOptions):
     """How to export."""
 
     topics: Sequence[str] = topics()
@@ -97,20 +96,6 @@ class ExportOptions(SliceOptions):
         most = MAX_CRF[self.codec]
         if not 0 <= self.crf <= most:
             raise OptionError(f"`crf` {self.crf} is not from 0 to {most}, as {self.codec} has it.")
-
-    @property
-    def reduction(self) -> Reduction:
-        """How to reduce images.
-
-        Raises:
-            OptionError: The size, number or rate is not valid.
-        """
-        return Reduction(self.resize, self.every, self.max_rate)
-
-    @property
-    def selected(self) -> Selection:
-        """Which topics are selected by globs."""
-        return Selection(self.topics, self.exclude)
 
     def chosen(self, topic: str) -> bool:
         """Whether a topic was selected, by a glob or by name."""

@@ -6,21 +6,17 @@ and answers with a line. If the input ends in the middle of an order, its record
 
 from __future__ import annotations
 
-import io
 import json
 import os
-import queue
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
 from mp4ds.errors import Mp4dsError, sentence_of
 from mp4ds.format.sidecars import load_about
-from mp4ds.packing.engine import give_back
+from mp4ds.packing.engine import Orders, give_back, tell
 from mp4ds.packing.pack import pack
 from mp4ds.packing.spool import SpoolFolder
 
@@ -108,29 +104,6 @@ def _pipe(pipe: IO[str] | None) -> IO[str]:
 # ---------------------------------------------------------------- the process
 
 
-class _Orders:
-    """Orders from standard input."""
-
-    def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self._is_busy = False
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self) -> None:
-        # unbuffered: Python could not end while another thread waits within a buffer
-        for line in io.FileIO(sys.stdin.fileno(), closefd=False):
-            self._queue.put(line)
-        if self._is_busy:
-            os._exit(1)
-        self._queue.put(None)
-
-    def __iter__(self) -> Iterator[list[Any]]:
-        while (line := self._queue.get()) is not None:
-            self._is_busy = True
-            yield json.loads(line)
-            self._is_busy = False
-
-
 def _carry_out(kind: str, folder: str, number: int, *rest: Any) -> str:
     """Carry out an order; returns the sentence of its error, empty if there is none."""
     spool = SpoolFolder(Path(folder))
@@ -151,11 +124,10 @@ def _carry_out(kind: str, folder: str, number: int, *rest: Any) -> str:
 def _main() -> None:
     if hasattr(os, "nice"):
         os.nice(_NICE)
-    for order in _Orders():
+    for order in Orders():
         problem = _carry_out(*order)
         give_back()
-        sys.stdout.write(json.dumps(problem) + "\n")
-        sys.stdout.flush()
+        tell(problem)
 
 
 if __name__ == "__main__":
