@@ -297,7 +297,7 @@ class Coordinator:
             with _forgetting_damaged(places):
                 parts = [stack.enter_context(Dataset(place)) for place in places]
                 manifests = [part.manifest for part in parts if part.manifest]
-                _check_counts(reader, parts, facts, selected)
+                _check_facts(parts, facts)
                 digests = job.digests(reader, partial(_digest, run.place))
                 job.check_sources(reader.files)
                 origin = Origin.of(reader.files, digests, job.about, reader.slice.span)
@@ -305,6 +305,7 @@ class Coordinator:
                 left_out = [topic for one in manifests for topic in one.topics_left_out]
                 changes = origin.fields(reader, losses, left_out)
                 if job.is_single:
+                    parts[0].verify_messages()
                     for name in facts[0].files:
                         _link(places[0] / name, folder / name)
                     manifest = manifests[0].model_copy(update=changes)
@@ -318,6 +319,8 @@ class Coordinator:
                         changes=changes,
                         report=lambda name: progress.report("joining", name, now=True),
                     )
+                # last, since damage of a part would be taken for that of the index
+                _check_index(reader, parts, selected)
             whole = _joined(folder, manifest, sidecars, facts)
             whole.losses, whole.left_out = losses, dict.fromkeys(left_out)
             size = sum(source.size for source in job.sources)
@@ -347,31 +350,42 @@ def _forgetting_damaged(places: Sequence[Path]) -> Iterator[None]:
         raise
 
 
-def _check_counts(
-    reader: BagReader,
-    parts: Sequence[Dataset],
-    facts: Sequence[PartFacts],
-    selected: Selection,
-) -> None:
-    """Refuse parts that together lack messages.
+def _check_facts(parts: Sequence[Dataset], facts: Sequence[PartFacts]) -> None:
+    """Refuse parts whose facts are not those of their datasets.
 
     Raises:
-        FormatError: The facts of a part are not those of its dataset.
-        SourceError: The recording's index is wrong.
+        FormatError: Names one; it is made again.
     """
-    found = Counter[tuple[object, ...]]()  # by channel: those of one topic may make up for it
     for part, told in zip(parts, facts, strict=True):
-        own = Counter[str]()
+        found = Counter[str]()
         counts = part.counts()
         for channel in part.channels:
-            count = counts.get(channel.id, 0)
-            own[channel.topic] += count
-            found[channel.identity] += count
-        if +own != +Counter({topic.topic: topic.messages for topic in told.topics}):
+            found[channel.topic] += counts.get(channel.id, 0)
+        if +found != +Counter({topic.topic: topic.messages for topic in told.topics}):
             (part.path / RECORD_NAME).unlink()
             raise FormatError("file-missing", part.path, "was damaged after it was made")
+
+
+def _check_index(
+    reader: BagReader, parts: Sequence[Dataset], selected: Callable[[str], bool]
+) -> None:
+    """Refuse parts that together lack messages: those of other channels do not make up for it.
+
+    Args:
+        reader: The recording.
+        parts: All of them, undamaged.
+        selected: Whether a topic is packed.
+
+    Raises:
+        SourceError: The recording's index is wrong.
+    """
+    found = Counter[tuple[object, ...]]()  # by channel; equal ones of a recording are one in a part
+    for part in parts:
+        counts = part.counts()
+        for channel in part.channels:
+            found[channel.identity] += counts.get(channel.id, 0)
     stats = reader.stats()
-    due = Counter[tuple[object, ...]]()  # equal channels of a recording are one of a part
+    due = Counter[tuple[object, ...]]()
     for channel in reader.channels:
         if selected(channel.topic) and channel.id in stats:
             due[channel.identity] += stats[channel.id].count
