@@ -354,7 +354,13 @@ def test_a_burst_ends_with_the_pause(drive: tuple[Path, list[Recorded]]) -> None
     publisher = RecordingPublisher(world="ros1")
     done: list[int] = []
     with running(drive[0], publisher, paused=True) as (player, _):
-        publisher.on_sent = lambda _: player.resume() if len(publisher.sent) == 7 else None
+
+        def resume(_: object) -> None:
+            if len(publisher.sent) == 7:
+                player.resume()
+                time.sleep(0.1)  # so that who waits for the burst wakes up before it is counted
+
+        publisher.on_sent = resume
         done.append(player.burst(0))
         until(lambda: len(publisher.sent) == len(drive[1]))
     assert done == [7]

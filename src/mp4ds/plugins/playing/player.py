@@ -133,6 +133,7 @@ class _Burst:
 
     left: float
     done: int = 0
+    is_sending: bool = False  # one of them is being published, and counts whatever ends the burst
 
 
 class Player:
@@ -267,7 +268,7 @@ class Player:
                 return 0
             self._burst = mine
             self._changed.notify_all()
-            while self._burst is mine and self._can_step():
+            while mine.is_sending or (self._burst is mine and self._can_step()):
                 self._changed.wait(_WAKE_S)
             if self._burst is mine:
                 self._burst = None
@@ -418,7 +419,15 @@ class Player:
                     self._changed.wait(min(seconds, self._ticks.seconds_left, _WAKE_S))
                 return True
             burst = self._burst
-        self._publish(due, burst)
+            if burst is not None:
+                burst.is_sending = True
+        try:
+            self._publish(due, burst)
+        finally:
+            if burst is not None:
+                with self._changed:
+                    burst.is_sending = False
+                    self._changed.notify_all()
         return True
 
     def _seconds_until(self, due: Due | None) -> tuple[float, str]:
