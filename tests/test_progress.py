@@ -29,14 +29,14 @@ from mp4ds.cli.progress import (
     Lines,
     Log,
     LogOf,
-    PackStanding,
+    PackState,
     duration_text,
     left_text,
     on_terminal,
     pack_progress,
     percent_text,
     plain,
-    told_by,
+    progress_to,
 )
 from mp4ds.packing.options import PackProgress
 from mp4ds.plugins.demo import demo
@@ -91,10 +91,10 @@ class Clock:
 # ---------------------------------------------------------------- where it stands
 
 
-def paced(share: Callable[[float], float | None], seconds: int, **values: Any) -> PackStanding:
+def paced(share: Callable[[float], float | None], seconds: int, **values: Any) -> PackState:
     """A job that was told of each second."""
     clock = Clock()
-    job = PackStanding(clock=clock)
+    job = PackState(clock=clock)
     for n in range(seconds + 1):
         clock.seconds = 1000.0 + n
         job.take(told(share(n), **values))
@@ -120,7 +120,7 @@ def test_a_pace_that_changes_is_followed() -> None:
 )
 def test_nothing_is_told_that_is_not_known(state: PackProgress) -> None:
     clock = Clock()
-    job = PackStanding(clock=clock)
+    job = PackState(clock=clock)
     for n in range(100):
         clock.seconds = 1000.0 + n
         job.take(state)
@@ -130,7 +130,7 @@ def test_nothing_is_told_that_is_not_known(state: PackProgress) -> None:
 
 def test_the_least_share_that_there_is() -> None:
     clock = Clock(0.0)
-    job = PackStanding(clock=clock)
+    job = PackState(clock=clock)
     for seconds, share in ((0.0, 0.0), (5.0, 0.0), (6.0, 5e-324), (7.0, 1e-323), (8.0, 1e-9)):
         clock.seconds = seconds
         job.take(told(share))
@@ -139,7 +139,7 @@ def test_the_least_share_that_there_is() -> None:
 
 def test_no_time_left_is_told_of_a_share_of_a_job() -> None:
     clock = Clock()
-    job = PackStanding(whole=False, clock=clock)
+    job = PackState(whole=False, clock=clock)
     for n in range(100):
         clock.seconds = 1000.0 + n
         job.take(told(n / 200))
@@ -148,13 +148,13 @@ def test_no_time_left_is_told_of_a_share_of_a_job() -> None:
 
 
 def test_parts_tell_where_the_work_does_not() -> None:
-    job = PackStanding()
+    job = PackState()
     job.take(told(None, tasks_done=119))
     assert job.share == 119 / 240
 
 
 def test_datasets_count_by_their_size() -> None:
-    job = PackStanding()
+    job = PackState()
     job.take(told(1.0, dataset="a", gigabytes=10, phase="joining"))
     job.take(told(0.5, dataset="b", gigabytes=30))
     assert job.share == pytest.approx(25 / 40)
@@ -198,8 +198,8 @@ def test_whatever_is_told_nothing_silly_is_shown(
         file=screen, force_terminal=True, width=width, height=height, color_system=None
     )
     tellers = (
-        Log(PackStanding(clock=clock), Lines(log), now=clock.now),
-        Events(PackStanding(clock=clock), Lines(events), now=clock.now),
+        Log(PackState(clock=clock), Lines(log), now=clock.now),
+        Events(PackState(clock=clock), Lines(events), now=clock.now),
     )
     with on_terminal(console) as show:
         for now, state in reports:
@@ -221,7 +221,7 @@ def test_whatever_is_told_nothing_silly_is_shown(
 def logged(work: Work, seconds: float, *, outcome: str = "done", step: float = 0.5) -> list[str]:
     """The lines of a pack."""
     clock, stream = Clock(), io.StringIO()
-    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
     for n in range(int(seconds / step) + 1):
         clock.seconds = 1000.0 + n * step
         log.take(told(work(n * step)))
@@ -277,7 +277,7 @@ def test_the_lines_of_a_long_pack_become_rare() -> None:
 
 def test_a_resumed_pack_tells_what_was_done_before() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
     for n in range(100):
         clock.seconds = 1000.0 + n
         log.take(told(0.8 + n / 10_000, before=192))
@@ -286,7 +286,7 @@ def test_a_resumed_pack_tells_what_was_done_before() -> None:
 
 def test_silence_is_logged_too() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
     for n in range(100):
         clock.seconds = 1000.0 + n
         log.take(told(n / 1000))
@@ -301,7 +301,7 @@ def test_silence_is_logged_too() -> None:
 
 def test_the_log_of_several_datasets() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
     for name in ("a", "b", "c"):
         log.take(told(0.0, dataset=name))
     for n in range(1, 100):
@@ -322,7 +322,7 @@ def test_the_log_of_several_datasets() -> None:
 
 def test_hostile_names_reach_no_log() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(PackStanding(clock=clock), Lines(stream), now=clock.now)
+    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
     topics = {HOSTILE + "\udcff" + str(n) + "x" * n: (n, None) for n in range(1000)}
     for n in range(20):
         clock.seconds = 1000.0 + n
@@ -438,7 +438,7 @@ def parsed(text: str) -> list[dict[str, Any]]:
 
 def test_the_events_of_a_pack() -> None:
     clock, stream = Clock(), io.StringIO()
-    events = Events(PackStanding(clock=clock), Lines(stream), now=clock.now)
+    events = Events(PackState(clock=clock), Lines(stream), now=clock.now)
     for n in range(1001):
         clock.seconds = 1000.0 + n / 10
         events.take(told(n / 1000, note=HOSTILE))
@@ -469,7 +469,7 @@ def test_the_events_of_a_pack() -> None:
 
 def test_the_last_event_is_not_lost_and_none_is_told_twice() -> None:
     clock, stream = Clock(), io.StringIO()
-    events = Events(PackStanding(clock=clock), Lines(stream), now=clock.now)
+    events = Events(PackState(clock=clock), Lines(stream), now=clock.now)
     for n in range(5):
         clock.seconds = 1000.0 + n / 10
         events.take(told(n / 4))
@@ -479,7 +479,7 @@ def test_the_last_event_is_not_lost_and_none_is_told_twice() -> None:
 
 def test_each_dataset_is_told_of_once_a_second() -> None:
     clock, stream = Clock(), io.StringIO()
-    events = Events(PackStanding(clock=clock), Lines(stream), now=clock.now)
+    events = Events(PackState(clock=clock), Lines(stream), now=clock.now)
     for n in range(81):
         clock.seconds = 1000.0 + n / 8
         for name in ("a", "b"):
@@ -497,7 +497,7 @@ def test_each_dataset_is_told_of_once_a_second() -> None:
 
 def test_silence_is_told_of() -> None:
     clock, stream = Clock(), io.StringIO()
-    events = Events(PackStanding(clock=clock), Lines(stream), now=clock.now)
+    events = Events(PackState(clock=clock), Lines(stream), now=clock.now)
     for n in range(100):
         clock.seconds = 1000.0 + n
         events.take(told(n / 1000))
@@ -512,7 +512,7 @@ def test_silence_is_told_of() -> None:
 
 def test_a_pack_that_does_not_begin_has_no_events() -> None:
     stream = io.StringIO()
-    events = Events(PackStanding(), Lines(stream))
+    events = Events(PackState(), Lines(stream))
     events.tick()
     events.end("failed")
     assert stream.getvalue() == ""
@@ -551,7 +551,7 @@ def test_the_end_is_told_however_it_comes(error: type[BaseException] | None, out
     teller, threads = _Counting(), threading.active_count()
     with (
         suppress(ValueError, MemoryError, KeyboardInterrupt, SystemExit),
-        told_by(teller, tick_seconds=0.01) as take,
+        progress_to(teller, tick_seconds=0.01) as take,
     ):
         take(told(0.5))
         assert teller.ticked.wait(WATCHDOG_S)

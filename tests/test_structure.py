@@ -100,8 +100,8 @@ HOMES = {
 def test_each_library_has_its_room(package: str) -> None:
     found = [path for path in MODULES if package in imports_of(path)]
     homes = [SOURCE / home for home in HOMES[package]]
-    strangers = [path for path in found if not any(map(path.is_relative_to, homes))]
-    assert not strangers, f"{strangers} may not import {package}"
+    others = [path for path in found if not any(map(path.is_relative_to, homes))]
+    assert not others, f"{others} may not import {package}"
     assert found, f"nobody imports {package}: strike it, and from pyproject.toml"
 
 

@@ -9,7 +9,7 @@ import typer
 
 from mp4ds.cli.options import ForceFlag, JsonFlag
 from mp4ds.cli.output import print_json, say
-from mp4ds.cli.process import told_errors
+from mp4ds.cli.process import report_errors
 from mp4ds.errors import counted, path_text
 from mp4ds.plugins.demo import demo as make_demo
 
@@ -26,7 +26,7 @@ def demo(
     as_json: JsonFlag = False,
 ) -> None:
     """Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf."""
-    with told_errors(as_json):
+    with report_errors(as_json):
         messages = make_demo(output, seconds=seconds, force=force)
     if as_json:
         print_json({"output": output, "messages": messages})

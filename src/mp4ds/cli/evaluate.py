@@ -10,7 +10,7 @@ import typer
 
 from mp4ds.cli.options import JsonFlag, takes
 from mp4ds.cli.output import Column, print_json, print_table, say
-from mp4ds.cli.process import told_errors
+from mp4ds.cli.process import report_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.errors import counted, interrupted, path_text
 from mp4ds.plugins.evaluating.evaluate import evaluate as run
@@ -79,7 +79,7 @@ def evaluate(
     Writes a folder with tables, plots and a page, and recommends options for `mp4ds pack`. To
     resume an interrupted evaluation, run the same command again.
     """
-    with told_errors(as_json), progress_of("evaluating", as_json) as tell:
+    with report_errors(as_json), progress_of("evaluating", as_json) as tell:
         try:
             result = run(source, options(), output=output, progress=tell)
         except (KeyboardInterrupt, SystemExit) as error:

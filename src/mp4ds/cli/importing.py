@@ -10,7 +10,7 @@ import typer
 
 from mp4ds.cli.options import Command, ForceFlag, JsonFlag, quietable, takes
 from mp4ds.cli.output import print_json, print_pack
-from mp4ds.cli.process import told_errors
+from mp4ds.cli.process import report_errors
 from mp4ds.cli.progress import pack_progress
 from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.packing.pack import pack as run
@@ -49,7 +49,7 @@ def images(
     EuRoC and TUM RGB-D folders are imported with all their cameras. Lossless by default. To
     resume a long import that was interrupted, run the same command again.
     """
-    with told_errors(as_json), pack_progress(as_json) as progress:
+    with report_errors(as_json), pack_progress(as_json) as progress:
         chosen = replace(options(), images=images_as())
         summary = run(folder, output, chosen, progress=progress)
     if as_json:
@@ -73,7 +73,7 @@ def ros_mp4(
 
     The video is not re-encoded: its packets are copied.
     """
-    with told_errors(as_json):
+    with report_errors(as_json):
         summary = import_ros_mp4(video, sidecar, output, force=force)
     if as_json:
         print_json(summary)

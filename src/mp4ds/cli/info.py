@@ -10,7 +10,7 @@ import typer
 
 from mp4ds.cli.options import JsonFlag
 from mp4ds.cli.output import print_info, print_json, print_overview, print_speeds, say
-from mp4ds.cli.process import told_errors
+from mp4ds.cli.process import report_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, SourceError, counted, path_text
@@ -70,9 +70,9 @@ def info(
 ) -> None:
     """Show what is in a recording or a dataset."""
     if intrinsics and speed:
-        with told_errors(as_json):
+        with report_errors(as_json):
             raise OptionError("Give --intrinsics or --speed, not both.")
-    with told_errors(as_json):
+    with report_errors(as_json):
         found = _found(paths)
         asked = Slice(start, end, duration)
         if len(found) > 1 and (intrinsics or speed or asked or checksums):
@@ -88,7 +88,7 @@ def info(
     elif len(found) > 1:
         _print_overview(found, as_json)
     else:
-        with told_errors(as_json):
+        with report_errors(as_json):
             result = facts.info(found[0], asked)
         if as_json:
             print_json(result)
@@ -108,7 +108,7 @@ def _found(paths: Sequence[str]) -> list[Path]:
 
 def _print_checksums(path: Path, as_json: bool) -> None:
     """Print the hashes of a dataset's files from its manifest, and that of the manifest itself."""
-    with told_errors(as_json):
+    with report_errors(as_json):
         if not (path / MANIFEST_NAME).is_file():
             raise OptionError(f"{path} is not a dataset; only datasets have checksums.")
         told = {item.name: item.sha256 for item in load_manifest(path / MANIFEST_NAME).files}
@@ -121,7 +121,7 @@ def _print_checksums(path: Path, as_json: bool) -> None:
 
 
 def _print_card(found: Sequence[Path], as_json: bool) -> None:
-    with told_errors(as_json):
+    with report_errors(as_json):
         text = card_of(found)
     if as_json:
         print_json({"card": text})
@@ -131,7 +131,7 @@ def _print_card(found: Sequence[Path], as_json: bool) -> None:
 
 
 def _print_overview(found: Sequence[Path], as_json: bool) -> None:
-    with told_errors(as_json), progress_of("reading", as_json) as tell:
+    with report_errors(as_json), progress_of("reading", as_json) as tell:
         rows = []
         for number, path in enumerate(found):
             if tell:
@@ -144,7 +144,7 @@ def _print_overview(found: Sequence[Path], as_json: bool) -> None:
 
 
 def _print_intrinsics(path: str, as_json: bool) -> None:
-    with told_errors(as_json), progress_of("reading", as_json):
+    with report_errors(as_json), progress_of("reading", as_json):
         result = facts.intrinsics(path)
     if as_json:
         print_json(result)
@@ -153,7 +153,7 @@ def _print_intrinsics(path: str, as_json: bool) -> None:
 
 
 def _print_speeds(path: str, as_json: bool) -> None:
-    with told_errors(as_json), progress_of("reading", as_json):
+    with report_errors(as_json), progress_of("reading", as_json):
         speeds = facts.reading_speeds(path)
     if as_json:
         print_json(speeds)

@@ -9,7 +9,7 @@ from typing import Any
 
 from mp4ds.cli.options import Command
 from mp4ds.cli.output import be_quiet
-from mp4ds.cli.process import DEBUG, told_errors
+from mp4ds.cli.process import DEBUG, report_errors
 from mp4ds.errors import OptionError
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames, node_arguments
 
@@ -22,7 +22,7 @@ class NodeCommand(Command):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments other than ROS arguments."""
-        with told_errors("--json" in args):
+        with report_errors("--json" in args):
             words, ctx.meta[_NAMES] = self.spelled(ctx, args)
         parsed: list[str] = super().parse_args(ctx, words)
         return parsed

@@ -9,7 +9,7 @@ import typer
 
 from mp4ds.cli.options import JsonFlag, parse_share, takes
 from mp4ds.cli.output import print_json, print_pack, print_speeds, say
-from mp4ds.cli.process import told_errors
+from mp4ds.cli.process import report_errors
 from mp4ds.cli.progress import pack_progress
 from mp4ds.errors import OptionError
 from mp4ds.files.urls import remote
@@ -50,7 +50,7 @@ def pack(
     was interrupted, run the same command again. Repacking a dataset keeps exact what was exact.
     """
     summaries: list[PackSummary] = []
-    with told_errors(as_json), pack_progress(as_json, whole=not shard) as progress:
+    with report_errors(as_json), pack_progress(as_json, whole=not shard) as progress:
         chosen = options()
         into = output if output and output.endswith("/") else None
         if shard and (chosen.join or into):
@@ -69,7 +69,7 @@ def pack(
         if chosen.purpose is not None and not remote(summary.dataset):
             from mp4ds.plugins.info import reading_speeds  # not for every short pack
 
-            with told_errors(as_json):
+            with report_errors(as_json):
                 print_speeds(reading_speeds(summary.dataset))
     if shard:
         say(f"share {shard} is packed; once all shares are, run --join to make the dataset")

@@ -15,7 +15,7 @@ from mp4ds.cli.nodes import NodeCommand, names_in, say_as_much
 from mp4ds.cli.options import JsonFlag, takes
 from mp4ds.cli.output import be_quiet, complain, is_quiet, print_json, say, shown
 from mp4ds.cli.play_words import STORAGES, spelled
-from mp4ds.cli.process import caught_signals, told_errors
+from mp4ds.cli.process import caught_signals, report_errors
 from mp4ds.errors import OptionError
 from mp4ds.plugins.playing.play import PlayOptions, open_player
 from mp4ds.plugins.publishing.publisher import Controls
@@ -200,7 +200,7 @@ def play(
     --ros2, -x means --exclude-regex, -s means --storage, and -i names a dataset; with --ros1, -p
     means --prefix.
     """
-    with told_errors(as_json), ExitStack() as stack:
+    with report_errors(as_json), ExitStack() as stack:
         names = names_in(context)
         say_as_much(log_level or names.log_level)
         if quiet:

@@ -34,7 +34,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 @contextmanager
-def told_errors(as_json: bool) -> Iterator[None]:
+def report_errors(as_json: bool) -> Iterator[None]:
     """Turn errors into one sentence and an exit code."""
     try:
         yield
@@ -209,7 +209,7 @@ def exit_code_of(command: Callable[[], object], *, as_json: bool) -> int:
     """
     code = 0
     try:
-        with told_errors(as_json), printed():  # the commands report everything else themselves
+        with report_errors(as_json), printed():  # the commands report everything else themselves
             try:
                 command()
             except SystemExit as ended:

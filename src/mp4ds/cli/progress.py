@@ -31,7 +31,7 @@ _ROUNDING = 1e-6
 _DIGITS = 9  # digits of a share: with a float's full precision, the time left may overflow
 
 
-class PackStanding:
+class PackState:
     """Progress of one or several packs.
 
     Args:
@@ -193,7 +193,7 @@ class Events:
 
     def __init__(
         self,
-        job: PackStanding,
+        job: PackState,
         lines: Lines,
         *,
         now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
@@ -279,7 +279,7 @@ class Log:
     """
 
     def __init__(
-        self, job: PackStanding, lines: Lines, *, now: Callable[[], datetime] = datetime.now
+        self, job: PackState, lines: Lines, *, now: Callable[[], datetime] = datetime.now
     ) -> None:
         self._job = job
         self._lines = lines
@@ -380,9 +380,9 @@ def pack_progress(as_json: bool, *, whole: bool = True) -> Iterator[Take]:
             with on_terminal(console, whole=whole) as take:
                 yield take
             return
-    job = PackStanding(whole=whole)
+    job = PackState(whole=whole)
     teller = (Events if as_json else Log)(job, Lines(stream))
-    with told_by(teller, tick_seconds=_TICK_SECONDS) as take:
+    with progress_to(teller, tick_seconds=_TICK_SECONDS) as take:
         yield take
 
 
@@ -403,7 +403,7 @@ def on_terminal(console: Console, *, whole: bool = True) -> Iterator[Take]:
         TaskProgressColumn(),
         TextColumn("{task.fields[told]}", markup=False),
     ]
-    job = PackStanding(whole=False)
+    job = PackState(whole=False)
     with Progress(
         *columns,
         *([TimeRemainingColumn()] if whole else []),
@@ -453,7 +453,7 @@ class ProgressWriter(Protocol):
 
 
 @contextmanager
-def told_by(teller: ProgressWriter, *, tick_seconds: float) -> Iterator[Take]:
+def progress_to(teller: ProgressWriter, *, tick_seconds: float) -> Iterator[Take]:
     """Let a job be told of while the context lasts, on from silence to its end."""
     lock, stop = threading.Lock(), threading.Event()
 
@@ -489,7 +489,7 @@ _LINE_PAUSE = 10.0  # seconds
 _SURE_SECONDS = 2.0  # from when on the time left is shown
 
 
-class Telling(Protocol):
+class ProgressCallback(Protocol):
     """What takes the progress of a command."""
 
     def __call__(self, what: str, share: float | None = None) -> None:
@@ -497,7 +497,7 @@ class Telling(Protocol):
 
 
 @contextmanager
-def progress_of(doing: str, as_json: bool) -> Iterator[Telling | None]:
+def progress_of(doing: str, as_json: bool) -> Iterator[ProgressCallback | None]:
     """Tell of the progress of a command while the context lasts.
 
     On a terminal a bar with percent and time left, once a share is known; else a line every 10 s.
@@ -521,7 +521,7 @@ def progress_of(doing: str, as_json: bool) -> Iterator[Telling | None]:
 
 
 @contextmanager
-def _bar(console: Console, doing: str) -> Iterator[Telling]:
+def _bar(console: Console, doing: str) -> Iterator[ProgressCallback]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = [
@@ -564,7 +564,7 @@ class LogOf:
         self._share: float | None = None
 
     def __call__(self, what: str, share: float | None = None) -> None:
-        """See `Telling`."""
+        """See `ProgressCallback`."""
         now = self._clock()
         self._share = self._share if share is None else share
         if now - self._told < _LINE_PAUSE:

@@ -13,7 +13,7 @@ from mp4ds.cli.keyboard import Keyboard
 from mp4ds.cli.nodes import NodeCommand, names_in, say_as_much
 from mp4ds.cli.options import JsonFlag, takes
 from mp4ds.cli.output import complain, is_quiet, print_json, print_pack, say
-from mp4ds.cli.process import caught_signals, told_errors
+from mp4ds.cli.process import caught_signals, report_errors
 from mp4ds.cli.record_words import spelled
 from mp4ds.errors import OptionError, counted, path_text
 from mp4ds.files.sources import salvage_command
@@ -81,7 +81,7 @@ def record(
     Ctrl-C ends the recording. It is lossless by default, with the fastest encoder settings. What
     cannot be packed in time waits on disk. Keys: space pauses and resumes, q ends.
     """
-    with told_errors(as_json), ExitStack() as stack:
+    with report_errors(as_json), ExitStack() as stack:
         if ros1 and ros2:
             raise OptionError("--ros1 contradicts --ros2.")
         kind = "ros1" if ros1 else "ros2" if ros2 else None

@@ -19,7 +19,7 @@ from mp4ds.cli.options import (
     takes,
 )
 from mp4ds.cli.output import print_json, printed, say
-from mp4ds.cli.process import told_errors
+from mp4ds.cli.process import report_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, counted, path_text, size_text
@@ -49,7 +49,7 @@ def report(
     Open its index.html in a browser, from disk or with --serve; it works offline. Several datasets,
     or a folder of them, get an overview page with a picture of each and links to their reports.
     """
-    with told_errors(as_json):
+    with report_errors(as_json):
         found, chosen = datasets_in(datasets), options()
         if len(found) > 1:
             if serve:
@@ -130,7 +130,7 @@ def frames(
     as_json: JsonFlag = False,
 ) -> None:
     """Save one frame as an image, or many frames as a contact sheet."""
-    with told_errors(as_json):
+    with report_errors(as_json):
         summary = run_frames(dataset, output, options())
     if as_json:
         print_json(summary)

@@ -10,7 +10,7 @@ import typer
 
 from mp4ds.cli.options import DatasetsArgument, JobsOption, JsonFlag, cores, takes
 from mp4ds.cli.output import print_json, print_unpack, say
-from mp4ds.cli.process import told_errors
+from mp4ds.cli.process import report_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import counted, path_text
@@ -45,7 +45,7 @@ def unpack(
 
     Messages are converted between ROS 1 and ROS 2 if the output format requires it.
     """
-    with told_errors(as_json), progress_of("unpacking", as_json) as tell:
+    with report_errors(as_json), progress_of("unpacking", as_json) as tell:
         noun = "image" if to == "images" else "message"
         found, chosen = datasets_in(datasets), options()
 
@@ -89,7 +89,7 @@ def export(
 
     What is left out is counted by topic and listed, here and in mp4ds_export.json.
     """
-    with told_errors(as_json), progress_of("exporting", as_json) as tell:
+    with report_errors(as_json), progress_of("exporting", as_json) as tell:
         summary = run_export(datasets, to, output, options(), progress=tell)
     if as_json:
         print_json(summary)

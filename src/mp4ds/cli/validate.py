@@ -10,7 +10,7 @@ import typer
 
 from mp4ds.cli.options import DatasetsArgument, JobsOption, JsonFlag, cores
 from mp4ds.cli.output import print_json, print_validation
-from mp4ds.cli.process import told_errors
+from mp4ds.cli.process import report_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset import checks
 from mp4ds.dataset.collections import datasets_in, each
@@ -29,7 +29,7 @@ def validate(
 ) -> None:
     """Check datasets and list every problem; exits with 1 if there are any."""
     found: dict[Path, list[checks.Problem]] = {}
-    with told_errors(as_json), progress_of("validating", as_json) as tell:
+    with report_errors(as_json), progress_of("validating", as_json) as tell:
         where = datasets_in(paths)
         if len(where) == 1:
             found[where[0]] = checks.validate(where[0], deep=deep, progress=tell)

@@ -151,7 +151,7 @@ def check_replaceable(target: Path, owned: Owned) -> None:
         return
     names = refuse_not_ours(target, owned(target))
     if is_folder:
-        refuse_strangers(target, strangers(target, names))
+        refuse_unknown_files(target, unknown_files(target, names))
 
 
 def refuse_not_ours(target: Path, names: Iterable[str] | None) -> set[str]:
@@ -169,7 +169,7 @@ def refuse_not_ours(target: Path, names: Iterable[str] | None) -> set[str]:
     return set(names)
 
 
-def refuse_strangers(target: Path, others: Collection[str]) -> None:
+def refuse_unknown_files(target: Path, others: Collection[str]) -> None:
     """Refuse to replace a folder that holds something else, too.
 
     Raises:
@@ -186,7 +186,7 @@ def refuse_strangers(target: Path, others: Collection[str]) -> None:
     )
 
 
-def strangers(folder: Path, names: Collection[str]) -> list[str]:
+def unknown_files(folder: Path, names: Collection[str]) -> list[str]:
     """What a folder holds besides the named files, those of a report in it, and their folders.
 
     Args:
@@ -392,7 +392,7 @@ def _prefix(target: Path) -> str:
 def _clear_leftovers(target: Path) -> None:
     """Remove what killed runs for a target left behind, if it is recognisable."""
 
-    def give_back() -> None:
+    def restore() -> None:
         if os.path.lexists(old) and not os.path.lexists(target):
             old.rename(target)
 
@@ -405,7 +405,7 @@ def _clear_leftovers(target: Path) -> None:
             if {part.name for part in parts} <= {_LOCK, _NEW, _OLD} and (
                 {*inner} <= {target.name} and not any(part.is_symlink() for part in parts)
             ):
-                _remove_abandoned(folder, give_back)
+                _remove_abandoned(folder, restore)
 
 
 def check_target(

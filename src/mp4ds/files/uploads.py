@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from mp4ds.errors import Mp4dsError, RemoteError, TargetError, TargetExistsError, interrupted
-from mp4ds.files.outputs import Owned, lock, refuse_not_ours, refuse_strangers
+from mp4ds.files.outputs import Owned, lock, refuse_not_ours, refuse_unknown_files
 from mp4ds.files.urls import RemotePath
 
 Made = TypeVar("Made")
@@ -133,7 +133,7 @@ def _replaced(target: RemotePath, *, is_folder: bool, force: bool, owned: Owned)
         return {""}
     begin = len(target.url) + 1
     there = {path.url[begin:] for path in now.files()}
-    refuse_strangers(shown, there - old)
+    refuse_unknown_files(shown, there - old)
     return there
 
 

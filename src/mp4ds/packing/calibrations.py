@@ -12,7 +12,7 @@ from mp4ds.errors import OptionError, Refused
 from mp4ds.format.models import CameraInfo
 from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
-from mp4ds.packing.look import CameraMessage
+from mp4ds.packing.inspection import CameraMessage
 from mp4ds.packing.options import TopicSummary
 from mp4ds.plan import INFO_NAMES, TRANSPORTS
 from mp4ds.records import Channel, Message

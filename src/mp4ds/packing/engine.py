@@ -62,7 +62,7 @@ class Engine(Protocol):
 # ---------------------------------------------------------------- memory
 
 
-def give_back() -> None:
+def release_memory() -> None:
     """Release the memory that a task took.
 
     Encoders in reference cycles wait for a collector that does not know how large they are, and the

@@ -15,7 +15,7 @@ from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
 from mp4ds.packing.calibrations import Calibrations
 from mp4ds.packing.engine import Workers
-from mp4ds.packing.look import CameraMessage, Looker, StreamKey
+from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
 from mp4ds.packing.manifest import PartRecord, PartStream, declare_rest
 from mp4ds.packing.options import TopicSummary
 from mp4ds.packing.survey import MAX_STREAMS_PER_CHANNEL, SAMPLES, Decision, Survey, decide, rate_of
@@ -67,7 +67,7 @@ class _Route:
 class _CameraChannel:
     """A camera channel being packed."""
 
-    looker: Looker
+    inspector: MessageInspector
     count: int = 0
     routes: dict[StreamKey, _Route] = field(default_factory=dict)
     held: list[_Item] = field(default_factory=list)
@@ -120,7 +120,7 @@ class CameraRouter:
         ordinal, number = state.count, self._topic_of(channel).messages - 1
         state.count += 1
         try:
-            seen = state.looker.look(message)
+            seen = state.inspector.inspect(message)
         except Refused as reason:
             self._settle(state, workers)
             self._keep_verbatim(message, number, str(reason))
@@ -140,8 +140,8 @@ class CameraRouter:
 
     def _state_of(self, channel: Channel) -> _CameraChannel:
         if channel.identity not in self._channels:
-            looker = Looker(channel, transcode=self._settings.transcode)
-            state = self._channels[channel.identity] = _CameraChannel(looker)
+            inspector = MessageInspector(channel, transcode=self._settings.transcode)
+            state = self._channels[channel.identity] = _CameraChannel(inspector)
             decisions = self._survey.decisions.get(channel.id) if self._survey else None
             if decisions is not None:
                 state.is_surveyed = True
@@ -197,7 +197,7 @@ class CameraRouter:
                 self._calibrations.adopt(stream)
             workers.submit(number, job)
             return
-        state.looker.leave_out(item.seen)
+        state.inspector.leave_out(item.seen)
         self._keep_verbatim(item.message, item.number, route.refusal or reason)
 
     def _candidates(

@@ -17,8 +17,8 @@ from mp4ds.files.sources import SourceState
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.options import Slice
 from mp4ds.packing.calibrations import choose_pairs, pair_camera_infos, unpaired_infos
+from mp4ds.packing.inspection import depends_on_others
 from mp4ds.packing.job import Job, Task, absolute, is_hashed, outcome_options, tools
-from mp4ds.packing.look import depends_on_others
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.survey import Survey, survey_channel, survey_pairs
 from mp4ds.packing.tracks import PicturePlan, StreamSettings, TrackPlan

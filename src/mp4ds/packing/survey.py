@@ -12,7 +12,7 @@ from mp4ds.dataset.rebuild import MessageSplitter
 from mp4ds.errors import Refused
 from mp4ds.messages.serializations import is_calibration
 from mp4ds.packing.calibrations import StampPairing
-from mp4ds.packing.look import CameraMessage, Looker, StreamKey
+from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
 from mp4ds.packing.tracks import (
     StreamSettings,
     TrackPlan,
@@ -153,15 +153,15 @@ def survey_channel(
         starts: Log times, ns, at which parts begin; None for the recording's start.
         settings: What was asked for.
     """
-    looker = Looker(channel, transcode=settings.transcode)
+    inspector = MessageInspector(channel, transcode=settings.transcode)
     decisions: dict[StreamKey, Decision] = {}
     step = -(-len(starts) // _MAX_LOOKS) or 1
     for start in starts[::step]:
-        samples = _samples(reader, channel, start, looker, settings)
+        samples = _samples(reader, channel, start, inspector, settings)
         if samples and samples[0].key not in decisions:
             key = samples[0].key
             places = dict.fromkeys((start, *_places_between(starts)))
-            runs = (_run(reader, channel, place, looker, key) for place in places)
+            runs = (_run(reader, channel, place, inspector, key) for place in places)
             decisions[key] = decide(samples, settings, rate_of(reader, channel), runs)
             if len(decisions) == MAX_STREAMS_PER_CHANNEL:
                 break
@@ -174,7 +174,11 @@ def _places_between(starts: Sequence[int | None]) -> list[int | None]:
 
 
 def _run(
-    reader: BagReader, channel: Channel, start: int | None, looker: Looker, key: StreamKey
+    reader: BagReader,
+    channel: Channel,
+    start: int | None,
+    inspector: MessageInspector,
+    key: StreamKey,
 ) -> Iterator[CameraMessage]:
     """Images of a key from a log time on; of another one's stretch there are none."""
     left = _RUN
@@ -182,7 +186,7 @@ def _run(
     for number, record in enumerate(reader.records(excerpt)):
         if isinstance(record, Message) and record.channel.id == channel.id:
             with suppress(Refused):
-                seen = looker.look(record)
+                seen = inspector.inspect(record)
                 if seen.key == key:
                     yield seen
                     left -= 1
@@ -194,7 +198,7 @@ def _samples(
     reader: BagReader,
     channel: Channel,
     start: int | None,
-    looker: Looker,
+    inspector: MessageInspector,
     settings: StreamSettings,
 ) -> list[CameraMessage]:
     """The first images of one key from a log time on, as many as needed to decide."""
@@ -203,7 +207,7 @@ def _samples(
     for number, record in enumerate(reader.records(excerpt)):
         if isinstance(record, Message) and record.channel.id == channel.id:
             with suppress(Refused):
-                seen = looker.look(record)
+                seen = inspector.inspect(record)
                 if not samples or seen.key == samples[0].key:
                     samples.append(seen)
         enough = SAMPLES if samples and needs_trial(samples[0], settings) else 1
@@ -228,7 +232,7 @@ def survey_pairs(
     """
     topics = frozenset(channel.topic for channel in (*cameras, *infos))
     forms = {channel.id: MessageSplitter(channel) for channel in infos}
-    lookers = {channel.id: Looker(channel) for channel in cameras}
+    inspectors = {channel.id: MessageInspector(channel) for channel in cameras}
     pairing = StampPairing()
     found = dict(pairs)
     records = reader.records(Excerpt(topics=topics, others=False))
@@ -239,8 +243,8 @@ def survey_pairs(
         try:
             if is_calibration(channel) and channel.id in forms:
                 pairing.add(channel, forms[channel.id].split(record)[1])
-            elif channel.id in lookers:
-                seen = lookers[channel.id].look(record)
+            elif channel.id in inspectors:
+                seen = inspectors[channel.id].inspect(record)
                 pairing.add(channel, seen.parts, size=(seen.key.width, seen.key.height))
         except Refused:
             continue

@@ -19,7 +19,7 @@ from mp4ds.errors import Refused
 from mp4ds.format.models import SCORE_STEPS
 from mp4ds.format.models import Quality as Measured
 from mp4ds.messages.layouts import Layout
-from mp4ds.packing.look import CameraMessage, StreamKey
+from mp4ds.packing.inspection import CameraMessage, StreamKey
 from mp4ds.packing.tracks import PicturePlan, StreamSettings, TargetPlan, picture_facts
 from mp4ds.plan import QualityTarget
 from mp4ds.times import TIMESCALE

@@ -13,7 +13,7 @@ from mp4ds.errors import EncoderRefusedError, OptionError, Refused
 from mp4ds.format.models import Color, LayoutParameters
 from mp4ds.messages.encodings import ENCODINGS, Parameters
 from mp4ds.messages.layouts import Layout, bind, layout_for
-from mp4ds.packing.look import CameraMessage, StreamKey
+from mp4ds.packing.inspection import CameraMessage, StreamKey
 from mp4ds.plan import MAX_GOP, Purpose, QualitySetting, QualityTarget, visual_setting
 from mp4ds.video.codecs import (
     AV1,

@@ -17,7 +17,7 @@ from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import Mp4dsError, sentence_of
 from mp4ds.files.outputs import write_synced
 from mp4ds.files.sources import unchanged
-from mp4ds.packing.engine import give_back, serve, tell
+from mp4ds.packing.engine import release_memory, serve, tell
 from mp4ds.packing.job import Job, Task, digest_source
 from mp4ds.packing.manifest import RECORD_NAME, Origin, PartRecord, dump_kept, write_manifest
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
@@ -143,7 +143,7 @@ def _outcome(tasks: Tasks, folder: str, name: str) -> dict[str, Any]:
         said = str(error) if isinstance(error, Mp4dsError) else sentence_of(error)
         return {"error": (type(error).__name__, said), "ready": True}
     peak = _memory("VmHWM")
-    give_back()
+    release_memory()
     return {
         "done": True,
         # memory fragmented by large encoders is only released by exiting

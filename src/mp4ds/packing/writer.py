@@ -26,7 +26,7 @@ from mp4ds.format.models import (
 from mp4ds.format.sidecars import dump_document
 from mp4ds.messages.png import PngRecipe, zlib_fingerprint
 from mp4ds.messages.wire import CodedFields
-from mp4ds.packing.look import CameraMessage
+from mp4ds.packing.inspection import CameraMessage
 from mp4ds.packing.tracks import StreamSettings, TrackPlan
 from mp4ds.records import Channel, Message
 from mp4ds.times import PresentationClock

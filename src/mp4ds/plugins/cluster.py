@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from mp4ds.errors import ClusterError, OptionError
-from mp4ds.packing.engine import Outcome, give_back
+from mp4ds.packing.engine import Outcome, release_memory
 
 if TYPE_CHECKING:
     from dask_jobqueue import JobQueueCluster
@@ -59,7 +59,7 @@ def attempt(task: tuple[str, ...], *, function: Callable[..., None]) -> None:
         kind = type(error).__name__
         raise TaskFailedError(kind, f"on worker {where}: {str(error) or kind}") from None
     finally:
-        give_back()  # a worker using too much is paused and gets no more tasks
+        release_memory()  # a worker using too much is paused and gets no more tasks
 
 
 # ---------------------------------------------------------------- batch systems

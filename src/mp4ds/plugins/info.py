@@ -28,8 +28,8 @@ from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.messages.wire import CalibrationFields, CodedFields, ImageFields
 from mp4ds.options import WHOLE, Slice
 from mp4ds.packing.calibrations import StampPairing, pair_camera_infos
+from mp4ds.packing.inspection import MessageInspector
 from mp4ds.packing.job import open_recording
-from mp4ds.packing.look import Looker
 from mp4ds.records import Channel, Message, latched_text
 from mp4ds.times import intervals, lost_frames
 
@@ -548,7 +548,7 @@ class _Cameras:
 
 def _coded_size(message: Message, told: tuple[int, int]) -> tuple[int, int]:
     try:
-        key = Looker(message.channel).look(message).key
+        key = MessageInspector(message.channel).inspect(message).key
     except Refused:
         return told
     return key.width, key.height

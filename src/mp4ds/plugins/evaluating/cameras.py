@@ -22,7 +22,7 @@ from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera, kind_of
 from mp4ds.messages.wire import CodedFields
-from mp4ds.packing.look import Looker, depends_on_others
+from mp4ds.packing.inspection import MessageInspector, depends_on_others
 from mp4ds.packing.options import ImageFolder
 from mp4ds.plan import LOSSLESS
 from mp4ds.plugins.importing.layouts import images_in, open_images
@@ -126,7 +126,7 @@ def _of_recording(reader: BagReader) -> tuple[list[Camera], dict[str, str]]:
 
 def _is_jpeg(message: Message) -> bool:
     with suppress(Refused):
-        return Looker(message.channel).look(message).key.codec == "mjpeg"
+        return MessageInspector(message.channel).inspect(message).key.codec == "mjpeg"
     return False
 
 
@@ -138,13 +138,13 @@ def _of_channel(
         first, last = int(times[indices[0]]), int(times[indices[-1]])
         number = int(np.searchsorted(times, first))
         excerpt = Excerpt(first, last + 1, frozenset([channel.topic]), others=False)
-        looker = Looker(channel, transcode=True)
+        inspector = MessageInspector(channel, transcode=True)
         for record in reader.records(excerpt):
             if not isinstance(record, Message) or record.channel.id != channel.id:
                 continue
             if number in wanted:
                 with suppress(Refused):
-                    seen = looker.look(record)
+                    seen = inspector.inspect(record)
                     if seen.pixels is not None:
                         kind = seen.key.encoding, seen.key.width, seen.key.height
                         yield Shot(kind, seen.pixels, seen.parts.stamp, record.log_time)

@@ -16,7 +16,7 @@ from typing import IO, Any
 
 from mp4ds.errors import Mp4dsError, sentence_of
 from mp4ds.format.sidecars import load_about
-from mp4ds.packing.engine import Orders, give_back, tell
+from mp4ds.packing.engine import Orders, release_memory, tell
 from mp4ds.packing.pack import pack
 from mp4ds.packing.spool import SpoolFolder
 
@@ -126,7 +126,7 @@ def _main() -> None:
         os.nice(_NICE)
     for order in Orders():
         problem = _carry_out(*order)
-        give_back()
+        release_memory()
         tell(problem)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mp4ds.bags.mcap_write import McapWriter
 from mp4ds.messages.serializations import is_camera
-from mp4ds.packing.look import begins_anew, depends_on_others
+from mp4ds.packing.inspection import begins_anew, depends_on_others
 from mp4ds.packing.spool import SpoolFolder
 from mp4ds.records import Channel, Message, MetadataRecord
 from mp4ds.times import INT64_MAX

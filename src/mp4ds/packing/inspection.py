@@ -87,7 +87,7 @@ class CameraMessage:
     parameters: bytes = b""
 
 
-class Looker:
+class MessageInspector:
     """Inspects the messages of one channel.
 
     Args:
@@ -103,7 +103,7 @@ class Looker:
         self._png_refusals = 0
         self._transcode = transcode
 
-    def look(self, message: Message) -> CameraMessage:
+    def inspect(self, message: Message) -> CameraMessage:
         """What a message holds.
 
         Raises:
@@ -210,7 +210,7 @@ def depends_on_others(channel: Channel, message: Message) -> bool:
 def begins_anew(message: Message) -> bool:
     """Whether a stream may begin with a message of a camera channel."""
     try:
-        return Looker(message.channel).look(message).keyframe
+        return MessageInspector(message.channel).inspect(message).keyframe
     except Refused:
         return False
 
