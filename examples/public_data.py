@@ -79,7 +79,7 @@ def evaluation(dataset: Path, options: argparse.Namespace) -> Iterator[tuple[str
     """The smallest setting for each camera that reaches a score."""
     target = "vmaf=97" if find_spec("imageio_ffmpeg") else "psnr_y=42"
     chosen = mp4ds.EvaluateOptions(
-        codecs=["svtav1", "x264"],
+        codecs=["av1", "h264"],
         presets=["8", "veryfast"],
         crf=[options.crf],
         frames=options.frames,

@@ -30,20 +30,17 @@ from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, Target
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.demo import demo
-from mp4ds.plugins.evaluating.cameras import open_cameras
-from mp4ds.plugins.evaluating.clips import Clip, chosen, chosen_at_rate, make_clip
-from mp4ds.plugins.evaluating.evaluate import evaluate
-from mp4ds.plugins.evaluating.options import (
+from mp4ds.plugins.evaluating.clips import chosen, make_clip, open_cameras
+from mp4ds.plugins.evaluating.evaluate import (
     EvaluateOptions,
-    ScoreGoal,
-    Setting,
+    evaluate,
     parse_crfs,
     parse_target,
     settings_of,
 )
-from mp4ds.plugins.evaluating.page import page, table
-from mp4ds.plugins.evaluating.plots import pareto
-from mp4ds.plugins.evaluating.results import Cell, Evaluation, reachable_score, recommend
+from mp4ds.plugins.evaluating.page import page, pareto, table
+from mp4ds.plugins.evaluating.results import Evaluation, ScoreGoal, reachable_score, recommend
+from mp4ds.plugins.evaluating.trials import Cell, Clip, Setting
 from mp4ds.unpacking.options import UnpackOptions
 from mp4ds.video.planes import PacketSizes, packet_sizes
 from mp4ds.video.scores import ScoreSummary, largest_crf
@@ -54,7 +51,7 @@ from waiting import WATCHDOG_S, until
 ROOT = Path(__file__).parents[1]
 TOPIC = "/cam/image_raw"
 QUICK = EvaluateOptions(
-    codecs=["x264"], presets=["ultrafast"], crf=["24"], frames=10, target="psnr_y=20",
+    codecs=["h264"], presets=["ultrafast"], crf=["24"], frames=10, target="psnr_y=20",
     threads=1,
 )  # fmt: skip
 
@@ -96,15 +93,15 @@ def test_no_crfs(text: str) -> None:
 
 
 def test_targets() -> None:
-    assert parse_target("99") == ScoreGoal("vmaf", 99)
+    assert parse_target("vmaf=99") == ScoreGoal("vmaf", 99)
     assert parse_target("psnr_y=42.5") == ScoreGoal("psnr_y", 42.5)
-    for text in ("", "vmaf", "vmaf=", "=3", "psnr=40", "vmaf=0", "vmaf=101", "vmaf=nan"):
+    for text in ("", "99", "vmaf", "vmaf=", "=3", "psnr=40", "vmaf=0", "vmaf=101", "vmaf=nan"):
         with pytest.raises(OptionError, match="`target`"):
             parse_target(text)
 
 
 def test_presets_go_to_the_codecs_that_have_them() -> None:
-    options = EvaluateOptions(codecs=["svtav1", "h264", "x265"], presets=["8", "fast"], crf=["20"])
+    options = EvaluateOptions(codecs=["av1", "h264", "h265"], presets=["8", "fast"], crf=["20"])
     settings = settings_of(options)
     assert [(item.codec, item.preset) for item in settings] == [
         ("av1", "8"), ("h264", "fast"), ("h265", "fast"),
@@ -125,10 +122,8 @@ def test_a_codec_has_only_its_crfs() -> None:
         ({"codecs": ["vp9"]}, "`codecs` 'vp9'"),
         ({"codecs": []}, "`codecs`"),
         ({"presets": ["fastest"]}, "`presets` 'fastest'"),
-        ({"codecs": ["x264"], "crf": ["60"]}, "0 settings"),
+        ({"codecs": ["h264"], "crf": ["60"]}, "0 settings"),
         ({"frames": 0}, "`frames` 0"),
-        ({"rates": [-1.0]}, "`rates` -1"),
-        ({"duration": float("nan")}, "`duration`"),
         ({"start": -1.0}, "`start` -1"),
         ({"hours": 0.0}, "`hours` 0"),
         ({"fps": 0.0}, "`fps` 0"),
@@ -147,35 +142,15 @@ def at_hertz(hertz: float, count: int) -> np.ndarray[Any, np.dtype[np.int64]]:
     return 5_000_000_000 + (np.arange(count) * 1e9 / hertz).astype(np.int64)
 
 
-def test_clips_are_from_the_middle() -> None:
-    options = EvaluateOptions(frames=10)
-    assert chosen(at_hertz(10, 100), 0, options) == list(range(45, 55))
-    assert chosen(at_hertz(10, 6), 0, options) == list(range(6))
-
-
-def test_clips_of_a_time() -> None:
+def test_clips_are_from_the_middle_or_a_given_time() -> None:
     times, origin = at_hertz(10, 100), 4_500_000_000
-    given = EvaluateOptions(start=1.5, duration=0.75)
-    assert chosen(times, origin, given) == list(range(10, 18))
-    assert chosen(times, origin, replace(given, duration=None, frames=3)) == [10, 11, 12]
-    middle = chosen(times, origin, replace(given, start=None))
-    assert len(middle) in (7, 8)
-    assert abs(np.mean(middle) - 49.5) < 1
-    assert chosen(times, origin, replace(given, start=0.0)) == [0, 1, 2]
-    for start in (11.0, 1e6):
-        with pytest.raises(Refused, match="no images in the requested time"):
-            chosen(times, origin, replace(given, start=start))
-
-
-@pytest.mark.parametrize("rate", [0.7, 2, 5, 7.5, 10])
-def test_clips_of_fewer_frames_a_second(rate: float) -> None:
-    times = at_hertz(10, 200)
-    found = chosen_at_rate(times, rate, 12)
-    assert len(found) == min(12, int(20 * rate) + 1)
-    steps = np.diff(times[found]) / 1e9
-    assert np.abs(steps - 1 / rate).max() <= 0.1 + 1e-9  # the nearest of those that there are
-    assert abs(np.mean(found) - 99.5) <= 1
-    assert found == sorted(set(found))
+    assert chosen(times, origin, 10) == list(range(45, 55))
+    assert chosen(times[:6], origin, 10) == list(range(6))
+    assert chosen(times, origin, 3, start=1.5) == [10, 11, 12]
+    assert chosen(times, origin, 3, start=0.0) == [0, 1, 2]
+    assert chosen(times, origin, 3, start=10.35) == [99]
+    with pytest.raises(Refused, match="no images in the requested time"):
+        chosen(times, origin, 3, start=11.0)
 
 
 # ---------------------------------------------------------------- search, recommendation
@@ -212,7 +187,7 @@ def cell(crf: int, score: float, size: float, cpu: float, preset: str = "fast") 
     summary = ScoreSummary(score, score, score, score)
     return Cell(
         Setting("h264", preset, crf), 2 * cpu, cpu, 100, 1, size, size, 1, {"vmaf": summary},
-        "none.png", 1, 1, "here",
+        "none.png", 1, 1,
     )  # fmt: skip
 
 
@@ -311,8 +286,7 @@ def test_recordings(source: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("encoding", "width", "codec", "preset"),
     [
-        *((name, 96, "h264", "ultrafast") for name in ("mono8", "bgr8", "bayer_rggb8", "yuv422")),
-        *((name, 96, "h264", "ultrafast") for name in ("yuv422_yuy2", "nv12", "8UC3")),
+        *((name, 96, "h264", "ultrafast") for name in ("mono8", "bayer_rggb8", "yuv422")),
         ("rgb8", 97, "h264", "ultrafast"),
         ("rgb8", 96, "av1", "12"),
         ("rgb8", 96, "h265", "ultrafast"),
@@ -338,7 +312,7 @@ def test_cameras_that_are_no_light_are_left_out(tmp_path: Path) -> None:
 
 
 def test_a_setting_that_cannot_be_tried_is_told(tmp_path: Path) -> None:
-    options = replace(QUICK, codecs=["x264", "x265"])
+    options = replace(QUICK, codecs=["h264", "h265"])
     (camera,) = evaluate(
         recording(tmp_path, "rgb8", width=48), options, output=tmp_path / "out"
     ).cameras
@@ -376,9 +350,9 @@ def clips_of(path: Path, folder: Path) -> tuple[dict[str, Clip | str], dict[str,
     found: dict[str, Clip | str] = {}
     with open_cameras(path, fps=30) as (cameras, left_out):
         for camera in cameras:
-            indices = chosen(camera.times, int(camera.times[0]), EvaluateOptions())
+            indices = chosen(camera.times, 0, 150)
             try:
-                found[camera.topic] = make_clip(camera, indices, camera.rate, folder)
+                found[camera.topic] = make_clip(camera, indices, folder)
             except Refused as reason:
                 found[camera.topic] = str(reason)
         return found, left_out
@@ -452,8 +426,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 WHOLE = EvaluateOptions(
-    codecs=["svtav1", "x264"], presets=["12", "ultrafast"], crf=["8", "40"], frames=12,
-    target="vmaf=95", streams=9, hours=10, rates=[5, 100],
+    codecs=["av1", "h264"], presets=["12", "ultrafast"], crf=["8", "40"], frames=12,
+    target="vmaf=95", streams=9, hours=10,
     topics=["/left/*"], threads=1,
 )  # fmt: skip
 
@@ -510,18 +484,6 @@ def test_the_data_set_is_reckoned(whole: Evaluation) -> None:
     assert ours.cpu_days == pytest.approx(shown.encode_cpu_seconds / 12 * frames / 86_400)
 
 
-def test_rates_are_searched(whole: Evaluation) -> None:
-    (camera,) = whole.cameras
-    (row,) = camera.rates
-    setting, score = row.cell.setting, row.cell.scores["vmaf"].mean
-    assert (row.rate, setting.codec, setting.preset) == (5, "av1", "12")
-    assert 3 <= row.frames <= 4
-    assert row.reached
-    assert 95 <= score < 99.8
-    assert setting.crf > 8
-    assert any("100 images per second" in note for note in camera.notes)
-
-
 def test_names_in_the_table_are_no_formulas(whole: Evaluation) -> None:
     (camera,) = whole.cameras
     cell = camera.cells[0]
@@ -546,8 +508,6 @@ def test_files(whole: Evaluation) -> None:
         name = f"left_image_raw-{kind}"
         root = ET.fromstring((folder / "plots" / f"{name}.svg").read_text())
         assert len(root.findall(".//{*}circle/{*}title")) == len(camera.cells)
-        with Image.open(folder / "plots" / f"{name}.png") as image:
-            assert image.size == (1280, 840)
     with Image.open(folder / camera.ground_truth) as image:
         assert image.size == (256, 192)
         truth = np.asarray(image, np.float64)
@@ -595,16 +555,12 @@ def test_a_larger_grid_tries_what_is_new(tmp_path: Path) -> None:
 def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
     path = recording(tmp_path)
     first = evaluate(path, QUICK, output=tmp_path / "out")
-    results = sorted((tmp_path / "out" / "cells").iterdir())
-    results[0].write_text("{}")
-    results[1].write_text("[1")
-    again = evaluate(path, QUICK, output=tmp_path / "out")
-    assert (again.tried, again.known) == (1, 0)
-    (result,) = (place for place in results if "original" not in place.name)
-    result.write_text(json.dumps({**json.loads(result.read_text()), "size": "large"}))
-    again = evaluate(path, QUICK, output=tmp_path / "out")
-    assert (again.tried, again.known) == (1, 0)
-    assert again.cameras[0].cells[0].size == first.cameras[0].cells[0].size
+    (result,) = (tmp_path / "out" / "cells").iterdir()
+    for damaged in ("[1", json.dumps({**json.loads(result.read_text()), "size": "large"})):
+        result.write_text(damaged)
+        again = evaluate(path, QUICK, output=tmp_path / "out")
+        assert (again.tried, again.known) == (1, 0)
+        assert again.cameras[0].cells[0].size == first.cameras[0].cells[0].size
 
 
 @pytest.mark.slow
@@ -632,7 +588,7 @@ def test_a_killed_one_goes_on(number: signal.Signals, tmp_path: Path) -> None:
     path, out = recording(tmp_path), tmp_path / "out"
     command = [
         *(sys.executable, "-m", "mp4ds", "evaluate", str(path), "-o", str(out)),
-        *("--codecs", "x264", "--presets", "ultrafast", "--crf", "20:51", "--frames", "10"),
+        *("--codecs", "h264", "--presets", "ultrafast", "--crf", "20:51", "--frames", "10"),
         *("--threads", "1", "--target", "psnr_y=20"),
     ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
@@ -643,7 +599,7 @@ def test_a_killed_one_goes_on(number: signal.Signals, tmp_path: Path) -> None:
     if number == signal.SIGINT:
         assert process.returncode == 130
         assert "run the same command again" in said
-    known = len([path for path in out.glob("cells/*.json") if "-original-" not in path.name])
+    known = len(list(out.glob("cells/*.json")))
     again = evaluate(path, replace(QUICK, crf=["20:22"]), output=out)
     assert again.known >= min(known, 2)
     assert again.tried + again.known == 3
@@ -717,7 +673,7 @@ def run(*command: str, cwd: Path, code: int = 0) -> str:
 
 def test_the_command_line(tmp_path: Path) -> None:
     path = recording(tmp_path)
-    plain = ("--codecs", "x264", "--presets", "ultrafast", "--frames", "10", "--crf", "24")
+    plain = ("--codecs", "h264", "--presets", "ultrafast", "--frames", "10", "--crf", "24")
     given = ("mp4ds", "evaluate", str(path), *plain, "--target", "psnr_y=20")
     out = run(*given, cwd=tmp_path)
     assert re.search(r"h264 +ultrafast +24 ", out)
@@ -726,7 +682,7 @@ def test_the_command_line(tmp_path: Path) -> None:
     assert out.rstrip().endswith("index.html: 1 setting tried")
     values = json.loads(run(*given, "--json", cwd=tmp_path))
     assert (values["tried"], values["known"]) == (0, 1)
-    for wrong in (("--crf", "x"), ("--rates", "a,b"), ("--target", "x=1"), ("--codecs", "vp9")):
+    for wrong in (("--crf", "x"), ("--target", "x=1"), ("--codecs", "vp9")):
         out = run(*given, *wrong, cwd=tmp_path, code=2)
         assert out.startswith(f"mp4ds: {wrong[0]}")
 
@@ -756,7 +712,7 @@ def commands_in(name: str) -> list[str]:
 @needs_vmaf
 def test_the_commands_of_the_page(tmp_path: Path) -> None:
     lines = commands_in("evaluate.md")
-    assert sum(line.startswith("mp4ds evaluate ") for line in lines) == 4
+    assert sum(line.startswith("mp4ds evaluate ") for line in lines) == 3
     for line in lines:
         run("bash", "-c", line, cwd=tmp_path)
     (code,) = re.findall(
@@ -771,4 +727,4 @@ def test_the_commands_of_the_paper_are_understood(tmp_path: Path) -> None:
     assert len(lines) == 3
     for line in lines:
         out = run("bash", "-c", line, cwd=tmp_path, code=2)
-        assert out == "mp4ds: drive.bag: no such file or folder. Check the path.\n"
+        assert re.fullmatch(r"mp4ds: drive\S+: no such file or folder. Check the path.\n", out)

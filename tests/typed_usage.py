@@ -69,7 +69,7 @@ def export(datasets: list[str]) -> dict[str, dict[str, int]]:
 def evaluate(source: str | Path) -> dict[str, float]:
     """Mean VMAF of each setting, by the options that pack with it."""
     options = mp4ds.EvaluateOptions(
-        codecs=["svtav1"], crf=["16:25:3"], target="vmaf=97", cluster="slurm", threads=4
+        codecs=["av1"], crf=["16:25:3"], target="vmaf=97", cluster="slurm", threads=4
     )
     found: mp4ds.Evaluation = mp4ds.evaluate(source, options, output=Path("out"), progress=use)
     use(mp4ds.evaluate(Path("drive.bag")).output.name, found.left_out, found.tried + found.known)

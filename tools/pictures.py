@@ -33,7 +33,7 @@ def main() -> None:
         mp4ds.pack(folder / "demo.mcap", folder / "demo")
         report = mp4ds.report(folder / "demo").index
         options = mp4ds.EvaluateOptions(
-            codecs=["svtav1", "x264"],
+            codecs=["av1", "h264"],
             crf=["6:36:6"],
             presets=["6", "10", "medium"],
             frames=60,

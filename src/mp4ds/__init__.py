@@ -61,8 +61,7 @@ if TYPE_CHECKING:
     )
     from mp4ds.packing.options import ImageFolder, PackOptions, PackSummary
     from mp4ds.packing.pack import pack, pack_each, pack_share
-    from mp4ds.plugins.evaluating.evaluate import evaluate
-    from mp4ds.plugins.evaluating.options import EvaluateOptions
+    from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
     from mp4ds.plugins.evaluating.results import Evaluation
     from mp4ds.plugins.exporting.export import export
     from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
@@ -100,8 +99,7 @@ _HOMES = {
         "pack_each",
         "pack_share",
     ),
-    "plugins.evaluating.evaluate": ("evaluate",),
-    "plugins.evaluating.options": ("EvaluateOptions",),
+    "plugins.evaluating.evaluate": ("EvaluateOptions", "evaluate"),
     "plugins.evaluating.results": ("Evaluation",),
     "plugins.exporting.export": ("export",),
     "plugins.exporting.job": (

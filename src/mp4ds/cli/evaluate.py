@@ -13,9 +13,10 @@ from mp4ds.cli.output import Column, print_json, print_table, say
 from mp4ds.cli.process import report_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.errors import counted, interrupted, path_text
+from mp4ds.plugins.evaluating.evaluate import EvaluateOptions
 from mp4ds.plugins.evaluating.evaluate import evaluate as run
-from mp4ds.plugins.evaluating.options import EvaluateOptions
-from mp4ds.plugins.evaluating.results import Evaluation, told
+from mp4ds.plugins.evaluating.page import told
+from mp4ds.plugins.evaluating.results import Evaluation
 
 _SPARE = {  # see `Column`
     "best": 12,

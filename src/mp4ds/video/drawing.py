@@ -1,18 +1,15 @@
-"""Drawings of lines, dots and words, as SVG and as PNG, and pictures on one page."""
+"""Drawings of lines, dots and words as SVG, and pictures on one page."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from xml.sax.saxutils import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
 _TEXT_SIZE = 12
-_SCALE = 2  # of a PNG
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,60 +101,6 @@ def _svg_shape(shape: Shape) -> str:
         f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{shape.anchor}" '
         f'dominant-baseline="central" fill="{shape.color}">{escape(shape.words)}</text>'
     )
-
-
-def png_of(shapes: Sequence[Shape], size: tuple[int, int]) -> bytes:
-    """The drawing as a PNG file of twice its size.
-
-    Args:
-        shapes: Later shapes cover earlier ones.
-        size: Width and height, pixels.
-    """
-    from PIL import Image, ImageDraw, ImageFont
-
-    image = Image.new("RGB", (size[0] * _SCALE, size[1] * _SCALE), "#ffffff")
-    pen = ImageDraw.Draw(image)
-    font = ImageFont.load_default(_TEXT_SIZE * _SCALE)
-    for shape in shapes:
-        if isinstance(shape, Line):
-            width = max(1, round(shape.width * _SCALE))
-            for begin, end in _strokes(shape):
-                pen.line((*begin, *end), shape.color, width)
-            continue
-        x, y = (side * _SCALE for side in shape.place)
-        if isinstance(shape, Dot):
-            r = shape.radius * _SCALE
-            pen.ellipse((x - r, y - r, x + r, y + r), shape.color)
-        else:
-            anchor = {"start": "lm", "middle": "mm", "end": "rm"}[shape.anchor]
-            pen.text((x, y), shape.words, shape.color, font, anchor)
-    file = io.BytesIO()
-    image.save(file, "PNG", optimize=True)
-    return file.getvalue()
-
-
-def _strokes(line: Line) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """Straight pieces of a line, in pixels of a PNG."""
-    points = [(x * _SCALE, y * _SCALE) for x, y in line.points]
-    pieces = list(pairwise(points))
-    if not line.dashed:
-        return pieces
-    dash, gap = 5.0 * _SCALE, 4.0 * _SCALE
-    strokes = []
-    for (x0, y0), (x1, y1) in pieces:
-        length = ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
-        at = 0.0
-        while at < length:
-            end = min(at + dash, length)
-            a, b = at / length, end / length
-            strokes.append(
-                (
-                    (x0 + a * (x1 - x0), y0 + a * (y1 - y0)),
-                    (x0 + b * (x1 - x0), y0 + b * (y1 - y0)),
-                )
-            )
-            at += dash + gap
-    return strokes
 
 
 # ---------------------------------------------------------------- sheets

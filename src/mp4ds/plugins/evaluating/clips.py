@@ -1,132 +1,217 @@
-"""Clips of cameras as encoder input, each in a file of its own."""
+"""The cameras of a source, and clips of them as encoder input."""
 
 from __future__ import annotations
 
 import json
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain, product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from mp4ds.errors import Refused
-from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.bags.formats import open_reader
+from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.dataset import open_dataset
+from mp4ds.dataset.frames import Frames
+from mp4ds.dataset.stream import Stream
+from mp4ds.errors import Refused, SourceNotFoundError
+from mp4ds.files.urls import remote
+from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.layouts import Layout, layout_for
-from mp4ds.plugins.evaluating.options import EvaluateOptions
-from mp4ds.times import TIMESCALE, PresentationClock, nearest
-from mp4ds.video.planes import PlaneMaker, Planes, PlaneSpool
+from mp4ds.messages.serializations import is_camera, kind_of
+from mp4ds.messages.wire import CodedFields
+from mp4ds.packing.inspection import MessageInspector, depends_on_others
+from mp4ds.packing.options import ImageFolder
+from mp4ds.plan import LOSSLESS
+from mp4ds.plugins.evaluating.trials import FRAMES, TICKS, Clip
+from mp4ds.plugins.importing.layouts import images_in, open_images
+from mp4ds.records import Channel, Excerpt, Message
+from mp4ds.times import TIMESCALE, PresentationClock
+from mp4ds.video.planes import PlaneMaker, PlaneSpool
 from mp4ds.video.scores import SMALLEST
 
-if TYPE_CHECKING:  # the processes of trials need no readers
-    from mp4ds.plugins.evaluating.cameras import Camera, Shot
+_JPEG = "JPEG files, which `mp4ds pack` re-encodes only with --transcode"
 
-FRAMES, TICKS = "frames.yuv", "ticks.npy"
-"""The files of a clip: its frames (see `PlaneSpool`), and when each is shown, as in a packed
-video."""
-
+_VIDEOS = (".mp4", ".m4v", ".mov", ".yaml", ".yml")
+_AT_ONCE = 8  # frames of a dataset in memory at once
 _SECOND = 1_000_000_000
 _DETAIL = (96, 128)  # rows and columns shown side by side
 
 
-@dataclass(frozen=True)
-class Clip:
-    """Frames of a camera as encoder input.
+class Shot(NamedTuple):
+    """One image of a camera.
 
     Attributes:
-        encoding: ROS encoding of the images.
-        picture_format: Pixel format of their pictures, which determines their tags.
-        image_size: Width and height of an image.
-        size: Columns and rows of a frame, even.
-        rate: Frames per second of the camera, or of the clip if lower.
-        frames: How many there are.
-        seconds: Their duration, the last one as long as the others.
-        digest: Of the frames, and when each is shown.
-        detail: x, y, width and height of the detail shown.
-        detail_frame: Number of the frame shown.
-        start: Log time of the first frame, seconds from the camera's first one.
-        source_frames: Total number of the camera's images.
-        left_out: Images in between with another size or encoding, or unreadable.
+        kind: ROS encoding, width and height.
+        pixels: Of the encoding.
+        stamp: Header stamp, nanoseconds.
+        log_time: When it was recorded, nanoseconds.
     """
 
-    encoding: str
-    picture_format: str
-    image_size: tuple[int, int]
-    size: tuple[int, int]
-    rate: float | None
-    frames: int
-    seconds: float
-    digest: str
-    detail: tuple[int, int, int, int]
-    detail_frame: int
-    start: float
-    source_frames: int
-    left_out: int
-
-    def open(self, folder: Path) -> PlaneSpool:
-        """Open the file of its frames."""
-        return PlaneSpool(folder / FRAMES, *self.size, frames=self.frames)
-
-    def detail_of(self, planes: Planes) -> Planes:
-        """The detail of a frame, as views."""
-        x, y, width, height = self.detail
-        luma = planes[0][y : y + height, x : x + width]
-        rows, columns = slice(y // 2, (y + height) // 2), slice(x // 2, (x + width) // 2)
-        return luma, planes[1][rows, columns], planes[2][rows, columns]
+    kind: tuple[str, int, int]
+    pixels: Pixels
+    stamp: int
+    log_time: int
 
 
-def chosen(times: NDArray[np.int64], origin: int, options: EvaluateOptions) -> list[int]:
-    """The images of a representative clip, or of the requested one.
+@dataclass(frozen=True)
+class Camera:
+    """One camera of a source.
+
+    Attributes:
+        topic: Its topic, or the name of a video.
+        times: Log times of all its images, nanoseconds, sorted, at least one.
+        read: Yields images by increasing number, without messages that hold none.
+        lossy: The lossy encoding they already went through; empty if none is known.
+    """
+
+    topic: str
+    times: NDArray[np.int64]
+    read: Callable[[Sequence[int]], Iterator[Shot]]
+    lossy: str = ""
+
+    @property
+    def rate(self) -> float | None:
+        """Images per second; None below two, or without a time span."""
+        span = int(self.times[-1] - self.times[0])
+        return (len(self.times) - 1) * 1e9 / span if span > 0 else None
+
+
+@contextmanager
+def open_cameras(place: Path, fps: float) -> Iterator[tuple[list[Camera], dict[str, str]]]:
+    """Open a recording, a dataset, a video, or a folder of images.
+
+    Args:
+        place: Where it is; a folder of images is on this machine.
+        fps: Frames per second of a folder of images.
+
+    Yields:
+        Its cameras, and the topics of those whose images no encoder takes, with the reason.
+
+    Raises:
+        SourceError: It is not a recording, a dataset or such a folder.
+        FormatError: It is a dataset, and breaks a rule of the format.
+    """
+    if not place.exists():
+        raise SourceNotFoundError(place)
+    if (place / MANIFEST_NAME).exists() or place.suffix.lower() in _VIDEOS:
+        with open_dataset(place) as dataset:
+            yield [_of_frames(frames) for frames in dataset if len(frames)], {}
+        return
+    with _reader_of(place, fps) as reader:
+        yield _of_recording(reader)
+
+
+def _reader_of(place: Path, fps: float) -> BagReader:
+    # a rosbag2 folder may hold pictures, too
+    is_plain = place.is_dir() and not (place / "metadata.yaml").exists()
+    if is_plain and not remote(place) and images_in(place):
+        return open_images(place, ImageFolder(layout="plain", rate=str(fps)))
+    return open_reader(place)
+
+
+def _of_recording(reader: BagReader) -> tuple[list[Camera], dict[str, str]]:
+    times = reader.times()
+    cameras: list[Camera] = []
+    left_out: dict[str, str] = {}
+    for channel in filter(is_camera, reader.channels):
+        own = times.get(channel.id, np.empty(0, np.int64))
+        first = reader.first(channel)
+        if first is None or not len(own):
+            left_out[channel.topic] = "has no images"
+        elif kind_of(channel) is CodedFields and depends_on_others(channel, first):
+            left_out[channel.topic] = "has video packets, which `mp4ds pack` copies"
+        else:
+            cameras.append(_of_channel(reader, channel, own, _JPEG if _is_jpeg(first) else ""))
+    return cameras, left_out
+
+
+def _is_jpeg(message: Message) -> bool:
+    with suppress(Refused):
+        return MessageInspector(message.channel).inspect(message).key.codec == "mjpeg"
+    return False
+
+
+def _of_channel(
+    reader: BagReader, channel: Channel, times: NDArray[np.int64], lossy: str
+) -> Camera:
+    def read(indices: Sequence[int]) -> Iterator[Shot]:
+        wanted = set(indices)
+        first, last = int(times[indices[0]]), int(times[indices[-1]])
+        number = int(np.searchsorted(times, first))
+        excerpt = Excerpt(first, last + 1, frozenset([channel.topic]), others=False)
+        inspector = MessageInspector(channel, transcode=True)
+        for record in reader.records(excerpt):
+            if not isinstance(record, Message) or record.channel.id != channel.id:
+                continue
+            if number in wanted:
+                with suppress(Refused):
+                    seen = inspector.inspect(record)
+                    if seen.pixels is not None:
+                        kind = seen.key.encoding, seen.key.width, seen.key.height
+                        yield Shot(kind, seen.pixels, seen.parts.stamp, record.log_time)
+            number += 1
+
+    return Camera(channel.topic, times, read, lossy)
+
+
+def _of_frames(frames: Frames) -> Camera:
+    lossy, form = "", "native"
+    if isinstance(frames, Stream) and frames.sidecar.video.codec == "mjpeg":
+        lossy = _JPEG
+    if isinstance(frames, Stream) and frames.sidecar.profile != LOSSLESS:
+        lossy = f"a dataset of {frames.sidecar.profile}"
+        # a lossy video has already been demosaiced; doing it again would not help
+        form = "rgb" if ENCODINGS[frames.encoding].mosaic else "native"
+    order = np.argsort(frames.log_times, kind="stable")
+
+    def read(indices: Sequence[int]) -> Iterator[Shot]:
+        for at in range(0, len(indices), _AT_ONCE):
+            numbers = [int(order[index]) for index in indices[at : at + _AT_ONCE]]
+            for frame in frames.get(numbers, format=form):
+                kind = (frame.encoding, *frames.image_size)
+                yield Shot(kind, frame.data, frame.stamp_ns, frame.log_time_ns)
+
+    return Camera(frames.topic, frames.log_times[order], read, lossy)
+
+
+# ---------------------------------------------------------------- clips
+
+
+def chosen(
+    times: NDArray[np.int64], origin: int, frames: int, start: float | None = None
+) -> list[int]:
+    """The images of a clip.
 
     Args:
         times: Of a camera's images, nanoseconds, sorted.
         origin: Log time at which the source begins, nanoseconds.
-        options: Of the evaluation.
+        frames: Maximum number.
+        start: Where the clip begins, seconds from the origin; None: it is in the middle.
 
     Raises:
         Refused: There are none.
     """
-    first = max(0, (len(times) - options.frames) // 2)
-    last = first + options.frames
-    if options.start is not None or options.duration is not None:
-        length = round((options.duration or 0) * _SECOND)
-        begin = (int(times[0]) + int(times[-1]) - length) // 2
-        if options.start is not None:
-            begin = origin + round(options.start * _SECOND)
-        first, end = (int(np.searchsorted(times, time)) for time in (begin, begin + length))
-        last = first + options.frames if options.duration is None else end
-    found = list(range(first, min(len(times), last)))
-    if not found:
+    first = max(0, (len(times) - frames) // 2)
+    if start is not None:
+        first = int(np.searchsorted(times, origin + round(start * _SECOND)))
+    if first >= len(times):
         raise Refused("has no images in the requested time")
-    return found
+    return list(range(first, min(len(times), first + frames)))
 
 
-def chosen_at_rate(times: NDArray[np.int64], rate: float, frames: int) -> list[int]:
-    """Images from the middle of a camera's recording, at a lower rate.
-
-    Args:
-        times: Nanoseconds, sorted, at least one.
-        rate: Per second.
-        frames: Maximum number.
-    """
-    period = _SECOND / rate
-    start, end = int(times[0]), int(times[-1])
-    count = min(frames, int((end - start) / period) + 1)
-    begin = (start + end - (count - 1) * period) / 2
-    due = np.rint(begin + period * np.arange(count)).astype(np.int64)
-    return [int(index) for index in np.unique(nearest(times, due))]
-
-
-def make_clip(camera: Camera, indices: list[int], rate: float | None, folder: Path) -> Clip:
+def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
     """Write images to files as encoder input.
 
     Args:
         camera: The camera.
         indices: Numbers of the images, increasing.
-        rate: Frames per second.
         folder: Where to make the files.
 
     Raises:
@@ -162,9 +247,9 @@ def make_clip(camera: Camera, indices: list[int], rate: float | None, folder: Pa
         picture_format=layout.pixel_format,
         image_size=(width, height),
         size=size,
-        rate=rate,
+        rate=camera.rate,
         frames=len(ticks),
-        seconds=len(ticks) * (gap or 1 / (rate or 1.0)),
+        seconds=len(ticks) * (gap or 1 / (camera.rate or 1.0)),
         digest=digest.hexdigest(),
         detail=detail,
         detail_frame=middle,

@@ -9,32 +9,34 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from mp4ds._version import __version__
-from mp4ds.errors import Refused, ScoringError, SourceError, counted
+from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, counted
 from mp4ds.files.outputs import check_place, refuse_not_ours, work_folder, write_synced
 from mp4ds.files.urls import location, remote
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.packing.engine import Engine, ProcessEngine
-from mp4ds.plan import FileNames, Selection, visual_setting
-from mp4ds.plugins.cluster import ClusterEngine, Connection, check_address
-from mp4ds.plugins.evaluating.cameras import JPEG, Camera, open_cameras
-from mp4ds.plugins.evaluating.clips import Clip, chosen, chosen_at_rate, make_clip
-from mp4ds.plugins.evaluating.options import EvaluateOptions, ScoreGoal, Setting, settings_of
+from mp4ds.options import Options, option, parse_words
+from mp4ds.plan import FileNames, Selection
+from mp4ds.plugins.evaluating.clips import (
+    Camera,
+    chosen,
+    make_clip,
+    open_cameras,
+)
 from mp4ds.plugins.evaluating.page import PLOTS, write_files
 from mp4ds.plugins.evaluating.results import (
     CEILING_MARGIN,
     CameraEvaluation,
-    Cell,
     Evaluation,
-    RateRow,
+    ScoreGoal,
     StorageRow,
     reachable_score,
     recommend,
@@ -43,29 +45,174 @@ from mp4ds.plugins.evaluating.results import (
 from mp4ds.plugins.evaluating.trials import (
     CELLS,
     PICTURES,
+    Cell,
+    Clip,
+    Setting,
     Trial,
-    command,
-    plain_recipe,
-    run_task,
     try_out,
     versions_of,
 )
-from mp4ds.video.codecs import AV1, MAX_CRF
+from mp4ds.video.codecs import AV1, LOSSY_GOP, MAX_CRF, check_codec, codec_name
 from mp4ds.video.images import jpeg_bytes
-from mp4ds.video.libvmaf import VMAF_MODEL, Ffmpeg, find_ffmpeg
+from mp4ds.video.libvmaf import Ffmpeg, find_ffmpeg
 from mp4ds.video.planes import rgb_of
-from mp4ds.video.scores import ScoreSummary, largest_crf
+from mp4ds.video.scores import METRICS, Scorer
 
-_NEAR = 1.05  # rates that differ by less count as equal
+_DEFAULT_PRESETS = {
+    **dict.fromkeys(AV1, ("6", "8")),
+    "h264": ("medium",),
+    "h265": ("medium",),
+}
+_MOST_CELLS = 10_000
+_LEAST, _MOST = 0.001, 1_000_000  # of seconds, hours and hertz
+_CRF = re.compile(r"(?P<first>[0-9]{1,4})(:(?P<last>[0-9]{1,4})(:(?P<step>[0-9]{1,4}))?)?")
+
+
+@dataclass(frozen=True)
+class EvaluateOptions(Options):
+    """How to evaluate."""
+
+    codecs: Sequence[str] = option(
+        "Codecs of `mp4ds pack` to try: av1, av1-10bit, h264, h265.",
+        ("av1", "h264", "h265"),
+        parse=parse_words,
+        default_text="av1,h264,h265",
+    )
+    crf: Sequence[str] = option(
+        "crf values to try, such as 16:25, 16:25:3 or 16,20,24.",
+        ("16:25:3",),
+        parse=parse_words,
+        default_text="16:25:3",
+    )
+    presets: Sequence[str] = option(
+        "Presets, such as 6,8,medium; each is tried with the codecs that have it.",
+        (),
+        parse=parse_words,
+    )
+    topics: Sequence[str] = option("Only matching cameras.", (), "-t", metavar="GLOB")
+    exclude: Sequence[str] = option("Leave out matching cameras.", (), "-x", metavar="GLOB")
+    start: float | None = option(
+        "Where the clips start; default: in the middle.", metavar="SECONDS", least=0, most=_MOST
+    )
+    frames: int = option("Frames per clip.", 150, least=1)
+    fps: float = option("Frame rate of a folder of images.", 30.0, least=_LEAST, most=_MOST)
+    target: str = option("Score to reach, such as vmaf=99.5, psnr_y=42 or ssim=0.98.", "vmaf=99.5")
+    streams: int | None = option("Number of cameras, to estimate the size of a dataset.", least=1)
+    hours: float | None = option(
+        "Hours of recording, to estimate the size of a dataset.", least=_LEAST, most=_MOST
+    )
+    gop: int = option("Maximum key frame interval in frames.", LOSSY_GOP, least=1, most=100_000)
+    threads: int | None = option("Threads per encoder; default: all cores.", least=1, most=1024)
+    jobs: int = option(
+        "Settings tried in parallel; use 1 for accurate times.", 1, "-j", least=1, most=1024
+    )
+
+    @property
+    def encoder_threads(self) -> int:
+        """Threads of an encoder."""
+        return self.threads or max(1, (os.cpu_count() or 1) // self.jobs)
+
+    @property
+    def goal(self) -> ScoreGoal:
+        """The score to reach.
+
+        Raises:
+            OptionError: `target` is not valid.
+        """
+        return parse_target(self.target)
+
+
+def settings_of(options: EvaluateOptions) -> list[Setting]:
+    """The requested grid; a codec is not tried with a crf that it does not have.
+
+    Raises:
+        OptionError: There is no such codec, preset or crf, or too many of them.
+    """
+    codecs = list(dict.fromkeys(map(codec_name, options.codecs)))
+    wrong = [codec for codec in codecs if codec not in MAX_CRF]
+    if wrong or not codecs:
+        raise OptionError(f"`codecs` {', '.join(wrong)!r}: use some of {', '.join(MAX_CRF)}.")
+    crfs = parse_crfs(options.crf)
+    presets: dict[str, Sequence[str]] = {}
+    for codec in codecs:
+        own = [preset for preset in dict.fromkeys(options.presets) if _has(codec, preset)]
+        presets[codec] = own or _DEFAULT_PRESETS[codec]
+    for preset in options.presets:
+        if not any(preset in own for own in presets.values()):
+            raise OptionError(f"`presets` {preset!r} is not a preset of {', '.join(codecs)}.")
+    settings = [
+        Setting(codec, preset, crf, options.gop)
+        for codec in codecs
+        for preset in presets[codec]
+        for crf in crfs
+        if crf <= MAX_CRF[codec]
+    ]
+    if not 0 < len(settings) <= _MOST_CELLS:
+        raise OptionError(
+            f"{len(settings)} settings were asked for; give `codecs`, `presets` and `crf` "
+            f"that make 1 to {_MOST_CELLS}."
+        )
+    return settings
+
+
+def _has(codec: str, preset: str) -> bool:
+    try:
+        check_codec(codec, preset, lossless=False)
+    except OptionError:
+        return False
+    return True
+
+
+def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
+    """The values of ``18``, ``16:25`` and ``16:25:3``.
+
+    Raises:
+        OptionError: One is not valid.
+    """
+    found: set[int] = set()
+    for text in texts:
+        match = _CRF.fullmatch(text.strip())
+        step = int(match["step"] or 1) if match else 0
+        if match is None or step == 0:
+            raise OptionError(
+                f"`crf` {text!r} is not valid. Use a value such as 18, 16:25 or 16:25:3."
+            )
+        first = int(match["first"])
+        found.update(range(first, int(match["last"] or first) + 1, step))
+    if not found or min(found) < 1 or max(found) > max(MAX_CRF.values()):
+        raise OptionError(
+            f"`crf` {', '.join(texts)} has values outside 1 to {max(MAX_CRF.values())}."
+        )
+    return tuple(sorted(found))
+
+
+def parse_target(text: str) -> ScoreGoal:
+    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``.
+
+    Raises:
+        OptionError: It is not valid.
+    """
+    metric, _, score = text.partition("=")
+    try:
+        value = float(score)
+    except ValueError:
+        value = -1.0
+    if metric not in METRICS or not 0 < value <= 100:
+        raise OptionError(
+            f"`target` {text!r} is not valid. Use METRIC=SCORE, such as vmaf=99.5; metrics: "
+            f"{', '.join(METRICS)}."
+        )
+    return ScoreGoal(metric, value)
+
+
+# ---------------------------------------------------------------- evaluation
+
 _SHORT = 30  # frames
-_MODEL_ROWS = 1080
 _JPEG_FRAMES = 20
 _DAY = 86_400
 _FOLDERS = (CELLS, PICTURES, PLOTS)
 _WORK = "work-"
 _NOTE_NAME = "mp4ds_evaluation.json"  # marks folders made by an evaluation
-
-Progress = Callable[[str, float | None], None]
 
 
 def evaluate(
@@ -73,7 +220,7 @@ def evaluate(
     options: EvaluateOptions | None = None,
     *,
     output: Path | str | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[str, float | None], None] | None = None,
 ) -> Evaluation:
     """Compare a grid of encoder settings on clips of a recording's cameras.
 
@@ -93,23 +240,19 @@ def evaluate(
         TargetError: The folder cannot be used.
         ScoringError: The target is a VMAF score but libvmaf is missing; or no setting could be
             tried.
-        ClusterError: The cluster does not respond, or was lost; results so far are kept.
         RemoteError: A store or web server fails.
         OSError: It cannot be written.
     """
     asked = options or EvaluateOptions()
-    target, settings = asked.wanted, settings_of(asked)
-    if asked.cluster:
-        check_address(asked.cluster)
-    place, versions = location(source), versions_of(_ffmpeg(target))
+    goal, settings, place = asked.goal, settings_of(asked), location(source)
+    ffmpeg = _ffmpeg(goal)
     with open_cameras(place, asked.fps) as (found, left_out):
-        cameras = [camera for camera in found if len(camera.times)]
-        cameras = _selected(cameras, left_out, asked)
-        # judging by its cameras
-        origin = min((int(camera.times[0]) for camera in found if len(camera.times)), default=0)
-        result = Evaluation(place, _folder(place, output), [], left_out, versions)
+        cameras = _selected(found, left_out, asked)
+        origin = min((int(camera.times[0]) for camera in found), default=0)
+        result = Evaluation(place, _folder(place, output), [], left_out, versions_of(ffmpeg))
         names = FileNames()
-        with _work_in(result.output) as work, _engine(asked, len(settings) + 1) as engine:
+        with _work_in(result.output) as work:
+            run = _Run(asked, settings, ffmpeg, result)
             for number, camera in enumerate(cameras):
 
                 def tell(what: str, share: float, number: int = number) -> None:
@@ -118,9 +261,11 @@ def evaluate(
                         progress(f"{topic}: {what}", (number + share) / len(cameras))
 
                 name, _ = names.name_for(camera.topic)
-                run = _CameraRun(camera, name, settings, asked, result, work, engine, tell)
                 try:
-                    result.cameras.append(run.evaluate(origin))
+                    with TemporaryDirectory(dir=work) as folder:
+                        result.cameras.append(
+                            run.evaluate(camera, name, origin, Path(folder), tell)
+                        )
                 except Refused as reason:
                     left_out[camera.topic] = str(reason)
         if not result.cameras:
@@ -128,16 +273,16 @@ def evaluate(
             why = f": {reasons}" if reasons else ""
             raise SourceError(place, f"has no camera to try settings on{why}")
         rated = [(camera.cells, camera.reachable) for camera in result.cameras]
-        result.recommended = recommend(rated, target)
-        write_files(result, asked)
+        result.recommended = recommend(rated, goal)
+        write_files(result, asdict(asked))
     return result
 
 
-def _ffmpeg(target: ScoreGoal) -> Ffmpeg | None:
+def _ffmpeg(goal: ScoreGoal) -> Ffmpeg | None:
     try:
         return find_ffmpeg()
     except ScoringError as error:
-        if target.metric == "vmaf":
+        if goal.metric == "vmaf":
             raise ScoringError(
                 f"{error} Or choose another metric, such as `target` psnr_y=42."
             ) from None
@@ -170,11 +315,7 @@ def _is_evaluation(path: Path) -> bool:
 
 @contextmanager
 def _work_in(folder: Path) -> Iterator[Path]:
-    """A folder for temporary files, inside that of the evaluation.
-
-    It has a new name each time: cluster workers may still be running a trial of an interrupted run,
-    and must not mistake another clip for theirs.
-    """
+    """A folder for temporary files, inside that of the evaluation."""
     folder.mkdir(parents=True, exist_ok=True)
     write_synced(folder / _NOTE_NAME, json.dumps({"mp4ds": __version__}).encode())
     for name in _FOLDERS:
@@ -183,227 +324,161 @@ def _work_in(folder: Path) -> Iterator[Path]:
         yield work
 
 
-@contextmanager
-def _engine(options: EvaluateOptions, most: int) -> Iterator[Engine]:
-    """What runs up to so many trials at a time."""
-    if options.cluster is None:
-        yield ProcessEngine(command, options.jobs)
-        return
-    with Connection(options.cluster, most) as connection:
-        yield ClusterEngine(run_task, connection)
-
-
 # ---------------------------------------------------------------- one camera
 
 
-@dataclass
-class _CameraRun:
-    """The trials of one camera.
+@dataclass(frozen=True)
+class _Run:
+    """What the evaluations of all cameras have in common."""
 
-    Attributes:
-        camera: The camera.
-        name: For names of files.
-        settings: What to try.
-        options: Of the evaluation.
-        result: Of the evaluation; what was tried is counted there.
-        work: Folder for temporary files.
-        engine: Runs the trials.
-        tell: Called with what is done, and the share of it.
-        notes: What is worth knowing.
-    """
-
-    camera: Camera
-    name: str
-    settings: Sequence[Setting]
     options: EvaluateOptions
+    settings: Sequence[Setting]
+    ffmpeg: Ffmpeg | None
     result: Evaluation
-    work: Path
-    engine: Engine
-    tell: Callable[[str, float], None]
-    notes: list[str] = field(default_factory=list)
 
-    def evaluate(self, origin: int) -> CameraEvaluation:
-        """Try all settings.
+    def evaluate(
+        self,
+        camera: Camera,
+        name: str,
+        origin: int,
+        folder: Path,
+        tell: Callable[[str, float], None],
+    ) -> CameraEvaluation:
+        """Try all settings on a camera.
 
         Args:
+            camera: The camera.
+            name: For names of files.
             origin: Log time at which the source begins, nanoseconds.
+            folder: For the files of its clip.
+            tell: Called with what is done, and the share of it.
 
         Raises:
             Refused: The camera's images are not usable.
             ScoringError: No setting could be tried.
         """
-        self.tell("reading", 0)
-        target = self.options.wanted
-        indices = chosen(self.camera.times, origin, self.options)
-        with self._clip(indices, self.camera.rate) as trial:
-            ceiling = self._ceiling(trial)
-            reachable = reachable_score(target, ceiling)
-            cells = self._cells(trial)
-            found = CameraEvaluation(
-                topic=self.camera.topic,
-                name=self.name,
-                clip=trial.clip,
-                ceiling=ceiling,
-                target=target,
-                reachable=reachable,
-                cells=cells,
-                recommended=recommend([(cells, reachable)], target),
-                ground_truth=trial.picture,
-                notes=self.notes,
+        options, goal = self.options, self.options.goal
+        tell("reading", 0)
+        clip = make_clip(
+            camera, chosen(camera.times, origin, options.frames, options.start), folder
+        )
+        truth = f"{PICTURES}/{name}-original.png"
+        with closing(clip.open(folder)) as frames:
+            picture = clip.picture(frames.frame(clip.detail_frame), clip.recipe)
+            write_synced(self.result.output / truth, picture)
+            scorer = Scorer(self.ffmpeg, threads=options.encoder_threads)
+            # without which the scores of settings say little
+            ceiling = scorer.score(frames, frames).summaries()
+        reachable = reachable_score(goal, ceiling)
+        cells, notes = self._cells(camera.topic, name, clip, folder, tell)
+        found = CameraEvaluation(
+            topic=camera.topic,
+            name=name,
+            clip=clip,
+            ceiling=ceiling,
+            target=goal,
+            reachable=reachable,
+            cells=cells,
+            recommended=recommend([(cells, reachable)], goal),
+            ground_truth=truth,
+            notes=[*notes, *_notes(clip, cells, goal, reachable, camera.lossy, options.jobs)],
+        )
+        if camera.rate is not None:
+            streams, hours = options.streams or 1, options.hours or 1.0
+            count = streams * hours * 3600 * camera.rate
+            found.data_set = (
+                f"{counted(streams, 'camera')} for {hours:g} hour{'s' * (hours != 1)} "
+                f"at {camera.rate:.2f} Hz, {count:.0f} frames"
             )
-            self.notes += _notes(found, self.camera.lossy, self.options)
-            if self.camera.rate is not None:
-                self._estimate(found, trial.work, self.camera.rate)
-        found.rates = list(self._rates())
+            found.storage = _storage(found, folder, count)
         return found
 
-    @contextmanager
-    def _clip(self, indices: list[int], rate: float | None) -> Iterator[Trial]:
-        """A clip, as a trial that encodes nothing."""
-        # a folder of its own: a worker taken for lost may still be reading the clip before it
-        with TemporaryDirectory(dir=self.work, ignore_cleanup_errors=True) as folder:
-            yield Trial(
-                camera=self.name,
-                clip=make_clip(self.camera, indices, rate, Path(folder)),
-                setting=None,
-                threads=self.options.encoder_threads,
-                versions=self.result.versions,
-                work=Path(folder),
-                output=self.result.output,
-            )
-
-    def _ceiling(self, trial: Trial) -> dict[str, ScoreSummary]:
-        """The scores of a clip against itself, without which others are useless.
-
-        Raises:
-            ScoringError: It cannot be scored.
-        """
-        ((_, found, _),) = try_out([trial], self.engine)
-        if not isinstance(found, dict):
-            raise ScoringError(str(found))
-        return found
-
-    def _cells(self, trial: Trial) -> list[Cell]:
+    def _cells(
+        self,
+        topic: str,
+        name: str,
+        clip: Clip,
+        folder: Path,
+        tell: Callable[[str, float], None],
+    ) -> tuple[list[Cell], list[str]]:
+        """What was measured, and notes about what could not be."""
+        threads, versions = self.options.encoder_threads, self.result.versions
+        trials = [
+            Trial(name, clip, setting, threads, versions, folder, self.result.output)
+            for setting in self.settings
+        ]
         cells: list[Cell] = []
         failures: dict[str, list[str]] = {}
-        trials = [replace(trial, setting=setting) for setting in self.settings]
 
         def count(done: int) -> None:
-            self.tell(f"{done} of {len(trials)} settings", done / len(trials))
+            tell(f"{done} of {len(trials)} settings", done / len(trials))
 
-        for tried, found, is_known in try_out(trials, self.engine, count):
+        for trial, found, is_known in try_out(trials, self.options.jobs, count):
             if isinstance(found, Cell):
                 cells.append(found)
                 self.result.known += is_known
                 self.result.tried += not is_known
-            elif tried.setting is not None:
-                failures.setdefault(str(found), []).append(tried.setting.name)
+            else:
+                failures.setdefault(found, []).append(trial.setting.name)
         if not cells:
-            reason = next(iter(failures))
-            raise ScoringError(f"{self.camera.topic}: no setting could be tried. {reason}")
-        for sentence, names in failures.items():
-            self.notes.append(f"not tried: {', '.join(names)}: {sentence}")
-        return cells
-
-    def _estimate(self, found: CameraEvaluation, work: Path, rate: float) -> None:
-        """Estimate the cost of storing a data set, in several forms."""
-        streams, hours, clip = self.options.streams or 1, self.options.hours or 1.0, found.clip
-        frames = streams * hours * 3600 * rate
-        found.data_set = (
-            f"{counted(streams, 'camera')} for {hours:g} hour{'s' * (hours != 1)} "
-            f"at {rate:.2f} Hz, {frames:.0f} frames"
-        )
-        encoding, (width, height) = ENCODINGS[clip.encoding], clip.image_size
-        best = max(found.cells, key=lambda cell: score_of(cell, found.target)).setting
-        setting = found.recommended[0].setting if found.recommended else best
-        cell = next(cell for cell in found.cells if cell.setting == setting)
-        sizes = {
-            "raw": float(encoding.size(width * encoding.pixel_bytes, height)),
-            "YUV 4:4:4": 3.0 * width * height,
-            "RGB": 3.0 * width * height,
-            **{f"JPEG {quality}": _jpeg_bytes(clip, work, quality) for quality in (90, 75)},
-            setting.name: cell.frame_bytes,
-        }
-        rows = [StorageRow(form, size, size * frames / 1e9) for form, size in sizes.items()]
-        days = frames / clip.frames / _DAY
-        ours = replace(
-            rows[-1], days=cell.encode_seconds * days, cpu_days=cell.encode_cpu_seconds * days
-        )
-        found.storage = [*rows[:-1], ours]
-
-    def _rates(self) -> Iterator[RateRow]:
-        first, own = self.settings[0], self.camera.rate
-        presets = dict.fromkeys(item.preset for item in self.settings if item.codec == first.codec)
-        for rate in sorted(set(self.options.rates)):
-            if own is None or rate > own * _NEAR:
-                self.notes.append(
-                    f"has fewer than {rate:g} images per second: not tried at this rate"
-                )
-                continue
-            self.tell(f"looking for the crf at {rate:g} Hz", 1)
-            indices = chosen_at_rate(self.camera.times, rate, self.options.frames)
-            with self._clip(indices, min(rate, own)) as trial:
-                for preset in presets:
-                    yield self._rate_row(trial, rate, replace(first, preset=preset))
-
-    def _rate_row(self, trial: Trial, rate: float, setting: Setting) -> RateRow:
-        target, ceiling = self.options.wanted, self._ceiling(trial)
-        cells: dict[int, Cell] = {}
-
-        def score(crf: int) -> float:
-            tried = replace(trial, setting=replace(setting, crf=crf))
-            ((_, found, _),) = try_out([tried], self.engine)
-            if not isinstance(found, Cell):
-                raise ScoringError(str(found))
-            cells[crf] = found
-            return score_of(found, target)
-
-        usual, _ = visual_setting(rate)  # for AV1
-        crf, reached, _ = largest_crf(
-            score,
-            reachable_score(target, ceiling),
-            guess=usual if setting.codec in AV1 else usual - 2,
-            largest=MAX_CRF[setting.codec],
-        )
-        return RateRow(rate, trial.clip.frames, cells[crf], reached, ceiling[target.metric].mean)
+            raise ScoringError(f"{topic}: no setting could be tried. {next(iter(failures))}")
+        return cells, [f"not tried: {', '.join(names)}: {why}" for why, names in failures.items()]
 
 
-def _jpeg_bytes(clip: Clip, work: Path, quality: int) -> float:
+def _storage(found: CameraEvaluation, folder: Path, count: float) -> list[StorageRow]:
+    """The cost of storing so many frames, in several forms."""
+    clip, (width, height) = found.clip, found.clip.image_size
+    encoding = ENCODINGS[clip.encoding]
+    best = max(found.cells, key=lambda cell: score_of(cell, found.target)).setting
+    setting = found.recommended[0].setting if found.recommended else best
+    cell = next(cell for cell in found.cells if cell.setting == setting)
+    sizes = {
+        "raw": float(encoding.size(width * encoding.pixel_bytes, height)),
+        "YUV 4:4:4": 3.0 * width * height,
+        "RGB": 3.0 * width * height,
+        **{f"JPEG {quality}": _jpeg_bytes(clip, folder, quality) for quality in (90, 75)},
+    }
+    days = count / clip.frames / _DAY
+    return [
+        *(StorageRow(form, size, size * count / 1e9) for form, size in sizes.items()),
+        StorageRow(
+            setting.name,
+            cell.frame_bytes,
+            cell.frame_bytes * count / 1e9,
+            days=cell.encode_seconds * days,
+            cpu_days=cell.encode_cpu_seconds * days,
+        ),
+    ]
+
+
+def _jpeg_bytes(clip: Clip, folder: Path, quality: int) -> float:
     """Mean bytes of JPEG files of some frames of a clip."""
-    recipe, is_grey = plain_recipe(clip), clip.picture_format == "gray"
+    recipe, is_grey = clip.recipe, clip.picture_format == "gray"
     numbers = np.unique(np.linspace(0, clip.frames - 1, _JPEG_FRAMES).round().astype(int))
-    with closing(clip.open(work)) as frames:
+    with closing(clip.open(folder)) as frames:
         pictures = (rgb_of(frames.frame(number), recipe) for number in numbers.tolist())
         sizes = [jpeg_bytes(picture, quality, is_grey=is_grey) for picture in pictures]
     return sum(sizes) / len(sizes)
 
 
-def _notes(found: CameraEvaluation, lossy: str, options: EvaluateOptions) -> list[str]:
+def _notes(
+    clip: Clip, cells: Sequence[Cell], goal: ScoreGoal, reachable: float, lossy: str, jobs: int
+) -> list[str]:
     """What is worth knowing about the figures."""
-    clip, metric, reachable = found.clip, found.target.metric, found.reachable
-    best = max(found.cells, key=lambda cell: score_of(cell, found.target))
-    reached, machines = score_of(best, found.target), sorted({c.machine for c in found.cells})
+    best = max(cells, key=lambda cell: score_of(cell, goal))
+    reached = score_of(best, goal)
     notes = {
         f"its images are already lossy ({lossy}): scores measure the distance from these, not "
         "from what the camera saw": bool(lossy),
-        f"the clip scored against itself has {metric} {reachable + CEILING_MARGIN:.2f}, so the "
-        f"target is {CEILING_MARGIN} below that, {reachable:.2f} instead of "
-        f"{found.target.score:g}": reachable < found.target.score,
-        f"no setting reaches {metric} {reachable:.2f}; the best is {best.setting.name} with "
+        f"the clip scored against itself has {goal.metric} {reachable + CEILING_MARGIN:.2f}, so "
+        f"the target is {CEILING_MARGIN} below that, {reachable:.2f} instead of "
+        f"{goal.score:g}": reachable < goal.score,
+        f"no setting reaches {goal.metric} {reachable:.2f}; the best is {best.setting.name} with "
         f"{reached:.2f}: try a lower --crf": reached < reachable,
         f"left out of the clip: {counted(clip.left_out, 'image')} of a different size or "
         "encoding, or that cannot be read": clip.left_out > 0,
-        "was recorded as JPEG files, which `mp4ds pack --transcode` re-encodes": lossy == JPEG,
         f"a clip of {clip.frames} frames says little: give more --frames": clip.frames < _SHORT,
-        f"{VMAF_MODEL} is made for {_MODEL_ROWS} rows; it is used for {clip.size[1]} rows too, "
-        "instead of the 4K model, so that cameras are comparable": (
-            clip.size[1] > _MODEL_ROWS and "vmaf" in best.scores
-        ),
-        "times were measured with several settings running at once": (
-            options.jobs > 1 or bool(options.cluster)
-        ),
-        f"times were measured on {len(machines)} machines, {', '.join(machines)}, and are "
-        "comparable only if these are alike": len(machines) > 1,
+        "times were measured with several settings running at once": jobs > 1,
         "has no frame rate, so no storage estimate is given": clip.rate is None,
     }
     return [note for note, applies in notes.items() if applies]

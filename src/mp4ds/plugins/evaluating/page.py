@@ -1,4 +1,4 @@
-"""The files of an evaluation's results: tables, plots, and one page."""
+"""What an evaluation found, in words, tables, plots, and on one page."""
 
 from __future__ import annotations
 
@@ -6,33 +6,31 @@ import base64
 import csv
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from html import escape
 from importlib.resources import files
+from math import ceil, floor, log10
 from string import Template
 from typing import Any
 
+from mp4ds.errors import size_text
 from mp4ds.files.outputs import csv_cell, write_synced
-from mp4ds.plugins.evaluating.options import EvaluateOptions
-from mp4ds.plugins.evaluating.plots import COSTS, SIZE, plot
 from mp4ds.plugins.evaluating.results import (
     CameraEvaluation,
-    Cell,
     Evaluation,
-    Row,
+    StorageRow,
     score_of,
-    told,
-    why_of,
 )
-from mp4ds.video.drawing import png_of, svg_of
+from mp4ds.plugins.evaluating.trials import Cell
+from mp4ds.video.drawing import Dot, Line, Shape, Text, svg_of
 from mp4ds.video.scores import METRICS, ScoreSummary
 
 PLOTS = "plots"
 """The folder of an evaluation for plots."""
 
 
-def write_files(result: Evaluation, options: EvaluateOptions) -> None:
+def write_files(result: Evaluation, options: dict[str, Any]) -> None:
     """Write all files into the folder of an evaluation.
 
     Args:
@@ -44,15 +42,13 @@ def write_files(result: Evaluation, options: EvaluateOptions) -> None:
     """
     folder = result.output
     write_synced(folder / "evaluation.csv", table(result).encode())
-    values = {"options": asdict(options), **asdict(result)}
+    values = {"options": options, **asdict(result)}
     text = json.dumps(values, default=str, indent=1)  # paths
     write_synced(folder / "evaluation.json", f"{text}\n".encode())
     for camera in result.cameras:
         for kind in COSTS:
-            shapes = plot(camera, kind)
             path = folder / PLOTS / f"{camera.name}-{kind}.svg"
-            write_synced(path, svg_of(shapes, SIZE).encode())
-            write_synced(path.with_suffix(".png"), png_of(shapes, SIZE))
+            write_synced(path, svg_of(plot(camera, kind), SIZE).encode())
     write_synced(folder / "index.html", page(result).encode())
 
 
@@ -71,7 +67,7 @@ def table(result: Evaluation) -> str:
 
 def _figures(camera: CameraEvaluation, cell: Cell) -> dict[str, Any]:
     figures = asdict(cell)
-    setting, machine = figures.pop("setting"), figures.pop("machine")
+    setting = figures.pop("setting")
     del figures["picture"]
     scores: dict[str, dict[str, float]] = figures.pop("scores")
     return {
@@ -84,9 +80,195 @@ def _figures(camera: CameraEvaluation, cell: Cell) -> dict[str, Any]:
             for metric in METRICS
             for statistic in ScoreSummary.__slots__
         },
-        "machine": machine,
         "recommended": why_of(camera, cell),
     }
+
+
+# ---------------------------------------------------------------- in words
+
+Row = dict[str, str]
+"""A row of a table: headings and texts."""
+
+
+def told(camera: CameraEvaluation) -> Iterator[str | list[Row]]:
+    """What was found for a camera, in sentences and tables."""
+    clip = camera.clip
+    width, height = clip.image_size
+    rate = f" at {clip.rate:.2f} Hz" if clip.rate else ""
+    yield (
+        f"{camera.topic}: {clip.encoding} {width}x{height}{rate}; clip of {clip.frames} of "
+        f"{clip.source_frames} frames, starting at {clip.start:.2f} s"
+    )
+    yield [_cell_row(camera, cell) for cell in camera.cells]
+    scores = ", ".join(f"{name} {value.mean:.2f}" for name, value in camera.ceiling.items())
+    yield f"ceiling, the clip scored against itself: {scores}"
+    if camera.storage:
+        yield f"{camera.data_set}:"
+        yield [_storage_row(row) for row in camera.storage]
+    yield from (f"note: {note}" for note in camera.notes)
+    for item in camera.recommended:
+        yield f"{item.why}: {item.options} ({camera.target.metric} {item.score:.2f})"
+
+
+def _cell_row(camera: CameraEvaluation, cell: Cell) -> Row:
+    def score(metric: str, statistic: str = "mean", digits: int = 2) -> str:
+        summary = cell.scores.get(metric)
+        return f"{getattr(summary, statistic):.{digits}f}" if summary else ""
+
+    return {
+        "codec": cell.setting.codec,
+        "preset": cell.setting.preset,
+        "crf": str(cell.setting.crf),
+        "kbit/s": f"{cell.kbps:.0f}",
+        "B/frame": f"{cell.frame_bytes:.0f}",
+        "fps": f"{cell.encode_fps:.1f}",
+        "CPU s": f"{cell.encode_cpu_seconds:.2f}",
+        "decoded/CPU s": f"{cell.decode_fps:.0f}",
+        "VMAF": score("vmaf"),
+        "harmonic": score("vmaf", "harmonic_mean"),
+        "5 %": score("vmaf", "percentile_5"),
+        "least": score("vmaf", "minimum"),
+        "PSNR Y": score("psnr_y"),
+        "PSNR Cb": score("psnr_cb"),
+        "PSNR Cr": score("psnr_cr"),
+        "SSIM": score("ssim", digits=4),
+        "whole": size_text(cell.whole_bytes),
+        "time": _time_text(cell.whole_seconds),
+        "best": why_of(camera, cell),
+    }
+
+
+def why_of(camera: CameraEvaluation, cell: Cell) -> str:
+    """Why a cell is recommended; empty if it is not."""
+    return " ".join(item.why for item in camera.recommended if item.setting == cell.setting)
+
+
+def _storage_row(row: StorageRow) -> Row:
+    return {
+        "stored as": row.form,
+        "B/frame": f"{row.frame_bytes:.0f}",
+        "size": f"{row.gigabytes:.1f} GB",
+        "days": "" if row.days is None else f"{row.days:.2f}",
+        "CPU days": "" if row.cpu_days is None else f"{row.cpu_days:.2f}",
+    }
+
+
+def _time_text(seconds: float) -> str:
+    """A duration in a suitable unit."""
+    for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172_800, "h", 3600)):
+        if seconds < limit:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds / 86_400:.1f} days"
+
+
+# ---------------------------------------------------------------- plots
+
+SIZE = (640, 420)
+"""Width and height of a plot, pixels."""
+
+COSTS = {
+    "bitrate": ("kbit/s", "quality against bitrate"),
+    "time": ("CPU seconds per frame", "quality against time"),
+}
+"""For each plot: the label of the cost of a setting, and the plot's title."""
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 64, 490, 38, 368
+_LEGEND = _RIGHT + 18
+_SPARE = 1.15  # factor between the outermost cost and the frame
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#666666")
+_GRID, _INK, _FRONT, _TARGET = "#e4e4e4", "#333333", "#999999", "#cc0000"
+_NAMES = {"vmaf": "VMAF", "psnr_y": "PSNR Y, dB", "psnr_cb": "PSNR Cb, dB",
+          "psnr_cr": "PSNR Cr, dB", "ssim": "SSIM"}  # fmt: skip
+
+
+def plot(camera: CameraEvaluation, kind: str) -> list[Shape]:
+    """A plot of all settings of a camera.
+
+    Args:
+        camera: With at least one cell.
+        kind: One of `COSTS`.
+    """
+    label, title = COSTS[kind]
+    costs = [
+        max(1e-9, cell.encode_cpu_seconds / camera.clip.frames if kind == "time" else cell.kbps)
+        for cell in camera.cells
+    ]
+    scores = [score_of(cell, camera.target) for cell in camera.cells]
+    shapes, place = _frame(
+        costs, [*scores, camera.reachable, camera.ceiling[camera.target.metric].mean]
+    )
+    shapes += [
+        Text((SIZE[0] / 2, 12), f"{camera.topic}: {title}", "middle"),
+        Text((_LEFT, _TOP - 14), _NAMES[camera.target.metric]),
+        Text(((_LEFT + _RIGHT) / 2, _BOTTOM + 36), label, "middle"),
+    ]
+    _, height = place(costs[0], camera.reachable)
+    shapes.append(Line([(_LEFT, height), (_RIGHT, height)], _TARGET, dashed=True))
+    target = f"target {camera.reachable:.4g}"
+    shapes.append(Text((_LEFT + 6, height - 9), target, color=_TARGET))
+    front = [place(costs[n], scores[n]) for n in pareto(costs, scores)]
+    if len(front) > 1:
+        shapes.append(Line(front, _FRONT, 6))
+    groups: dict[str, list[int]] = {}
+    for number, cell in enumerate(camera.cells):
+        groups.setdefault(f"{cell.setting.codec} {cell.setting.preset}", []).append(number)
+    legend = _TOP + 8
+    for number, (name, members) in enumerate(groups.items()):
+        color = _COLORS[number % len(_COLORS)]
+        places = [place(costs[n], scores[n]) for n in members]
+        if len(places) > 1:
+            shapes.append(Line(places, color, 1.5))
+        for n, dot in zip(members, places, strict=True):
+            tip = f"{camera.cells[n].setting.name}: {scores[n]:.3f}, {costs[n]:.4g} {label}"
+            shapes.append(Dot(dot, color, 3.5, tip))
+        shapes += [Dot((_LEGEND, legend), color), Text((_LEGEND + 12, legend), name)]
+        legend += 20
+    shapes.append(Line([(_LEGEND - 7, legend), (_LEGEND + 7, legend)], _FRONT, 6))
+    shapes.append(Text((_LEGEND + 12, legend), "Pareto front"))
+    return shapes
+
+
+def pareto(costs: Sequence[float], scores: Sequence[float]) -> list[int]:
+    """Indices of what nothing cheaper is as good as, the cheapest first."""
+    found: list[int] = []
+    for number in sorted(range(len(costs)), key=lambda n: (costs[n], -scores[n])):
+        if not found or scores[number] > scores[found[-1]]:
+            found.append(number)
+    return found
+
+
+def _frame(
+    costs: Sequence[float], scores: Sequence[float]
+) -> tuple[list[Shape], Callable[[float, float], tuple[float, float]]]:
+    """Axes of costs, which are logarithmic, and of scores; and where a pair of both is."""
+    least, most = min(costs) / _SPARE, max(costs) * _SPARE
+    margin = max((max(scores) - min(scores)) * 0.05, 1e-6 * max(1.0, abs(max(scores))))
+    low, high = min(scores) - margin, max(scores) + margin
+
+    def place(cost: float, score: float) -> tuple[float, float]:
+        across = (log10(cost) - log10(least)) / (log10(most) - log10(least))
+        up = (score - low) / (high - low)
+        return _LEFT + across * (_RIGHT - _LEFT), _BOTTOM - up * (_BOTTOM - _TOP)
+
+    shapes: list[Shape] = []
+    powers = range(floor(log10(least)), ceil(log10(most)) + 1)
+    for cost in (times * 10.0**power for power in powers for times in (1, 2, 5)):
+        if least <= cost <= most:
+            x, _ = place(cost, low)
+            shapes.append(Line([(x, _BOTTOM), (x, _TOP)], _GRID))
+            shapes.append(Text((x, _BOTTOM + 14), f"{cost:g}", "middle"))
+    step = _round_step((high - low) / 6)
+    for score in (step * n for n in range(ceil(low / step), floor(high / step) + 1)):
+        _, y = place(least, score)
+        shapes.append(Line([(_LEFT, y), (_RIGHT, y)], _GRID))
+        shapes.append(Text((_LEFT - 6, y), f"{score:.6g}", "end"))
+    shapes.append(Line([(_LEFT, _TOP), (_LEFT, _BOTTOM), (_RIGHT, _BOTTOM)], _INK))
+    return shapes, place
+
+
+def _round_step(step: float) -> float:
+    power = 10.0 ** floor(log10(step))
+    return next(times * power for times in (1, 2, 5, 10) if times * power >= step * 0.999)
 
 
 # ---------------------------------------------------------------- page

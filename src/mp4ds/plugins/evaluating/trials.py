@@ -3,42 +3,159 @@
 from __future__ import annotations
 
 import hashlib
-import socket
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from mp4ds._version import __version__
-from mp4ds.errors import EncoderRefusedError, Mp4dsError
-from mp4ds.files.outputs import is_seen, write_synced
-from mp4ds.packing.engine import Engine, ProcessEngine, serve
-from mp4ds.plugins.evaluating.clips import TICKS, Clip
-from mp4ds.plugins.evaluating.options import Setting
-from mp4ds.plugins.evaluating.results import Cell
-from mp4ds.video.codecs import Recipe, recipe_for
+from mp4ds.errors import Mp4dsError
+from mp4ds.files.outputs import write_synced
+from mp4ds.packing.engine import ProcessEngine, serve
+from mp4ds.video.codecs import LOSSY_GOP, Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import png_file
 from mp4ds.video.libvmaf import Ffmpeg, find_ffmpeg
-from mp4ds.video.planes import PLANES_FORMAT, Planes, decoded_planes, packet_sizes, rgb_of
+from mp4ds.video.planes import (
+    PLANES_FORMAT,
+    Planes,
+    PlaneSpool,
+    decoded_planes,
+    packet_sizes,
+    rgb_of,
+)
 from mp4ds.video.scores import Scorer, ScoreSummary
 
 CELLS, PICTURES = "cells", "pictures"
 """The folders of an evaluation for measurements, and for the details shown."""
 
-Found = Cell | dict[str, ScoreSummary] | str
-"""The measurements of a setting; for the clip as it is, its scores; or why there are none."""
+FRAMES, TICKS = "frames.yuv", "ticks.npy"
+"""The files of a clip: its frames (see `PlaneSpool`), and when each is shown, as in a packed
+video."""
 
 _ENLARGED = 2
 _NO_VMAF = "none"
 _DIGITS = 12  # of a digest in a name
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How to encode a clip, in the terms of ``mp4ds pack``.
+
+    Attributes:
+        codec: ``av1``, ``av1-10bit``, ``h264`` or ``h265``.
+        preset: Of its encoder.
+        crf: Constant rate factor.
+        gop: Most frames between key frames.
+    """
+
+    codec: str
+    preset: str
+    crf: int
+    gop: int = LOSSY_GOP
+
+    @property
+    def name(self) -> str:
+        """A short name, unique within a grid."""
+        return f"{self.codec} {self.preset} crf {self.crf}"
+
+    @property
+    def pack_options(self) -> str:
+        """The corresponding options of ``mp4ds pack``."""
+        gop = f" --gop {self.gop}" if self.gop != LOSSY_GOP else ""
+        return f"--quality crf={self.crf} --codec {self.codec} --preset {self.preset}{gop}"
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames of a camera as encoder input.
+
+    Attributes:
+        encoding: ROS encoding of the images.
+        picture_format: Pixel format of their pictures, which determines their tags.
+        image_size: Width and height of an image.
+        size: Columns and rows of a frame, even.
+        rate: Frames per second of the camera; None if unknown.
+        frames: How many there are.
+        seconds: Their duration, the last one as long as the others.
+        digest: Of the frames, and when each is shown.
+        detail: x, y, width and height of the detail shown.
+        detail_frame: Number of the frame shown.
+        start: Log time of the first frame, seconds from the camera's first one.
+        source_frames: Total number of the camera's images.
+        left_out: Images in between with another size or encoding, or unreadable.
+    """
+
+    encoding: str
+    picture_format: str
+    image_size: tuple[int, int]
+    size: tuple[int, int]
+    rate: float | None
+    frames: int
+    seconds: float
+    digest: str
+    detail: tuple[int, int, int, int]
+    detail_frame: int
+    start: float
+    source_frames: int
+    left_out: int
+
+    @property
+    def recipe(self) -> Recipe:
+        """One that says how the colours of the frames are coded."""
+        return recipe_for(self.picture_format, lossless=False, crf=1)
+
+    def open(self, folder: Path) -> PlaneSpool:
+        """Open the file of the frames."""
+        return PlaneSpool(folder / FRAMES, *self.size, frames=self.frames)
+
+    def picture(self, planes: Planes, recipe: Recipe) -> bytes:
+        """The detail of a frame, enlarged, as a PNG file."""
+        x, y, width, height = self.detail
+        rows, columns = slice(y // 2, (y + height) // 2), slice(x // 2, (x + width) // 2)
+        luma = planes[0][y : y + height, x : x + width]
+        rgb = rgb_of((luma, planes[1][rows, columns], planes[2][rows, columns]), recipe)
+        return png_file(rgb.repeat(_ENLARGED, axis=0).repeat(_ENLARGED, axis=1))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The results of one setting on one clip.
+
+    Attributes:
+        setting: How it was encoded.
+        encode_seconds: Time to encode the clip.
+        encode_cpu_seconds: CPU time of that, over all threads.
+        decode_fps: Frames decoded per second of CPU time.
+        size: Bytes of the coded frames of the clip.
+        frame_bytes: Bytes of a frame of a long video.
+        kbps: Kilobits per second of a long video.
+        encode_fps: Frames encoded per second.
+        scores: Of the clip, by metric.
+        picture: Name of the PNG file of its detail, in the folder of the evaluation.
+        whole_bytes: Bytes of the camera's whole recording.
+        whole_seconds: Time to encode the camera's whole recording.
+    """
+
+    setting: Setting
+    encode_seconds: float
+    encode_cpu_seconds: float
+    decode_fps: float
+    size: int
+    frame_bytes: float
+    kbps: float
+    encode_fps: float
+    scores: Mapping[str, ScoreSummary]
+    picture: str
+    whole_bytes: float
+    whole_seconds: float
 
 
 @dataclass(frozen=True)
@@ -48,16 +165,16 @@ class Trial:
     Attributes:
         camera: Name of the camera, for names of files.
         clip: The clip.
-        setting: How to encode; None: score the clip against itself, which gives its ceiling.
+        setting: How to encode.
         threads: Of the encoder and of libvmaf.
-        versions: The versions to use; see `versions_of`.
+        versions: Of the software, see `versions_of`: others may give other results.
         work: The folder with the files of the clip.
         output: The folder of the evaluation.
     """
 
     camera: str
     clip: Clip
-    setting: Setting | None
+    setting: Setting
     threads: int
     versions: dict[str, str]
     work: Path
@@ -66,108 +183,69 @@ class Trial:
     @property
     def name(self) -> str:
         """Name of its files: the same for the same measurement, in another run too."""
-        key = _TRIAL.dump_json(self, exclude={"work", "output"})
-        what = self.setting.name.replace(" ", "-") if self.setting else "original"
-        return f"{self.camera}-{what}-{hashlib.sha256(key).hexdigest()[:_DIGITS]}"
+        key = hashlib.sha256(_TRIAL.dump_json(self, exclude={"work", "output"})).hexdigest()
+        return f"{self.camera}-{self.setting.name.replace(' ', '-')}-{key[:_DIGITS]}"
 
     @property
     def picture(self) -> str:
         """Name of the PNG file of the detail, in the folder of the evaluation."""
         return f"{PICTURES}/{self.name}.png"
 
-    def found(self) -> Found | None:
-        """What was found; None if it is not all there."""
+    @property
+    def path(self) -> Path:
+        """The file of its measurements."""
+        return self.output / CELLS / f"{self.name}.json"
+
+    def known(self) -> Cell | None:
+        """What an earlier run measured; None if it is not all there."""
         try:
-            found = _FOUND.validate_json((self.output / CELLS / f"{self.name}.json").read_bytes())
+            found = _CELL.validate_json(self.path.read_bytes())
         except (OSError, ValidationError):
             return None
-        is_shown = isinstance(found, str) or (self.output / self.picture).is_file()
-        is_right = isinstance(found, dict) == (self.setting is None)
-        return found if is_right and is_shown else None
-
-    def keep(self, found: Found) -> None:
-        """Keep what was found.
-
-        Raises:
-            OSError: It cannot be written.
-        """
-        text = _FOUND.dump_json(found, indent=1)
-        write_synced(self.output / CELLS / f"{self.name}.json", text)
+        return found if (self.output / self.picture).is_file() else None
 
 
-_FOUND: TypeAdapter[Found] = TypeAdapter(Found)
-_TRIAL = TypeAdapter(Trial)
+_CELL, _TRIAL = TypeAdapter(Cell), TypeAdapter(Trial)
 
 
 def try_out(
-    trials: Sequence[Trial], engine: Engine, on_done: Callable[[int], None] = lambda _: None
-) -> Iterator[tuple[Trial, Found, bool]]:
+    trials: Sequence[Trial], jobs: int, on_done: Callable[[int], None] = lambda _: None
+) -> Iterator[tuple[Trial, Cell | str, bool]]:
     """Run trials, except for those with existing results.
 
     Args:
         trials: Different ones.
-        engine: Runs them.
+        jobs: How many at a time.
         on_done: Called with the number of trials done.
 
     Yields:
-        Each in turn, what was found, and whether that was before.
+        Each in turn, what was measured, or why that is not possible; and whether it was before.
 
     Raises:
-        ClusterError: The cluster does not answer, or was lost.
+        OSError: A result cannot be written.
     """
-    known: dict[str, Found] = {}
-    tasks: dict[tuple[str, ...], Trial] = {}
-    for trial in trials:
-        if found := trial.found():
-            known[trial.name] = found
-            continue
-        job = trial.work / f"{trial.name}.job"
-        write_synced(job, _TRIAL.dump_json(trial))
-        tasks[(str(job),)] = trial
+    known = {trial.name: cell for trial in trials if (cell := trial.known())}
+    tasks: dict[tuple[str, ...], Trial] = {
+        (_TRIAL.dump_json(trial).decode(),): trial for trial in trials if trial.name not in known
+    }
+    new: dict[str, Cell | str] = {}
     on_done(len(known))
-    new: dict[str, Found] = {}
-    with closing(engine.run(list(tasks), lambda *_: None)) as outcomes:
+    with closing(ProcessEngine(_command, jobs).run(list(tasks), lambda *_: None)) as outcomes:
         for outcome in outcomes:
             trial = tasks[outcome.task]
-            new[trial.name] = outcome.error[1] if outcome.error else _seen(trial)
+            if outcome.error is not None:
+                new[trial.name] = outcome.error[1]
+            else:
+                cell = _CELL.validate_python(outcome.facts["cell"])
+                write_synced(trial.path, _CELL.dump_json(cell, indent=1))
+                new[trial.name] = cell
             on_done(len(known) + len(new))
     for trial in trials:
         yield trial, (known | new)[trial.name], trial.name in known
 
 
-def _seen(trial: Trial) -> Found:
-    folder = trial.output / CELLS
-    is_seen(lambda: trial.found() is not None, folder, trial.output / PICTURES)
-    missing = f"its result did not appear in {folder}; all machines must share this folder."
-    return trial.found() or missing
-
-
-# ---------------------------------------------------------------- in a process
-
-
-def command(task: tuple[str, ...]) -> list[str]:
-    """The command line that runs a task: the file of a `Trial`."""
-    return [sys.executable, "-m", "mp4ds.plugins.evaluating.trials", *task]
-
-
-def run_task(job: str) -> None:
-    """Run a task on a cluster worker, in a separate process as on this machine.
-
-    Args:
-        job: The file of a `Trial`.
-
-    Raises:
-        Mp4dsError: It failed; says why.
-    """
-    if not Path(job).is_file():
-        raise Mp4dsError(f"{job} does not exist: all machines must share the evaluation's folder.")
-    for outcome in ProcessEngine(command, 1).run([(job,)], lambda *_: None):
-        if outcome.error is not None:
-            raise Mp4dsError(outcome.error[1])
-
-
 def versions_of(ffmpeg: Ffmpeg | None) -> dict[str, str]:
-    """Versions of the software that makes videos and scores here: others may give other results.
+    """Versions of the software that makes videos and scores here.
 
     Args:
         ffmpeg: Computes VMAF; None for no VMAF.
@@ -176,94 +254,68 @@ def versions_of(ffmpeg: Ffmpeg | None) -> dict[str, str]:
     return {**tool_versions(), "mp4ds": __version__, "vmaf": vmaf}
 
 
-def plain_recipe(clip: Clip) -> Recipe:
-    """One that says how the colours of a clip are coded."""
-    return recipe_for(clip.picture_format, lossless=False, crf=1)
+# ---------------------------------------------------------------- in a process
 
 
-def run(trial: Trial) -> None:
-    """Encode, decode, score, and keep what was found.
+def _command(task: tuple[str, ...]) -> list[str]:
+    return [sys.executable, "-m", "mp4ds.plugins.evaluating.trials", *task]
+
+
+def run(trial: Trial) -> Cell:
+    """Encode, decode, and score.
 
     Raises:
-        Mp4dsError: Different versions are installed here, or libvmaf failed.
-        OSError: It cannot be written.
+        Mp4dsError: The encoder refuses, or libvmaf failed.
+        OSError: A file cannot be written.
     """
+    clip, setting = trial.clip, trial.setting
     ffmpeg = None if trial.versions["vmaf"] == _NO_VMAF else find_ffmpeg()
-    _check_versions(versions_of(ffmpeg), trial.versions)
-    found: Found
-    with (
-        closing(trial.clip.open(trial.work)) as frames,
-        tempfile.TemporaryDirectory(dir=trial.work) as folder,
-    ):
-        if trial.setting is None:
-            figures, recipe = {}, plain_recipe(trial.clip)
-            decoded: Iterable[Planes] = frames
-        else:
-            codec, preset, crf = trial.setting.codec, trial.setting.preset, trial.setting.crf
-            form = trial.clip.picture_format
-            recipe = recipe_for(form, lossless=False, codec=codec, crf=crf, preset=preset)
-            video = Path(folder, "video.mp4")
-            try:
-                figures = _encoded(trial, trial.setting, recipe, video)
-            except EncoderRefusedError as error:
-                trial.keep(str(error))
-                return
-            decoded = decoded_planes(video)
-        shown: list[Planes] = []
+    recipe = recipe_for(
+        clip.picture_format,
+        lossless=False,
+        codec=setting.codec,
+        crf=setting.crf,
+        preset=setting.preset,
+    )
+    with closing(clip.open(trial.work)) as frames, TemporaryDirectory(dir=trial.work) as folder:
+        video = Path(folder, "video.mp4")
+        figures = _encoded(trial, frames, recipe, video)
 
-        def watched() -> Iterator[Planes]:
+        def watched(decoded: Iterable[Planes]) -> Iterator[Planes]:
             for number, planes in enumerate(decoded):
-                if number == trial.clip.detail_frame:
-                    y, u, v = (plane.copy() for plane in trial.clip.detail_of(planes))
-                    shown.append((y, u, v))
+                if number == clip.detail_frame:
+                    write_synced(trial.output / trial.picture, clip.picture(planes, recipe))
                 yield planes
 
-        found = Scorer(ffmpeg, threads=trial.threads).score(frames, watched()).summaries()
-    if trial.setting is not None:
-        found = Cell(setting=trial.setting, scores=found, picture=trial.picture, **figures)
-    rgb = rgb_of(shown[0], recipe).repeat(_ENLARGED, axis=0).repeat(_ENLARGED, axis=1)
-    write_synced(trial.output / trial.picture, png_file(rgb))
-    trial.keep(found)
+        scores = Scorer(ffmpeg, threads=trial.threads).score(frames, watched(decoded_planes(video)))
+    return Cell(setting=setting, scores=scores.summaries(), picture=trial.picture, **figures)
 
 
-def _check_versions(here: dict[str, str], wanted: dict[str, str]) -> None:
-    others = [
-        f"{name} {here.get(name, 'none')} instead of {version}"
-        for name, version in wanted.items()
-        if here.get(name) != version
-    ]
-    if others:
-        raise Mp4dsError(
-            f"versions differ between machines: {', '.join(others)}. Install the same."
-        )
-
-
-def _encoded(trial: Trial, setting: Setting, recipe: Recipe, video: Path) -> dict[str, Any]:
+def _encoded(trial: Trial, frames: PlaneSpool, recipe: Recipe, video: Path) -> dict[str, Any]:
     """Encode the clip as `mp4ds pack` does, and decode it; returns the figures of a `Cell`."""
-    clip = trial.clip
+    clip, gop = trial.clip, trial.setting.gop
     ticks = np.load(trial.work / TICKS).tolist()
-    with closing(clip.open(trial.work)) as frames:
-        for _ in frames:
-            pass  # so that the encoder does not wait for a disk or network
-        wall, cpu = time.perf_counter(), time.process_time()
-        with VideoEncoder(
-            video,
-            recipe,
-            picture_format=PLANES_FORMAT,
-            width=frames.width,
-            height=frames.height,
-            gop=setting.gop,
-            threads=trial.threads,
-            rate=clip.rate,
-        ) as encoder:
-            for planes, tick in zip(frames, ticks, strict=True):
-                encoder.write(planes, tick)
+    for _ in frames:
+        pass  # so that the encoder does not wait for a disk or network
+    wall, cpu = time.perf_counter(), time.process_time()
+    with VideoEncoder(
+        video,
+        recipe,
+        picture_format=PLANES_FORMAT,
+        width=frames.width,
+        height=frames.height,
+        gop=gop,
+        threads=trial.threads,
+        rate=clip.rate,
+    ) as encoder:
+        for planes, tick in zip(frames, ticks, strict=True):
+            encoder.write(planes, tick)
     seconds, encoded = time.perf_counter() - wall, time.process_time()
     for _ in decoded_planes(video):
         pass
     decode_seconds = time.process_time() - encoded
     sizes = packet_sizes(video)
-    frame_bytes = sizes.frame_bytes(setting.gop)
+    frame_bytes = sizes.frame_bytes(gop)
     return {
         "encode_seconds": seconds,
         "encode_cpu_seconds": encoded - cpu,
@@ -274,18 +326,16 @@ def _encoded(trial: Trial, setting: Setting, recipe: Recipe, video: Path) -> dic
         "kbps": frame_bytes * clip.frames / clip.seconds * 8 / 1000,
         "whole_bytes": frame_bytes * clip.source_frames,
         "whole_seconds": seconds / clip.frames * clip.source_frames,
-        "machine": socket.gethostname(),
     }
 
 
-def _outcome(job: str) -> dict[str, Any]:
+def _outcome(task: str) -> dict[str, Any]:
     try:
-        run(_TRIAL.validate_json(Path(job).read_bytes()))
+        return {"done": True, "cell": _CELL.dump_python(run(_TRIAL.validate_json(task)))}
     except MemoryError:
         return {"error": ("MemoryError", "out of memory; try fewer `jobs` or `frames`")}
     except (Mp4dsError, OSError) as error:
         return {"error": (type(error).__name__, str(error))}
-    return {"done": True}
 
 
 if __name__ == "__main__":
