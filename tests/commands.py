@@ -7,6 +7,7 @@ import hashlib
 import io
 import os
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import mp4ds
-from mp4ds.cli import app_for
+from mp4ds.cli import app_for, output
 from waiting import WATCHDOG_S
 
 ROOT = Path(mp4ds.__file__).parents[1]
@@ -39,6 +40,7 @@ def without_progress(err: str) -> str:
 def call(*arguments: object, screen: Callable[[], io.StringIO] = io.StringIO) -> Result:
     """A command in this process: its exit code and what it wrote, but for its progress."""
     out, err = screen(), screen()
+    output._quiet = False  # whatever the command before was asked for
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             app_for()([str(argument) for argument in arguments])
@@ -65,6 +67,30 @@ def run(*arguments: object, **options: Any) -> Result:
     with start(*arguments, **options) as process:
         out, err = process.communicate(timeout=WATCHDOG_S)
     return Result(process.returncode, out, without_progress(err))
+
+
+def typed(line: str, folder: Path) -> Result:
+    """A line as it is typed into a shell in a folder.
+
+    A command of the package runs in this process, which has it loaded, unless it needs a shell.
+    """
+    words = shlex.split(line)
+    needs_shell = set(re.sub("'[^']*'", "", line)) & set("*|;&$<>")
+    if words[0] == "mp4ds" and not needs_shell:
+        with contextlib.ExitStack() as stack:
+            stack.callback(os.chdir, Path.cwd())
+            os.chdir(folder)
+            return call(*words[1:])
+    done = subprocess.run(
+        ["bash", "-c", line],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=WATCHDOG_S,
+        check=False,
+        env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
+    )
+    return Result(done.returncode, done.stdout, done.stderr)
 
 
 def tree(folder: Path) -> dict[str, str]:

@@ -217,6 +217,7 @@ def test_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
         refused(call("pack", path, "-o", tmp_path / "dataset"), 2, word)
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("name", [n for n in BAD_SOURCES if not n.startswith("damaged")])
 def test_info_on_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
     make, word = BAD_SOURCES[name]

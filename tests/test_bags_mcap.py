@@ -134,6 +134,7 @@ def check_index(reader: McapReader, got: list[Message]) -> None:
         assert (first and fields(first)) == (expected and fields(expected))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", REAL_FILES)
 def test_real_recordings(name: str) -> None:
     check_against_library(real(name))

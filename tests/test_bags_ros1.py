@@ -210,6 +210,7 @@ def refuse(path: Path, problem: str) -> None:
     assert problem in str(caught.value)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", REAL_BAGS)
 def test_real_bags(name: str, tmp_path: Path) -> None:
     path = real(name)

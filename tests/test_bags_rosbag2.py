@@ -128,6 +128,7 @@ def test_real_recordings(name: str) -> None:
     check_index(reader, got)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", FOLDERS)
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 def test_real_recordings_round_trip(name: str, storage: str, tmp_path: Path) -> None:
@@ -273,6 +274,7 @@ def source_record(version: int, **more: Any) -> MetadataRecord:
     return MetadataRecord(RECORD, {"metadata.yaml": text, "storage": "sqlite3", "files": ""})
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 @pytest.mark.parametrize("version", [None, *range(2, 10)])
 def test_round_trip(tmp_path: Path, storage: str, version: int | None) -> None:

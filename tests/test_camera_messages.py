@@ -71,7 +71,7 @@ EVEN |= {("full", "32FC1")}
 """Where the two are of about one size, so that either may be taken."""
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("content", "encoding", "source", "shape"), share(RAW, 6))
 def test_raw_images(
     content: str, encoding: str, source: str, shape: str, tmp_path: Path, compare: Compare
@@ -162,7 +162,7 @@ EVEN_PNG |= {"png-called-jpeg"}
 STREAMS = {"jpeg-mixed-sizes": 2, "video-h264-resized": 2}
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("name", "source"), share([(name, s) for name in CODED for s in CODED_SOURCES], 6)
 )
@@ -343,7 +343,7 @@ QUALITIES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize(
     ("quality", "encoding"),
     share([(quality, name) for name in ENCODINGS for quality in QUALITIES], len(QUALITIES)),
@@ -465,6 +465,7 @@ OTHERS = [
 ]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("name", "quality"),
     share([(name, quality) for name in OTHERS for quality in QUALITIES], 2 * len(QUALITIES)),

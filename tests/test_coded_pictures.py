@@ -46,6 +46,7 @@ def without(codec: str, body: bytes, *kinds: int) -> bytes:
     return nal.join_plain([u for u in units if UNITS[codec].unit_type(u) not in kinds])
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", IN_ORDER)
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (66, 50), (322, 178)])
 def test_streams_in_order(name: str, width: int, height: int) -> None:

@@ -92,6 +92,7 @@ def check(data: bytes, hint: png.PngRecipe | None = None) -> png.PngRecipe:
 LEVELS = range(1, 10)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("channels", "dtype"), KINDS)
 @pytest.mark.parametrize("size", SIZES)
 def test_opencv(size: tuple[int, int], channels: int, dtype: Any) -> None:
@@ -109,6 +110,7 @@ def test_opencv_with_strategies_and_filters(strategy: int, filters: int) -> None
     check(by_opencv(pixels, cv2.IMWRITE_PNG_STRATEGY, strategy, cv2.IMWRITE_PNG_FILTER, filters))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("optimize", [False, True])
 @pytest.mark.parametrize("channels", [1, 3, 4])
 @pytest.mark.parametrize("size", SIZES)
@@ -118,6 +120,7 @@ def test_pillow(size: tuple[int, int], channels: int, optimize: bool) -> None:
         check(by_pillow(picture(*size, 1, np.uint16)))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("channels", "dtype"), [(1, np.uint8), (3, np.uint8), (1, np.uint16)])
 @pytest.mark.parametrize("size", SIZES)
 def test_ffmpeg(size: tuple[int, int], channels: int, dtype: Any) -> None:

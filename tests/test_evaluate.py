@@ -358,6 +358,7 @@ def clips_of(path: Path, folder: Path) -> tuple[dict[str, Clip | str], dict[str,
         return found, left_out
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_every_encoding_is_tried_or_told(encoding: str, tmp_path: Path) -> None:
     ((_, found),) = clips_of(recording(tmp_path, encoding), tmp_path)[0].items()
@@ -373,6 +374,7 @@ def test_every_encoding_is_tried_or_told(encoding: str, tmp_path: Path) -> None:
     assert len({plane.tobytes() for plane, _, _ in frames}) == 10
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("name", CODED)
 def test_every_coded_image_is_tried_or_told(name: str, tmp_path: Path) -> None:
     write_bag(tmp_path / "drive.bag", CODED[name]())
@@ -390,6 +392,7 @@ def test_every_coded_image_is_tried_or_told(name: str, tmp_path: Path) -> None:
         assert made[0].frames + made[0].left_out == 10
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("trait", TRAITS)
 def test_every_oddity_is_tried_or_told(trait: str, tmp_path: Path) -> None:
     write_bag(tmp_path / "drive.bag", odd_scene(trait))

@@ -14,6 +14,7 @@ import pytest
 import typer
 
 import mp4ds
+from commands import typed
 from mp4ds.cli import COMMANDS, app_for
 from mp4ds.plugins.demo import demo
 from sources import SOURCES, scene
@@ -131,7 +132,8 @@ def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> No
         shutil.copytree(demo_dataset, tmp_path / "drive")
     for line in lines:
         brief = " --seconds 0.5" if line.startswith("mp4ds demo") else ""
-        run("bash", "-c", line + brief, cwd=tmp_path)
+        done = typed(line + brief, tmp_path)
+        assert done.code == 0, f"{line}\n{done}"
 
 
 def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:

@@ -155,7 +155,7 @@ def test_stats_of_two_parts() -> None:
 # ---------------------------------------------------------------- all kinds of sources
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", SOURCES)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_parts_of_every_source(name: str, seed: int, tmp_path: Path) -> None:
@@ -172,6 +172,7 @@ def test_parts_of_every_source(name: str, seed: int, tmp_path: Path) -> None:
     assert sorted(rows(apart), key=repr) == sorted(rows(whole), key=repr)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", SOURCES)
 def test_spans_without_messages(name: str, tmp_path: Path) -> None:
     paths = SOURCES[name](tmp_path, scene("mono8", frames=4))

@@ -110,6 +110,7 @@ def noted(folder: Path) -> None:
     (folder / "cells" / "culture.csv").write_text("years of work")
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", FOLDERS)
 @pytest.mark.parametrize("folder", [yolo, described, beside_images, noted])
 def test_a_folder_that_looks_like_an_output_is_kept(

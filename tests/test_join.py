@@ -171,7 +171,7 @@ def joined(elsewhere: Path, tmp_path_factory: pytest.TempPathFactory) -> Joined:
     return make
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @every_kind
 def test_pictures_are_those_of_the_segments(kind: Kind, joined: Joined) -> None:
     target, segments, told = joined(kind)
@@ -192,7 +192,7 @@ def test_pictures_are_those_of_the_segments(kind: Kind, joined: Joined) -> None:
             assert same(planes if len(planes) > 1 else planes[0], expected[number]), number
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @every_kind
 def test_the_file_is_as_one_encoder_writes_it(kind: Kind, joined: Joined, tmp_path: Path) -> None:
     target, segments, _ = joined(kind)
@@ -212,7 +212,7 @@ def test_the_file_is_as_one_encoder_writes_it(kind: Kind, joined: Joined, tmp_pa
     assert keys == expected
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @every_kind
 def test_one_segment_is_the_file_itself(kind: Kind, joined: Joined, tmp_path: Path) -> None:
     segment = joined(kind)[1][0]
@@ -224,6 +224,7 @@ def test_one_segment_is_the_file_itself(kind: Kind, joined: Joined, tmp_path: Pa
         assert target.read_bytes() == segment.read_bytes()
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("picture_format", [f for codec, f in LOSSLESS if codec == "ffv1"])
 def test_parts_that_end_at_key_frames_give_the_uncut_file(
     picture_format: str, tmp_path: Path
@@ -251,7 +252,7 @@ def ffmpeg_says(path: Path) -> tuple[int, str]:
     return done.returncode, done.stderr.decode()
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(6)
 @every_kind
 def test_ffmpeg_reads_it_without_a_word(kind: Kind, joined: Joined) -> None:
     target, segments, told = joined(kind)
@@ -269,7 +270,7 @@ def test_ffmpeg_reads_it_without_a_word(kind: Kind, joined: Joined) -> None:
     assert times == [number * STEP for number in range(TOTAL)]
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(6)
 @every_kind
 def test_pyav_seeks_across_the_seams(kind: Kind, joined: Joined) -> None:
     target, _, _ = joined(kind)
@@ -285,7 +286,7 @@ def test_pyav_seeks_across_the_seams(kind: Kind, joined: Joined) -> None:
             assert times == list(range(times[0], TOTAL * STEP, STEP))
 
 
-@pytest.mark.one_in(8)
+@pytest.mark.one_in(18)
 @pytest.mark.parametrize("kind", KINDS, ids=IDS)
 @pytest.mark.parametrize("size", [(640, 360), (1920, 1200)])
 def test_what_a_track_says_does_not_hang_on_threads(
@@ -321,6 +322,7 @@ def cut_at_keys(bodies: Sequence[tuple[bytes, bool]]) -> list[list[bytes]]:
     return parts
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", IN_ORDER)
 def test_copied_packets_give_the_uncut_file(name: str, tmp_path: Path) -> None:
     codec = ENCODINGS[name].codec

@@ -81,7 +81,7 @@ def colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
 # ---------------------------------------------------------------- frames
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("encoding", COMMON)
 @pytest.mark.parametrize(
     ("variant", "shape"),
@@ -458,6 +458,7 @@ def recalibrated(first_new: int, *, frames: int = 8, delay: int = 90_000) -> Sce
     return source
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("first_new", [0, 3, 5])
 @pytest.mark.parametrize("delay", [90_000, 0, -1, 40_000_000])
 @pytest.mark.parametrize("variant", ["bag-none", "mcap-ros2-lz4"])

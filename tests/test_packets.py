@@ -91,6 +91,7 @@ def ffprobe(path: Path) -> Any:
     return json.loads(done.stdout)["streams"]
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", IN_ORDER)
 def test_packets_come_back(name: str, tmp_path: Path) -> None:
     codec = ENCODINGS[name].codec
@@ -106,6 +107,7 @@ def test_packets_come_back(name: str, tmp_path: Path) -> None:
             assert reader.packet(index) == everything[index]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", IN_ORDER)
 def test_the_file_plays(name: str, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
@@ -420,6 +422,7 @@ def standing_alone(path: Path, codec: str) -> list[bytes]:
         return list(packets.packets())
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", IN_ORDER)
 def test_packets_stand_alone(name: str, tmp_path: Path) -> None:
     codec, path = ENCODINGS[name].codec, tmp_path / "a.mp4"

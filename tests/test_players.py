@@ -249,7 +249,7 @@ def test_ffprobe_knows_all(name: str, datasets: dict[str, Path]) -> None:
     assert tags == [case.range, case.matrix, *others]
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", CASES)
 def test_ffprobe_reads_the_times(name: str, datasets: dict[str, Path]) -> None:
     path = video_of(datasets[name])
@@ -289,6 +289,7 @@ def untile(picture: NDArray[Any]) -> NDArray[Any]:
     return mosaic
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", [name for name in CASES if CASES[name].raw])
 def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: dict[str, Path]) -> None:
     """Without mp4ds: by ffmpeg, and the words of the spec."""
@@ -327,6 +328,7 @@ def test_ffmpeg_decodes_packets_as_if_they_had_just_been_recorded(
 SHOWN = [name for name, case in CASES.items() if case.codec != "ffv1" and not case.raw]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", SHOWN)
 def test_ffmpeg_shows_the_same_colours(name: str, datasets: dict[str, Path]) -> None:
     """Nearly, where it is told in which way to interpolate: its weights are not to a 32nd.
@@ -355,6 +357,7 @@ def blocks(picture: NDArray[Any]) -> NDArray[np.float64]:
 # ---------------------------------------------------------------- PyAV
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", CASES)
 def test_pyav_plays_and_seeks(name: str, datasets: dict[str, Path]) -> None:
     ticks = expected_ticks(datasets[name])
@@ -581,6 +584,7 @@ def test_a_browser_plays_it(name: str, played: dict[str, Any], datasets: dict[st
     assert result["decoded"] == FRAMES
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.browser
 @pytest.mark.parametrize("name", PLAYED)
 def test_a_browser_shows_the_right_frames_in_the_right_colours(

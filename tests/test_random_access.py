@@ -234,6 +234,7 @@ def distance(one: NDArray[Any], other: NDArray[Any]) -> float:
     return float(np.abs(one.astype(float) - other.astype(float)).mean() / np.iinfo(one.dtype).max)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("encoding", LIGHT)
 def test_formats_of_every_encoding(encoding: str, tmp_path: Path) -> None:
     source = scene(encoding, frames=2, width=64, height=48, noisy=False)
@@ -312,6 +313,7 @@ def test_no_such_format(name: Any, colour: mp4ds.Stream) -> None:
 # ---------------------------------------------------------------- sizes
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("size", [(16, 12), (32, 24), (40, 30), (7, 48), (64, 5)])
 @pytest.mark.parametrize("name", ["native", "rgb", "bgr", "gray"])
 def test_smaller(size: tuple[int, int], name: str, colour: mp4ds.Stream) -> None:
@@ -415,6 +417,7 @@ def test_camera_yuv_is_not_cut(encoding: str, tmp_path: Path) -> None:
         assert np.array_equal(part, stream.read([0])[0][3:10, 1:10])
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 4), (5, 1), (2, 2), (3, 3), (63, 47)])
 @pytest.mark.parametrize("encoding", [name for name in ENCODINGS if name.startswith("bayer")])
 def test_mosaics_of_odd_sizes(encoding: str, width: int, height: int) -> None:

@@ -70,7 +70,7 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ---------------------------------------------------------------- from a time on
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", SCENES)
 def test_from_every_kind_of_place(name: str, tmp_path: Path) -> None:
     """What comes from a time on is what has come before, however it was stored."""

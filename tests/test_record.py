@@ -187,7 +187,6 @@ class Opened:
 
 
 def test_what_launch_files_append(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mp4ds.cli.output._quiet", False)
     source = PlayedSource(write(tmp_path, of=scene("mono8", frames=2)))
     opened = Opened(source, monkeypatch)
     told = call(
@@ -222,7 +221,6 @@ def test_one_that_may_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_nothing_to_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As ROS's own recorders do: a recording without messages, and that is no failure."""
-    monkeypatch.setattr("mp4ds.cli.output._quiet", False)
     Opened(PlayedSource(write(tmp_path, of=scene("mono8", frames=2))), monkeypatch)
     told = call("record", "--ros1", "-o", tmp_path / "live", "/nothing", "--no-progress")
     assert told.code == 0, told
@@ -411,7 +409,6 @@ def test_times_that_no_recording_can_hold(
     def altered(message: Message, number: int) -> Message:
         return replace(message, **{field: times[number]}) if number in times else message
 
-    monkeypatch.setattr("mp4ds.cli.output._quiet", False)
     source = PlayedSource(paths, altered={"/cam/image_raw": altered, "/imu": altered})
     Opened(source, monkeypatch)
     told = call("record", "--ros1", "-a", "-o", tmp_path / "live", "--no-progress")

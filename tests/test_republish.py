@@ -306,7 +306,7 @@ def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str)
     check(made, summary, messages, name, kind, to, fate_of(FATES[name], name, kind, to))
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("name", "kind", "to"), in_turn([*FOXGLOVE_FATES], KINDS, [*TARGETS]))
 def test_foxglove_cameras_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
     made = packed(name, "mcap-protobuf")
@@ -319,7 +319,7 @@ def test_foxglove_cameras_as_every_kind(packed: Pack, name: str, kind: str, to: 
     check(made, summary, messages, name, kind, to, fate)
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["foxglove-raw-mono8", "foxglove-jpeg-rgb", "foxglove-video-h264"])
 def test_foxglove_cameras_of_ros2(packed: Pack, name: str, kind: str) -> None:

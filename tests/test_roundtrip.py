@@ -36,7 +36,7 @@ def has_streams(folder: Path) -> bool:
     return bool(list(folder.glob("*.mp4")))
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("encoding", ["bayer_gbrg8", "mono16"])
 def test_every_source_returns_to_its_own_format(
@@ -77,7 +77,7 @@ def test_every_source_and_encoding(
     assert compare(sources, output) == []
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("target", [*TARGETS][:4])
 @pytest.mark.parametrize(
     "source",
@@ -192,6 +192,7 @@ def test_what_ros_can_hold_of_the_rest(target: str, tmp_path: Path, compare: Com
     assert all("/cam/image_raw" not in line for line in compare(sources, output))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("trait", TRAITS)
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-none"])
 def test_odd_messages_return(trait: str, source: str, tmp_path: Path, compare: Compare) -> None:
@@ -218,7 +219,7 @@ REAL_FOLDERS = sorted(
 )
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", [*REAL, *REAL_FOLDERS] or ["bags"])
 def test_real_recordings_return(name: str, tmp_path: Path, compare: Compare) -> None:
     path = real(name)

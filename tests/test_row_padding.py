@@ -37,6 +37,7 @@ def recording(folder: Path, trait: str, source: str = "mcap-ros2-none", **option
     return SOURCES[source](folder / "source", odd_scene(trait, **options))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("quality", ["lossless", "crf=20", "psnr=30"])
 @pytest.mark.parametrize(
     "trait", ["row-padding-garbage", "row-padding-varied", "row-padding-not-last"]

@@ -76,6 +76,7 @@ def plain(record: Record) -> Any:
 # ---------------------------------------------------------------- intact recordings
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", SOURCES)
 def test_an_intact_recording_is_read_as_usual(name: str, tmp_path: Path) -> None:
     paths = SOURCES[name](tmp_path, scene("bayer_rggb8"))
@@ -103,7 +104,7 @@ REAL = [
 ]
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", REAL)
 def test_a_real_intact_recording_is_read_as_usual(name: str) -> None:
     path = real(name)
@@ -209,7 +210,7 @@ def test_the_pieces_are_all_there_is(kind: str, intact: Intact) -> None:
     assert Counter(key[:2] for key in all_messages(pieces)) == written
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("injury", INJURIES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_not_damaged_comes_back(
@@ -426,6 +427,7 @@ def test_losses_that_follow_each_other_are_one() -> None:
 # ---------------------------------------------------------------- the usual reader
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", SOURCES)
 def test_the_usual_error_names_the_option(name: str, tmp_path: Path) -> None:
     paths = SOURCES[name](tmp_path, scene("mono8"))

@@ -86,6 +86,7 @@ def written(path: Path, codec: str, picture_format: str, *, lossless: bool, fram
     return path
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("codec", "picture_format", "lossless"),
     [(*pair, True) for pair in LOSSLESS]
@@ -171,6 +172,7 @@ def muxed(
     return path
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("mux", MUXED)
 @pytest.mark.parametrize(
     ("name", "extension"),

@@ -52,6 +52,7 @@ class Tagged:
         return tags(frame)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("colour_range", [1, 2])
 @pytest.mark.parametrize("colour", [BT709, BT601])
 @pytest.mark.parametrize("name", NAMES)

@@ -207,6 +207,7 @@ def test_the_earlier_of_two_near_ones_is_taken() -> None:
     assert choice.bytes_per_frame <= NEAR * min(every)
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_codec_that_was_asked_for(encoding: str) -> None:
     for codec in ["h264", "h265", "ffv1"]:

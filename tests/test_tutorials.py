@@ -10,11 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import re
-import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -25,19 +21,16 @@ from typing import Any
 import pytest
 import typer
 
+from commands import Result, typed
 from mp4ds.cli import app_for, play_words, record_words
 from ros2_sides import alone_in_ros2
 from test_examples import ROOT
-from waiting import WATCHDOG_S
 
 DOCS = ROOT / "docs"
 PAGES = sorted((DOCS / "tutorials").glob("*.md"))
 OTHERS = [DOCS / "exporting.md", DOCS / "hub.md"]
 NEEDS = {"--ros2": "cyclonedds", "mp4ds.torch": "torch"}
 """What a line needs beside the package -> the module of it; the page is skipped without."""
-
-# a demonstration as long as these tests can afford
-SECONDS = {"mp4ds demo": "--seconds 0.8"}
 
 
 @dataclass(frozen=True)
@@ -46,14 +39,6 @@ class Block:
 
     kind: str
     text: str
-
-
-@dataclass(frozen=True)
-class Done:
-    """What a command or snippet did."""
-
-    code: int
-    printed: str
 
 
 def blocks_of(page: Path) -> list[Block]:
@@ -69,37 +54,10 @@ def commands(text: str) -> Iterator[tuple[str, int]]:
             yield command.strip(), int(found[1]) if found else 0
 
 
-def run_command(command: str, folder: Path) -> Done:
-    """A command of the package in this process, which has it loaded; any other in a shell."""
-    for begins, option in SECONDS.items():
-        if command.startswith(begins) and "--seconds" not in command:
-            command = f"{command} {option}"
-    words = shlex.split(command)
-    needs_shell = set(re.sub("'[^']*'", "", command)) & set("*|;&$<>")
-    if words[0] == "mp4ds" and not needs_shell:
-        return call(words[1:])
-    bin_folder = str(Path(sys.executable).parent)
-    done = subprocess.run(
-        ["bash", "-c", command],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        env={**os.environ, "PATH": f"{bin_folder}:{os.environ['PATH']}"},
-    )
-    return Done(done.returncode, done.stdout + done.stderr)
-
-
-def call(arguments: list[str]) -> Done:
-    printed = io.StringIO()
-    code = 0
-    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-        try:
-            app_for()(args=arguments)
-        except SystemExit as ended:
-            code = int(ended.code or 0)
-    return Done(code, printed.getvalue())
+def run_command(command: str, folder: Path) -> Result:
+    """A command, with a demonstration as long as these tests can afford."""
+    is_demo = command.startswith("mp4ds demo") and "--seconds" not in command
+    return typed(f"{command} --seconds 0.8" if is_demo else command, folder)
 
 
 def run_snippet(text: str, names: dict[str, Any]) -> str:
@@ -140,8 +98,8 @@ def test_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             printed = ""
             for command, code in commands(block.text):
                 done = run_command(command, tmp_path)
-                assert done.code == code, f"{command}\n{done.printed}"
-                printed += done.printed
+                assert done.code == code, f"{command}\n{done}"
+                printed += done.out + done.err
         elif block.kind == "python":
             printed = run_snippet(block.text, names)
         elif block.kind == "text":

@@ -27,15 +27,14 @@ FRAMES = 12
 PIECE, PART = "000002.mcap", "000001"
 
 
-@pytest.fixture
-def unfinished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a recorder that could not finish, in a folder of its own."""
-    monkeypatch.setattr("mp4ds.cli.output._quiet", False)
-    (tmp_path / "source").mkdir()
+@pytest.fixture(scope="module")
+def left(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a recorder leaves that could not finish, beside what was recorded; not to be changed."""
+    folder = tmp_path_factory.mktemp("left")
+    (folder / "source").mkdir()
     made = replace(scene("bayer_rggb8", frames=FRAMES), silent={})
-    paths = SOURCES["bag-none"](tmp_path / "source", made)
-    place = tmp_path / "robot" / "drives"
-    place.mkdir(parents=True)
+    paths = SOURCES["bag-none"](folder / "source", made)
+    (folder / "robot" / "drives").mkdir(parents=True)
     pack = PackingProcess.pack
 
     def fail(self: PackingProcess, folder: Path, number: int) -> None:
@@ -43,12 +42,19 @@ def unfinished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             raise PackingError("the disk is tired")
         pack(self, folder, number)
 
-    with monkeypatch.context() as tired:
+    with pytest.MonkeyPatch.context() as tired:
         tired.setattr(spool, "WINDOW_NS", 100_000_000)
         tired.setattr(PackingProcess, "pack", fail)
         with pytest.raises(RecordError, match="the disk is tired"):
-            recorded(PlayedSource(paths), place / "drive")
-    folder = place / "drive.recording"
+            recorded(PlayedSource(paths), folder / "robot" / "drives" / "drive")
+    return folder
+
+
+@pytest.fixture
+def unfinished(left: Path, tmp_path: Path) -> Path:
+    """The folder of a recorder that could not finish, in a folder of its own."""
+    shutil.copytree(left, tmp_path, dirs_exist_ok=True)
+    folder = tmp_path / "robot" / "drives" / "drive.recording"
     names = {path.name for path in folder.iterdir()}
     assert {"000000", PART, PIECE, "000003.mcap", RECORDING_NAME} <= names
     return folder

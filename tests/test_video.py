@@ -227,6 +227,7 @@ SCENES = {"gray": "mono8", "gray16le": "mono16", "rgb24": "rgb8", "bgr24": "bgr8
           "rgba": "rgba8", "bgra": "bgra8"}  # fmt: skip
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("codec", "picture_format"), [pair for pair in LOSSLESS if pair[1] in SCENES]
 )
@@ -256,7 +257,7 @@ def images_for(name: str, layout: str, width: int, height: int) -> list[Pixels]:
     ]
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize(("name", "layout_name"), PAIRS)
 def test_every_layout_returns_through_every_codec(
     name: str, layout_name: str, tmp_path: Path
@@ -290,6 +291,7 @@ def test_every_layout_returns_through_every_codec(
 TAGS = ("color_range", "color_space", "color_transfer", "color_primaries")
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("codec", LOSSY)
 @pytest.mark.parametrize("picture_format", ["rgb24", "bgr24", "gray", "bayer_rggb8"])
 def test_lossy_files_are_tagged_as_bt709_full_range(
@@ -443,6 +445,7 @@ def plane_samples(frame: av.VideoFrame, index: int) -> Pixels:
     return np.frombuffer(bytes(plane), dtype).reshape(plane.height, -1)[:, : plane.width]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("codec", LOSSY)
 @pytest.mark.parametrize("encoding", BAYER)
 @pytest.mark.parametrize(("width", "height"), [(128, 96), (127, 95)])
@@ -470,6 +473,7 @@ def test_a_demosaiced_video_gives_the_mosaic_back(
 # ---------------------------------------------------------------- random access
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("gop", [1, 3, 60])
 @pytest.mark.parametrize("codec", ["h264 lossless", "ffv1 lossless", *LOSSY])
 def test_any_frame_is_found(codec: str, gop: int, tmp_path: Path) -> None:
@@ -775,6 +779,7 @@ def read_png(data: bytes) -> Pixels:
     return pixels[..., 0].copy() if count == 1 else pixels.copy()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", ["random", "extreme"])
 @pytest.mark.parametrize("encoding", KEPT)
 def test_a_png_keeps_every_sample(encoding: str, kind: str) -> None:
