@@ -34,8 +34,6 @@ from mp4ds.plugins.evaluating.clips import chosen, make_clip, open_cameras
 from mp4ds.plugins.evaluating.evaluate import (
     EvaluateOptions,
     evaluate,
-    parse_crfs,
-    parse_target,
     settings_of,
 )
 from mp4ds.plugins.evaluating.page import page, pareto, table
@@ -75,29 +73,29 @@ def recording(folder: Path, encoding: str = "rgb8", source: str = "bag-none", **
 @pytest.mark.parametrize(
     ("texts", "values"),
     [
-        (["18"], (18,)),
+        ("18", (18,)),
         (["16:25"], tuple(range(16, 26))),
         (["16:25:3"], (16, 19, 22, 25)),
-        (["30", "20:22", "21"], (20, 21, 22, 30)),
-        (["63"], (63,)),
+        ("30,20:22,21", (20, 21, 22, 30)),
+        ([63], (63,)),
     ],
 )
-def test_crfs(texts: list[str], values: tuple[int, ...]) -> None:
-    assert parse_crfs(texts) == values
+def test_crfs(texts: str | list[str | int], values: tuple[int, ...]) -> None:
+    assert EvaluateOptions(crf=texts).crf == values
 
 
 @pytest.mark.parametrize("text", ["", "a", "16:", "25:16", "0", "64", "16:25:0", "-3", "16-25"])
 def test_no_crfs(text: str) -> None:
     with pytest.raises(OptionError, match="`crf`"):
-        parse_crfs([text])
+        EvaluateOptions(crf=text)
 
 
 def test_targets() -> None:
-    assert parse_target("vmaf=99") == ScoreGoal("vmaf", 99)
-    assert parse_target("psnr_y=42.5") == ScoreGoal("psnr_y", 42.5)
+    assert EvaluateOptions(target="vmaf=99").target == ScoreGoal("vmaf", 99)
+    assert EvaluateOptions(target="psnr_y=42.5").target == ScoreGoal("psnr_y", 42.5)
     for text in ("", "99", "vmaf", "vmaf=", "=3", "psnr=40", "vmaf=0", "vmaf=101", "vmaf=nan"):
         with pytest.raises(OptionError, match="`target`"):
-            parse_target(text)
+            EvaluateOptions(target=text)
 
 
 def test_presets_go_to_the_codecs_that_have_them() -> None:

@@ -13,7 +13,7 @@ from mp4ds.bags import latched
 from mp4ds.bags.formats import open_reader, open_writer
 from mp4ds.cli import app_for
 from mp4ds.format.sidecars import load_manifest
-from mp4ds.options import Slice
+from mp4ds.options import Slice, parse_time
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.info import info
 from mp4ds.plugins.playing.play import PlayOptions, open_player
@@ -161,7 +161,7 @@ def test_only_latched_topics_are_read_before_the_start(
             return records(excerpt)
 
         monkeypatch.setattr(reader, "_records", noted)
-        latched.take_slice(reader, Slice(str(FIRST), latched=True))
+        latched.take_slice(reader, Slice(parse_time(str(FIRST)), latched=True))
         found: list[Record] = [*reader.records()]
     assert len(found) > 2
     before, after = asked

@@ -14,7 +14,6 @@ from coded_scenes import CODED
 from mp4ds.errors import FormatError, OptionError, SourceError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
-from mp4ds.options import Slice
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_each, pack_share
 from mp4ds.plugins.exporting.export import export
@@ -296,45 +295,53 @@ def test_one_slice_each(recording: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("asked", "start", "end"),
     [
-        (Slice(), None, None),
-        (Slice("1"), START + 10**9, None),
-        (Slice(1.5), START + 1_500_000_000, None),
-        (Slice("+1", "2"), START + 10**9, START + 2 * 10**9),
-        (Slice("1", None, "2"), START + 10**9, START + 3 * 10**9),
-        (Slice(None, None, 2), None, START + 2 * 10**9),
-        (Slice(None, "2", "0.5"), START + 1_500_000_000, START + 2 * 10**9),
-        (Slice("1700000001.000000001"), START + 10**9 + 1, None),
-        (Slice(str(START + 7)), START + 7, None),
-        (Slice("2023-11-14T22:13:21"), START + 10**9, None),
-        (Slice("1", None, "9000000000"), START + 10**9, 2**63 - 1),
-        (Slice(1e-5, None, 1e-6), START + 10**4, START + 11_000),
+        ({}, None, None),
+        ({"start": "1"}, START + 10**9, None),
+        ({"start": 1.5}, START + 1_500_000_000, None),
+        ({"start": "+1", "end": "2"}, START + 10**9, START + 2 * 10**9),
+        ({"start": "1", "duration": "2"}, START + 10**9, START + 3 * 10**9),
+        ({"duration": 2}, None, START + 2 * 10**9),
+        ({"end": "2", "duration": "0.5"}, START + 1_500_000_000, START + 2 * 10**9),
+        ({"start": "1700000001.000000001"}, START + 10**9 + 1, None),
+        ({"start": str(START + 7)}, START + 7, None),
+        ({"start": "2023-11-14T22:13:21"}, START + 10**9, None),
+        ({"start": "1", "duration": "9000000000"}, START + 10**9, 2**63 - 1),
+        ({"start": 1e-5, "duration": 1e-6}, START + 10**4, START + 11_000),
     ],
 )
-def test_how_it_is_written(asked: Slice, start: int | None, end: int | None) -> None:
-    assert asked.times(START, START + 3 * 10**9, "drive.bag") == (start, end)
-    assert bool(asked) == (asked != Slice())
+def test_how_it_is_written(asked: dict[str, Any], start: int | None, end: int | None) -> None:
+    options = PackOptions(**asked)
+    assert options.slice.times(START, START + 3 * 10**9, "drive.bag") == (start, end)
+    assert bool(options.slice) == bool(asked)
+    assert replace(options, force=True).slice == options.slice
 
 
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        (Slice("1", "2", "3"), "two of `start`, `end` and `duration`"),
-        (Slice("soon"), "`start` 'soon' is not a valid time"),
-        (Slice(duration="-1"), "`duration`"),
-        (Slice(duration="+1e9"), r"`duration` '\+1e9' is not a number of seconds"),
-        (Slice("2", "1"), "slice is empty: `start` is .*22:13:22Z, `end` is .*22:13:21Z"),
-        (Slice("3.1"), r"drive.bag: nothing was recorded from \S*23.1Z on\. .* 3 seconds"),
-        (Slice(end="2023-11-14T22:13:20"), "nothing was recorded before \\S*22:13:20Z"),
-        (Slice("2020-01-01T00:00:00", duration=1), r"nothing was recorded from \S+ until \S+1Z\."),
-        (Slice("9999999999999999999"), "is not a valid time"),
-        (Slice("99999999999.5"), "is not a valid time"),
-        (Slice(duration="9999999999999999999"), "is not a number of seconds"),
-        (Slice(duration="0"), "is not a number of seconds"),
+        ({"start": "1", "end": "2", "duration": "3"}, "two of `start`, `end` and `duration`"),
+        ({"start": "soon"}, "`start` 'soon' is not a valid time"),
+        ({"duration": "-1"}, "`duration`"),
+        ({"duration": "+1e9"}, r"`duration` '\+1e9' is not a number of seconds"),
+        (
+            {"start": "2", "end": "1"},
+            "slice is empty: `start` is .*22:13:22Z, `end` is .*22:13:21Z",
+        ),
+        ({"start": "3.1"}, r"drive.bag: nothing was recorded from \S*23.1Z on\. .* 3 seconds"),
+        ({"end": "2023-11-14T22:13:20"}, "nothing was recorded before \\S*22:13:20Z"),
+        (
+            {"start": "2020-01-01T00:00:00", "duration": 1},
+            r"nothing was recorded from \S+ until \S+1Z\.",
+        ),
+        ({"start": "9999999999999999999"}, "is not a valid time"),
+        ({"start": "99999999999.5"}, "is not a valid time"),
+        ({"duration": "9999999999999999999"}, "is not a number of seconds"),
+        ({"duration": "0"}, "is not a number of seconds"),
     ],
 )
-def test_what_is_none(asked: Slice, message: str) -> None:
+def test_what_is_none(asked: dict[str, Any], message: str) -> None:
     with pytest.raises(OptionError, match=message):
-        asked.times(START, START + 3 * 10**9, "drive.bag")
+        PackOptions(**asked).slice.times(START, START + 3 * 10**9, "drive.bag")
 
 
 def test_of_nothing_there_is_no_slice(tmp_path: Path) -> None:

@@ -13,13 +13,12 @@ import pytest
 import mp4ds
 from commands import call
 from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
-from mp4ds.options import time_of
+from mp4ds.options import parse_time
 from mp4ds.plugins.reporting.proxies import Look
 from mp4ds.plugins.reporting.stills import (
     StillOptions,
     frames,
     number_at,
-    parse_sheet,
     spread,
 )
 from report_scenes import COLOUR, DEPTH, FRAMES, HEIGHT, WIDTH, blocks, pack_cameras, two_cameras
@@ -60,33 +59,51 @@ def read(path: Path) -> np.ndarray[Any, Any]:
     ],
 )
 def test_times_as_they_are_written(text: str, time: int) -> None:
-    assert time_of(text, START, "at") == time
+    assert parse_time(text).after(START) == time
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "now", "1e9", "+", "+1.0000000001", "-5", "2023-13-14T22:13:20", "1.5 s", "12:30", "٣"],
+    [
+        "",
+        "#x",
+        "#-1",
+        "now",
+        "1e9",
+        "+",
+        "+1.0000000001",
+        "-5",
+        "2023-13-14T22:13:20",
+        "1.5 s",
+        "12:30",
+        "٣",
+    ],
 )
 def test_what_is_no_time(text: str) -> None:
     with pytest.raises(OptionError, match="`at`"):
-        time_of(text, START, "at")
+        StillOptions(at=text)
 
 
 def test_the_nearest_frame_is_meant(drive: Path) -> None:
     with mp4ds.open(drive) as dataset:
         stream = dataset[COLOUR]
         stamps = stream.stamps.tolist()
-        assert number_at(stream, str(stamps[7])) == 7
-        assert number_at(stream, str(stamps[7] + 9_000_000)) == 7
-        assert number_at(stream, f"+{(stamps[9] - stamps[0]) / 1e9:.9f}") == 9
-        assert number_at(stream, "#29") == FRAMES - 1
-        assert number_at(stream, str(stamps[0] - 900_000_000)) == 0
+
+        def number(text: str) -> int:
+            at = StillOptions(at=text).at
+            assert at is not None
+            return number_at(stream, at)
+
+        assert number(str(stamps[7])) == 7
+        assert number(str(stamps[7] + 9_000_000)) == 7
+        assert number(f"+{(stamps[9] - stamps[0]) / 1e9:.9f}") == 9
+        assert number("#29") == FRAMES - 1
+        assert number(str(stamps[0] - 900_000_000)) == 0
         for text in (str(stamps[0] - 1_100_000_000), "+99", "12"):
             with pytest.raises(FrameNotFoundError):
-                number_at(stream, text)
-        for text in ("#30", "#-1", "#x"):
-            with pytest.raises(OptionError, match="#0 to #29"):
-                number_at(stream, text)
+                number(text)
+        with pytest.raises(OptionError, match="#0 to #29"):
+            number("#30")
 
 
 # ---------------------------------------------------------------- one frame
@@ -216,7 +233,7 @@ def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1"])
 def test_what_is_no_sheet(text: str) -> None:
     with pytest.raises(OptionError, match="`sheet`"):
-        parse_sheet(text)
+        StillOptions(sheet=text)
 
 
 # ---------------------------------------------------------------- options and the command

@@ -24,7 +24,7 @@ from mkdocs.structure.pages import Page
 
 import mp4ds
 from mp4ds.cli import app_for
-from mp4ds.options import Options, shown_of
+from mp4ds.options import Options, declared_in
 
 ROOT = Path(__file__).resolve().parents[1]
 OTHERS = ("*.md", "spec/*.md", "conformance/README.md", "benchmarks/RESULTS.md", "benchmarks/*.svg")
@@ -197,7 +197,7 @@ def _paragraphs(text: str) -> str:
 
 
 def _field(key: str, kinds: list[type[Options]]) -> str:
-    return _code(key) if any(key in shown_of(kind) for kind in kinds) else ""
+    return _code(key) if any(key in dict(declared_in(kind)) for kind in kinds) else ""
 
 
 def _text(text: str) -> str:
@@ -291,6 +291,6 @@ def is_public(kind: type[Options]) -> bool:
 def _options_table(kind: type[Options]) -> str:
     """Fields, their defaults, and what they are."""
     lines = ["| field | default | |", "| --- | --- | --- |"]
-    for name, shown in shown_of(kind).items():
+    for name, shown in declared_in(kind):
         lines.append(f"| `{name}` | `{getattr(kind, name)!r}` | {_text(shown.help)} |")
     return "\n".join(lines)

@@ -1,135 +1,182 @@
-"""Options, declared once: as fields of dataclasses, with everything the command line shows.
+"""Options, declared once: as fields of dataclasses, with everything that is to be known of them.
 
-Errors name an option by its field, in backticks; the command line turns it into the flag.
+The command line and the documentation are made from these fields. Errors name an option by its
+field, in backticks; the command line turns it into the flag.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import Field, dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field, dataclass, field
 from datetime import datetime, timezone
-from typing import Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from mp4ds.errors import OptionError
+from mp4ds.plan import Selection
 
+_T = TypeVar("_T")
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+
+WHAT, HOW, WHERE, LONG = "What", "How", "Where", "Long jobs"
+PANELS = (WHAT, HOW, WHERE, LONG)
+"""What options are about, in the order of help."""
+
+CONTENT, ENCODING = "content", "encoding"
+"""What of a result an option may change: what it holds, which a copy of a dataset can do, too; or
+how that is encoded. Other options say where it is written and by what means."""
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
-    """How an option is shown.
+class Declared:
+    """What is declared of an option.
 
     Attributes:
         help: A phrase.
-        flags: Of the command line; without a long one it is named like the field.
+        flags: Of the command line; without a long one it is named like the field. None: it is no
+            option of the command line.
+        panel: One of `PANELS`.
         metavar: Placeholder for its value.
         least: The minimum; None for any value.
         most: The maximum; None for any value.
-        parse: Converts text to the value, if the command line cannot do so itself.
-        default: The default as text, if there is `parse`.
+        parse: Makes the value of text; passes on what is a value.
+        changes: `CONTENT`, `ENCODING`, or empty.
     """
 
     help: str
-    flags: tuple[str, ...]
-    metavar: str | None
-    least: float | None
-    most: float | None
-    parse: Callable[[str], Any] | None
-    default: str | None
+    flags: tuple[str, ...] | None
+    panel: str = HOW
+    metavar: str | None = None
+    least: float | None = None
+    most: float | None = None
+    parse: Callable[[Any], Any] | None = None
+    changes: str = ""
+
+
+class Parsed(Generic[_T]):
+    """Type of a field that may be given in other ways, such as by text, and is parsed."""
+
+    if TYPE_CHECKING:  # the fields are what type checkers take for descriptors, and plain ones
+
+        def __get__(self, instance: object, owner: type) -> _T: ...
+        def __set__(self, instance: object, value: _T | str | float | Sequence[str]) -> None: ...
 
 
 def option(
     help: str,  # noqa: A002 - as all libraries of command lines call it
     default: Any = None,
     *flags: str,
+    panel: str = HOW,
     metavar: str | None = None,
     least: float | None = None,
     most: float | None = None,
-    parse: Callable[[str], Any] | None = None,
-    default_text: str | None = None,
+    parse: Callable[[Any], Any] | None = None,
+    changes: str = "",
 ) -> Any:
-    """A field of `Options`; see `Shown`."""
-    shown = Shown(help, flags, metavar, least, most, parse, default_text)
-    return field(default=default, metadata={"shown": shown})
+    """A field of `Options`; see `Declared`."""
+    declared = Declared(help, flags, panel, metavar, least, most, parse, changes)
+    return field(default=default, metadata={"declared": declared})
 
 
-def argument(help: str, default: Any) -> Any:  # noqa: A002
-    """A field of `Options` that is no option of a command."""
-    return field(default=default, metadata={"help": help})
+def argument(help: str, default: Any = None, *, changes: str = "") -> Any:  # noqa: A002
+    """A field of `Options` that is no option of the command line."""
+    return field(default=default, metadata={"declared": Declared(help, None, changes=changes)})
 
 
 class Options:
-    """Base of dataclasses of options: documents their fields, and keeps values within bounds.
+    """Base of dataclasses of options: documents their fields, parses and checks their values.
 
     Raises:
-        OptionError: A value is out of its bounds.
+        OptionError: A value is not valid, or out of its bounds.
     """
 
     def __init_subclass__(cls) -> None:
         told = {
-            name: value.metadata.get("help") or value.metadata["shown"].help
-            for name, value in vars(cls).items()
-            if isinstance(value, Field)
+            name: declared.help for base in cls.__bases__ for name, declared in declared_in(base)
         }
+        for name, value in vars(cls).items():
+            if isinstance(value, Field):
+                told[name] = value.metadata["declared"].help
         lines = [f"    {name}: {text}" for name, text in told.items()]
         cls.__doc__ = "\n".join([f"{cls.__doc__}\n\nAttributes:", *lines])
 
     def __post_init__(self) -> None:
-        for name, shown in shown_of(type(self)).items():
+        for name, declared in declared_in(type(self)):
             value = getattr(self, name)
-            if not isinstance(value, (int, float)) or shown.least is shown.most is None:
+            if value is None:
                 continue
-            least, most = shown.least, shown.most
-            if (least is not None and not value >= least) or (most is not None and value > most):
-                bounds = f"not from {least} to {most}" if most is not None else f"below {least}"
-                raise OptionError(f"`{name}` {value} is {bounds}.")
+            try:
+                if declared.parse:
+                    value = declared.parse(value)
+                    object.__setattr__(self, name, value)  # dataclasses of options are frozen
+                _check_bounds(value, declared)
+            except OptionError as error:
+                raise OptionError(f"`{name}` {error}") from None
+
+    def changing(self, *what: str) -> dict[str, Any]:
+        """The options that change this of a result, by name."""
+        return {
+            name: getattr(self, name)
+            for name, declared in declared_in(type(self))
+            if declared.changes in what
+        }
 
 
-def shown_of(kind: type[Options]) -> Mapping[str, Shown]:
-    """What is shown of the options of a dataclass, by field."""
-    declared: Any = kind  # a dataclass, which is what makes it one
-    return {
-        item.name: item.metadata["shown"] for item in fields(declared) if "shown" in item.metadata
-    }
+def declared_in(kind: type) -> list[tuple[str, Declared]]:
+    """Name and declaration of each field of a dataclass of options."""
+    known: Mapping[str, Field[Any]] = getattr(kind, "__dataclass_fields__", {})
+    return [(name, item.metadata["declared"]) for name, item in known.items()]
+
+
+def _check_bounds(value: Any, declared: Declared) -> None:
+    if isinstance(value, (int, float)):
+        if declared.least is not None and not value >= declared.least:  # no number, too
+            raise OptionError(f"{value} is below {declared.least:g}.")
+        if declared.most is not None and not value <= declared.most:
+            raise OptionError(f"{value} is above {declared.most:g}.")
 
 
 # ---------------------------------------------------------------- values of text
 
 
-def parse_size(text: str) -> int:
+def parse_size(text: str | int) -> int:
     """Bytes of ``8G``, ``500M`` or ``1.5GB``; units of 1024.
 
     Raises:
         OptionError: It is not a size.
     """
-    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) *([kmgt]?)(?:i?b)?", text.strip().lower())
+    pattern = r"([0-9]+(?:\.[0-9]+)?) *([kmgt]?)(?:i?b)?"
+    match = re.fullmatch(pattern, str(text).strip().lower())
     size = int(float(match[1]) * _UNITS[match[2]]) if match else 0
     if not size:
         raise OptionError(f"{text!r} is not a size. Use a value such as 8G or 500M.")
     return size
 
 
-def parse_resize(text: str) -> float | tuple[int, int]:
+def parse_resize(value: str | float | tuple[int, int]) -> float | tuple[int, int]:
     """A factor, or width and height, of ``0.5`` or ``640x480``.
 
     Raises:
         OptionError: It is neither.
     """
-    match = re.fullmatch(r"([0-9]{1,6})x([0-9]{1,6})", text.strip().lower())
+    if not isinstance(value, str):
+        return value
+    match = re.fullmatch(r"([0-9]{1,6})x([0-9]{1,6})", value.strip().lower())
     if match:
         return int(match[1]), int(match[2])
     try:
-        return float(text)
+        return float(value)
     except ValueError:
         raise OptionError(
-            f"`resize` {text!r} is not a size. Use a factor such as 0.5, or WxH such as 640x480."
+            f"{value!r} is not a size. Use a factor such as 0.5, or WxH such as 640x480."
         ) from None
 
 
-def parse_words(text: str) -> tuple[str, ...]:
+def parse_words(value: str | Sequence[_T]) -> Sequence[str | _T]:
     """The words of a comma-separated list."""
-    return tuple(word.strip() for word in text.split(",") if word.strip())
+    if not isinstance(value, str):
+        return value
+    return tuple(word.strip() for word in value.split(",") if word.strip())
 
 
 # ---------------------------------------------------------------- times
@@ -141,38 +188,80 @@ _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?Z?")
 _SINCE_1970, _IN_NS = 10**8, 10**11  # smaller numbers are seconds from the beginning, or since 1970
 
 
-def time_of(text: str, start_ns: int, option: str) -> int:
-    """Nanoseconds since 1970 of a time as users write it.
+@dataclass(frozen=True, slots=True)
+class Time:
+    """A time as users give it.
+
+    Attributes:
+        ns: Nanoseconds since 1970, or from the beginning.
+        from_start: Whether it is from the beginning.
+    """
+
+    ns: int
+    from_start: bool
+
+    def after(self, start_ns: int) -> int:
+        """Nanoseconds since 1970, of a recording that begins then."""
+        return min(start_ns + self.ns if self.from_start else self.ns, _LATEST)
+
+    def __str__(self) -> str:
+        return f"+{seconds_text(self.ns)}" if self.from_start else str(self.ns)
+
+
+def parse_time(value: str | float | Time) -> Time:
+    """A time as users write it.
 
     Args:
-        text: ``2.5`` or ``+2.5``: seconds from the beginning; from 1e8 on, ``1700000000.5``:
+        value: ``2.5`` or ``+2.5``: seconds from the beginning; from 1e8 on, ``1700000000.5``:
             seconds since 1970, with nanosecond precision; from 1e11 on, ``1700000000123456789``:
             nanoseconds; ``2023-11-14T22:13:20.5``: UTC.
-        start_ns: The beginning.
-        option: The option's name, for errors.
 
     Raises:
         OptionError: It is not written in any of these ways.
     """
-    clean = text.strip()
+    if isinstance(value, Time):
+        return value
+    clean = _written(value).strip()
     if clean.isascii() and (match := _NUMBER.fullmatch(clean)):
         number = int(match[1])
-        is_since_1970 = number >= _SINCE_1970 and not clean.startswith("+")
-        time = (0 if is_since_1970 else start_ns) + _nanoseconds(number, match[2])
-        if is_since_1970 and number >= _IN_NS and match[2] is None:
+        from_start = number < _SINCE_1970 or clean.startswith("+")
+        time = _nanoseconds(number, match[2])
+        if not from_start and number >= _IN_NS and match[2] is None:
             time = number
-        if abs(time) <= _LATEST:
-            return time
+        if time <= _LATEST:
+            return Time(time, from_start)
     elif clean.isascii() and (match := _ISO.fullmatch(clean)):
         try:
             moment = datetime.fromisoformat(match[1]).replace(tzinfo=timezone.utc)
         except ValueError as error:
-            raise OptionError(f"`{option}` {text!r} is not a valid date: {error}.") from None
-        return _nanoseconds(int(moment.timestamp()), match[2])
+            raise OptionError(f"{value!r} is not a valid date: {error}.") from None
+        return Time(_nanoseconds(int(moment.timestamp()), match[2]), from_start=False)
     raise OptionError(
-        f"`{option}` {text!r} is not a valid time. Use seconds from the beginning or since 1970, "
-        "nanoseconds since 1970, or a date such as 2023-11-14T22:13:20.5."
+        f"{value!r} is not a valid time. Use seconds from the beginning or since 1970, nanoseconds "
+        "since 1970, or a date such as 2023-11-14T22:13:20.5."
     )
+
+
+def parse_duration(value: str | float | Time) -> Time:
+    """The time after so many seconds, such as 2.5.
+
+    Raises:
+        OptionError: It is no such number.
+    """
+    if isinstance(value, Time):
+        return value
+    text = _written(value).strip()
+    match = _NUMBER.fullmatch(text)
+    length = _nanoseconds(int(match[1]), match[2]) if match and text.isascii() else 0
+    if not 0 < length <= _LATEST:
+        raise OptionError(f"{value!r} is not a number of seconds, such as 2.5.")
+    return Time(length, from_start=True)
+
+
+def _written(value: str | float) -> str:
+    """A time or duration as users write it, without an exponent."""
+    text = str(value)
+    return f"{value:.9f}" if isinstance(value, float) and "e" in text else text
 
 
 def _nanoseconds(seconds: int, fraction: str | None) -> int:
@@ -198,18 +287,18 @@ def seconds_text(time_ns: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """A time slice, as users write it. False if empty.
+    """A time slice. False if it is the whole recording.
 
     Attributes:
         start: The first time included; None for the beginning.
         end: The time before which everything is included; None for no end.
-        duration: Seconds from `start`, or before `end`; None if the others define the slice.
+        duration: Length from `start`, or before `end`; None if the others define the slice.
         latched: Include the latched messages from before it.
     """
 
-    start: str | float | None = None
-    end: str | float | None = None
-    duration: str | float | None = None
+    start: Time | None = None
+    end: Time | None = None
+    duration: Time | None = None
     latched: bool = False
 
     def __bool__(self) -> bool:
@@ -224,18 +313,17 @@ class Slice:
             place: The recording, for errors.
 
         Raises:
-            OptionError: A time is not valid, or the slice contains nothing.
+            OptionError: The slice contains nothing.
         """
-        start = None if self.start is None else time_of(_written(self.start), first, "start")
-        end = None if self.end is None else time_of(_written(self.end), first, "end")
+        start = None if self.start is None else self.start.after(first)
+        end = None if self.end is None else self.end.after(first)
         if self.duration is not None:
-            length = _length(_written(self.duration))
             if start is not None and end is not None:
                 raise OptionError("Give at most two of `start`, `end` and `duration`.")
             if end is not None:
-                start = max(end - length, -_LATEST)
+                start = max(end - self.duration.ns, -_LATEST)
             else:
-                end = min((first if start is None else start) + length, _LATEST)
+                end = self.duration.after(first if start is None else start)
         if start is not None and end is not None and start >= end:
             raise OptionError(
                 f"The slice is empty: `start` is {iso_text(start)}, `end` is {iso_text(end)}."
@@ -246,21 +334,6 @@ class Slice:
                 f"{iso_text(first)} to {iso_text(last)}, {(last - first) / _NS:.9g} seconds."
             )
         return start, end
-
-
-def _written(value: str | float) -> str:
-    """A time or duration as users write it, without an exponent."""
-    text = str(value)
-    return f"{value:.9f}" if isinstance(value, float) and "e" in text else text
-
-
-def _length(text: str) -> int:
-    """Nanoseconds of a duration in seconds."""
-    match = _NUMBER.fullmatch(text.strip())
-    length = _nanoseconds(int(match[1]), match[2]) if match and text.isascii() else 0
-    if not 0 < length <= _LATEST:
-        raise OptionError(f"`duration` {text!r} is not a number of seconds, such as 2.5.")
-    return length
 
 
 def _span_text(start: int | None, end: int | None) -> str:
@@ -275,70 +348,64 @@ WHOLE = Slice()
 """No slice: the whole recording."""
 
 
-class SliceOptions(Options):
-    """Base of options that have these three fields."""
+# ---------------------------------------------------------------- options of several commands
 
-    start: str | float | None
-    end: str | float | None
-    duration: str | float | None
-    latched = False
+
+@dataclass(frozen=True, kw_only=True)
+class TopicOptions(Options):
+    """Which topics."""
+
+    topics: Sequence[str] = option(
+        "Only matching topics; repeatable.",
+        (),
+        "-t",
+        panel=WHAT,
+        metavar="GLOB",
+        changes=CONTENT,
+    )
+    exclude: Sequence[str] = option(
+        "Leave out matching topics.", (), "-x", panel=WHAT, metavar="GLOB", changes=CONTENT
+    )
+
+    @property
+    def selected(self) -> Selection:
+        """Which topics, by globs."""
+        return Selection(self.topics, self.exclude)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SliceOptions(Options):
+    """Which time."""
+
+    start: Parsed[Time | None] = option(
+        "Begin at this time: seconds from the beginning or since 1970, nanoseconds since 1970, "
+        "or an ISO date.",
+        panel=WHAT,
+        metavar="TIME",
+        parse=parse_time,
+        changes=CONTENT,
+    )
+    end: Parsed[Time | None] = option(
+        "Stop before this time.",
+        panel=WHAT,
+        metavar="TIME",
+        parse=parse_time,
+        changes=CONTENT,
+    )
+    duration: Parsed[Time | None] = option(
+        "Length of the slice: seconds from `start`, or before `end`.",
+        panel=WHAT,
+        metavar="SECONDS",
+        parse=parse_duration,
+        changes=CONTENT,
+    )
+
+    latched = False  # for those without the option
 
     @property
     def slice(self) -> Slice:
         """The slice of the recording; false for all of it."""
         return Slice(self.start, self.end, self.duration, self.latched)
-
-
-# ---------------------------------------------------------------- options of several kinds
-
-
-def topics() -> Any:
-    """The option for topics to include."""
-    return option("Only matching topics; repeatable.", (), "-t", metavar="GLOB")
-
-
-def exclude(*flags: str) -> Any:
-    """The option for topics to leave out."""
-    return option("Leave out matching topics.", (), *flags, "-x", metavar="GLOB")
-
-
-def resize(help: str = "Scale images down, and the calibrations with them.") -> Any:  # noqa: A002
-    """The option for resizing images: a factor, or width and height in pixels."""
-    return option(help, None, metavar="0.5|WxH", parse=parse_resize)
-
-
-def every() -> Any:
-    """The option for fewer frames, by number."""
-    return option("Keep only every Nth frame, starting with the first.", 1, metavar="N", least=1)
-
-
-def max_rate() -> Any:
-    """The option for fewer frames, by time."""
-    return option("Maximum frames per second.", None, metavar="HZ")
-
-
-def jpeg_quality() -> Any:
-    """The option for the quality of JPEG files."""
-    return option("Quality of JPEG images that are encoded.", 95, least=1, most=100)
-
-
-def start() -> Any:
-    """The option for the first time included."""
-    return option(
-        "Begin at this time: seconds from the beginning or since 1970, nanoseconds since 1970, "
-        "or an ISO date.",
-        metavar="TIME",
-    )
-
-
-def end() -> Any:
-    """The option for the time before which everything is included."""
-    return option("Stop before this time.", metavar="TIME")
-
-
-def duration() -> Any:
-    """The option for the length of a slice."""
-    return option("Length of the slice: seconds from `start`, or before `end`.", metavar="SECONDS")
 
 
 def latched() -> Any:
@@ -347,18 +414,39 @@ def latched() -> Any:
         "Begin a slice with the latched messages from before it, such as those of /tf_static.",
         True,
         "--latched/--no-latched",
+        panel=WHAT,
+        changes=CONTENT,
     )
+
+
+def jpeg_quality() -> Any:
+    """The option for the quality of JPEG files."""
+    return option("Quality of JPEG images that are encoded.", 95, least=1, most=100)
+
+
+def about() -> Any:
+    """The option for the description of a dataset."""
+    return option(
+        "YAML file with title, description, authors, license, doi, links or keywords.",
+        metavar="FILE",
+        changes=CONTENT,
+    )
+
+
+def jobs(help: str, default: int | None = None) -> Any:  # noqa: A002
+    """The option for the number of processes."""
+    return option(help, default, "-j", panel=LONG, metavar="N", least=1, most=1024)
 
 
 def cluster() -> Any:
     """The option for what runs the tasks."""
     return option(
         "Dask scheduler at tcp://HOST:PORT, or slurm; default: this machine.",
-        None,
+        panel=LONG,
         metavar="ADDRESS",
     )
 
 
 def force(help: str = "Replace an existing output.") -> Any:  # noqa: A002
     """The option to replace existing output."""
-    return option(help, False, "-f")
+    return option(help, False, "-f", panel=WHERE)

@@ -92,25 +92,27 @@ class QualitySetting:
         return self.name if self.crf is None else f"crf={self.crf}"
 
 
-def parse_quality(text: str) -> QualitySetting:
+def parse_quality(value: str | QualitySetting) -> QualitySetting:
     """Parse ``lossless``, ``visual``, ``crf=N``, ``vmaf=SCORE``, ``psnr=DB`` or ``ssim=SCORE``.
 
     Raises:
         OptionError: Anything else.
     """
-    if text in (LOSSLESS, "visual"):
-        return QualitySetting(text)
-    match = re.fullmatch(r"crf=([0-9]{1,2})", text)
+    if isinstance(value, QualitySetting):
+        return value
+    if value in (LOSSLESS, "visual"):
+        return QualitySetting(value)
+    match = re.fullmatch(r"crf=([0-9]{1,2})", value)
     if match and int(match.group(1)) <= 63:
         return QualitySetting("crf", int(match.group(1)))
-    match = re.fullmatch(r"(vmaf|psnr|ssim)=([0-9]{1,3}(?:\.[0-9]{1,4})?)", text)
+    match = re.fullmatch(r"(vmaf|psnr|ssim)=([0-9]{1,3}(?:\.[0-9]{1,4})?)", value)
     if match:
         target = QualityTarget(match.group(1), float(match.group(2)))
         if 0 < target.score < _BOUNDS[target.metric]:
             return QualitySetting("target", target=target)
     raise OptionError(
-        f"`quality` {text!r} is not known. Use lossless, visual, crf=N with N from 0 to 63, or a "
-        "score to reach: vmaf=99.5 (below 100), psnr=42 (dB, below 60) or ssim=0.98 (below 1)."
+        f"{value!r} is not known. Use lossless, visual, crf=N with N from 0 to 63, or a score to "
+        "reach: vmaf=99.5 (below 100), psnr=42 (dB, below 60) or ssim=0.98 (below 1)."
     )
 
 
@@ -124,11 +126,11 @@ class Purpose:
 
     Attributes:
         name: ``archive``, ``training`` or ``speed``.
-        larger: For training, share by which lossless videos may be larger than the smallest.
+        larger: For training, percent by which lossless videos may be larger than the smallest.
     """
 
     name: str
-    larger: float = 0.0
+    larger: int = 0
 
     @property
     def is_training(self) -> bool:
@@ -140,24 +142,27 @@ class Purpose:
         """Whether fast packing matters; what is packed in parts then fits together untried."""
         return self.name == SPEED
 
+    def __str__(self) -> str:
+        return f"{self.name}={self.larger}" if self.is_training else self.name
 
-def parse_purpose(text: str | None) -> Purpose | None:
-    """Parse ``archive``, ``training``, ``training=PERCENT`` or ``speed``; None is none.
+
+def parse_purpose(value: str | Purpose) -> Purpose:
+    """Parse ``archive``, ``training``, ``training=PERCENT`` or ``speed``.
 
     Raises:
         OptionError: Anything else.
     """
-    if text is None:
-        return None
-    match = re.fullmatch(rf"{ARCHIVE}|{SPEED}|{TRAINING}(?:=([0-9]{{1,4}}))?", text)
+    if isinstance(value, Purpose):
+        return value
+    match = re.fullmatch(rf"{ARCHIVE}|{SPEED}|{TRAINING}(?:=([0-9]{{1,4}}))?", value)
     if not match:
         raise OptionError(
-            f"`purpose` {text!r} is not known. Use archive, speed, training, or training=PERCENT: "
-            f"how much larger lossless videos may be, {_LARGER} by default."
+            f"{value!r} is not known. Use archive, speed, training, or training=PERCENT: how much "
+            f"larger lossless videos may be, {_LARGER} by default."
         )
-    if text in (ARCHIVE, SPEED):
-        return Purpose(text)
-    return Purpose(TRAINING, int(match[1] or _LARGER) / 100)
+    if value in (ARCHIVE, SPEED):
+        return Purpose(value)
+    return Purpose(TRAINING, int(match[1] or _LARGER))
 
 
 def visual_setting(rate: float | None) -> tuple[int, int]:

@@ -16,10 +16,6 @@ from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.packing.pack import pack as run
 from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
 
-_ONLY_OF_RECORDINGS = (
-    *("topics", "exclude", "camera_info", "window", "cluster", "join", "keep_going", "salvage"),
-)
-
 imports = typer.Typer(
     name="import",
     help="Make a dataset from images, or from a video made by the paper's tool.",
@@ -34,7 +30,7 @@ _Output = Annotated[
 
 @imports.command(cls=Command)
 @quietable
-@takes(ImageFolder, PackOptions, without=("images", *_ONLY_OF_RECORDINGS))
+@takes(ImageFolder, PackOptions)
 def images(
     images_as: Callable[[], ImageFolder],
     options: Callable[[], PackOptions],

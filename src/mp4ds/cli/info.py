@@ -17,7 +17,7 @@ from mp4ds.errors import OptionError, SourceError, counted, path_text
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
-from mp4ds.options import Slice
+from mp4ds.options import SliceOptions
 from mp4ds.plugins import info as facts
 from mp4ds.plugins.reporting.card import card as card_of
 from mp4ds.plugins.reporting.overview import brief
@@ -74,7 +74,7 @@ def info(
             raise OptionError("Give --intrinsics or --speed, not both.")
     with report_errors(as_json):
         found = _found(paths)
-        asked = Slice(start, end, duration)
+        asked = SliceOptions(start=start, end=end, duration=duration).slice
         if len(found) > 1 and (intrinsics or speed or asked or checksums):
             raise OptionError("These options work with one recording or dataset only.")
     if intrinsics:

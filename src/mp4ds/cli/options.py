@@ -14,7 +14,7 @@ from typer.models import OptionInfo
 
 from mp4ds.cli.output import be_quiet
 from mp4ds.errors import OptionError
-from mp4ds.options import Options, Shown, shown_of
+from mp4ds.options import PANELS, Declared, Options, declared_in
 
 DatasetArgument = Annotated[str, typer.Argument(help="A dataset, or a sidecar next to its video.")]
 DatasetsArgument = Annotated[
@@ -51,53 +51,6 @@ def in_flags(text: str) -> str:
 
 # ---------------------------------------------------------------- help
 
-_PANELS = {
-    "What": (
-        *("topics", "exclude", "regex", "exclude_regex", "start", "end", "duration"),
-        *("start_offset", "until_sec", "until_nsec", "skip_empty", "topic", "at"),
-        *("sheet", "every", "max_rate", "sync", "tolerance_ns", "camera_info", "salvage", "poses"),
-        *("all", "all_topics", "all_services", "topic_types", "exclude_topic_types"),
-        *(
-            "hidden",
-            "latched",
-            "unpublished",
-            "ignore_leaf",
-            "max_duration",
-            "max_size",
-            "start_paused",
-        ),
-        *("state", "action", "task", "cameras", "frames", "clips", "streams", "hours"),
-    ),
-    "How": (
-        *("layout", "stamps", "unit", "calibration", "frame_id", "encoding"),
-        *("codecs", "presets", "target", "rates"),
-        *("quality", "codec", "preset", "transcode", "purpose", "gop", "images", "image_format"),
-        *("jpeg_quality", "resize", "pixels", "fps", "crf", "proxies", "proxy_width", "scores"),
-        *("publish_as", "storage", "exact", "about", "skip_unconvertible", "rate", "loop"),
-        *("keep_alive", "clock_topics", "clock_topics_all", "pause_topics", "rate_control_topic"),
-        *("rate_control_max_delay", "wait_for_all_acked", "queue"),
-        *("delay", "paused", "immediate", "drop", "restamp", "lock_step", "clock", "clock_hz"),
-        *("follow_clock", "wait_for_subscribers", "qos_overrides", "read_ahead", "deep"),
-        *(
-            "intrinsics",
-            "speed",
-            "seconds",
-            "checksums",
-            "card",
-            "buffer",
-            "use_sim_time",
-            "discover",
-            "polling_interval",
-            "custom_data",
-        ),
-    ),
-    "Where": (*("output", "to", "ros1", "ros2", "force", "remap", "prefix", "port", "serve"),),
-    "Long jobs": (
-        *("jobs", "window", "cluster", "shard", "join", "keep_going", "restart"),
-        "threads",
-    ),
-}
-_PANEL_OF = {name: panel for panel, names in _PANELS.items() for name in names}
 _TYPES = {"int": "N", "float": "N", "str": "TEXT", "path": "PATH"}
 _NOT_A_NUMBER = {  # by the type of pydantic's error: typer shows its sentences
     "int_parsing": "{input!r} is not a whole number",
@@ -136,14 +89,19 @@ class Command(typer.core.TyperCommand):
     def panels(self, ctx: Any) -> dict[str, list[tuple[str, str, str]]]:
         """Name, words and help of arguments and options, by what they are about."""
         panels: dict[str, list[tuple[str, str, str]]] = {
-            name: [] for name in ("Arguments", *_PANELS, "Options")
+            name: [] for name in ("Arguments", *PANELS, "Options")
+        }
+        panels_of = {
+            field: item.panel
+            for kind in getattr(self.callback, "kinds", ())
+            for field, item in declared_in(kind)
         }
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
             if record is None:
                 continue
             name = _argument(parameter)
-            panel = "Arguments" if name else _PANEL_OF.get(parameter.name or "", "Options")
+            panel = "Arguments" if name else panels_of.get(parameter.name or "", "Options")
             words = re.sub(
                 "<([a-z]+)(?: range)?>", lambda match: _TYPES.get(match[1], "TEXT"), record[0]
             )
@@ -175,9 +133,7 @@ def _argument(parameter: Any) -> str:
 # ---------------------------------------------------------------- options of dataclasses
 
 
-def takes(
-    *kinds: type[Options], without: Sequence[str] = ()
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def takes(*kinds: type[Options]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of dataclasses, after its own required ones.
 
     For each dataclass the command gets a function that builds it from the user's values and raises
@@ -185,7 +141,6 @@ def takes(
 
     Args:
         kinds: The dataclasses; no two have an option of the same name.
-        without: Options that the command does not have.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -200,9 +155,9 @@ def takes(
                     flag = next(str(one) for one in told if str(one).startswith("--"))
                     _FLAGS[parameter.name] = flag.partition("/")[0]
         for kind in kinds:
-            for name, item in shown_of(kind).items():
+            for name, item in declared_in(kind):
                 _FLAGS[name] = flags_of(name, item)[0].partition("/")[0]
-        made = [_parameters(kind, without) for kind in kinds]
+        made = [_parameters(kind) for kind in kinds]
         required = [parameter for parameter in own if parameter.default is parameter.empty]
         others = [parameter for parameter in own if parameter.default is not parameter.empty]
         parameters = [*required, *(one for found in made for one in found.values()), *others]
@@ -264,18 +219,18 @@ def _annotated(hint: Any) -> Any:
     return next((part for part in get_args(hint) if get_origin(part) is Annotated), hint)
 
 
-def _parameters(kind: type[Options], without: Sequence[str]) -> Mapping[str, inspect.Parameter]:
+def _parameters(kind: type[Options]) -> Mapping[str, inspect.Parameter]:
     hints = get_type_hints(kind)
     return {
         name: _parameter(name, hints[name], getattr(kind, name), item)
-        for name, item in shown_of(kind).items()
-        if name not in without
+        for name, item in declared_in(kind)
+        if item.flags is not None
     }
 
 
-def _parameter(name: str, hint: Any, default: Any, shown: Shown) -> inspect.Parameter:
+def _parameter(name: str, hint: Any, default: Any, shown: Declared) -> inspect.Parameter:
     if shown.parse or default == ():
-        default = shown.default
+        default = default or None
     info = typer.Option(
         *flags_of(name, shown),
         help=in_flags(shown.help),
@@ -291,13 +246,14 @@ def _parameter(name: str, hint: Any, default: Any, shown: Shown) -> inspect.Para
     )
 
 
-def flags_of(name: str, shown: Shown) -> Sequence[str]:
+def flags_of(name: str, shown: Declared) -> Sequence[str]:
     """The flags of an option, long ones before short ones."""
-    has_long = any(flag.startswith("--") for flag in shown.flags)
-    return shown.flags if has_long else ("--" + name.replace("_", "-"), *shown.flags)
+    flags = shown.flags or ()
+    has_long = any(flag.startswith("--") for flag in flags)
+    return flags if has_long else ("--" + name.replace("_", "-"), *flags)
 
 
-def _plain(hint: Any, shown: Shown) -> Any:
+def _plain(hint: Any, shown: Declared) -> Any:
     """A type that typer can parse."""
     if shown.parse:
         return Optional[str]  # noqa: UP045
@@ -309,13 +265,7 @@ def _plain(hint: Any, shown: Shown) -> Any:
 
 
 def _made(kind: type[Options], given: Mapping[str, Any]) -> Options:
-    shown = shown_of(kind)
-    values = {}
-    for name, value in given.items():
-        parse = shown[name].parse
-        if value is not None:
-            values[name] = parse(value) if parse else value
-    return kind(**values)
+    return kind(**{name: value for name, value in given.items() if value is not None})
 
 
 def cores(jobs: int | None) -> int:

@@ -18,7 +18,7 @@ from mp4ds.packing.pack import pack as run
 from mp4ds.packing.pack import pack_each, pack_share
 
 
-@takes(PackOptions, without=("images",))
+@takes(PackOptions)
 def pack(
     options: Callable[[], PackOptions],
     sources: Annotated[

@@ -147,7 +147,7 @@ class PlayCommand(NodeCommand):
 COMMAND = PlayCommand
 
 
-@takes(PlayOptions, without=("to", "clock"))
+@takes(PlayOptions)
 def play(
     options: Callable[[], PlayOptions],
     context: typer.Context,

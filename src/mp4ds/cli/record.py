@@ -42,7 +42,7 @@ class RecordCommand(NodeCommand):
 COMMAND = RecordCommand
 
 
-@takes(RecordOptions, without=("to",))
+@takes(RecordOptions)
 def record(
     options: Callable[[], RecordOptions],
     context: typer.Context,

@@ -11,22 +11,18 @@ from mp4ds.dataset.slicing import copy_part, latched_at, span_in
 from mp4ds.errors import FormatError, advising
 from mp4ds.files.outputs import staged
 from mp4ds.format.sidecars import COPY_AGAIN, load_about
+from mp4ds.options import ENCODING
 from mp4ds.packing.job import dataset_at
 from mp4ds.packing.manifest import dataset_files, folder_size
 from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary
-from mp4ds.plan import Selection
-
-_OF_ENCODERS = (
-    *("quality", "codec", "preset", "transcode", "camera_info", "purpose", "gop", "window"),
-    *("cluster", "join", "salvage", "images"),
-)
 
 
 def is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
     """Whether it is one dataset, and no option asks for encoding its videos."""
-    usual = PackOptions()
-    is_usual = all(getattr(options, name) == getattr(usual, name) for name in _OF_ENCODERS)
-    return is_usual and len(paths) == 1 and dataset_at(paths[0]) is not None
+    if options.changing(ENCODING) != PackOptions().changing(ENCODING):
+        return False
+    is_divided = options.join or options.cluster is not None
+    return not is_divided and len(paths) == 1 and dataset_at(paths[0]) is not None
 
 
 def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
@@ -50,7 +46,7 @@ def copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
         Dataset(path) as dataset,
         staged(target, force=options.force, owned=dataset_files, sources=[path]) as folder,
     ):
-        selected = Selection(options.topics, options.exclude)
+        selected = options.selected
         selected.check(channel.topic for channel in dataset.channels)
         folder.mkdir()
         span = span_in(dataset, options.slice)

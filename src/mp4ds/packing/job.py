@@ -19,7 +19,7 @@ from mp4ds.files.urls import location, spelled
 from mp4ds.format.fields import document_of
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import MANIFEST_NAME, load_about
-from mp4ds.options import WHOLE, Slice
+from mp4ds.options import CONTENT, ENCODING, WHOLE, Slice
 from mp4ds.packing.manifest import dump_kept, load_kept
 from mp4ds.packing.options import ImageFolder, PackOptions, PackSummary
 from mp4ds.packing.packer import Exact, PartSettings
@@ -34,21 +34,6 @@ TASK_NAME = r"source-[0-9]{1,9}|whole-[0-9]{1,9}|[0-9]{5,9}-[0-9]{1,9}|all"
 """Pattern of task names, which are also folder names."""
 
 _MOST_THREADS = 4096
-_OUTCOME_OPTIONS = (
-    *("topics", "exclude", "quality", "codec", "preset", "transcode", "camera_info"),
-    *(
-        "gop",
-        "window",
-        "salvage",
-        "images",
-        "purpose",
-        "about",
-        "start",
-        "end",
-        "duration",
-        "latched",
-    ),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +171,7 @@ class Job:
             raise ValueError("not a number of threads")
         if max(self.threads, self.workers) > _MOST_THREADS:
             raise ValueError("too many threads")
-        if set(self.options) != set(_OUTCOME_OPTIONS):
+        if set(self.options) != set(outcome_options(PackOptions())):
             raise ValueError("different options")
         self.about  # noqa: B018 - refuses what cannot be told
 
@@ -223,7 +208,8 @@ class Job:
     @property
     def slice(self) -> Slice:
         """The slice of the recording to pack; false for all."""
-        return Slice(*(self.options[name] for name in ("start", "end", "duration", "latched")))
+        names = ("start", "end", "duration", "latched")
+        return PackOptions(**{name: self.options[name] for name in names}).slice
 
     def digests(
         self, reader: BagReader, digest_of: Callable[[int], tuple[int, str]]
@@ -278,7 +264,7 @@ class Job:
                 gop=options["gop"],
                 threads=self.threads,
                 transcode=options["transcode"],
-                purpose=parse_purpose(options["purpose"]),
+                purpose=options["purpose"] and parse_purpose(options["purpose"]),
             ),
             selected=Selection(options["topics"], options["exclude"]),
             excerpt=task.excerpt,
@@ -372,10 +358,12 @@ def _task(item: Mapping[str, Any]) -> Task:
 
 def outcome_options(options: PackOptions) -> dict[str, Any]:
     """The options that determine the result, as JSON values."""
-    values = {name: getattr(options, name) for name in _OUTCOME_OPTIONS}
+    values = options.changing(CONTENT, ENCODING)
     values["gop"] = options.group_frames
     values["about"] = None if options.about is None else document_of(load_about(options.about))
     values["images"] = None if options.images is None else asdict(options.images)
+    for name in ("quality", "purpose", "start", "end", "duration"):
+        values[name] = None if values[name] is None else str(values[name])
     return {
         name: list(value) if isinstance(value, (list, tuple)) else value
         for name, value in values.items()

@@ -9,23 +9,27 @@ from pathlib import Path
 
 from mp4ds.errors import OptionError
 from mp4ds.options import (
+    ENCODING,
+    LONG,
+    WHAT,
     Options,
+    Parsed,
     SliceOptions,
+    TopicOptions,
+    about,
+    argument,
     cluster,
-    duration,
-    end,
-    exclude,
     force,
+    jobs,
     latched,
     option,
-    start,
-    topics,
 )
-from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, parse_purpose, parse_quality
+from mp4ds.plan import MAX_GOP, Purpose, QualitySetting, parse_purpose, parse_quality
 from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
+from mp4ds.video.codecs import ARCHIVE_GOP, LOSSLESS_GOP, LOSSY_GOP, LOSSY_TRAINING_GOP
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImageFolder(Options):
     """How a folder of images is read as a recording."""
 
@@ -44,7 +48,7 @@ class ImageFolder(Options):
     calibration: str | None = option(
         "Calibration as saved by ROS's camera_calibration.", metavar="YAML"
     )
-    topic: str | None = option("Topic of plain images; default: /camera/image_raw.", None, "-t")
+    topic: str | None = option("Topic of plain images; default: /camera/image_raw.", panel=WHAT)
     frame_id: str | None = option("Frame id of plain images; default: camera.")
     encoding: str | None = option(
         "Encoding of plain images, such as bayer_rggb8 or 16UC1; default: as in the files."
@@ -62,96 +66,92 @@ class ImageFolder(Options):
 # ---------------------------------------------------------------- pack
 
 
-@dataclass(frozen=True)
-class PackOptions(SliceOptions):
+@dataclass(frozen=True, kw_only=True)
+class PackOptions(SliceOptions, TopicOptions):
     """How to pack."""
 
-    topics: Sequence[str] = topics()
-    exclude: Sequence[str] = exclude()
-    start: str | float | None = start()
-    end: str | float | None = end()
-    duration: str | float | None = duration()
     latched: bool = latched()
-    quality: str | None = option(
-        "lossless, visual, crf=N, or a score to reach: vmaf=99.5, psnr=42, ssim=0.98; default: "
-        "lossless, or the quality of a repacked dataset."
+    salvage: bool = option(
+        "Pack what is still readable of a damaged recording.",
+        False,
+        panel=WHAT,
+        changes=ENCODING,
     )
-    codec: str | None = option(
-        "h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); default: chosen by trial."
-    )
-    preset: str | None = option("Encoder preset, such as 6 or veryfast.")
-    transcode: bool = option("Re-encode JPEG images at `quality` instead of copying them.", False)
     camera_info: Sequence[str] = option(
         "Pair a camera topic with its camera_info, if neither names nor stamps do.",
         (),
+        panel=WHAT,
         metavar="IMAGE=INFO",
+        changes=ENCODING,
     )
-    purpose: str | None = option(
+    quality: Parsed[QualitySetting | None] = option(
+        "lossless, visual, crf=N, or a score to reach: vmaf=99.5, psnr=42, ssim=0.98; default: "
+        "lossless, or the quality of a repacked dataset.",
+        parse=parse_quality,
+        changes=ENCODING,
+    )
+    codec: str | None = option(
+        "h264, h265, ffv1 (lossless), av1, av1-10bit (lossy); default: chosen by trial.",
+        changes=ENCODING,
+    )
+    preset: str | None = option("Encoder preset, such as 6 or veryfast.", changes=ENCODING)
+    transcode: bool = option(
+        "Re-encode JPEG images at `quality` instead of copying them.", False, changes=ENCODING
+    )
+    purpose: Parsed[Purpose | None] = option(
         "archive: smallest files. speed: fastest packing, as while recording. training: fastest "
         "random access, with lossless videos up to 15 % larger; training=N: up to N %.",
         None,
         "--for",
         metavar="PURPOSE",
+        parse=parse_purpose,
+        changes=ENCODING,
     )
     gop: int | None = option(
         "Maximum key frame interval in frames; default: 10, or 30 if lossy.",
         least=1,
         most=MAX_GOP,
+        changes=ENCODING,
     )
+    about: str | None = about()
     window: int | None = option(
         "Frames of the busiest camera per part of a long recording; default: 10 times `gop`, "
         "or 300.",
+        panel=LONG,
         least=2,
         most=10_000_000,
+        changes=ENCODING,
     )
-    jobs: int | None = option(
-        "Parallel processes; default: one per core. Each holds the encoders of all cameras.",
-        None,
-        "-j",
-        least=1,
-        most=1024,
+    jobs: int | None = jobs(
+        "Parallel processes; default: one per core. Each holds the encoders of all cameras."
     )
     cluster: str | None = cluster()
-    join: bool = option("Join the parts packed with --shard into the dataset.", False)
-    keep_going: bool = option("If a part fails, continue with the others.", False)
-    salvage: bool = option("Pack what is still readable of a damaged recording.", False)
-    restart: bool = option("Discard an unfinished run and start over.", False)
-    about: str | None = option(
-        "YAML file with title, description, authors, license, doi, links or keywords.",
-        metavar="FILE",
-    )
+    join: bool = option("Join the parts packed with --shard into the dataset.", False, panel=LONG)
+    keep_going: bool = option("If a part fails, continue with the others.", False, panel=LONG)
+    restart: bool = option("Discard an unfinished run and start over.", False, panel=LONG)
     force: bool = force()
-    images: ImageFolder | None = option("How a folder of images is read as a recording.")
-
-    @property
-    def setting(self) -> QualitySetting:
-        """The parsed `quality`; lossless if it is left to the source.
-
-        Raises:
-            OptionError: `quality` is not valid.
-        """
-        return parse_quality(LOSSLESS if self.quality is None else self.quality)
+    images: ImageFolder | None = argument(
+        "How a folder of images is read as a recording.", changes=ENCODING
+    )
 
     @property
     def group_frames(self) -> int:
         """Maximum key frame interval, frames.
 
         Raises:
-            OptionError: `quality` or `purpose` is not valid.
+            OptionError: `purpose` and `gop` contradict each other.
         """
-        from mp4ds.video.codecs import ARCHIVE_GOP, LOSSLESS_GOP, LOSSY_GOP, LOSSY_TRAINING_GOP
-
-        purpose = parse_purpose(self.purpose)
-        if purpose is None or purpose.is_speed:
-            return self.gop or (LOSSLESS_GOP if self.setting.lossless else LOSSY_GOP)
+        is_lossless = self.quality is None or self.quality.lossless
+        if self.purpose is None or self.purpose.is_speed:
+            return self.gop or (LOSSLESS_GOP if is_lossless else LOSSY_GOP)
         if self.gop is not None:
             raise OptionError(
                 "`purpose` chooses the key frame interval itself. Give `purpose` or `gop`, not "
                 "both."
             )
-        if not purpose.is_training:
+        if not self.purpose.is_training:
             return ARCHIVE_GOP
-        return LOSSLESS_GOP if self.setting.lossless else LOSSY_TRAINING_GOP
+        return LOSSLESS_GOP if is_lossless else LOSSY_TRAINING_GOP
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.planning import Resources, plan_job
 from mp4ds.packing.workplace import Workplace
-from mp4ds.plan import LOSSLESS, SPEED, QualitySetting, parse_quality
+from mp4ds.plan import LOSSLESS, Purpose, QualitySetting, parse_quality
 from mp4ds.registry import plugin
 from mp4ds.video.codecs import DEFAULT_LOSSY, check_codec, fastest_preset
 
@@ -465,8 +465,7 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
         load_about(options.about)  # fails before anything is read
     if may_copy and _is_copy(paths, options):
         return options
-    asked = _quality_of(paths) if options.quality is None else options.quality
-    quality = parse_quality(asked)
+    quality = options.quality or parse_quality(_quality_of(paths))
     if options.transcode and quality.lossless:
         raise OptionError(
             "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
@@ -478,13 +477,13 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
 
         find_ffmpeg()  # fails before anything is read, saying how to get one
     transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))
-    chosen = replace(options, quality=str(quality), codec=codec, transcode=transcode, images=images)
-    chosen.group_frames  # noqa: B018 - refuses a purpose that is none
+    chosen = replace(options, quality=quality, codec=codec, transcode=transcode, images=images)
+    chosen.group_frames  # noqa: B018 - refuses a contradiction
     return chosen
 
 
 def checked_codec(
-    quality: QualitySetting, codec: str | None, preset: str | None, purpose: str | None
+    quality: QualitySetting, codec: str | None, preset: str | None, purpose: Purpose | None
 ) -> str | None:
     """The codec by its usual name; None for the default.
 
@@ -497,7 +496,7 @@ def checked_codec(
     Raises:
         OptionError: It cannot do that, or has no such preset.
     """
-    if purpose == SPEED and quality.crf is not None:
+    if purpose is not None and purpose.is_speed and quality.crf is not None:
         preset = preset or fastest_preset(codec or DEFAULT_LOSSY)
     return check_codec(codec, preset, lossless=quality.lossless, crf=quality.crf)
 

@@ -22,7 +22,7 @@ from mp4ds.packing.job import Job, Task, absolute, is_hashed, outcome_options, t
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.survey import Survey, survey_channel, survey_pairs
 from mp4ds.packing.tracks import PicturePlan, StreamSettings, TrackPlan
-from mp4ds.plan import Selection, parse_purpose
+from mp4ds.plan import LOSSLESS, parse_quality
 from mp4ds.records import Channel
 
 GOPS_PER_WINDOW = 10
@@ -178,20 +178,20 @@ def plan_job(
     Raises:
         OptionError: An option is wrong.
     """
-    selected = Selection(options.topics, options.exclude)
+    selected = options.selected
     selected.check(channel.topic for channel in reader.channels)
     channels = [channel for channel in reader.channels if selected(channel.topic)]
     if not reader.is_indexed:
         return _single(reader, paths, options, means)
     topics, pairs = _topics(reader, channels, options)
     settings = StreamSettings(
-        quality=options.setting,
+        quality=options.quality or parse_quality(LOSSLESS),
         codec=options.codec,
         preset=options.preset,
         gop=options.group_frames,
         threads=_side_by_side(reader, means)[1],
         transcode=options.transcode,
-        purpose=parse_purpose(options.purpose),
+        purpose=options.purpose,
     )
     if not topics.free:
         return _single(reader, paths, options, means)

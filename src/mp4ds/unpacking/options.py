@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mp4ds.options import (
-    SliceOptions,
-    duration,
-    end,
-    every,
-    exclude,
-    force,
-    jpeg_quality,
-    latched,
-    max_rate,
-    option,
-    resize,
-    start,
-    topics,
-)
+from mp4ds.options import WHAT, SliceOptions, force, jpeg_quality, latched, option
 from mp4ds.records import Loss
 from mp4ds.unpacking.pictures import ReductionOptions
 from mp4ds.unpacking.republish import Republished
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class UnpackOptions(SliceOptions, ReductionOptions):
     """How to unpack."""
 
+    latched: bool = latched()
+    salvage: bool = option("Restore what can be read of a damaged dataset.", False, panel=WHAT)
     storage: str | None = option(
         "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap."
     )
@@ -42,19 +29,9 @@ class UnpackOptions(SliceOptions, ReductionOptions):
         metavar="KIND",
     )
     jpeg_quality: int = jpeg_quality()
-    resize: float | tuple[int, int] | None = resize()
-    every: int = every()
-    max_rate: float | None = max_rate()
-    topics: Sequence[str] = topics()
-    exclude: Sequence[str] = exclude()
-    start: str | float | None = start()
-    end: str | float | None = end()
-    duration: str | float | None = duration()
-    latched: bool = latched()
     skip_unconvertible: bool = option(
         "Leave out, and count, what the output format cannot hold.", False
     )
-    salvage: bool = option("Restore what can be read of a damaged dataset.", False)
     force: bool = force()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -29,7 +29,7 @@ from mp4ds.messages.depth import (
 )
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
-from mp4ds.plan import Selection
+from mp4ds.options import WHAT, Parsed, TopicOptions, option, parse_resize
 from mp4ds.times import intervals, usual_interval
 from mp4ds.unpacking.types import VideoFields, type_of
 from mp4ds.video.images import ImageFile
@@ -103,14 +103,19 @@ class Reduction:
         return is_kept
 
 
-class ReductionOptions:
-    """What options of several commands have in common: they choose topics and reduce images."""
+@dataclass(frozen=True, kw_only=True)
+class ReductionOptions(TopicOptions):
+    """Which topics, and how to reduce their images."""
 
-    resize: float | tuple[int, int] | None
-    every: int
-    max_rate: float | None
-    topics: Sequence[str]
-    exclude: Sequence[str]
+    every: int = option(
+        "Keep only every Nth frame, starting with the first.", 1, panel=WHAT, metavar="N", least=1
+    )
+    max_rate: float | None = option("Maximum frames per second.", panel=WHAT, metavar="HZ")
+    resize: Parsed[float | tuple[int, int] | None] = option(
+        "Scale images down, and the calibrations with them.",
+        metavar="0.5|WxH",
+        parse=parse_resize,
+    )
 
     @property
     def reduction(self) -> Reduction:
@@ -120,11 +125,6 @@ class ReductionOptions:
             OptionError: The size, number or rate is not valid.
         """
         return Reduction(self.resize, self.every, self.max_rate)
-
-    @property
-    def selected(self) -> Selection:
-        """Which topics, by globs."""
-        return Selection(self.topics, self.exclude)
 
 
 def _check_size(resize: Any) -> None:

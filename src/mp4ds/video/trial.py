@@ -214,7 +214,7 @@ def choose(
         raise next((e for e in refusals if isinstance(e, EncoderRefusedError)), refusals[0])
     smallest = min(choice.bytes_per_frame for choice, _ in tried)
     if purpose is not None and purpose.is_training:
-        return _fastest(tried, share, most=(1 + purpose.larger) * smallest)
+        return _fastest(tried, share, most=(1 + purpose.larger / 100) * smallest)
     near = NEAR if purpose is None else 1.0
     return next(choice for choice, _ in tried if choice.bytes_per_frame <= near * smallest)
 

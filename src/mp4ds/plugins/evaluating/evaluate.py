@@ -23,8 +23,8 @@ from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, counte
 from mp4ds.files.outputs import check_place, refuse_not_ours, work_folder, write_synced
 from mp4ds.files.urls import location, remote
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.options import Options, option, parse_words
-from mp4ds.plan import FileNames, Selection
+from mp4ds.options import LONG, WHAT, Parsed, TopicOptions, jobs, option, parse_words
+from mp4ds.plan import FileNames
 from mp4ds.plugins.evaluating.clips import (
     Camera,
     chosen,
@@ -68,58 +68,88 @@ _LEAST, _MOST = 0.001, 1_000_000  # of seconds, hours and hertz
 _CRF = re.compile(r"(?P<first>[0-9]{1,4})(:(?P<last>[0-9]{1,4})(:(?P<step>[0-9]{1,4}))?)?")
 
 
-@dataclass(frozen=True)
-class EvaluateOptions(Options):
+def _parse_crfs(value: str | Sequence[str | int]) -> tuple[int, ...]:
+    """The values of ``18``, ``16:25``, ``16:25:3`` and ``18,20``."""
+    found: set[int] = set()
+    for text in map(str, parse_words(value)):
+        match = _CRF.fullmatch(text.strip())
+        step = int(match["step"] or 1) if match else 0
+        if match is None or step == 0:
+            raise OptionError(f"{text!r} is not valid. Use a value such as 18, 16:25 or 16:25:3.")
+        first = int(match["first"])
+        found.update(range(first, int(match["last"] or first) + 1, step))
+    if not found or min(found) < 1 or max(found) > max(MAX_CRF.values()):
+        raise OptionError(f"{value!r} has values outside 1 to {max(MAX_CRF.values())}.")
+    return tuple(sorted(found))
+
+
+def _parse_target(value: str | ScoreGoal) -> ScoreGoal:
+    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``."""
+    if isinstance(value, ScoreGoal):
+        return value
+    metric, _, text = value.partition("=")
+    try:
+        score = float(text)
+    except ValueError:
+        score = -1.0
+    if metric not in METRICS or not 0 < score <= 100:
+        raise OptionError(
+            f"{value!r} is not valid. Use METRIC=SCORE, such as vmaf=99.5; metrics: "
+            f"{', '.join(METRICS)}."
+        )
+    return ScoreGoal(metric, score)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(TopicOptions):
     """How to evaluate."""
 
-    codecs: Sequence[str] = option(
+    codecs: Parsed[Sequence[str]] = option(
         "Codecs of `mp4ds pack` to try: av1, av1-10bit, h264, h265.",
-        ("av1", "h264", "h265"),
+        "av1,h264,h265",
         parse=parse_words,
-        default_text="av1,h264,h265",
     )
-    crf: Sequence[str] = option(
-        "crf values to try, such as 16:25, 16:25:3 or 16,20,24.",
-        ("16:25:3",),
-        parse=parse_words,
-        default_text="16:25:3",
+    crf: Parsed[Sequence[int]] = option(
+        "crf values to try, such as 16:25, 16:25:3 or 16,20,24.", "16:25:3", parse=_parse_crfs
     )
-    presets: Sequence[str] = option(
+    presets: Parsed[Sequence[str]] = option(
         "Presets, such as 6,8,medium; each is tried with the codecs that have it.",
         (),
         parse=parse_words,
     )
-    topics: Sequence[str] = option("Only matching cameras.", (), "-t", metavar="GLOB")
-    exclude: Sequence[str] = option("Leave out matching cameras.", (), "-x", metavar="GLOB")
     start: float | None = option(
-        "Where the clips start; default: in the middle.", metavar="SECONDS", least=0, most=_MOST
+        "Where the clips start; default: in the middle.",
+        panel=WHAT,
+        metavar="SECONDS",
+        least=0,
+        most=_MOST,
     )
-    frames: int = option("Frames per clip.", 150, least=1)
+    frames: int = option("Frames per clip.", 150, panel=WHAT, least=1)
     fps: float = option("Frame rate of a folder of images.", 30.0, least=_LEAST, most=_MOST)
-    target: str = option("Score to reach, such as vmaf=99.5, psnr_y=42 or ssim=0.98.", "vmaf=99.5")
-    streams: int | None = option("Number of cameras, to estimate the size of a dataset.", least=1)
+    target: Parsed[ScoreGoal] = option(
+        "Score to reach, such as vmaf=99.5, psnr_y=42 or ssim=0.98.",
+        "vmaf=99.5",
+        parse=_parse_target,
+    )
+    streams: int | None = option(
+        "Number of cameras, to estimate the size of a dataset.", panel=WHAT, least=1
+    )
     hours: float | None = option(
-        "Hours of recording, to estimate the size of a dataset.", least=_LEAST, most=_MOST
+        "Hours of recording, to estimate the size of a dataset.",
+        panel=WHAT,
+        least=_LEAST,
+        most=_MOST,
     )
     gop: int = option("Maximum key frame interval in frames.", LOSSY_GOP, least=1, most=100_000)
-    threads: int | None = option("Threads per encoder; default: all cores.", least=1, most=1024)
-    jobs: int = option(
-        "Settings tried in parallel; use 1 for accurate times.", 1, "-j", least=1, most=1024
+    threads: int | None = option(
+        "Threads per encoder; default: all cores.", panel=LONG, least=1, most=1024
     )
+    jobs: int = jobs("Settings tried in parallel; use 1 for accurate times.", 1)
 
     @property
     def encoder_threads(self) -> int:
         """Threads of an encoder."""
         return self.threads or max(1, (os.cpu_count() or 1) // self.jobs)
-
-    @property
-    def goal(self) -> ScoreGoal:
-        """The score to reach.
-
-        Raises:
-            OptionError: `target` is not valid.
-        """
-        return parse_target(self.target)
 
 
 def settings_of(options: EvaluateOptions) -> list[Setting]:
@@ -132,7 +162,6 @@ def settings_of(options: EvaluateOptions) -> list[Setting]:
     wrong = [codec for codec in codecs if codec not in MAX_CRF]
     if wrong or not codecs:
         raise OptionError(f"`codecs` {', '.join(wrong)!r}: use some of {', '.join(MAX_CRF)}.")
-    crfs = parse_crfs(options.crf)
     presets: dict[str, Sequence[str]] = {}
     for codec in codecs:
         own = [preset for preset in dict.fromkeys(options.presets) if _has(codec, preset)]
@@ -144,7 +173,7 @@ def settings_of(options: EvaluateOptions) -> list[Setting]:
         Setting(codec, preset, crf, options.gop)
         for codec in codecs
         for preset in presets[codec]
-        for crf in crfs
+        for crf in options.crf
         if crf <= MAX_CRF[codec]
     ]
     if not 0 < len(settings) <= _MOST_CELLS:
@@ -161,48 +190,6 @@ def _has(codec: str, preset: str) -> bool:
     except OptionError:
         return False
     return True
-
-
-def parse_crfs(texts: Sequence[str]) -> tuple[int, ...]:
-    """The values of ``18``, ``16:25`` and ``16:25:3``.
-
-    Raises:
-        OptionError: One is not valid.
-    """
-    found: set[int] = set()
-    for text in texts:
-        match = _CRF.fullmatch(text.strip())
-        step = int(match["step"] or 1) if match else 0
-        if match is None or step == 0:
-            raise OptionError(
-                f"`crf` {text!r} is not valid. Use a value such as 18, 16:25 or 16:25:3."
-            )
-        first = int(match["first"])
-        found.update(range(first, int(match["last"] or first) + 1, step))
-    if not found or min(found) < 1 or max(found) > max(MAX_CRF.values()):
-        raise OptionError(
-            f"`crf` {', '.join(texts)} has values outside 1 to {max(MAX_CRF.values())}."
-        )
-    return tuple(sorted(found))
-
-
-def parse_target(text: str) -> ScoreGoal:
-    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``.
-
-    Raises:
-        OptionError: It is not valid.
-    """
-    metric, _, score = text.partition("=")
-    try:
-        value = float(score)
-    except ValueError:
-        value = -1.0
-    if metric not in METRICS or not 0 < value <= 100:
-        raise OptionError(
-            f"`target` {text!r} is not valid. Use METRIC=SCORE, such as vmaf=99.5; metrics: "
-            f"{', '.join(METRICS)}."
-        )
-    return ScoreGoal(metric, value)
 
 
 # ---------------------------------------------------------------- evaluation
@@ -244,7 +231,7 @@ def evaluate(
         OSError: It cannot be written.
     """
     asked = options or EvaluateOptions()
-    goal, settings, place = asked.goal, settings_of(asked), location(source)
+    goal, settings, place = asked.target, settings_of(asked), location(source)
     ffmpeg = _ffmpeg(goal)
     with open_cameras(place, asked.fps) as (found, left_out):
         cameras = _selected(found, left_out, asked)
@@ -292,7 +279,7 @@ def _ffmpeg(goal: ScoreGoal) -> Ffmpeg | None:
 def _selected(
     cameras: Sequence[Camera], left_out: dict[str, str], options: EvaluateOptions
 ) -> list[Camera]:
-    selection = Selection(options.topics, options.exclude)
+    selection = options.selected
     selection.check([*(camera.topic for camera in cameras), *left_out])
     wanted = (camera for camera in cameras if selection(camera.topic))
     return sorted(wanted, key=lambda camera: camera.topic)
@@ -357,7 +344,7 @@ class _Run:
             Refused: The camera's images are not usable.
             ScoringError: No setting could be tried.
         """
-        options, goal = self.options, self.options.goal
+        options, goal = self.options, self.options.target
         tell("reading", 0)
         clip = make_clip(
             camera, chosen(camera.times, origin, options.frames, options.start), folder

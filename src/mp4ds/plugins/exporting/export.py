@@ -144,8 +144,6 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
         raise OptionError(
             f"LeRobot's videos are in colour: `pixels` {options.pixels} does not apply."
         )
-    if options.tolerance_ns is not None and options.tolerance_ns < 0:
-        raise OptionError("`tolerance_ns` is the maximum time between frames: use 0 or more.")
     _ = options.reduction  # refuses invalid ones
 
 

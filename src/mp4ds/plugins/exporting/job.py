@@ -19,19 +19,7 @@ from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
 from mp4ds.messages.serializations import is_camera
-from mp4ds.options import (
-    SliceOptions,
-    duration,
-    end,
-    every,
-    exclude,
-    force,
-    max_rate,
-    option,
-    resize,
-    start,
-    topics,
-)
+from mp4ds.options import WHAT, Parsed, SliceOptions, force, option
 from mp4ds.records import Channel
 from mp4ds.times import intervals, synchronize, usual_interval
 from mp4ds.unpacking.pictures import ReductionOptions, is_inverse_depth, times_of
@@ -43,46 +31,45 @@ _CODECS = ("av1", "h264", "h265")
 _NS_PER_MS = 1_000_000
 
 
-def _nanoseconds(milliseconds: str) -> int:
+def _nanoseconds(value: str | int) -> int:
+    """Nanoseconds of milliseconds as text."""
+    if not isinstance(value, str):
+        return value
     try:
-        return round(float(milliseconds) * _NS_PER_MS)
+        return round(float(value) * _NS_PER_MS)
     except (ValueError, OverflowError):
-        raise OptionError(
-            f"`tolerance_ns` {milliseconds!r} is not a number of milliseconds."
-        ) from None
+        raise OptionError(f"{value!r} is not a number of milliseconds.") from None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ExportOptions(SliceOptions, ReductionOptions):
     """How to export."""
 
-    topics: Sequence[str] = topics()
-    exclude: Sequence[str] = exclude()
-    start: str | float | None = start()
-    end: str | float | None = end()
-    duration: str | float | None = duration()
-    resize: float | tuple[int, int] | None = resize()
-    every: int = every()
-    max_rate: float | None = max_rate()
     pixels: str = option(
         "seen: as recorded, but Bayer and YUV as RGB; native: keep Bayer mosaics; rgb; gray.",
         "seen",
         metavar="KIND",
     )
-    tolerance_ns: int | None = option(
+    tolerance_ns: Parsed[int | None] = option(
         "Keep only frames that all cameras have within this time of each other.",
         None,
         "--sync",
+        panel=WHAT,
         metavar="MS",
+        least=0,
         parse=_nanoseconds,
     )
-    poses: str | None = option("Topic with poses, for euroc, tum and colmap.", metavar="TOPIC")
+    poses: str | None = option(
+        "Topic with poses, for euroc, tum and colmap.", panel=WHAT, metavar="TOPIC"
+    )
     fps: int | None = option(
         "Frame rate for lerobot; default: that of the first camera.", least=1, most=1000
     )
-    state: str | None = option("Topic for lerobot's observation.state.", metavar="TOPIC")
-    action: str | None = option("Topic for lerobot's action.", metavar="TOPIC")
-    task: str = option("Task description, for lerobot.", "", metavar="TEXT")
+    state: str | None = option(
+        "Topic for lerobot's observation.state.", panel=WHAT, metavar="TOPIC"
+    )
+    action: str | None = option("Topic for lerobot's action.", panel=WHAT, metavar="TOPIC")
+    task: str = option("Task description, for lerobot.", "", panel=WHAT, metavar="TEXT")
     codec: str = option("Video codec for lerobot: av1, h264 or h265.", "av1")
     crf: int = option("Quality of lerobot's videos; lower is better.", 30, least=0, most=63)
     force: bool = force()
@@ -329,7 +316,12 @@ def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:
     if encoding_as(known, "rgb") is None:
         colours = "native"  # depths and other measurements have no colours
     return view_of(
-        stream.topic, known, stream.image_size, format=colours, resize=options.resize, crop=None
+        stream.topic,
+        known,
+        stream.image_size,
+        format=colours,
+        resize=options.reduction.resize,
+        crop=None,
     )
 
 

@@ -394,7 +394,9 @@ class _Maker:
         chosen = np.unique(np.linspace(0, len(camera) - 1, count).astype(np.int64))
         found = []
         for number in camera.numbers[chosen].tolist():
-            (frame,) = camera.stream.get([number], format="rgb", resize=self._job.options.resize)
+            (frame,) = camera.stream.get(
+                [number], format="rgb", resize=self._job.options.reduction.resize
+            )
             found.append(Statistics.of_picture(frame.data))
         return merged(found)
 

@@ -12,22 +12,12 @@ from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.salvage import HOW_TO_SALVAGE
 from mp4ds.errors import OptionError, advising
-from mp4ds.options import (
-    Options,
-    argument,
-    every,
-    exclude,
-    jpeg_quality,
-    max_rate,
-    option,
-    resize,
-    topics,
-)
+from mp4ds.options import WHAT, WHERE, argument, jpeg_quality, option
 from mp4ds.plugins.playing.player import Player, PlayerOptions, PlayProgress, PlaySummary
 from mp4ds.plugins.playing.timeline import Names, Timeline, Wanted
 from mp4ds.plugins.publishing.names import PLAIN, NodeNames
 from mp4ds.plugins.publishing.publisher import Publisher, open_publisher, sourced
-from mp4ds.unpacking.pictures import Reduction
+from mp4ds.unpacking.pictures import ReductionOptions
 
 KINDS = {"raw": "raw", "compressed": "jpeg", "ffmpeg": "ffmpeg"}
 """Transport that cameras are published as -> kind of image in `mp4ds.unpacking`."""
@@ -36,39 +26,66 @@ _NS = 1_000_000_000
 _CLOCK = "/clock"
 
 
-@dataclass(frozen=True)
-class PlayOptions(Options):
+@dataclass(frozen=True, kw_only=True)
+class PlayOptions(ReductionOptions):
     """How to play datasets back."""
 
-    to: str | None = option("ros1 or ros2; default: the ROS that is sourced.")
+    exclude: Sequence[str] = option(
+        "Leave out matching topics.",
+        (),
+        "--exclude",
+        "--exclude-topics",
+        "-x",
+        panel=WHAT,
+        metavar="GLOB",
+    )
+    to: str | None = argument("ros1 or ros2; default: the ROS that is sourced.")
     rate: float = option("Playback rate; 2 is twice as fast.", 1.0, "-r")
     start_offset: float = option(
-        "Start this many seconds into the recording.", 0.0, "--start-offset", "--start", "-s"
+        "Start this many seconds into the recording.",
+        0.0,
+        "--start-offset",
+        "--start",
+        "-s",
+        panel=WHAT,
     )
     duration: float | None = option(
-        "Play only this many seconds.", None, "--duration", "--playback-duration", "-u"
+        "Play only this many seconds.", None, "--duration", "--playback-duration", "-u", panel=WHAT
     )
     until_sec: float | None = option(
         "Play until this time, in seconds since 1970, or for `duration`, whichever is later.",
         None,
         "--playback-until-sec",
+        panel=WHAT,
     )
     until_nsec: int | None = option(
-        "Play until this time, in nanoseconds since 1970.", None, "--playback-until-nsec"
+        "Play until this time, in nanoseconds since 1970.",
+        None,
+        "--playback-until-nsec",
+        panel=WHAT,
     )
     loop: bool = option("Loop playback.", False, "-l")
     keep_alive: bool = option("Keep running at the end, for late subscribers.", False, "-k")
     delay: float = option("Seconds to wait before playing; in ROS 2, before each loop.", 0.0, "-d")
     paused: bool = option("Start paused.", False, "--pause", "--start-paused", "-p")
-    topics: Sequence[str] = topics()
-    exclude: Sequence[str] = exclude("--exclude", "--exclude-topics")
     regex: str = option(
-        "Only topics that fully match a regular expression, and those of `topics`.", "", "-e"
+        "Only topics that fully match a regular expression, and those of `topics`.",
+        "",
+        "-e",
+        panel=WHAT,
     )
-    exclude_regex: str = option("Leave out topics that fully match a regular expression.", "")
-    remap: Sequence[str] = option("Rename a topic; repeatable.", (), "-m", metavar="OLD:=NEW")
-    prefix: str = option("Prefix for all topics that are not remapped.", "")
-    clock: float | None = option("Publish /clock at this rate in Hz; default: do not publish it.")
+    exclude_regex: str = option(
+        "Leave out topics that fully match a regular expression.", "", panel=WHAT
+    )
+    remap: Sequence[str] = option(
+        "Rename a topic; repeatable.", (), "-m", metavar="OLD:=NEW", panel=WHERE
+    )
+    prefix: str = option(
+        "Prefix for all topics that are not remapped.",
+        "",
+        panel=WHERE,
+    )
+    clock: float | None = argument("Publish /clock at this rate in Hz; default: do not publish it.")
     clock_topics: Sequence[str] = option(
         "Publish /clock just before each message on these topics.", (), metavar="TOPIC"
     )
@@ -81,7 +98,7 @@ class PlayOptions(Options):
     )
     immediate: bool = option("Publish as fast as possible.", False, "-i")
     skip_empty: float | None = option(
-        "Skip gaps between messages that are longer than this.", metavar="SECONDS"
+        "Skip gaps between messages that are longer than this.", metavar="SECONDS", panel=WHAT
     )
     pause_topics: Sequence[str] = option(
         "Pause before each message on these topics.", (), metavar="TOPIC"
@@ -112,9 +129,6 @@ class PlayOptions(Options):
         "Publish cameras as raw, compressed (JPEG) or ffmpeg (video packets); default: as recorded."
     )
     jpeg_quality: int = jpeg_quality()
-    resize: float | tuple[int, int] | None = resize()
-    every: int = every()
-    max_rate: float | None = max_rate()
     read_ahead: int = option(
         "Frames per camera to decode ahead.",
         8,
@@ -200,7 +214,7 @@ def open_player(
             wanted=wanted,
             names=Names(chosen.remap, chosen.prefix, chosen.names),
             kind=KINDS[chosen.publish_as] if chosen.publish_as else None,
-            reduction=Reduction(chosen.resize, chosen.every, chosen.max_rate),
+            reduction=chosen.reduction,
             jpeg_quality=chosen.jpeg_quality,
             read_ahead=chosen.read_ahead,
         )

@@ -19,7 +19,7 @@ from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.pack import checked_codec
-from mp4ds.plan import SPEED, parse_quality
+from mp4ds.plan import SPEED, Purpose
 from mp4ds.plugins.playing.timeline import quick_switches
 from mp4ds.plugins.publishing.publisher import sourced
 from mp4ds.plugins.recording.options import RecordOptions
@@ -206,7 +206,7 @@ def _check(options: RecordOptions) -> None:
     Raises:
         OptionError: One of them is wrong.
     """
-    quality = parse_quality(options.quality)
+    quality = options.quality
     if quality.target is not None:
         raise OptionError(
             f"`quality` {options.quality} takes several tries per video. Record lossless or "
@@ -217,7 +217,7 @@ def _check(options: RecordOptions) -> None:
             raise OptionError(f"`{name}` {seconds:g} is not a number of seconds, 0 or more.")
     if options.about is not None:
         load_about(options.about)
-    checked_codec(quality, options.codec, options.preset, SPEED)
+    checked_codec(quality, options.codec, options.preset, Purpose(SPEED))
 
 
 def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:

@@ -88,7 +88,7 @@ class Split:
         settings = SpoolSettings(
             format=source.format,
             profile=source.profile,
-            quality=options.quality,
+            quality=str(options.quality),
             codec=options.codec,
             preset=options.preset,
             gop=options.gop,

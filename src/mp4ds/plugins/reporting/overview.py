@@ -179,7 +179,7 @@ def _shown(
         if told.frames:
             topic = next(iter(told.frames))
             with Dataset(path) as dataset:
-                middle = f"#{len(dataset[topic]) // 2}"
+                middle = len(dataset[topic]) // 2
                 scale = min(1.0, _WIDTH / dataset[topic].image_size[0])
             still = StillOptions(topic=topic, at=middle, resize=scale)
             frames(path, pictures / f"{number}.jpg", still)

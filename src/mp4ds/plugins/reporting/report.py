@@ -32,7 +32,7 @@ from mp4ds.files.outputs import (
     write_synced,
 )
 from mp4ds.files.urls import remote
-from mp4ds.options import SliceOptions, duration, end, force, option, start
+from mp4ds.options import WHERE, SliceOptions, force, option
 from mp4ds.plugins.reporting.cameras import ReportedCamera, Scores, read_scores, scores_of
 from mp4ds.plugins.reporting.page import (
     FOLDER_NAME,
@@ -56,16 +56,17 @@ PROXIES = ("auto", "all", "none")
 _KEYS_NAME = "proxies.json"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReportOptions(SliceOptions):
     """How to make a report."""
 
     output: Path | None = option(
-        "Folder to write to; default: the dataset itself.", None, "-o", metavar="FOLDER"
+        "Folder to write to; default: the dataset itself.",
+        None,
+        "-o",
+        panel=WHERE,
+        metavar="FOLDER",
     )
-    start: str | float | None = start()
-    end: str | float | None = end()
-    duration: str | float | None = duration()
     proxies: str = option(
         "Make small videos for cameras browsers cannot play (auto), for all, or for none.",
         "auto",

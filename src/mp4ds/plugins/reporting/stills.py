@@ -17,15 +17,15 @@ from mp4ds.errors import FrameNotFoundError, OptionError
 from mp4ds.files.outputs import begins_with, staged
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.options import (
+    WHAT,
+    Parsed,
     Slice,
     SliceOptions,
-    duration,
-    end,
+    Time,
     force,
     option,
-    resize,
-    start,
-    time_of,
+    parse_resize,
+    parse_time,
 )
 from mp4ds.plugins.reporting.proxies import Look
 from mp4ds.video.drawing import Page
@@ -42,36 +42,42 @@ _QUALITY = 92
 _NS = 10**9
 
 
-def parse_sheet(text: str) -> tuple[int, int]:
-    """Columns and rows of ``5x4``.
-
-    Raises:
-        OptionError: It is not of that form.
-    """
-    match = re.fullmatch(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})", text.strip().lower())
+def _parse_sheet(value: str | tuple[int, int]) -> tuple[int, int]:
+    """Columns and rows of ``5x4``."""
+    if not isinstance(value, str):
+        return value
+    match = re.fullmatch(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})", value.strip().lower())
     if not match:
-        raise OptionError(f"`sheet` {text!r} is not COLUMNSxROWS, such as 5x4.")
+        raise OptionError(f"{value!r} is not COLUMNSxROWS, such as 5x4.")
     return int(match[1]), int(match[2])
 
 
-@dataclass(frozen=True)
+def _parse_at(value: str | float | Time) -> Time | int:
+    """A time, or the number of a frame as ``#N``."""
+    if isinstance(value, str) and re.fullmatch(r"#[0-9]{1,9}", value):
+        return int(value[1:])
+    return value if isinstance(value, int) else parse_time(value)
+
+
+@dataclass(frozen=True, kw_only=True)
 class StillOptions(SliceOptions):
     """Which frames to save, and how."""
 
-    topic: str = option("Camera topic, if there are several.", "", "-t")
-    at: str | None = option(
+    topic: str = option("Camera topic, if there are several.", "", "-t", panel=WHAT)
+    at: Parsed[Time | int | None] = option(
         "Seconds from the first frame or since 1970, nanoseconds since 1970, an ISO date, or #N "
         "for frame number N.",
+        panel=WHAT,
         metavar="TIME",
+        parse=_parse_at,
     )
-    sheet: tuple[int, int] | None = option(
-        "Columns and rows of a contact sheet.", metavar="5x4", parse=parse_sheet
+    sheet: Parsed[tuple[int, int] | None] = option(
+        "Columns and rows of a contact sheet.", panel=WHAT, metavar="5x4", parse=_parse_sheet
     )
-    start: str | float | None = start()
-    end: str | float | None = end()
-    duration: str | float | None = duration()
-    resize: float | tuple[int, int] | None = resize(
-        "Size of the image, or of each frame on a sheet (default: 320 pixels wide)."
+    resize: Parsed[float | tuple[int, int] | None] = option(
+        "Size of the image, or of each frame on a sheet (default: 320 pixels wide).",
+        metavar="0.5|WxH",
+        parse=parse_resize,
     )
     exact: bool = option("Keep the pixel values as recorded, as unpack --to images does.", False)
     force: bool = force()
@@ -144,16 +150,16 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
         raise OptionError(f"{target} is not a .png or .jpg: give a name with one of these endings.")
     with Dataset(dataset) as opened:
         stream = _chosen(opened, options.topic)
-        if options.sheet:
-            first, end = _places(stream, options.slice)
-            numbers = [first + n for n in spread(end - first, options.sheet[0] * options.sheet[1])]
-            pixels, encoding = _sheet(stream, numbers, options.sheet, options.resize), "rgb8"
-        else:
-            numbers = [number_at(stream, options.at or "")]
+        if options.at is not None:
+            numbers = [number_at(stream, options.at)]
             source = (stream, numbers[0])
             if isinstance(stream, TopicFrames):
                 source = stream.place_of(numbers[0])
             pixels, encoding = _still(*source, kind, options)
+        elif options.sheet:
+            first, end = _places(stream, options.slice)
+            numbers = [first + n for n in spread(end - first, options.sheet[0] * options.sheet[1])]
+            pixels, encoding = _sheet(stream, numbers, options.sheet, options.resize), "rgb8"
         data = ImageFile(encoding, kind, quality=_QUALITY).encode(pixels)
         with staged(
             target.absolute(),
@@ -217,20 +223,21 @@ def _places(stream: Frames, asked: Slice) -> tuple[int, int]:
     return int(numbers[0]), int(numbers[-1]) + 1
 
 
-def number_at(stream: Frames, text: str) -> int:
+def number_at(stream: Frames, at: Time | int) -> int:
     """Number of the frame nearest to a time, or given by number.
 
     Raises:
-        OptionError: The text is not a time, or there is no frame with that number.
+        OptionError: There is no frame with that number.
         FrameNotFoundError: The time is more than a second before the first frame, or after the
             last one.
     """
-    if text.startswith("#"):
-        count = len(stream)
-        if not re.fullmatch(r"#[0-9]{1,9}", text) or int(text[1:]) >= count:
-            raise OptionError(f"`at` {text!r}: frames of {stream.topic} are #0 to #{count - 1}.")
-        return int(text[1:])
-    time = time_of(text, int(stream.stamps[0]), "at")
+    if isinstance(at, int):
+        if at >= len(stream):
+            raise OptionError(
+                f"`at` '#{at}': frames of {stream.topic} are #0 to #{len(stream) - 1}."
+            )
+        return at
+    time = at.after(int(stream.stamps[0]))
     index = stream.index_at(time)
     nearest = int(stream.stamps[index])
     is_beyond = not int(stream.stamps.min()) <= time <= int(stream.stamps.max())
