@@ -12,6 +12,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mp4ds.messages.descriptors import decoder_of_schema
 from mp4ds.messages.serializations import wire_of
 from mp4ds.messages.wire import PrimitiveReader, WireError
@@ -183,6 +186,37 @@ def _numbers(node: Any, names: str, absent: tuple[float, ...]) -> list[float]:
     if not all(isinstance(value, (int, float)) for value in values):
         raise TypeError("a coordinate is not a number")
     return [float(value) for value in values]
+
+
+# ---------------------------------------------------------------- rotations
+
+_ROUNDED = 1e-2  # of a rotation given with few digits
+
+
+def quaternion_of(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """The unit quaternion x, y, z, w of a rotation, w not negative.
+
+    It is the eigenvector of the largest eigenvalue of a symmetric matrix (I. Bar-Itzhack, 2000),
+    which is the nearest rotation to a matrix with rounded digits.
+
+    Args:
+        rotation: Shape (3, 3).
+
+    Raises:
+        ValueError: It is not a rotation.
+    """
+    m = rotation
+    is_near = np.abs(m @ m.T - np.eye(3)).max(initial=0) < _ROUNDED
+    if not np.isfinite(m).all() or not is_near or np.linalg.det(m) < 0:
+        raise ValueError("the rotation is not valid")
+    symmetric = np.empty((4, 4))
+    symmetric[:3, :3] = m + m.T - np.trace(m) * np.eye(3)
+    vector = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
+    symmetric[3, :3] = symmetric[:3, 3] = vector
+    symmetric[3, 3] = np.trace(m)
+    found = np.linalg.eigh(symmetric)[1][:, -1]
+    x, y, z, w = (found if found[3] >= 0 else -found).tolist()
+    return x, y, z, w
 
 
 # ---------------------------------------------------------------- collecting

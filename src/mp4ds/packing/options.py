@@ -38,9 +38,7 @@ class ImageFolder(Options):
         "Text file with a time per line, or a time and a file name.", metavar="FILE"
     )
     rate: str | None = option(
-        "Frame rate of images without times, such as 20 or 30000/1001; of each camera if the "
-        "file names show several.",
-        metavar="HZ",
+        "Frame rate of images without times, such as 20 or 30000/1001.", metavar="HZ"
     )
     unit: str | None = option(
         "Unit of integer times: s, ms, us or ns; default: ns, if they have enough digits."

@@ -1,11 +1,11 @@
-"""The table of folder layouts, and plain folders."""
+"""Folders of images: EuRoC MAV, TUM RGB-D, and plain ones."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,315 +14,29 @@ from mp4ds.errors import OptionError, Refused, SourceError, SourceNotFoundError
 from mp4ds.files.sources import members
 from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.wire import CalibrationFields
 from mp4ds.packing.options import ImageFolder
-from mp4ds.plugins.importing.benchmarks import (
-    find_euroc,
-    find_tum,
-    is_euroc,
-    is_tum,
-)
-from mp4ds.plugins.importing.reader import ImagesReader
-from mp4ds.plugins.importing.scene import (
+from mp4ds.plugins.importing.parsing import (
     UNITS,
     Rows,
-    Scene,
-    SceneCamera,
     at_rate,
+    euroc_calibration,
+    euroc_pose,
     is_number,
     lines_of,
     listed_images,
     of_unit,
+    read_table,
     read_times,
+    read_yaml,
     ros_calibration,
     split,
     unit_of,
 )
-from mp4ds.video.images import STILL_SUFFIXES, image_kind, image_size
-
-_MOST = 8  # cameras; more words are not names of cameras
-_LOOKED_AT = 8
-# a number, except for that of a camera such as cam0
-_NUMBER = re.compile(r"(?<!\d)(?<!cam)(?<!camera)\d+|(?<=cam)\d{2,}|(?<=camera)\d{2,}", re.I)
-_HEX = re.compile(r"[0-9a-f]+", re.I)
-_WORD = re.compile(r"[^\W_]+")
-_ADVICE = (
-    "A single rate cannot give their times. Give `stamps` FILE with a time and a file name per "
-    "line, or put each camera's images into a folder of its own."
-)
-
-
-def by_camera(folder: Path, images: Sequence[Path]) -> Mapping[str, list[Path]]:
-    """The images of each camera by its name, which is empty if there is one camera.
-
-    There are several if the names have different words or extensions and the same numbers:
-    ``color_0001.jpg`` and ``depth_0001.png``.
-
-    Args:
-        folder: For errors.
-        images: In order.
-
-    Raises:
-        SourceError: It is unclear whether they are from one camera.
-    """
-    kinds: dict[str, list[Path]] = {}
-    for path in images:
-        kinds.setdefault(_NUMBER.sub("#", path.stem) + path.suffix.lower(), []).append(path)
-    numbers = [[_numbers(path) for path in paths] for paths in kinds.values()]
-    cameras = {"": list(images)}
-    if _may_be_cameras(images, numbers):
-        if any(found != numbers[0] for found in numbers):
-            first, second = (paths[0].name for paths in list(kinds.values())[:2])
-            raise SourceError(
-                folder,
-                f"holds images of several kinds, judging by names such as {first} and {second}, "
-                "but their numbers differ",
-                _ADVICE,
-            )
-        cameras = dict(zip(_names(list(kinds)), kinds.values(), strict=True))
-    for paths in cameras.values():
-        _check_turns(folder, paths)
-    return cameras
-
-
-def _numbers(path: Path) -> tuple[int, ...]:
-    return tuple(map(int, _NUMBER.findall(path.stem)))
-
-
-def _may_be_cameras(images: Sequence[Path], numbers: Sequence[list[tuple[int, ...]]]) -> bool:
-    """Whether there are a few kinds that share numbers."""
-    if not 1 < len(numbers) <= _MOST or min(map(len, numbers)) < 2:
-        return False
-    endings = {path.suffix.lower() for path in images}
-    if len(endings) < len(numbers) and all(_HEX.fullmatch(path.stem) for path in images):
-        return False  # hexadecimal letters are digits, too
-    return len(set().union(*numbers)) < len(images)
-
-
-def _names(kinds: Sequence[str]) -> list[str]:
-    """A name for each camera: the words that differ, else its files' extension."""
-    words = [_WORD.findall(Path(kind).stem) for kind in kinds]
-    shared = set(words[0]).intersection(*words)
-    names = ["_".join(word for word in own if word not in shared) for own in words]
-    if len(set(names)) < len(names):
-        endings = [Path(kind).suffix[1:] for kind in kinds]
-        names = ["_".join(filter(None, pair)) for pair in zip(names, endings, strict=True)]
-    if len(set(names)) < len(names):
-        return [f"camera{number}" for number in range(len(names))]
-    return [name or "camera" for name in names]
-
-
-def _check_turns(folder: Path, images: Sequence[Path]) -> None:
-    """Refuse interleaved images of two cameras; one camera may well change its size."""
-    kinds = [_kind(path) for path in images[:_LOOKED_AT]]
-    changes = [place for place in range(1, len(kinds)) if kinds[place] != kinds[place - 1]]
-    if len(changes) >= len(set(kinds)) > 1:
-        first, second = (
-            f"{images[place].name} ({kinds[place]})" for place in (changes[0] - 1, changes[0])
-        )
-        raise SourceError(
-            folder,
-            f"holds images of several kinds interleaved, such as {first} and {second}",
-            _ADVICE,
-        )
-
-
-def _kind(path: Path) -> str:
-    try:
-        return image_kind(path)
-    except SourceError:  # JPEG files are kept whatever they contain
-        return path.suffix.lower()
-
-
-# ---------------------------------------------------------------- plain
-
-_TOPIC, _FRAME = "/camera/image_raw", "camera"
-_LISTED = 3
-_IN_NS = re.compile(r"(?<![A-Za-z])ns\b")
-
-
-def images_in(folder: Path) -> list[Path]:
-    """The images directly in a folder, in the order of the numbers in their names."""
-    found = [path for path in members(folder) if path.suffix.lower() in STILL_SUFFIXES]
-    return sorted(found, key=_in_order)
-
-
-def _in_order(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """Sorts 9 before 10, with or without leading zeros."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return [(int(part or 0), "") if n % 2 else (0, part) for n, part in enumerate(parts)], path.name
-
-
-def find_plain(folder: Path, options: ImageFolder) -> Scene:
-    """The images of a folder: of one camera, or of several if a rate gives their times.
-
-    Raises:
-        SourceError: There are none, or their times are unknown.
-        OptionError: An option is wrong.
-    """
-    if options.stamps and options.rate:
-        raise OptionError(
-            "`stamps` gives the times that `rate` would make up. Give only one of them."
-        )
-    scene = Scene(folder)
-    images = images_in(folder)
-    if not images:
-        raise SourceError(folder, "holds no images" + _elsewhere(folder))
-    if options.rate:
-        scene.cameras += _by_rate(folder, images, options)
-        files = images
-    else:
-        if options.stamps:
-            files, stamps = _by_list(scene, images, Path(options.stamps), options.unit)
-        else:
-            files, stamps = images, _by_name(scene, images, options.unit)
-        scene.cameras.append(_camera("", files, stamps, options))
-    if unused := len(images) - len(set(files)):
-        scene.skipped["images without a time"] = unused
-    read = {Path(path).resolve() for path in (options.stamps, options.calibration) if path}
-    others = [path for path in members(folder) if path.resolve() not in read]
-    others = [path for path in others if path.suffix.lower() not in STILL_SUFFIXES]
-    if others:
-        scene.skipped[f"files in {folder.resolve().name} that are not images"] = len(others)
-    scene.files.append(folder)
-    return scene
-
-
-def _camera(
-    name: str, files: list[Path], stamps: NDArray[np.int64], options: ImageFolder
-) -> SceneCamera:
-    return SceneCamera(
-        options.topic or (f"/{name}/image_raw" if name else _TOPIC),
-        options.frame_id if options.frame_id is not None else name or _FRAME,
-        files,
-        stamps,
-        encoding=options.encoding,
-    )
-
-
-def _by_rate(folder: Path, images: list[Path], options: ImageFolder) -> list[SceneCamera]:
-    """The cameras whose images are in a folder, all starting at the same time."""
-    found = by_camera(folder, images)
-    given = [key for key in ("topic", "frame_id", "encoding") if getattr(options, key) is not None]
-    if len(found) > 1 and given:
-        raise OptionError(
-            f"`{given[0]}` is for the images of one camera, but {folder} holds those of "
-            f"{', '.join(found)}. Put each into a folder of its own."
-        )
-    try:
-        return [
-            _camera(name, files, at_rate(len(files), options.rate or ""), options)
-            for name, files in found.items()
-        ]
-    except Refused as error:
-        raise OptionError(f"`rate`: {error}") from None
-
-
-def _elsewhere(folder: Path) -> str:
-    """Where images are, if not in the folder itself."""
-    places = [path for path in sorted(folder.iterdir()) if path.is_dir() and images_in(path)]
-    if not places:
-        return ", and is not in a known layout"
-    listed = ", ".join(path.name for path in places[:_LISTED])
-    more = ", ..." if len(places) > _LISTED else ""
-    return f" itself, and is not in a known layout; there are some in {listed}{more}"
-
-
-def _by_list(
-    scene: Scene, images: list[Path], path: Path, unit: str | None
-) -> tuple[list[Path], NDArray[np.int64]]:
-    """The images of a list of times, which may also name them."""
-    rows: Rows = [(number, split(line)) for number, line in lines_of(path)]
-    header = rows.pop(0)[1] if rows and not any(map(is_number, rows[0][1])) else []
-    if not rows:
-        raise SourceError(path, "holds no times")
-    time, name = _columns(path, *rows[0])
-    if path.parent.resolve() != scene.folder.resolve():
-        scene.files.append(path)
-    chosen: Rows = []
-    for number, values in rows:
-        if len(values) <= max(time, name or 0):
-            raise SourceError(path, f"line {number} has {len(values)} values, fewer than before")
-        chosen.append((number, [values[time], *([] if name is None else [values[name]])]))
-    if unit is None and len(header) > time and _IN_NS.search(header[time]):
-        unit = "ns"
-    unit = unit or unit_of([values[0] for _, values in chosen if is_number(values[0])])
-    if unit is None:
-        raise OptionError(f"{path}: its times are integers of an unknown unit. Give `unit`.")
-    read = of_unit(unit, scene.skipped)
-    if name is not None:
-        return listed_images(path, scene.folder, read, chosen)
-    stamps = read_times(path, chosen, read)
-    if len(stamps) != len(images):
-        raise SourceError(
-            path, f"has {len(stamps)} times, but there are {len(images)} images in {scene.folder}"
-        )
-    return images, stamps
-
-
-def _columns(path: Path, number: int, values: list[str]) -> tuple[int, int | None]:
-    """Positions of a line's time, and of an image name, if any."""
-    time = next((place for place, value in enumerate(values) if is_number(value)), None)
-    if time is None:
-        raise SourceError(path, f"line {number} has no time")
-    names = (place for place, value in enumerate(values) if _is_image(value))
-    return time, next(names, None)
-
-
-def _is_image(name: str) -> bool:
-    return name.lower().endswith(STILL_SUFFIXES)
-
-
-def _by_name(scene: Scene, images: list[Path], unit: str | None) -> NDArray[np.int64]:
-    names = [path.stem for path in images]
-    if all(map(is_number, names)):
-        unit = unit or unit_of(names)
-    elif unit is not None:
-        wrong = next(path for path in images if not is_number(path.stem))
-        raise SourceError(
-            wrong, "has a name that is not a time", "Give `stamps` FILE or `rate` HZ."
-        )
-    if unit is None or not all(map(is_number, names)):
-        raise SourceError(
-            scene.folder,
-            "holds images whose names are not times in nanoseconds or decimal seconds",
-            "Give `stamps` FILE, `rate` HZ, or the `unit` of the names.",
-        )
-    read = of_unit(unit, scene.skipped)
-    stamps = np.empty(len(images), np.int64)
-    for place, path in enumerate(images):
-        try:
-            stamps[place] = read(path.stem)
-        except Refused as error:
-            raise SourceError(path, f"has a name that is not a time: {error}") from None
-    return stamps
-
-
-# ---------------------------------------------------------------- layouts
+from mp4ds.plugins.importing.reader import ImagesReader
+from mp4ds.video.images import STILL_SUFFIXES, image_size
 
 _PLAIN_ONLY = ("stamps", "rate", "unit", "topic", "frame_id", "encoding")
-
-
-@dataclass(frozen=True, slots=True)
-class FolderLayout:
-    """A layout of folders.
-
-    Attributes:
-        matches: Whether a folder has it.
-        find: Finds what it holds.
-        is_calibrated: Whether it has its own calibrations.
-    """
-
-    matches: Callable[[Path], bool]
-    find: Callable[[Path, ImageFolder], Scene]
-    is_calibrated: bool
-
-
-LAYOUTS: Mapping[str, FolderLayout] = {
-    "euroc": FolderLayout(is_euroc, find_euroc, is_calibrated=True),
-    "tum": FolderLayout(is_tum, find_tum, is_calibrated=False),
-    "plain": FolderLayout(lambda folder: True, find_plain, is_calibrated=False),
-}
-"""Layouts, in the order in which they are tried."""
 
 
 def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
@@ -344,35 +58,33 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
         raise SourceError(folder, "is not a folder of images")
     _check(options)
     try:
-        name = options.layout or next(key for key in LAYOUTS if LAYOUTS[key].matches(folder))
-        layout = LAYOUTS[name]
-        _check_for(name, layout, options)
-        if not layout.matches(folder):
+        name = options.layout or next(key for key in _LAYOUTS if _LAYOUTS[key][0](folder))
+        matches, add_all = _LAYOUTS[name]
+        _check_for(name, options)
+        if not matches(folder):
             raise SourceError(folder, f"does not have the layout {name}", "Omit `layout`.")
-        scene = layout.find(folder, options)
+        reader = ImagesReader(folder)
+        add_all(reader, options)
     except OSError as error:
         if isinstance(error, SourceError):
             raise
         raise SourceError(error.filename or folder, f"cannot be read: {error.strerror}") from None
     if options.calibration:
-        _calibrate(scene, Path(options.calibration))
-    if not any(len(camera.files) for camera in scene.cameras):
-        raise SourceError(folder, "holds no images")
-    return ImagesReader(scene)
+        reader.add_file(Path(options.calibration), is_kept=True)
+    reader.finish()
+    return reader
 
 
 def _check(options: ImageFolder) -> None:
-    if options.layout is not None and options.layout not in LAYOUTS:
-        raise OptionError(f"`layout` {options.layout!r} is not one of {', '.join(LAYOUTS)}.")
-    if options.unit is not None and options.unit not in UNITS:
-        raise OptionError(f"`unit` {options.unit!r} is not one of {', '.join(UNITS)}.")
-    if options.encoding is not None and options.encoding not in ENCODINGS:
-        raise OptionError(f"`encoding` {options.encoding!r} is not one of {', '.join(ENCODINGS)}.")
+    for name, known in (("layout", _LAYOUTS), ("unit", UNITS), ("encoding", ENCODINGS)):
+        value = getattr(options, name)
+        if value is not None and value not in known:
+            raise OptionError(f"`{name}` {value!r} is not one of {', '.join(known)}.")
     if options.topic is not None and not options.topic.strip("/"):
         raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
 
 
-def _check_for(name: str, layout: FolderLayout, options: ImageFolder) -> None:
+def _check_for(name: str, options: ImageFolder) -> None:
     """Refuse options for other layouts."""
     given = [key for key in _PLAIN_ONLY if getattr(options, key) is not None]
     if name != "plain" and given:
@@ -380,28 +92,328 @@ def _check_for(name: str, layout: FolderLayout, options: ImageFolder) -> None:
             f"`{given[0]}` is for plain folders of images, but this one has the layout {name}, "
             f"which already defines it. Give `layout` plain, or omit `{given[0]}`."
         )
-    if layout.is_calibrated and options.calibration:
-        raise OptionError(
-            f"`calibration` cannot be used with the layout {name}, which has its own."
-        )
+    if name == "euroc" and options.calibration:
+        raise OptionError("`calibration` cannot be used with the layout euroc, which has its own.")
 
 
-def _calibrate(scene: Scene, path: Path) -> None:
-    """Give all cameras a calibration that matches their size.
+def _calibration(
+    options: ImageFolder, topic: str, images: Sequence[Path]
+) -> CalibrationFields | None:
+    """The given calibration for the images of a camera.
 
     Raises:
         SourceError: It is not valid, or made for a different image size.
     """
-    calibration = ros_calibration(path)
-    for camera in scene.cameras:
-        size = image_size(camera.files[0]) if camera.files else None
-        if size not in (None, (calibration.width, calibration.height)):
-            raise SourceError(
-                path,
-                f"is for images of {calibration.width}x{calibration.height}, but those of "
-                f"{camera.topic} are {size[0]}x{size[1]}",
+    if not options.calibration:
+        return None
+    found = ros_calibration(Path(options.calibration))
+    size = image_size(images[0]) if images else None
+    if size not in (None, (found.width, found.height)):
+        raise SourceError(
+            Path(options.calibration),
+            f"is for images of {found.width}x{found.height}, but those of {topic} are "
+            f"{size[0]}x{size[1]}",
+        )
+    return found
+
+
+# ---------------------------------------------------------------- euroc
+
+_LIST = "data.csv"
+_BODY, _WORLD = "body", "world"
+_POSES = ("state_groundtruth_estimate", "mocap", "pose")
+
+
+def _root(folder: Path) -> Path:
+    return folder / "mav0" if (folder / "mav0").is_dir() else folder
+
+
+def _sensors(folder: Path) -> list[Path]:
+    """The folders of the sensors: those with a list."""
+    return sorted(path.parent for path in _root(folder).glob(f"*/{_LIST}"))
+
+
+def _is_euroc(folder: Path) -> bool:
+    return any((sensor / "data").is_dir() for sensor in _sensors(folder))
+
+
+def _add_euroc(reader: ImagesReader, _: ImageFolder) -> None:
+    """Add cameras, IMUs and poses."""
+    sensors = _sensors(reader.path)
+    for sensor in sensors:
+        name, is_camera = sensor.name, (sensor / "data").is_dir()
+        described = _described(reader, sensor / "sensor.yaml")
+        if is_camera or name.startswith("imu"):
+            reader.transforms += euroc_pose(sensor / "sensor.yaml", described, _BODY, name)
+        if is_camera:
+            _add_euroc_camera(reader, sensor, described)
+        elif name.startswith("imu"):
+            times, rows = read_table(sensor / _LIST, of_unit("ns", reader.left_out), 6)
+            reader.add_table(f"/{name}", "imu", name, times, rows)
+            reader.add_file(sensor / _LIST)
+        elif name.startswith(_POSES):
+            _add_euroc_poses(reader, sensor)
+        else:
+            reader.leave_out(sensor, f"{name}, which is not a camera, IMU or pose")
+    for path in sorted(_root(reader.path).iterdir()):
+        if path.is_file() and path.suffix == ".yaml":
+            reader.add_file(path, is_kept=True)
+        elif path not in sensors:
+            reader.leave_out(path, f"{path.name}, which has no {_LIST}")
+
+
+def _described(reader: ImagesReader, path: Path) -> dict[str, Any]:
+    """The contents of a sensor.yaml, which is kept."""
+    if not path.is_file():
+        return {}
+    reader.add_file(path, is_kept=True)
+    return read_yaml(path)
+
+
+def _add_euroc_camera(reader: ImagesReader, sensor: Path, described: dict[str, Any]) -> None:
+    path, images = sensor / _LIST, sensor / "data"
+    files, stamps = listed_images(path, images, of_unit("ns", reader.left_out))
+    if unlisted := len(members(images)) - len(set(files)):
+        what = f"files in {images.name} of {sensor.name} that {_LIST} does not list"
+        reader.left_out[what] = unlisted
+    calibration = None
+    if "intrinsics" in described:
+        calibration = euroc_calibration(sensor / "sensor.yaml", described)
+    topic = f"/{sensor.name}/image_raw"
+    reader.add_camera(topic, sensor.name, files, stamps, calibration=calibration)
+    reader.add_file(path)
+    reader.add_file(images)
+
+
+def _add_euroc_poses(reader: ImagesReader, sensor: Path) -> None:
+    """Position and w, x, y, z of the quaternion; a pose cannot hold velocities and biases."""
+    path = sensor / _LIST
+    stamps, rows = read_table(path, of_unit("ns", reader.left_out), 7, more=True)
+    reader.add_table(f"/{sensor.name}", "pose", _WORLD, stamps, rows[:, [0, 1, 2, 4, 5, 6, 3]])
+    reader.add_file(path)
+    if any(len(split(line)) > 8 for _, line in lines_of(path)):
+        reader.left_out[f"rows of {sensor.name} of which only the pose was taken"] = len(rows)
+
+
+# ---------------------------------------------------------------- tum
+
+# list -> the encoding of its images; depths are left in the unit of the files
+_CAMERAS = {"rgb": None, "depth": "16UC1"}
+_TABLES = {
+    "accelerometer": ("accelerometer", 3, "accelerometer"),
+    "groundtruth": ("pose", 7, _WORLD),
+}
+
+
+def _is_tum(folder: Path) -> bool:
+    return any((folder / f"{name}.txt").is_file() for name in _CAMERAS)
+
+
+def _add_tum(reader: ImagesReader, options: ImageFolder) -> None:
+    """Add the colour and depth images, accelerometer and poses."""
+    folder, seconds = reader.path, of_unit("s", reader.left_out)
+    listed: dict[Path, set[Path]] = {}
+    for name, encoding in _CAMERAS.items():
+        path = folder / f"{name}.txt"
+        if path.is_file():
+            files, stamps = listed_images(path, folder, seconds)
+            topic = f"/{name}/image_raw"
+            calibration = _calibration(options, topic, files)
+            reader.add_camera(
+                topic, name, files, stamps, calibration=calibration, encoding=encoding
             )
-    scene.cameras = [replace(camera, calibration=calibration) for camera in scene.cameras]
-    if path.resolve() not in {file.resolve() for file in scene.files}:
-        scene.files.append(path)
-    scene.kept.append(path)
+            reader.add_file(path)
+            for file in files:
+                listed.setdefault(file.parent, set()).add(file)
+    for place, own in listed.items():
+        reader.add_file(place)
+        if place != folder and (unlisted := len(members(place)) - len(own)):
+            reader.left_out[f"files in {place.name} that are not in any list"] = unlisted
+    for name, (kind, values, frame_id) in _TABLES.items():
+        path = folder / f"{name}.txt"
+        if path.is_file():
+            stamps, rows = read_table(path, seconds, values)
+            reader.add_table(f"/{name}", kind, frame_id, stamps, rows)
+            reader.add_file(path)
+    for path in sorted(folder.iterdir()):
+        if path not in reader.files:
+            reader.leave_out(path, f"{path.name}, which is not part of the layout")
+
+
+# ---------------------------------------------------------------- plain
+
+_LISTED = 3
+_IN_NS = re.compile(r"(?<![A-Za-z])ns\b")
+_MOST = 8  # cameras; more words are not names of cameras
+# a number, except for that of a camera such as cam0
+_NUMBER = re.compile(r"(?<!\d)(?<!cam)(?<!camera)\d+|(?<=cam)\d{2,}|(?<=camera)\d{2,}", re.I)
+_HEX = re.compile(r"[0-9a-f]+", re.I)
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images directly in a folder, in the order of the numbers in their names."""
+    found = [path for path in members(folder) if path.suffix.lower() in STILL_SUFFIXES]
+    return sorted(found, key=_in_order)
+
+
+def _in_order(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """Sorts 9 before 10, with or without leading zeros."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(int(part or 0), "") if n % 2 else (0, part) for n, part in enumerate(parts)], path.name
+
+
+def _add_plain(reader: ImagesReader, options: ImageFolder) -> None:
+    """Add the images of one camera.
+
+    Raises:
+        SourceError: There are none, or their times are unknown.
+        OptionError: An option is wrong.
+    """
+    if options.stamps and options.rate:
+        raise OptionError(
+            "`stamps` gives the times that `rate` would make up. Give only one of them."
+        )
+    folder = reader.path
+    images = files = images_in(folder)
+    if not images:
+        raise SourceError(folder, "holds no images" + _elsewhere(folder))
+    if options.rate:
+        _check_one_camera(folder, images)
+        try:
+            stamps = at_rate(len(images), options.rate)
+        except Refused as error:
+            raise OptionError(f"`rate`: {error}") from None
+    elif options.stamps:
+        files, stamps = _by_list(reader, images, Path(options.stamps), options.unit)
+    else:
+        stamps = _by_name(reader, images, options.unit)
+    topic = options.topic or "/camera/image_raw"
+    reader.add_camera(
+        topic,
+        options.frame_id if options.frame_id is not None else "camera",
+        files,
+        stamps,
+        calibration=_calibration(options, topic, files),
+        encoding=options.encoding,
+    )
+    if unused := len(images) - len(set(files)):
+        reader.left_out["images without a time"] = unused
+    read = {Path(path).resolve() for path in (options.stamps, options.calibration) if path}
+    others = [path for path in members(folder) if path.resolve() not in read]
+    others = [path for path in others if path.suffix.lower() not in STILL_SUFFIXES]
+    if others:
+        reader.left_out[f"files in {folder.resolve().name} that are not images"] = len(others)
+    reader.add_file(folder)
+
+
+def _check_one_camera(folder: Path, images: Sequence[Path]) -> None:
+    """Refuse images of several cameras: names with different words, and the same numbers.
+
+    Raises:
+        SourceError: They are ``color_0001.jpg`` and ``depth_0001.png``, or the like.
+    """
+    kinds: dict[str, list[Path]] = {}
+    for path in images:
+        kinds.setdefault(_NUMBER.sub("#", path.stem) + path.suffix.lower(), []).append(path)
+    if not 1 < len(kinds) <= _MOST or min(map(len, kinds.values())) < 2:
+        return
+    endings = {path.suffix.lower() for path in images}
+    if len(endings) < len(kinds) and all(_HEX.fullmatch(path.stem) for path in images):
+        return  # hexadecimal letters are digits, too
+    if len({tuple(map(int, _NUMBER.findall(path.stem))) for path in images}) < len(images):
+        first, second = (paths[0].name for paths in list(kinds.values())[:2])
+        raise SourceError(
+            folder,
+            f"holds images of several cameras, judging by names such as {first} and {second}",
+            "Put each camera's images into a folder of its own.",
+        )
+
+
+def _elsewhere(folder: Path) -> str:
+    """Where images are, if not in the folder itself."""
+    places = [path for path in sorted(folder.iterdir()) if path.is_dir() and images_in(path)]
+    if not places:
+        return ", and is not in a known layout"
+    listed = ", ".join(path.name for path in places[:_LISTED])
+    more = ", ..." if len(places) > _LISTED else ""
+    return f" itself, and is not in a known layout; there are some in {listed}{more}"
+
+
+def _by_list(
+    reader: ImagesReader, images: list[Path], path: Path, unit: str | None
+) -> tuple[list[Path], NDArray[np.int64]]:
+    """The images of a list of times, which may also name them."""
+    rows: Rows = [(number, split(line)) for number, line in lines_of(path)]
+    header = rows.pop(0)[1] if rows and not any(map(is_number, rows[0][1])) else []
+    if not rows:
+        raise SourceError(path, "holds no times")
+    time, name = _columns(path, *rows[0])
+    if path.parent.resolve() != reader.path.resolve():
+        reader.add_file(path)
+    chosen: Rows = []
+    for number, values in rows:
+        if len(values) <= max(time, name or 0):
+            raise SourceError(path, f"line {number} has {len(values)} values, fewer than before")
+        chosen.append((number, [values[time], *([] if name is None else [values[name]])]))
+    if unit is None and len(header) > time and _IN_NS.search(header[time]):
+        unit = "ns"
+    unit = unit or unit_of([values[0] for _, values in chosen if is_number(values[0])])
+    if unit is None:
+        raise OptionError(f"{path}: its times are integers of an unknown unit. Give `unit`.")
+    read = of_unit(unit, reader.left_out)
+    if name is not None:
+        return listed_images(path, reader.path, read, chosen)
+    stamps = read_times(path, chosen, read)
+    if len(stamps) != len(images):
+        raise SourceError(
+            path, f"has {len(stamps)} times, but there are {len(images)} images in {reader.path}"
+        )
+    return images, stamps
+
+
+def _columns(path: Path, number: int, values: list[str]) -> tuple[int, int | None]:
+    """Positions of a line's time, and of an image name, if any."""
+    time = next((place for place, value in enumerate(values) if is_number(value)), None)
+    if time is None:
+        raise SourceError(path, f"line {number} has no time")
+    names = (place for place, value in enumerate(values) if _is_image(value))
+    return time, next(names, None)
+
+
+def _is_image(name: str) -> bool:
+    return name.lower().endswith(STILL_SUFFIXES)
+
+
+def _by_name(reader: ImagesReader, images: list[Path], unit: str | None) -> NDArray[np.int64]:
+    names = [path.stem for path in images]
+    if all(map(is_number, names)):
+        unit = unit or unit_of(names)
+    elif unit is not None:
+        wrong = next(path for path in images if not is_number(path.stem))
+        raise SourceError(
+            wrong, "has a name that is not a time", "Give `stamps` FILE or `rate` HZ."
+        )
+    if unit is None or not all(map(is_number, names)):
+        raise SourceError(
+            reader.path,
+            "holds images whose names are not times in nanoseconds or decimal seconds",
+            "Give `stamps` FILE, `rate` HZ, or the `unit` of the names.",
+        )
+    read = of_unit(unit, reader.left_out)
+    stamps = np.empty(len(images), np.int64)
+    for place, path in enumerate(images):
+        try:
+            stamps[place] = read(path.stem)
+        except Refused as error:
+            raise SourceError(path, f"has a name that is not a time: {error}") from None
+    return stamps
+
+
+# name -> whether a folder has the layout, and what adds all that is in it; in the order of trial
+_LAYOUTS: Mapping[
+    str, tuple[Callable[[Path], bool], Callable[[ImagesReader, ImageFolder], None]]
+] = {
+    "euroc": (_is_euroc, _add_euroc),
+    "tum": (_is_tum, _add_tum),
+    "plain": (lambda _: True, _add_plain),
+}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import heapq
 import io
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,105 +22,48 @@ from mp4ds.files.sources import source_name, source_size
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
 from mp4ds.messages.serializations import plain_message
 from mp4ds.messages.transforms import Transform
-from mp4ds.messages.wire import NS, CodedFields, Fields, ImageFields, PrimitiveWriter, Slots
-from mp4ds.plugins.importing.scene import Scene, SceneCamera, SensorTable
-from mp4ds.records import (
-    Attachment,
-    Channel,
-    Excerpt,
-    Message,
-    Record,
+from mp4ds.messages.wire import (
+    NS,
+    CalibrationFields,
+    CodedFields,
+    Fields,
+    ImageFields,
+    PrimitiveWriter,
+    Slots,
 )
+from mp4ds.records import Attachment, Channel, Excerpt, Message, Record
 from mp4ds.video.images import read_image
-
-IMAGE = "sensor_msgs/msg/Image"
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
-INFO = "sensor_msgs/msg/CameraInfo"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
-
-_WIRE, _PREFIX = "cdr-le", b"\x00\x01\x00\x00"
-_UNKNOWN = (-1.0, *(0.0 for _ in range(8)))  # the covariance of what is not measured
-_NOT_TOLD = (0.0,) * 9
-
-
-def camera_message(
-    type_name: str, frame_id: str, fields: Fields, stamp: int, body: bytes = b""
-) -> bytes:
-    """An image or a calibration.
-
-    Args:
-        type_name: `IMAGE`, `COMPRESSED` or `INFO`.
-        frame_id: Coordinate frame.
-        fields: Of the type.
-        stamp: Nanoseconds.
-        body: Pixels or file of an image.
-
-    Raises:
-        WireError: The serialization cannot represent it.
-    """
-    return plain_message(_WIRE, type_name, frame_id, fields, Slots(stamp), body)
-
-
-def transforms_message(stamp: int, transforms: Sequence[Transform]) -> bytes:
-    """A tf2_msgs/TFMessage."""
-    writer = _new()
-    writer.put("I", len(transforms))
-    for item in transforms:
-        _header(writer, stamp, item.parent)
-        writer.string(item.child, terminated=True)
-        writer.put("d", *item.translation, *item.rotation)
-    return writer.getvalue()
-
-
-def _imu(stamp: int, frame_id: str, row: Sequence[float]) -> bytes:
-    """Angular velocity x, y, z in rad/s, then acceleration x, y, z in m/s^2."""
-    turn, acceleration = row[:3], row[3:]
-    writer = _new()
-    _header(writer, stamp, frame_id)
-    writer.put("d", 0.0, 0.0, 0.0, 1.0, *_UNKNOWN, *turn, *_NOT_TOLD, *acceleration, *_NOT_TOLD)
-    return writer.getvalue()
-
-
-def _accelerometer(stamp: int, frame_id: str, row: Sequence[float]) -> bytes:
-    """Acceleration x, y, z in m/s^2, as an Imu that measures nothing else."""
-    writer = _new()
-    _header(writer, stamp, frame_id)
-    writer.put("d", 0.0, 0.0, 0.0, 1.0, *_UNKNOWN, 0.0, 0.0, 0.0, *_UNKNOWN, *row, *_NOT_TOLD)
-    return writer.getvalue()
-
-
-def _pose(stamp: int, frame_id: str, row: Sequence[float]) -> bytes:
-    """Position x, y, z in metres, then the quaternion x, y, z, w."""
-    writer = _new()
-    _header(writer, stamp, frame_id)
-    writer.put("d", *row)
-    return writer.getvalue()
-
-
-TABLES: Mapping[str, tuple[str, Callable[[int, str, Sequence[float]], bytes]]] = {
-    "imu": ("sensor_msgs/msg/Imu", _imu),
-    "accelerometer": ("sensor_msgs/msg/Imu", _accelerometer),
-    "pose": ("geometry_msgs/msg/PoseStamped", _pose),
-}
-"""Kinds of tables -> message type, and what makes a message of stamp, frame and row."""
-
-
-def _new() -> PrimitiveWriter:
-    return PrimitiveWriter(_PREFIX, "<", aligned=True)
-
-
-def _header(writer: PrimitiveWriter, stamp: int, frame_id: str) -> None:
-    writer.put("I", *divmod(stamp, NS))
-    writer.string(frame_id, terminated=True)
-
-
-# ---------------------------------------------------------------- the reader
 
 FILE_LIST = "images.csv"
 """Name of the attachment that lists which message was made from which file."""
 
-_JPEG = (".jpg", ".jpeg")
+_IMAGE = "sensor_msgs/msg/Image"
+_COMPRESSED = "sensor_msgs/msg/CompressedImage"
+_INFO = "sensor_msgs/msg/CameraInfo"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _TF_STATIC = "/tf_static"
+_JPEG = (".jpg", ".jpeg")
+
+_WIRE, _PREFIX = "cdr-le", b"\x00\x01\x00\x00"
+_NO_TURN = (0.0, 0.0, 0.0, 1.0)
+_UNMEASURED = (-1.0, *(0.0 for _ in range(8)))  # the covariance of what is not measured
+_UNKNOWN = (0.0,) * 9  # the covariance of what is, if nobody says
+
+# kind of a table -> type of its messages, and the numbers of a row as they follow its header
+_TABLES: Mapping[str, tuple[str, Callable[[Sequence[float]], Sequence[float]]]] = {
+    # angular velocity x, y, z in rad/s, then acceleration x, y, z in m/s^2
+    "imu": (
+        "sensor_msgs/msg/Imu",
+        lambda row: (*_NO_TURN, *_UNMEASURED, *row[:3], *_UNKNOWN, *row[3:], *_UNKNOWN),
+    ),
+    # acceleration x, y, z in m/s^2
+    "accelerometer": (
+        "sensor_msgs/msg/Imu",
+        lambda row: (*_NO_TURN, *_UNMEASURED, 0.0, 0.0, 0.0, *_UNMEASURED, *row, *_UNKNOWN),
+    ),
+    # position x, y, z in metres, then the quaternion x, y, z, w
+    "pose": ("geometry_msgs/msg/PoseStamped", lambda row: row),
+}
 
 
 @dataclass(frozen=True)
@@ -139,33 +82,31 @@ class _Track:
     make: Callable[[int], bytes]
     files: Sequence[Path] = ()
 
-    def message(self, number: int) -> Message:
-        time = int(self.stamps[number])
-        return Message(self.channel, time, time, 0, self.make(number))
-
-    def within(self, excerpt: Excerpt) -> range:
-        """Numbers of the messages of an excerpt."""
+    def order(self, place: int, excerpt: Excerpt) -> Iterator[tuple[int, int, int]]:
+        """Time, place of the track and number of the messages of an excerpt."""
         if not excerpt.has_topic(self.channel.topic):
-            return range(0)
+            return iter(())
         start, end = (
             default if time is None else int(np.searchsorted(self.stamps, time))
             for time, default in ((excerpt.start, 0), (excerpt.end, len(self.stamps)))
         )
-        return range(start, end)
-
-    def order(self, place: int, excerpt: Excerpt) -> Iterator[tuple[int, int, int]]:
-        """Time, place of the track and number of the messages of an excerpt."""
-        return ((int(self.stamps[number]), place, number) for number in self.within(excerpt))
+        return ((int(self.stamps[number]), place, number) for number in range(start, end))
 
 
 class ImagesReader(BagReader):
-    """Reads a scene found by a layout.
+    """Reads what a layout adds of a folder.
 
     Log times and publish times are the stamps. JPEG files become CompressedImage unchanged, all
     other images Image; each image has a CameraInfo if its calibration is known.
 
     Args:
-        scene: What the folder holds.
+        folder: The folder.
+
+    Attributes:
+        files: What it was read from, including folders of images.
+        kept: Files to store as they are, because messages do not hold all of them.
+        transforms: Poses of sensors.
+        left_out: What is left out: a phrase -> how many.
     """
 
     # what a recorder of such messages would have written
@@ -173,69 +114,152 @@ class ImagesReader(BagReader):
     profile = "ros2"
     is_indexed = True
     position = 0
-    skipped: Mapping[str, int] = {}
 
-    def __init__(self, scene: Scene) -> None:
-        self.path = scene.folder
-        self.files = list(dict.fromkeys(scene.files))
-        self.skipped = dict(scene.skipped)
-        self._kept = scene.kept
+    def __init__(self, folder: Path) -> None:
+        self.path = folder
+        self.files: list[Path] = []
+        self.kept: list[Path] = []
+        self.transforms: list[Transform] = []
+        self.left_out: Counter[str] = Counter()
         self._tracks: list[_Track] = []
-        for camera in scene.cameras:
-            self._add_camera(camera.by_time())
-        for table in scene.tables:
-            self._add_table(table.by_time())
-        times = [int(track.stamps[0]) for track in self._tracks if len(track.stamps)]
-        self._start = min(times, default=0)
-        if scene.transforms:
-            payload = transforms_message(self._start, scene.transforms)
+
+    # ------------------------------------------------ for layouts
+
+    def add_file(self, path: Path, *, is_kept: bool = False) -> None:
+        """Note a file or folder of images that was read."""
+        if path.resolve() not in {file.resolve() for file in self.files}:
+            self.files.append(path)
+        if is_kept:
+            self.kept.append(path)
+
+    def leave_out(self, path: Path, what: str) -> None:
+        """Count files that do not become messages."""
+        files = [path] if path.is_file() else [item for item in path.rglob("*") if item.is_file()]
+        if files:
+            self.left_out[f"files of {what}"] += len(files)
+
+    def add_camera(
+        self,
+        topic: str,
+        frame_id: str,
+        images: Sequence[Path],
+        stamps: NDArray[np.int64],
+        *,
+        calibration: CalibrationFields | None = None,
+        encoding: str | None = None,
+    ) -> None:
+        """Add the images of a camera, in any order.
+
+        Args:
+            topic: Of its raw images.
+            frame_id: Coordinate frame.
+            images: Their files.
+            stamps: Their times, nanoseconds, int64, shape (images,).
+            calibration: Its intrinsics, if known.
+            encoding: ROS image encoding; None: as in the files.
+
+        Raises:
+            OptionError: The encoding cannot be that of its files.
+        """
+        order = np.argsort(stamps, kind="stable")
+        stamps, paths = stamps[order], [images[number] for number in order.tolist()]
+        is_jpeg = np.array([path.suffix.lower() in _JPEG for path in paths], bool)
+        if encoding and is_jpeg.any():
+            raise OptionError(
+                f"{topic} has JPEG files, which are kept as they are: `encoding` {encoding} "
+                "cannot apply to them."
+            )
+
+        def add(topic: str, type_name: str, chosen: NDArray[np.bool_]) -> None:
+            own, times = [paths[number] for number in np.flatnonzero(chosen)], stamps[chosen]
+
+            def make(number: int) -> bytes:
+                fields, body = _image(own[number], encoding)
+                return _camera_message(type_name, frame_id, fields, int(times[number]), body)
+
+            if own:
+                self._add(topic, type_name, times, make, own)
+
+        add(topic, _IMAGE, ~is_jpeg)
+        add(f"{topic}/compressed", _COMPRESSED, is_jpeg)
+        if calibration is not None and paths:
+            fields = calibration
+            self._add(
+                f"{''.join(topic.rpartition('/')[:2])}camera_info",
+                _INFO,
+                stamps,
+                lambda number: _camera_message(_INFO, frame_id, fields, int(stamps[number])),
+            )
+
+    def add_table(
+        self,
+        topic: str,
+        kind: str,
+        frame_id: str,
+        stamps: NDArray[np.int64],
+        rows: NDArray[np.float64],
+    ) -> None:
+        """Add the measurements of a sensor, in any order.
+
+        Args:
+            topic: Its topic.
+            kind: ``imu``, ``accelerometer`` or ``pose``.
+            frame_id: Coordinate frame.
+            stamps: Nanoseconds, int64, shape (rows,).
+            rows: float64, shape (rows, values).
+        """
+        type_name, values_of = _TABLES[kind]
+        order = np.argsort(stamps, kind="stable")
+        times, values = stamps[order], rows[order]
+
+        def make(number: int) -> bytes:
+            writer = PrimitiveWriter(_PREFIX, "<", aligned=True)
+            _put_header(writer, int(times[number]), frame_id)
+            writer.put("d", *values_of(values[number].tolist()))
+            return writer.getvalue()
+
+        self._add(topic, type_name, times, make)
+
+    def _add(
+        self,
+        topic: str,
+        type_name: str,
+        stamps: NDArray[np.int64],
+        make: Callable[[int], bytes],
+        files: Sequence[Path] = (),
+    ) -> None:
+        channel = ros2_channel(len(self._tracks), topic, type_name, "")
+        self._tracks.append(_Track(channel, stamps, make, files))
+
+    def finish(self) -> None:
+        """Add the transforms, after everything else.
+
+        Raises:
+            SourceError: There are no images.
+        """
+        if not any(track.files for track in self._tracks):
+            raise SourceError(self.path, "holds no images")
+        if self.transforms:
+            payload = _transforms_message(self._start, self.transforms)
+            channel = ros2_channel(len(self._tracks), _TF_STATIC, _TRANSFORMS, LATCHED_QOS)
             stamps = np.array([self._start], np.int64)
-            channel = self._channel(_TF_STATIC, TRANSFORMS, LATCHED_QOS)
             self._tracks.insert(0, _Track(channel, stamps, lambda _: payload))
 
-    def _channel(self, topic: str, type_name: str, qos: str = "") -> Channel:
-        return ros2_channel(len(self._tracks), topic, type_name, qos)
+    @property
+    def _start(self) -> int:
+        return min(int(track.stamps[0]) for track in self._tracks if len(track.stamps))
 
-    def _add_camera(self, camera: SceneCamera) -> None:
-        is_jpeg = np.array([path.suffix.lower() in _JPEG for path in camera.files], bool)
-        if camera.encoding and is_jpeg.any():
-            raise OptionError(
-                f"{camera.topic} has JPEG files, which are kept as they are: `encoding` "
-                f"{camera.encoding} cannot apply to them."
-            )
-        for chosen, topic, type_name in (
-            (~is_jpeg, camera.topic, IMAGE),
-            (is_jpeg, f"{camera.topic}/compressed", COMPRESSED),
-        ):
-            if chosen.any():
-                files = [camera.files[number] for number in np.flatnonzero(chosen).tolist()]
-                stamps = camera.stamps[chosen]
-                make = _jpeg_message if type_name == COMPRESSED else _image_message
-                self._tracks.append(
-                    _Track(
-                        self._channel(topic, type_name),
-                        stamps,
-                        partial(make, camera, files, stamps),
-                        files,
-                    )
-                )
-        if camera.calibration is not None and len(camera.stamps):
-            topic = f"{''.join(camera.topic.rpartition('/')[:2])}camera_info"
-            make_info = partial(_info_message, camera)
-            self._tracks.append(_Track(self._channel(topic, INFO), camera.stamps, make_info))
-
-    def _add_table(self, table: SensorTable) -> None:
-        type_name, make = TABLES[table.kind]
-
-        def message(number: int) -> bytes:
-            return make(int(table.stamps[number]), table.frame_id, table.rows[number].tolist())
-
-        self._tracks.append(_Track(self._channel(table.topic, type_name), table.stamps, message))
+    # ------------------------------------------------ for readers
 
     @property
     def channels(self) -> Sequence[Channel]:
         """All channels."""
         return [track.channel for track in self._tracks]
+
+    @property
+    def skipped(self) -> Mapping[str, int]:
+        """What is left out: a phrase -> how many."""
+        return self.left_out
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Attachments, then messages by log time."""
@@ -243,26 +267,22 @@ class ImagesReader(BagReader):
         if excerpt.others:
             yield from self._attachments()
         orders = [track.order(place, excerpt) for place, track in enumerate(self._tracks)]
-        for _, place, number in heapq.merge(*orders):
+        for time, place, number in heapq.merge(*orders):
             track = self._tracks[place]
             if track.files:
                 self.position += _size(track.files[number])
-            yield track.message(number)
+            yield Message(track.channel, time, time, 0, track.make(number))
         self.position = sum(map(source_size, self.files))
 
     def _attachments(self) -> Iterator[Attachment]:
         """What messages cannot hold: the original calibrations, and the file names."""
-        yield self._attached(FILE_LIST, "text/csv", self._file_list())
-        for path in self._kept:
-            try:
-                data = path.read_bytes()
-            except OSError as error:
-                raise SourceError(path, f"cannot be read: {error.strerror}") from None
+        yield self._attachment(FILE_LIST, "text/csv", self._file_list())
+        for path in self.kept:
             is_yaml = path.suffix in (".yaml", ".yml")
             media_type = "application/yaml" if is_yaml else "text/plain"
-            yield self._attached(source_name(path, self.path), media_type, data)
+            yield self._attachment(source_name(path, self.path), media_type, _bytes(path))
 
-    def _attached(self, name: str, media_type: str, data: bytes) -> Attachment:
+    def _attachment(self, name: str, media_type: str, data: bytes) -> Attachment:
         return Attachment(name, media_type, self._start, self._start, data)
 
     def _file_list(self) -> bytes:
@@ -281,6 +301,9 @@ class ImagesReader(BagReader):
         return {track.channel.id: track.stamps for track in self._tracks}
 
 
+# ---------------------------------------------------------------- messages
+
+
 def _size(path: Path) -> int:
     try:
         return path.stat().st_size
@@ -288,18 +311,24 @@ def _size(path: Path) -> int:
         raise SourceError(path, f"cannot be read: {error.strerror}") from None
 
 
-def _image_message(
-    camera: SceneCamera, files: Sequence[Path], stamps: NDArray[np.int64], number: int
-) -> bytes:
-    path = files[number]
-    told, pixels = read_image(path)
-    encoding = ENCODINGS[camera.encoding or told]
-    if not _suits(encoding, pixels):
-        raise SourceError(path, f"has {told} pixels, which cannot be {encoding.name}")
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SourceError(path, f"cannot be read: {error.strerror}") from None
+
+
+def _image(path: Path, encoding: str | None) -> tuple[Fields, bytes]:
+    """The fields of an image's message, and its pixels, or the file if it is JPEG."""
+    if path.suffix.lower() in _JPEG:
+        return CodedFields("jpeg"), _bytes(path)
+    found, pixels = read_image(path)
+    wanted = ENCODINGS[encoding or found]
+    if not _suits(wanted, pixels):
+        raise SourceError(path, f"has {found} pixels, which cannot be {wanted.name}")
     height, width = pixels.shape[:2]
-    step = width * encoding.pixel_bytes
-    fields = ImageFields(encoding.name, width, height, step, is_bigendian=0)
-    return camera_message(IMAGE, camera.frame_id, fields, int(stamps[number]), pixels.tobytes())
+    step = width * wanted.pixel_bytes
+    return ImageFields(wanted.name, width, height, step, is_bigendian=0), pixels.tobytes()
 
 
 def _suits(encoding: Encoding, pixels: Pixels) -> bool:
@@ -308,20 +337,22 @@ def _suits(encoding: Encoding, pixels: Pixels) -> bool:
     return is_whole and channels == encoding.channels and pixels.dtype == np.dtype(encoding.dtype)
 
 
-def _jpeg_message(
-    camera: SceneCamera, files: Sequence[Path], stamps: NDArray[np.int64], number: int
+def _camera_message(
+    type_name: str, frame_id: str, fields: Fields, stamp: int, body: bytes = b""
 ) -> bytes:
-    path = files[number]
-    try:
-        body = path.read_bytes()
-    except OSError as error:
-        raise SourceError(path, f"cannot be read: {error.strerror}") from None
-    return camera_message(
-        COMPRESSED, camera.frame_id, CodedFields("jpeg"), int(stamps[number]), body
-    )
+    return plain_message(_WIRE, type_name, frame_id, fields, Slots(stamp), body)
 
 
-def _info_message(camera: SceneCamera, number: int) -> bytes:
-    if camera.calibration is None:
-        raise ValueError(f"{camera.topic} has no calibration")
-    return camera_message(INFO, camera.frame_id, camera.calibration, int(camera.stamps[number]))
+def _transforms_message(stamp: int, transforms: Sequence[Transform]) -> bytes:
+    writer = PrimitiveWriter(_PREFIX, "<", aligned=True)
+    writer.put("I", len(transforms))
+    for item in transforms:
+        _put_header(writer, stamp, item.parent)
+        writer.string(item.child, terminated=True)
+        writer.put("d", *item.translation, *item.rotation)
+    return writer.getvalue()
+
+
+def _put_header(writer: PrimitiveWriter, stamp: int, frame_id: str) -> None:
+    writer.put("I", *divmod(stamp, NS))
+    writer.string(frame_id, terminated=True)

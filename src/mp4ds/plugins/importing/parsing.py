@@ -1,4 +1,4 @@
-"""The contents of a folder as found by a layout, and parsers for lists, times and calibrations."""
+"""Parsers for the times, lists and calibrations of folders of images."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from mp4ds import yamlio
 from mp4ds.errors import FormatError, Refused, SourceError
-from mp4ds.messages.transforms import Transform
+from mp4ds.messages.transforms import Transform, quaternion_of
 from mp4ds.messages.wire import CalibrationFields
 
 UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
@@ -97,57 +96,6 @@ def at_rate(count: int, rate: str) -> NDArray[np.int64]:
     if times and times[-1] > MAX_STAMP:
         raise Refused(f"{rate!r} Hz is too slow for {count} images")
     return np.array(times, np.int64)
-
-
-# ---------------------------------------------------------------- geometry
-
-_TOLERANCE = 1e-2  # of a rotation given with few digits
-
-Matrix = NDArray[np.float64]
-
-
-def quaternion(rotation: Matrix) -> tuple[float, float, float, float]:
-    """The unit quaternion x, y, z, w of a rotation, w not negative.
-
-    It is the eigenvector of the largest eigenvalue of a symmetric matrix (I. Bar-Itzhack, 2000),
-    which is the nearest rotation to a matrix with rounded digits.
-
-    Args:
-        rotation: Shape (3, 3).
-
-    Raises:
-        ValueError: It is not a rotation.
-    """
-    m = rotation
-    is_near = np.abs(m @ m.T - np.eye(3)).max(initial=0) < _TOLERANCE
-    if not np.isfinite(m).all() or not is_near or np.linalg.det(m) < 0:
-        raise ValueError("the rotation is not valid")
-    symmetric = np.empty((4, 4))
-    symmetric[:3, :3] = m + m.T - np.trace(m) * np.eye(3)
-    vector = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
-    symmetric[3, :3] = symmetric[:3, 3] = vector
-    symmetric[3, 3] = np.trace(m)
-    found = np.linalg.eigh(symmetric)[1][:, -1]
-    x, y, z, w = (found if found[3] >= 0 else -found).tolist()
-    return x, y, z, w
-
-
-def transform(parent: str, child: str, rotation: Matrix, translation: Matrix) -> Transform:
-    """The pose of a frame in another: a point p of the child is rotation * p + translation there.
-
-    Args:
-        parent: The frame in which the child is.
-        child: The frame whose pose this is.
-        rotation: Shape (3, 3).
-        translation: Metres, shape (3,).
-
-    Raises:
-        ValueError: The rotation is not valid.
-    """
-    if not np.isfinite(translation).all():
-        raise ValueError("the translation is not finite")
-    x, y, z = (translation + 0.0).tolist()  # without negative zeros
-    return Transform(parent, child, (x, y, z), quaternion(rotation))
 
 
 # ---------------------------------------------------------------- calibration
@@ -258,16 +206,18 @@ def euroc_calibration(path: Path, values: dict[str, Any]) -> CalibrationFields:
         raise SourceError(path, f"is not a valid calibration: {error}") from None
 
 
-def euroc_pose(path: Path, values: dict[str, Any]) -> Matrix | None:
-    """``T_BS`` of EuRoC's sensor.yaml: the pose of the sensor in the body, shape (4, 4).
+def euroc_pose(path: Path, values: dict[str, Any], body: str, sensor: str) -> list[Transform]:
+    """The pose of a sensor in the body, by ``T_BS`` of EuRoC's sensor.yaml; none if it is absent.
 
     Raises:
         SourceError: It is not valid.
     """
     if "T_BS" not in values:
-        return None
+        return []
     try:
-        return np.array(_matrix(values, "T_BS", 16)).reshape(4, 4)
+        pose = np.array(_matrix(values, "T_BS", 16)).reshape(4, 4)
+        x, y, z = (pose[:3, 3] + 0.0).tolist()  # without negative zeros
+        return [Transform(body, sensor, (x, y, z), quaternion_of(pose[:3, :3]))]
     except ValueError as error:
         raise SourceError(path, f"holds no valid pose: {error}") from None
 
@@ -333,90 +283,10 @@ def _number(value: Any, key: str) -> float:
     return number
 
 
-# ---------------------------------------------------------------- scene
+# ---------------------------------------------------------------- lists
 
 MAX_TEXT = 2**30
 _MAX_LINE = 2**16
-
-
-@dataclass(frozen=True)
-class SceneCamera:
-    """The images of a camera, by time.
-
-    Attributes:
-        topic: Of its raw images.
-        frame_id: Coordinate frame.
-        files: The images.
-        stamps: Their times, nanoseconds, int64, shape (images,).
-        calibration: Its intrinsics, if known.
-        encoding: ROS image encoding; None: as in the files.
-    """
-
-    topic: str
-    frame_id: str
-    files: Sequence[Path]
-    stamps: NDArray[np.int64]
-    calibration: CalibrationFields | None = None
-    encoding: str | None = None
-
-    def by_time(self) -> SceneCamera:
-        """The same sorted by time, stably."""
-        order = np.argsort(self.stamps, kind="stable")
-        files = [self.files[number] for number in order.tolist()]
-        return replace(self, files=files, stamps=self.stamps[order])
-
-
-@dataclass(frozen=True)
-class SensorTable:
-    """Measurements of a sensor that is not a camera.
-
-    Attributes:
-        topic: Its topic.
-        kind: One of `mp4ds.plugins.importing.reader.TABLES`.
-        frame_id: Coordinate frame.
-        stamps: Nanoseconds, int64, shape (rows,).
-        rows: float64, shape (rows, values).
-    """
-
-    topic: str
-    kind: str
-    frame_id: str
-    stamps: NDArray[np.int64]
-    rows: NDArray[np.float64]
-
-    def by_time(self) -> SensorTable:
-        """The same sorted by time."""
-        order = np.argsort(self.stamps, kind="stable")
-        return replace(self, stamps=self.stamps[order], rows=self.rows[order])
-
-
-@dataclass
-class Scene:
-    """Everything in a folder.
-
-    Attributes:
-        folder: The folder.
-        files: What it was read from, including folders of images.
-        cameras: Its cameras.
-        tables: Its other sensors.
-        transforms: Their poses.
-        kept: Files to store as they are, because messages do not hold all of them.
-        skipped: What is left out: a phrase -> how many.
-    """
-
-    folder: Path
-    files: list[Path] = field(default_factory=list)
-    cameras: list[SceneCamera] = field(default_factory=list)
-    tables: list[SensorTable] = field(default_factory=list)
-    transforms: list[Transform] = field(default_factory=list)
-    kept: list[Path] = field(default_factory=list)
-    skipped: Counter[str] = field(default_factory=Counter)
-
-    def leave_out(self, path: Path, what: str) -> None:
-        """Count files that do not become messages."""
-        files = [path] if path.is_file() else [item for item in path.rglob("*") if item.is_file()]
-        if files:
-            self.skipped[f"files of {what}"] += len(files)
 
 
 def lines_of(path: Path) -> Iterator[tuple[int, str]]:
