@@ -11,21 +11,21 @@ import re
 import shutil
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import av
 import pytest
 
 import mp4ds
 from mp4ds import yamlio
-from mp4ds.errors import FormatError, VideoError
+from mp4ds.errors import FormatError
 from mp4ds.format.fields import FORMAT_VERSION, Body
 from mp4ds.format.models import VIDEO_CODECS
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.messages.serializations import WIRES
-from mp4ds.video.planes import RawPicture, raw_pictures
 from sources import load_tool
 from waiting import WATCHDOG_S
 
@@ -72,7 +72,10 @@ def streams() -> Iterator[Case]:
 
 @pytest.mark.parametrize("case", LISTED["cases"], ids=ids)
 def test_mp4ds_reads_what_is_expected(case: Case) -> None:
-    found = load_tool("conformance").dump(CASES / case["path"])
+    module = load_tool("conformance_dump")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of newer minor versions
+        found = json.loads(module.as_json(module.conformance_dump(CASES / case["path"])))
     assert found == (expected(case) if "expected" in case else {"problems": case["problems"]})
 
 
@@ -296,13 +299,13 @@ def integers(value: Any) -> Iterator[int]:
         yield value
 
 
-@pytest.mark.parametrize("path", sorted(CASES.rglob("*.json")), ids=lambda path: path.stem)
-def test_the_json_can_be_read_in_any_language(path: Path) -> None:
+def test_the_json_can_be_read_in_any_language() -> None:
     def refuse(name: str) -> None:
         raise AssertionError(f"{name} is no JSON")
 
-    values = json.loads(path.read_text(), parse_constant=refuse)
-    assert all(abs(number) < 2**53 for number in integers(values))
+    for path in CASES.rglob("*.json"):
+        values = json.loads(path.read_text(), parse_constant=refuse)
+        assert all(abs(number) < 2**53 for number in integers(values)), path
 
 
 def test_the_list_is_whole() -> None:
@@ -328,54 +331,18 @@ def test_the_suite_is_small() -> None:
     assert size < 2_000_000
 
 
-# ---------------------------------------------------------------- planes
-
-ORDERS = {"rgb24": (1, 2, 0), "bgr24": (1, 0, 2), "rgba": (1, 2, 0, 3), "bgra": (1, 0, 2, 3)}
-
-
-def test_planes_of_rgb_are_the_samples_in_whatever_form_they_are_coded() -> None:
-    seen = set()
-    with mp4ds.open(CASES / "datasets" / "layouts-8") as dataset:
-        for stream in dataset:
-            video = stream.sidecar.video
-            order = ORDERS.get(video.layout)
-            if order is None:
-                continue
-            seen.add((video.codec, len(order)))
-            pictures = list(raw_pictures(stream.video_path, is_gray=False))
-            assert len(pictures) == len(stream)
-            for frame, raw in zip(stream, pictures, strict=True):
-                assert raw.pixel_format == ("gbrap" if len(order) == 4 else "gbrp")
-                pixels = frame.data.view(np.uint8) ^ (0x80 if stream.encoding == "8SC3" else 0)
-                for plane, place in zip(raw.planes, order, strict=True):
-                    assert np.array_equal(plane, pixels[..., place])
-    assert seen == {("ffv1", 3), ("h264", 3), ("ffv1", 4)}
-
-
-def test_a_video_that_does_not_decode_has_no_planes(tmp_path: Path) -> None:
-    path = tmp_path / "cut.mp4"
-    with pytest.raises(VideoError) as caught:
-        list(raw_pictures(path, is_gray=True))
-    assert caught.value.code == "file-missing"
-    data = bytearray((CASES / "sidecars" / "valid" / "gray.mp4").read_bytes())
-    start = data.index(b"mdat") + 4
-    data[start : start + 4000] = b"\xff" * len(data[start : start + 4000])
-    path.write_bytes(data)
-    with pytest.raises(VideoError):
-        list(raw_pictures(path, is_gray=True))
-
-
 def test_a_stream_that_does_not_decode_is_told_without_planes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As packets are that were recorded after others had been lost."""
-
-    def fail(path: Path, **_: object) -> Iterator[RawPicture]:
-        yield from itertools.islice(raw_pictures(path, is_gray=False), 1)
-        raise VideoError("decode-failed", path, "frame 1 cannot be decoded")
-
     module = load_tool("conformance_dump")
-    monkeypatch.setattr(module, "raw_pictures", fail)
+    decoded = module.decoded
+
+    def fail(path: Path) -> Iterator[Any]:
+        yield from itertools.islice(decoded(path), 1)
+        raise av.error.InvalidDataError(0, "damaged")
+
+    monkeypatch.setattr(module, "decoded", fail)
     found = module.conformance_dump(CASES / "sidecars" / "valid" / "packets.yaml")
     (stream,) = found["streams"]
     assert stream["planes"] is None
