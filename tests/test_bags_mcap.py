@@ -20,8 +20,7 @@ from mcap.writer import IndexType, Writer
 from conftest import real
 from mp4ds.bags import protocols
 from mp4ds.bags.files import DamageError, unzstd
-from mp4ds.bags.mcap import McapReader
-from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.mcap import McapReader, McapWriter
 from mp4ds.errors import ConversionError, Mp4dsError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
 
@@ -580,7 +579,7 @@ def test_a_release_of_mcap_without_what_is_set_in_it(
             super().__init__(*args, **options)
             del self._Writer__compression
 
-    monkeypatch.setattr("mp4ds.bags.mcap_write.Writer", Later)
+    monkeypatch.setattr("mp4ds.bags.mcap.Writer", Later)
     with pytest.raises(Mp4dsError, match=r"a\.mcap: mcap \S+ is newer .* 'mcap<"):
         McapWriter(tmp_path / "a.mcap", profile="")
 

@@ -20,10 +20,9 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 
 from conftest import real
 from mp4ds.bags.formats import open_sources
-from mp4ds.bags.rosbag2 import Rosbag2Reader
+from mp4ds.bags.rosbag2 import Rosbag2Reader, Rosbag2Writer
 from mp4ds.bags.rosbag2_metadata import RECORD, TABLES_RECORD, native_qos, parse_bag_info
-from mp4ds.bags.rosbag2_sqlite import SqliteReader
-from mp4ds.bags.rosbag2_write import Rosbag2Writer, SqliteWriter
+from mp4ds.bags.rosbag2_sqlite import SqliteReader, SqliteWriter
 from mp4ds.errors import ConversionError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
 

@@ -28,9 +28,8 @@ from mp4ds import yamlio
 from mp4ds.bags import files
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.files import DamageError, unzstd
-from mp4ds.bags.mcap import McapReader
-from mp4ds.bags.mcap_write import McapWriter
-from mp4ds.bags.ros1_write import Ros1Writer
+from mp4ds.bags.mcap import McapReader, McapWriter
+from mp4ds.bags.ros1 import Ros1Writer
 from mp4ds.bags.rosbag2_metadata import parse_qos
 from mp4ds.errors import RemoteError
 from mp4ds.records import Channel, Message, Schema
@@ -431,7 +430,7 @@ CHUNKS: dict[str, tuple[Callable[[], bytes], str]] = {
     "zstd": (lambda: chunk(zstd_bomb(LARGE, told=True), "zstd", size=LARGE), "declares"),
     "zstd-untold": (lambda: chunk(zstd_bomb(LARGE, told=False), "zstd", size=LARGE), "declares"),
     "zstd-small": (lambda: chunk(zstd_bomb(LARGE, told=False), "zstd", size=1000), "damaged"),
-    "lz4": (lambda: chunk(lz4_bomb(5 * 2**28), "lz4", size=1000), "after 1000 bytes"),
+    "lz4": (lambda: chunk(lz4_bomb(5 * 2**28), "lz4", size=1000), "does not unpack to 1000 bytes"),
 }
 
 

@@ -19,7 +19,7 @@ import pytest
 import mp4ds
 from commands import call, tree
 from mp4ds.bags.formats import open_sources
-from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError

@@ -117,22 +117,6 @@ def test_a_real_intact_recording_is_read_as_usual(name: str) -> None:
     assert losses == []
 
 
-@pytest.mark.parametrize("kind", ["bag", "mcap"])
-def test_what_is_far_out_of_order_is_put_in_order(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Topics one after the other, as converters write them; more than is held back."""
-    monkeypatch.setattr("mp4ds.bags.salvage.mcap.HOLD_BYTES", 2**14)
-    monkeypatch.setattr("mp4ds.bags.salvage.ros1.HOLD_BYTES", 2**14)
-    sorted_scene = scene("mono8", frames=20)
-    sorted_scene.messages.sort(key=lambda message: message.topic)
-    path = tmp_path / f"drive.{kind}"
-    write_bag(path, sorted_scene) if kind == "bag" else write_mcap(path, sorted_scene)
-    records, losses = salvaged(path)
-    assert list(map(plain, records)) == list(map(plain, usual(path)))
-    assert losses == []
-
-
 def test_an_excerpt_is_a_part_of_it(tmp_path: Path) -> None:
     (path,) = SOURCES["mcap-ros2-zstd"](tmp_path, scene("mono8"))
     os.truncate(path, path.stat().st_size * 3 // 4)
@@ -477,7 +461,7 @@ def test_the_damaged_files_of_others() -> None:
 def test_what_is_no_recording_is_refused(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"drive.{suffix}"
     path.write_bytes(random.Random(suffix).randbytes(10**6))
-    with pytest.raises(SourceError, match=r"holds no .* records"):
+    with pytest.raises(SourceError, match="holds no records of"):
         salvaged(path)
     path.write_bytes(b"")
     with pytest.raises(SourceError, match="is empty"):

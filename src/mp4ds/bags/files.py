@@ -5,21 +5,17 @@ from __future__ import annotations
 import io
 import os
 import shutil
-from contextlib import closing
+from bz2 import BZ2Decompressor
+from collections.abc import Iterator
+from contextlib import closing, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, TypeAlias
+from typing import Any, BinaryIO, NamedTuple
 
+import lz4.frame
 import zstandard
 
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.options import parse_size
-
-if TYPE_CHECKING:
-    from bz2 import BZ2Decompressor
-
-    from lz4.frame import LZ4FrameDecompressor
-
-    Decompressor: TypeAlias = BZ2Decompressor | LZ4FrameDecompressor
 
 SALVAGE = "use `mp4ds pack --salvage` to pack what is still readable."
 SALVAGE_REMEDY = "U" + SALVAGE[1:]
@@ -151,23 +147,65 @@ def most_held(packed: int | None = None) -> int:
 
 # ---------------------------------------------------------------- decompressing
 
+_MACHINES: dict[str, Any] = {
+    "bz2": BZ2Decompressor,
+    "lz4": lz4.frame.LZ4FrameDecompressor,
+    "zstd": lambda: zstandard.ZstdDecompressor().decompressobj(),
+}
+_DAMAGE = (OSError, RuntimeError, EOFError, ValueError, zstandard.ZstdError)
 
-def expand(machine: Decompressor, data: bytes | memoryview, size: int) -> bytes:
+
+def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
+    """The content of a compressed chunk.
+
+    Args:
+        compression: ``bz2``, ``lz4`` or ``zstd``.
+        data: As stored; what follows bz2 or lz4 data is ignored.
+        size: Of the content; decompression never goes beyond it.
+
+    Raises:
+        DamageError: The data is damaged or of another size, or the compression is not known.
+    """
+    return _unpacked(compression, data, size)[0]
+
+
+def _unpacked(compression: str, data: bytes | memoryview, size: int) -> tuple[bytes, int]:
+    """See `unpack`; also how many bytes of the data were used."""
+    if compression not in _MACHINES:
+        raise DamageError(f"it is compressed with {compression!r}, which is not supported")
+    if size > (most := most_held(len(data))):
+        raise OversizeError(f"it declares {size} bytes but has {len(data)}", most)
+    if compression == "zstd":
+        return unzstd(data, size), len(data)
+    machine = _MACHINES[compression]()
+    try:
+        content = _expand(machine, data, size)
+    except (OSError, RuntimeError):
+        raise DamageError(f"its {compression} data is damaged") from None
+    if not machine.eof:
+        raise DamageError(f"its {compression} data does not unpack to {size} bytes")
+    if len(content) != size:
+        raise DamageError(f"it unpacks to {len(content)} bytes instead of {size}")
+    return content, len(data) - len(machine.unused_data or b"")
+
+
+def _expand(machine: Any, data: bytes | memoryview, size: int) -> bytes:
     """Decompress data to a size, or to a byte more if there is more.
 
     A large result is made in pieces: both libraries need twice its memory to make it at once.
     """
     if size <= _PIECE_BYTES:
-        return machine.decompress(data, max_length=size + 1)
-    content = io.BytesIO()
+        content: bytes = machine.decompress(data, max_length=size + 1)
+        return content
+    gathered = io.BytesIO()
     for at in range(0, len(data), _PACKED_PIECE):
         piece = data[at : at + _PACKED_PIECE]
-        while not machine.eof and (left := size + 1 - content.tell()) > 0:
-            content.write(machine.decompress(piece, max_length=min(left, _PIECE_BYTES)))
+        while not machine.eof and (left := size + 1 - gathered.tell()) > 0:
+            gathered.write(machine.decompress(piece, max_length=min(left, _PIECE_BYTES)))
             piece = b""
             if machine.needs_input:
                 break
-    return content.getvalue()
+    return gathered.getvalue()
 
 
 def unzstd(data: bytes | memoryview, size: int | None = None) -> bytes:
@@ -208,6 +246,90 @@ def _unzstd_unsized(data: bytes | memoryview) -> bytes:
     if not decompressor.eof or decompressor.unused_data or used < len(data):
         raise DamageError("zstd data is cut short, or holds more than one frame")
     return content.getvalue()
+
+
+# ---------------------------------------------------------------- damaged chunks
+
+_SMALL_PIECE = 64
+"""Bytes decompressed at a time from damaged data: the piece with the damage yields nothing."""
+
+_CLOSE = 16
+"""Bytes at the end, of a marker and a checksum, that are decompressed one by one."""
+
+_MAGIC = {b"BZh": "bz2", b"\x04\x22\x4d\x18": "lz4", ZSTD_MAGIC: "zstd"}
+
+
+class Recovered(NamedTuple):
+    """Content of a chunk that may be damaged.
+
+    Attributes:
+        content: What could be decompressed, from the beginning.
+        used: Bytes of the data that belong to it; 0 if unknown.
+        problem: What is wrong, a phrase; empty if nothing is.
+        is_sound: Whether the content is correct, though some of it may be missing.
+    """
+
+    content: bytes
+    used: int
+    problem: str
+    is_sound: bool = True
+
+
+def recover(compression: str, data: memoryview, size: int) -> Recovered:
+    """Decompress as much as possible.
+
+    Args:
+        compression: Its name: ``none`` or empty, ``bz2``, ``lz4`` or ``zstd``; if damaged, it is
+            inferred from the data.
+        data: As stored; may be cut short.
+        size: Expected size; no more is decompressed, and no more than data of this length can hold.
+    """
+    if compression in ("", "none"):
+        content = bytes(data[:size])
+        problem = "" if len(content) == size else "a chunk is cut short"
+        return Recovered(content, len(content), problem)
+    most = most_held(len(data))
+    limit = f", the limit ({DECOMPRESSED} sets another)" if size > most else ""
+    size = min(size, most)
+    start = bytes(data[:4])
+    found = next((name for magic, name in _MAGIC.items() if start.startswith(magic)), compression)
+    if found not in _MACHINES:
+        problem = f"a chunk is compressed with {compression!r}, which is not supported"
+        return Recovered(b"", 0, problem)
+    with suppress(DamageError):
+        return Recovered(*_unpacked(found, data, size), "")
+    machine = _MACHINES[found]()
+    gathered = io.BytesIO()  # pieces in a list would need the memory twice
+    is_verified = found == "bz2"  # it has a checksum for each block
+    used, problem, is_sound = 0, f"the {found} data of a chunk is cut short", True
+    try:
+        for begin, end in _small_pieces(len(data)):
+            made = [machine.decompress(data[begin:end])]
+            while made[-1] and not machine.eof:  # bz2 compares a checksum with the last of a block
+                made.append(machine.decompress(b""))
+            gathered.writelines(made)
+            if machine.eof:
+                used, problem = end - len(machine.unused_data or b""), ""
+                if gathered.tell() != size:
+                    problem = f"a chunk holds {gathered.tell()} bytes instead of {size}"
+                    is_sound = is_verified
+                break
+            if gathered.tell() > size:
+                problem = f"the {found} data of a chunk unpacks to more than {size} bytes{limit}"
+                is_sound = is_verified
+                gathered.truncate(size)
+                break
+    except _DAMAGE:
+        problem, is_sound = f"the {found} data of a chunk is damaged", is_verified
+    return Recovered(gathered.getvalue(), used, problem, is_sound)
+
+
+def _small_pieces(length: int) -> Iterator[tuple[int, int]]:
+    body = max(0, length - _CLOSE)
+    for start in range(0, body, _SMALL_PIECE):
+        yield start, min(start + _SMALL_PIECE, body)
+    for start in range(body, length):
+        yield start, start + 1
 
 
 # ---------------------------------------------------------------- files compressed as a whole

@@ -34,9 +34,9 @@ _SALVAGERS = {
 
 
 _WRITERS = {
-    "bag": "ros1_write:Ros1Writer",
-    "mcap": "mcap_write:McapWriter",
-    "rosbag2": "rosbag2_write:Rosbag2Writer",
+    "bag": "ros1:Ros1Writer",
+    "mcap": "mcap:McapWriter",
+    "rosbag2": "rosbag2:Rosbag2Writer",
 }
 
 
@@ -157,7 +157,7 @@ def limits_of(
     """
     is_sqlite = target == "rosbag2" and storage == "sqlite3"
     name = (
-        "rosbag2_write:SqliteWriter"
+        "rosbag2_sqlite:SqliteWriter"
         if is_sqlite
         else _WRITERS["bag" if target == "bag" else "mcap"]
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import struct
 from array import array
 from collections import Counter
@@ -25,6 +24,7 @@ from mp4ds.bags.mcap_records import (
     RecordStream,
     parse,
 )
+from mp4ds.bags.protocols import LaterStarts
 from mp4ds.errors import SourceError
 from mp4ds.records import ChannelStats, Excerpt
 
@@ -58,6 +58,9 @@ class ChunkTable:
     """All chunks listed in a summary, in arrays: a long recording has many.
 
     Fill it with `add`, then call `finish` before any query.
+
+    Attributes:
+        later: When the chunks begin.
     """
 
     def __init__(self) -> None:
@@ -101,13 +104,8 @@ class ChunkTable:
         self._owners = np.repeat(np.argsort(order).astype(np.int32), counts)
         # A chunk without messages has start 0, which would hold back everything before it.
         self._empty = (self._held == 0) & (self._starts == 0) & (self._ends == 0)
-        self._later_starts = _later_starts(self._known_starts())
-        self._places = array("Q", self._offsets.tobytes())
-
-    def _known_starts(self) -> NDArray[np.uint64]:
-        starts: NDArray[np.uint64] = self._starts.copy()
-        starts[self._empty] = _LATEST
-        return starts
+        self._known_starts = np.where(self._empty, np.uint64(_LATEST), self._starts)
+        self.later = LaterStarts(self._offsets, self._known_starts)
 
     @property
     def has_messages(self) -> bool:
@@ -127,14 +125,9 @@ class ChunkTable:
             and (self._sizes <= MAX_RECORD_BYTES).all()
         )
 
-    def later_start(self, offset: int) -> int | None:
-        """The earliest log time in the chunks after a byte offset; None after the last."""
-        place = bisect.bisect_right(self._places, offset)
-        return self._later_starts[place] if place < len(self._later_starts) else None
-
     def span(self) -> tuple[int, int] | None:
         """Earliest and latest log time of all chunks; None without messages."""
-        return (self._later_starts[0], int(self._ends.max())) if self.has_messages else None
+        return (int(self._known_starts.min()), int(self._ends.max())) if self.has_messages else None
 
     def spans(self) -> dict[int, tuple[int, int]]:
         """Earliest and latest log time of the chunks that hold a channel, by its id.
@@ -169,7 +162,7 @@ class ChunkTable:
     def _most_held(self, order: NDArray[np.intp]) -> int:
         if not len(order):
             return 0
-        following = np.array(_later_starts(self._known_starts()[order]), np.uint64)[1:]
+        following = np.minimum.accumulate(self._known_starts[order][::-1])[::-1][1:]
         sizes = np.where(self._empty, 0, self._sizes).astype(np.int64)
         by_end = np.argsort(self._ends)
         gone = np.concatenate(([0], np.cumsum(sizes[by_end])))
@@ -223,11 +216,6 @@ class ChunkTable:
             int(self._sizes[number]),
             frozenset(channels.tolist()),
         )
-
-
-def _later_starts(starts: NDArray[np.uint64]) -> array[int]:
-    """The minimum of each start and those after it."""
-    return array("Q", np.minimum.accumulate(starts[::-1])[::-1].tobytes())
 
 
 # ---------------------------------------------------------------- the index
@@ -348,26 +336,6 @@ class McapSummary:
     def covers(self, count: int) -> bool:
         """Whether this count is all messages of the file."""
         return self.statistics is not None and self.statistics.message_count == count
-
-    def first_places(self, stream: RecordStream) -> dict[int, tuple[int, int, int]] | None:
-        """Where each channel's first message is, by the message indexes.
-
-        Returns:
-            Log time, byte offset of the chunk, and offset in its content, by the channel's id;
-            None if the indexes do not have all messages.
-
-        Raises:
-            DamageError: An index record is damaged.
-        """
-        places: dict[int, tuple[int, int, int]] = {}
-        count = 0
-        for entries in self.entries(stream):
-            count += len(entries.log_times)
-            if len(entries.log_times):
-                row = int(np.argmin(entries.log_times))
-                place = int(entries.log_times[row]), entries.chunk, int(entries.offsets[row])
-                places[entries.channel_id] = min(places.get(entries.channel_id, place), place)
-        return places if self.covers(count) else None
 
 
 def _parse_entries(chunk: int, body: bytes) -> IndexEntries:

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol, TypeVar
 
-import lz4.frame
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
@@ -22,11 +21,10 @@ from mp4ds.bags.files import (
     DamageError,
     OversizeError,
     ZstdStream,
-    expand,
     most_held,
     other_begin,
+    unpack,
     unreadable,
-    unzstd,
 )
 from mp4ds.errors import SourceError
 from mp4ds.files.urls import expect
@@ -242,33 +240,12 @@ def unpack_chunk(body: bytes | memoryview) -> bytes | memoryview:
     data = view[_CHUNK_HEAD.size + length + 8 :][:data_length]
     if len(data) != data_length:
         raise DamageError("a chunk is shorter than its fields")
-    content = _decompress(compression, data, size)
+    content = unpack(compression, data, size) if compression else data
     if len(content) != size:
         raise DamageError(f"a chunk holds {len(content)} bytes instead of {size}")
     if crc and crc != zlib.crc32(content):
         raise DamageError("a chunk does not match its checksum")
     return content
-
-
-def _decompress(compression: str, data: memoryview, size: int) -> bytes | memoryview:
-    if compression == "":
-        return data
-    if size > (most := most_held(len(data))):
-        raise OversizeError(f"a chunk declares {size} bytes but has {len(data)}", most)
-    if compression == "zstd":
-        return unzstd(data, size)
-    if compression == "lz4":
-        machine = lz4.frame.LZ4FrameDecompressor()
-        try:
-            content = expand(machine, data, size)
-        except RuntimeError as error:
-            raise DamageError(f"the lz4 data of a chunk is damaged: {error}") from None
-        if not machine.eof:
-            raise DamageError(f"the lz4 data of a chunk does not end after {size} bytes")
-        return content
-    raise DamageError(
-        f"a chunk is compressed with {compression!r}; only zstd and lz4 are supported"
-    )
 
 
 def chunk_records(content: bytes | memoryview) -> Iterator[tuple[int, int, memoryview]]:

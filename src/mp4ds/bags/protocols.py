@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import bisect
 import heapq
 from abc import ABC, abstractmethod
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -179,12 +181,16 @@ class BagReader(ABC):
         """`first` of the whole recording."""
         if not self.is_indexed:
             return self._first_messages.get(channel.id)
-        times = self.times().get(channel.id)
-        if times is None or not len(times):
+        start = self._first_times.get(channel.id)
+        if start is None:
             return None
-        start = int(times[0])
-        only = Excerpt(start, start + 1, frozenset([channel.topic]), others=False)
+        end = start + 1 if start < _INT64_MAX else None  # it may be later: it was clamped
+        only = Excerpt(start, end, frozenset([channel.topic]), others=False)
         return first_of(self.records(only)).get(channel.id)
+
+    @cached_property
+    def _first_times(self) -> Mapping[int, int]:
+        return {key: int(times[0]) for key, times in self.times().items() if len(times)}
 
     @cached_property
     def _first_messages(self) -> Mapping[int, Message]:
@@ -360,6 +366,25 @@ class HoldBack:
             message = heapq.heappop(self._heap)[-1]
             self._bytes -= len(message.data)
             yield message
+
+
+class LaterStarts:
+    """When the chunks of a file begin, for knowing which messages no later one can precede.
+
+    Args:
+        places: Byte offsets of chunks with messages, increasing.
+        starts: Their earliest log times, nanoseconds.
+    """
+
+    def __init__(self, places: NDArray[np.uint64], starts: NDArray[np.uint64]) -> None:
+        # arrays of Python: a query is as fast as of a list, at a fifth of its memory
+        self._places = array("Q", places.tobytes())
+        self._starts = array("Q", np.minimum.accumulate(starts[::-1])[::-1].tobytes())
+
+    def after(self, offset: int) -> int | None:
+        """The earliest log time in the chunks after a byte offset; None after the last."""
+        place = bisect.bisect_right(self._places, offset)
+        return self._starts[place] if place < len(self._starts) else None
 
 
 class SourcePart(NamedTuple):

@@ -1,4 +1,4 @@
-"""Reads ROS 1 bags of format 2.0 (wiki.ros.org/Bags/Format/2.0).
+"""Reads and writes ROS 1 bags of format 2.0 (wiki.ros.org/Bags/Format/2.0).
 
 Connection headers stay as recorded, the index is kept in arrays, and chunks are never decompressed
 beyond their declared size.
@@ -6,21 +6,27 @@ beyond their declared size.
 
 from __future__ import annotations
 
+import bz2
 import struct
 from array import array
 from collections import OrderedDict, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+import lz4.frame
 import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.files import DamageError
-from mp4ds.bags.protocols import BagReader
+from mp4ds.bags.protocols import BagReader, BagWriter
 from mp4ds.bags.ros1_records import (
+    CHUNK_COUNT,
     DAMAGE,
+    INDEX_ENTRY,
     MAGIC,
     MAX_TIME,
     BagFile,
@@ -30,11 +36,14 @@ from mp4ds.bags.ros1_records import (
     check_between,
     count_messages,
     damaged,
+    join_header,
     make_channel,
+    make_header,
     payload,
     split_header,
     unpack_chunk,
 )
+from mp4ds.errors import ConversionError, OptionError, TargetExistsError
 from mp4ds.files.urls import expect
 from mp4ds.records import Channel, Excerpt, Message, Record
 
@@ -44,8 +53,6 @@ CACHED_BYTES = 64 * 2**20
 
 _LATEST = 2**63 - 1  # more than any time of a bag
 _CHUNK_HEAD, _INDEX_HEAD = 96, 64  # maximum bytes of the records as usually written
-_COUNT = struct.Struct("<II")  # of a chunk: connection, messages
-_INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
 
 
 class _Index(NamedTuple):
@@ -160,14 +167,6 @@ class Ros1Reader(BagReader):
         """Log times from the index."""
         return {key: index.times for key, index in self._index.items()}
 
-    def _first(self, channel: Channel) -> Message | None:
-        """The channel's first message by log time, or None."""
-        index = self._index[channel.id]
-        if not len(index.times):
-            return None
-        time, chunk, offset = (int(column[0]) for column in index)
-        return self._message(channel, time, chunk, offset)
-
     def close(self) -> None:
         """Close the file."""
         self._chunks.clear()
@@ -275,7 +274,7 @@ class _Bag:
         _check_version(header)
         self.file.length()
         counts = self.file.take(8 * header.number(b"count"))
-        return _Chunk(header.number(b"chunk_pos", 8), dict(_COUNT.iter_unpack(counts)))
+        return _Chunk(header.number(b"chunk_pos", 8), dict(CHUNK_COUNT.iter_unpack(counts)))
 
     def _read_chunk(self, chunk: _Chunk) -> _Chunk:
         """A chunk with its header's fields; it will be decompressed to that size."""
@@ -295,7 +294,7 @@ class _Bag:
         chunk = self.chunks[-1]
         if (
             chunk.counts.get(number) != count
-            or len(entries) != count * _INDEX_ENTRY.itemsize
+            or len(entries) != count * INDEX_ENTRY.itemsize
             or number not in self.channels
         ):
             problem = f"the index of the chunk at byte {chunk.start} contradicts the bag's index"
@@ -310,7 +309,7 @@ class _Bag:
         for chunk, next_start in zip(chunks, ends, strict=True):
             head = chunk.start + _CHUNK_HEAD
             yield chunk.start, head
-            entries = (_INDEX_HEAD + _INDEX_ENTRY.itemsize * n for n in chunk.counts.values())
+            entries = (_INDEX_HEAD + INDEX_ENTRY.itemsize * n for n in chunk.counts.values())
             if head < next_start:
                 yield max(head, next_start - sum(entries)), next_start
 
@@ -339,7 +338,7 @@ class _Bag:
         return {number: self._sorted_index(number) for number in self.channels}
 
     def _sorted_index(self, number: int) -> _Index:
-        entries = np.frombuffer(self._index_entries.pop(number, b""), _INDEX_ENTRY)
+        entries = np.frombuffer(self._index_entries.pop(number, b""), INDEX_ENTRY)
         runs = np.array(self._index_runs.pop(number, []), np.int64).reshape(-1, 2)
         chunks = np.repeat(runs[:, 0].astype(np.int32), runs[:, 1])
         times = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
@@ -360,3 +359,209 @@ class _Bag:
 def _check_version(header: Fields) -> None:
     if (version := header.number(b"ver")) != 1:
         raise DamageError(f"its index has the unknown version {version}")
+
+
+# ---------------------------------------------------------------- the writer
+
+_MAX_PAYLOAD = 2**32 - 2**24  # lengths are uint32; leaves room for the rest of the chunk
+_CHUNK_BYTES = 2**20
+_BAG_HEADER_BYTES = 4096  # padded, so that it can be rewritten at the end
+_PAIR = struct.Struct("<II")
+_ENTRY = struct.Struct("<III")  # seconds, nanoseconds, offset in the chunk
+_MESSAGE_HEAD = struct.Struct("<II3sBI5sII5sIII")  # op, conn, time, and the payload's length
+
+
+class Ros1Writer(BagWriter):
+    """Writes a ROS 1 bag.
+
+    Args:
+        path: The file, which must not exist.
+        compression: Of the chunks: ``none``, ``bz2`` or ``lz4``.
+
+    Raises:
+        OptionError: The compression is unknown.
+        TargetExistsError: The file exists.
+        OSError: It cannot be written.
+    """
+
+    format = "bag"
+
+    def __init__(self, path: Path, compression: Literal["none", "bz2", "lz4"] = "none") -> None:
+        if compression not in _COMPRESSORS:
+            raise OptionError(f"compression {compression!r} is not known. Use none, bz2 or lz4.")
+        if path.exists():
+            raise TargetExistsError(path)
+        super().__init__()
+        self._numbers: dict[int, int] = {}
+        self._bag = _BagFile(path, compression)
+
+    @staticmethod
+    def check_channel(channel: Channel) -> None:
+        """Refuse a channel that a bag cannot hold.
+
+        Raises:
+            ConversionError: It is not a ROS 1 channel.
+        """
+        if channel.message_encoding != "ros1":
+            raise ConversionError(
+                channel.topic,
+                f"its messages are {channel.message_encoding or 'in an unknown encoding'}, and a "
+                "ROS 1 bag can only hold ROS 1 messages",
+                "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is.",
+            )
+
+    @staticmethod
+    def check_message(message: Message) -> None:
+        """Refuse a message that a bag cannot hold.
+
+        Raises:
+            ConversionError: It is too long, or its time is outside the range of ROS 1.
+        """
+        topic = message.channel.topic
+        if not 0 <= message.log_time < MAX_TIME:
+            raise ConversionError(
+                topic,
+                f"has a log time of {message.log_time} ns, and ROS 1 can hold 0 to 2^32 seconds",
+                "Unpack to mcap, which keeps it as it is.",
+            )
+        if len(message.data) > _MAX_PAYLOAD:
+            raise ConversionError(topic, "has a message too large for a ROS 1 bag")
+
+    def add_channel(self, channel: Channel) -> None:
+        """Declare a channel, which gets a connection."""
+        self.check_channel(channel)
+        if channel.id not in self._numbers:
+            self._numbers[channel.id] = self._bag.connect(*make_header(channel))
+
+    def write(self, message: Message) -> None:
+        """Append a message, payload verbatim."""
+        self.check_message(message)
+        if message.publish_time != message.log_time:
+            self._omitted["publish times that differ from the log time"] += 1
+        if message.sequence:
+            self._omitted["sequence numbers of messages"] += 1
+        self._bag.append(self._numbers[message.channel.id], message.log_time, message.data)
+
+    def finish(self) -> None:
+        """Write the last chunk and the index, and close the file."""
+        self._bag.finish()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        with suppress(OSError):
+            self._bag.file.close()
+
+
+class _BagFile:
+    """A bag being written: chunks, each with its index, then all connections and chunk infos.
+
+    Args:
+        path: The file, which must not exist.
+        compression: A key of `_COMPRESSORS`.
+
+    Attributes:
+        file: What is written to.
+    """
+
+    def __init__(self, path: Path, compression: str) -> None:
+        self._compression = compression
+        self._connections: list[bytes] = []
+        self._chunk_infos: list[bytes] = []
+        self._chunk = BytesIO()
+        self._index: dict[int, list[tuple[int, int]]] = {}  # connection -> times and offsets
+        self.file = path.open("xb")
+        self.file.write(MAGIC)
+        self._write_bag_header(0)
+
+    def _write_bag_header(self, index_pos: int) -> None:
+        header = _header(
+            Op.BAG,
+            (b"index_pos", index_pos.to_bytes(8, "little")),
+            (b"conn_count", _uint32(len(self._connections))),
+            (b"chunk_count", _uint32(len(self._chunk_infos))),
+        )
+        padding = _BAG_HEADER_BYTES - 4 - len(header)
+        self.file.write(header + _uint32(padding) + b" " * padding)
+
+    def connect(self, topic: bytes, header: Iterable[tuple[bytes, bytes]]) -> int:
+        """Add a connection with its own header, and return its number."""
+        number = len(self._connections)
+        record = _header(Op.CONNECTION, (b"conn", _uint32(number)), (b"topic", topic))
+        self._connections.append(record + join_header(header))
+        self._chunk.write(self._connections[-1])
+        return number
+
+    def append(self, number: int, time: int, data: bytes | memoryview) -> None:
+        """Add a message of a connection, log time in nanoseconds."""
+        self._index.setdefault(number, []).append((time, self._chunk.tell()))
+        op, conn = (4, b"op=", Op.MESSAGE), (9, b"conn=", number)
+        stamp = (13, b"time=", *divmod(time, 10**9))
+        self._chunk.write(_MESSAGE_HEAD.pack(38, *op, *conn, *stamp, len(data)))
+        self._chunk.write(data)
+        if self._chunk.tell() > _CHUNK_BYTES:
+            self._end_chunk()
+
+    def _end_chunk(self) -> None:
+        content, self._chunk = self._chunk.getvalue(), BytesIO()
+        index, self._index = self._index, {}
+        if not content:
+            return
+        place = self.file.tell()
+        packed = _COMPRESSORS[self._compression](content)
+        compression = (b"compression", self._compression.encode())
+        self.file.write(_header(Op.CHUNK, compression, (b"size", _uint32(len(content)))))
+        self.file.write(_uint32(len(packed)))
+        self.file.write(packed)
+        for number, entries in index.items():
+            data = b"".join(_ENTRY.pack(*divmod(time, 10**9), offset) for time, offset in entries)
+            counted = ((b"conn", _uint32(number)), (b"count", _uint32(len(entries))))
+            self.file.write(_header(Op.INDEX, (b"ver", _uint32(1)), *counted))
+            self.file.write(_uint32(len(data)) + data)
+        times = [time for entries in index.values() for time, _ in entries] or [0]
+        header = _header(
+            Op.CHUNK_INFO,
+            (b"ver", _uint32(1)),
+            (b"chunk_pos", place.to_bytes(8, "little")),
+            (b"start_time", _PAIR.pack(*divmod(min(times), 10**9))),
+            (b"end_time", _PAIR.pack(*divmod(max(times), 10**9))),
+            (b"count", _uint32(len(index))),
+        )
+        counts = b"".join(_PAIR.pack(number, len(entries)) for number, entries in index.items())
+        self._chunk_infos.append(header + _uint32(len(counts)) + counts)
+
+    def finish(self) -> None:
+        """Write the last chunk and the index, and close the file."""
+        self._end_chunk()
+        place = self.file.tell()
+        self.file.writelines(self._connections)
+        self.file.writelines(self._chunk_infos)
+        self.file.seek(len(MAGIC))
+        self._write_bag_header(place)
+        self.file.close()
+
+
+def _header(op: Op, *fields: tuple[bytes, bytes]) -> bytes:
+    return join_header([(b"op", bytes([op])), *fields])
+
+
+def _uint32(number: int) -> bytes:
+    return number.to_bytes(4, "little")
+
+
+def _pack_lz4(data: bytes) -> bytes:
+    """LZ4 as ROS 1 reads it: independent blocks, a checksum of the content, no size (lz4s.c)."""
+    packed: bytes = lz4.frame.compress(
+        data,
+        block_size=lz4.frame.BLOCKSIZE_MAX1MB,
+        block_linked=False,
+        content_checksum=True,
+        store_size=False,
+    )
+    return packed
+
+
+_COMPRESSORS: Mapping[str, Callable[[bytes], bytes]] = {
+    "none": bytes,
+    "bz2": bz2.compress,
+    "lz4": _pack_lz4,
+}

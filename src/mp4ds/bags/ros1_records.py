@@ -6,23 +6,20 @@ import base64
 import binascii
 import re
 import struct
-from bz2 import BZ2Decompressor
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame
+import numpy as np
 
 from mp4ds.bags.files import (
     SALVAGE,
     DamageError,
-    OversizeError,
-    expand,
-    most_held,
     open_source,
     other_begin,
+    unpack,
     unreadable,
 )
 from mp4ds.errors import SourceError
@@ -32,11 +29,14 @@ MAGIC = b"#ROSBAG V2.0\n"
 MAX_TIME = 2**32 * 10**9
 """A ROS 1 time is two uint32, seconds and nanoseconds: times must be below this."""
 UINT32 = struct.Struct("<I")
+CHUNK_COUNT = struct.Struct("<II")
+"""Of a chunk, in the index: a connection, and its messages."""
+INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
+"""Of a message, in the index of its chunk: log time, and its place in the content."""
 COPY_AGAIN = f"Copy it again, repair it with `rosbag reindex`, or {SALVAGE}"
 DAMAGE = (DamageError, OSError)
 """Errors raised while reading a damaged bag, or from a damaged disk."""
 
-_TIME = struct.Struct("<II")
 _BASE64 = ";base64"  # marks a connection header field that is not UTF-8, as metadata must be
 
 
@@ -67,6 +67,15 @@ class Fields(dict[bytes, bytes]):
         if len(value) != size:
             raise DamageError(f"a record has no field {name.decode()!r} of {size} bytes")
         return int.from_bytes(value, "little")
+
+    def time(self, name: bytes) -> int:
+        """A field that is a time, nanoseconds.
+
+        Raises:
+            DamageError: It is missing, or has another size.
+        """
+        nanoseconds, seconds = divmod(self.number(name, 8), 2**32)
+        return seconds * 10**9 + nanoseconds
 
     @property
     def op(self) -> int:
@@ -250,9 +259,7 @@ def payload(chunk: memoryview, offset: int, number: int, time: int) -> memoryvie
         offset = start + length  # some writers let the index point to the connection before it
     if fields.op != Op.MESSAGE:
         raise DamageError("the index does not point to a message")
-    stamp = fields.get(b"time", b"")
-    found = _TIME.unpack(stamp) if len(stamp) == _TIME.size else (0, -1)
-    if fields.number(b"conn") != number or found[0] * 10**9 + found[1] != time:
+    if fields.number(b"conn") != number or fields.time(b"time") != time:
         raise DamageError("the index points to another message")
     if start + length > len(chunk):
         raise DamageError("a message is longer than its chunk")
@@ -298,23 +305,11 @@ def unpack_chunk(compression: str, size: int, data: bytes) -> bytes:
     Raises:
         DamageError: The data is damaged, or the compression is not known.
     """
-    if compression == "none":
-        unpacked = data
-    elif compression in ("bz2", "lz4"):
-        if size > (most := most_held(len(data))):
-            raise OversizeError(f"it declares {size} bytes but has {len(data)}", most)
-        machine = BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
-        try:
-            unpacked = expand(machine, data, size)
-        except (OSError, RuntimeError):
-            raise DamageError(f"its {compression} data is damaged") from None
-        if not machine.eof:
-            raise DamageError(f"its {compression} data does not unpack to {size} bytes")
-    else:
-        raise DamageError(f"it is compressed with {compression!r}, which is not supported")
-    if len(unpacked) != size:
-        raise DamageError(f"it unpacks to {len(unpacked)} bytes instead of {size}")
-    return unpacked
+    if compression != "none":
+        return unpack(compression, data, size)
+    if len(data) != size:
+        raise DamageError(f"it holds {len(data)} bytes instead of {size}")
+    return data
 
 
 def make_channel(number: int, topic: bytes, header: Mapping[bytes, bytes]) -> Channel:

@@ -1,4 +1,4 @@
-"""Reads rosbag2 recordings: a folder with metadata.yaml, or a single storage file."""
+"""Reads and writes rosbag2 recordings: a folder with metadata.yaml, or a single storage file."""
 
 from __future__ import annotations
 
@@ -20,27 +20,38 @@ from mp4ds.bags.files import (
     open_source,
     unzstd,
 )
-from mp4ds.bags.mcap import McapReader
+from mp4ds.bags.mcap import McapReader, McapWriter
 from mp4ds.bags.mcap_records import MAGIC as MCAP_MAGIC
-from mp4ds.bags.protocols import BagReader
+from mp4ds.bags.protocols import BagReader, BagWriter
 from mp4ds.bags.rosbag2_metadata import (
+    MCAP_RECORD,
     METADATA_FILE,
+    NATIVE_QOS_VERSION,
+    NEWEST_VERSION,
     RECORD,
     TABLES_RECORD,
     BagInfo,
+    TopicMetadata,
+    dump_bag_info,
+    dump_yaml,
+    has_numeric_qos,
+    native_qos,
     parse_bag_info,
     read_bag_info,
 )
-from mp4ds.bags.rosbag2_sqlite import SqliteReader
-from mp4ds.errors import SourceError, SourceNotFoundError
+from mp4ds.bags.rosbag2_sqlite import SqliteReader, SqliteWriter
+from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.urls import remote
 from mp4ds.records import (
     QOS_KEY,
+    Attachment,
     Channel,
     ChannelStats,
     Excerpt,
+    Message,
     MetadataRecord,
     Record,
+    Schema,
 )
 
 Decompress = Callable[[Any], bytes]
@@ -301,3 +312,215 @@ def unlisted_storage(folder: Path, listed: Collection[str]) -> list[str]:
         and f"{name}.zstd" not in listed  # ROS 2 leaves behind the files it decompressed to play
         and (not stems or stem(name) in stems)
     ]
+
+
+# ---------------------------------------------------------------- the writer
+
+_EMPTY_START = 2**63 - 1  # what rosbag2 writes without messages
+_SUFFIXES = {"sqlite3": "db3", "mcap": "mcap"}
+
+
+class Rosbag2Writer(BagWriter):
+    """Writes a rosbag2 folder.
+
+    Given the metadata record ``mp4ds:rosbag2`` of a recording, its version, distribution and
+    custom data are kept.
+
+    Args:
+        folder: Does not exist yet.
+        storage: ``sqlite3`` or ``mcap``.
+        name: The recording's name, used as the prefix of its storage file; by default the folder's.
+        library: Library string of an MCAP storage; if empty, this library's own.
+        compression: Of the chunks of an MCAP storage: ``zstd``, ``lz4`` or ``none``.
+
+    Raises:
+        OptionError: The storage or compression is unknown.
+        OSError: It cannot be written.
+    """
+
+    format = "rosbag2"
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        storage: str,
+        name: str = "",
+        library: str = "",
+        compression: str = "zstd",
+    ) -> None:
+        if storage not in _SUFFIXES:
+            raise OptionError(f"storage {storage!r} is not known. Use {', '.join(_SUFFIXES)}.")
+        super().__init__()
+        self._folder = folder
+        self._storage = storage
+        self._name = name or folder.name
+        self._file_name = f"{self._name}_0.{_SUFFIXES[storage]}"
+        self._source: BagInfo | None = None
+        self._source_distro = ""
+        self._source_is_whole = False
+        self._source_has_record = False
+        self._topic_of: dict[int, TopicMetadata] = {}
+        self._counts: dict[TopicMetadata, int] = {}
+        self._start = _EMPTY_START
+        self._end = 0
+        folder.mkdir()
+        path = folder / self._file_name
+        self._writer: McapWriter | SqliteWriter = (
+            SqliteWriter(path)
+            if storage == "sqlite3"
+            else McapWriter(path, profile="ros2", library=library, compression=compression)
+        )
+
+    @property
+    def omitted(self) -> Mapping[str, int]:
+        """What the storage cannot hold: a phrase -> how many."""
+        return self._writer.omitted
+
+    def add_channel(self, channel: Channel) -> None:
+        """Declare a channel, which is a topic."""
+        if channel.id in self._topic_of:
+            return
+        self._writer.add_channel(channel)
+        topic = self._topic_of[channel.id] = TopicMetadata.of(channel)
+        self._counts.setdefault(topic, 0)
+
+    def add_schema(self, schema: Schema) -> None:
+        """Keep a definition that no channel refers to."""
+        self._writer.add_schema(schema)
+
+    def write(self, message: Message) -> None:
+        """Append a message, payload verbatim."""
+        self._writer.write(message)
+        self._counts[self._topic_of[message.channel.id]] += 1
+        self._start = min(self._start, message.log_time)
+        self._end = max(self._end, message.log_time)
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Append an attachment, if the storage can hold it."""
+        self._writer.add_attachment(attachment)
+
+    def add_metadata(self, record: MetadataRecord) -> None:
+        """Take over the metadata of the source recording, or append a metadata record."""
+        if record.name == RECORD:
+            self._take_source(record.metadata)
+        elif record.name == TABLES_RECORD:
+            self._take_distro(record.metadata)
+        else:
+            self._add_other_metadata(record)
+
+    def _add_other_metadata(self, record: MetadataRecord) -> None:
+        if record.name == MCAP_RECORD and not self._source_is_whole:
+            self._source = _parsed(record.metadata.get("serialized_metadata", "")) or self._source
+        self._source_has_record |= record.name == MCAP_RECORD
+        self._writer.add_metadata(record)
+
+    def _take_source(self, content: Mapping[str, str]) -> None:
+        self._take_distro(content)
+        texts = [text for key, text in content.items() if ":metadata:" in key]
+        self._source = _parsed(content.get(METADATA_FILE, texts[-1] if texts else ""))
+        self._source_is_whole = self._source is not None
+
+    def _take_distro(self, content: Mapping[str, str]) -> None:
+        distros = [text for key, text in content.items() if key.endswith(":ros_distro") and text]
+        self._source_distro = self._source_distro or (distros[0] if distros else "")
+
+    @property
+    def _ros_distro(self) -> str:
+        return (self._source.ros_distro if self._source else "") or self._source_distro
+
+    def _version(self) -> int:
+        if self._source:
+            return self._source.version
+        old_style = any(has_numeric_qos(topic.qos or "") for topic in self._counts)
+        return NATIVE_QOS_VERSION - 1 if old_style else NEWEST_VERSION
+
+    def _info(self) -> dict[str, Any]:
+        """The content of metadata.yaml in the layout of its version."""
+        version = self._version()
+        count = sum(self._counts.values())
+        span = {
+            "duration": {"nanoseconds": max(0, self._end - self._start)},
+            "starting_time": {"nanoseconds_since_epoch": self._start},
+        }
+        prefix = "" if version >= 4 else f"{self._name}/"
+        info: dict[str, Any] = {
+            "version": version,
+            "storage_identifier": self._storage,
+            **span,
+            "message_count": count,
+            "topics_with_message_count": [
+                _topic_entry(self._as_listed(topic), count, version)
+                for topic, count in self._counts.items()
+            ],
+        }
+        if version >= 3:
+            info |= {"compression_format": "", "compression_mode": ""}
+        info["relative_file_paths"] = [prefix + self._file_name]
+        if version >= 5:
+            info["files"] = [
+                {
+                    "path": self._file_name,
+                    "starting_time": span["starting_time"],
+                    "duration": span["duration"],
+                    "message_count": count,
+                }
+            ]
+        if version >= 6:
+            info["custom_data"] = (dict(self._source.custom_data) if self._source else {}) or None
+        if version >= 8:
+            info["ros_distro"] = self._ros_distro
+        return info
+
+    def _as_listed(self, topic: TopicMetadata) -> TopicMetadata:
+        """The topic as listed in the source's metadata.yaml, which may differ from its files."""
+        found = [
+            listed
+            for listed in (self._source.topics if self._source else ())
+            if (listed.name, listed.type_name) == (topic.name, topic.type_name)
+        ]
+        if len(found) != 1:
+            return topic
+        return replace(
+            topic,
+            serialization_format=found[0].serialization_format,
+            qos=topic.qos if found[0].qos is None else found[0].qos,
+            type_hash=topic.type_hash if found[0].type_hash is None else found[0].type_hash,
+        )
+
+    def finish(self) -> None:
+        """Complete the storage, and write metadata.yaml."""
+        info = self._info()
+        inside = dump_yaml(info)
+        if isinstance(self._writer, SqliteWriter):
+            self._writer.add_bag_info(info["version"], inside, self._ros_distro)
+        elif not self._source_has_record:
+            self._writer.add_metadata(MetadataRecord(MCAP_RECORD, {"serialized_metadata": inside}))
+        self._writer.finish()
+        (self._folder / METADATA_FILE).write_bytes(dump_bag_info(info).encode())
+
+    def abandon(self) -> None:
+        """Close the storage as it is."""
+        self._writer.abandon()
+
+
+def _parsed(text: str) -> BagInfo | None:
+    try:
+        return parse_bag_info(text, Path(METADATA_FILE))
+    except SourceError:
+        return None  # none, or edited by hand: a plain one is written
+
+
+def _topic_entry(topic: TopicMetadata, count: int, version: int) -> dict[str, Any]:
+    metadata: dict[str, Any] = {
+        "name": topic.name,
+        "type": topic.type_name,
+        "serialization_format": topic.serialization_format,
+    }
+    if version >= NATIVE_QOS_VERSION:
+        metadata["offered_qos_profiles"] = native_qos(topic.qos or "")
+    elif version >= 4:
+        metadata["offered_qos_profiles"] = topic.qos
+    if version >= 7:
+        metadata["type_description_hash"] = topic.type_hash
+    return {"topic_metadata": metadata, "message_count": count}

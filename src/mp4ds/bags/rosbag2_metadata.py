@@ -26,6 +26,9 @@ RECORD = "mp4ds:rosbag2"
 TABLES_RECORD = "mp4ds:rosbag2:tables"
 """Metadata record with the small tables of a storage file that is not open at first."""
 
+MCAP_RECORD = "rosbag2"
+"""Metadata record in which an MCAP storage file keeps a metadata.yaml."""
+
 _TOP_KEY = "rosbag2_bagfile_information"
 _MAX_BYTES = 64 * 2**20
 _STORAGES = {"db3": "sqlite3", "mcap": "mcap"}

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.combined import bounded
-from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import in_span, write_record
 from mp4ds.dataset.channels import by_time
 from mp4ds.dataset.dataset import Dataset

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import OutOfReachError, Refused
 from mp4ds.messages.serializations import is_calibration, is_camera

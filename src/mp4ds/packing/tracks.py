@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from mp4ds.bags.mcap_write import compressed_size
+from mp4ds.bags.mcap import compressed_size
 from mp4ds.errors import EncoderRefusedError, OptionError, Refused
 from mp4ds.format.models import Color, LayoutParameters
 from mp4ds.messages.encodings import ENCODINGS, Parameters

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mp4ds.bags.combined import MORE_LOSSES
-from mp4ds.bags.protocols import BagReader
-from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Excerpt, Loss, Message, Record
+from mp4ds.bags.files import DECOMPRESSED, DamageError, OversizeError
+from mp4ds.bags.protocols import BagReader, HoldBack
+from mp4ds.bags.salvage.scan import MAX_UNPROVEN, Framing, RecordFrame, Scan, Window
+from mp4ds.errors import SourceError
+from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Channel, Excerpt, Loss, Message, Record
 
 
 @dataclass(eq=False)
@@ -280,12 +287,14 @@ class Tally:
         self._index_is_whole |= offset == self._end
         return not self._losses and not self._held and count == self._read[channel]
 
-    def listed(self, channel: int, times: Mapping[int, int]) -> None:
-        """Add an index's messages: how many at each log time, ns."""
+    def listed(self, channel: int, times: NDArray[Any]) -> None:
+        """Add the messages that an index lists, by their log times, ns."""
+        found, numbers = np.unique(times, return_counts=True)
+        counts = dict(zip(found.tolist(), numbers.tolist(), strict=True))
         if self._held:
-            self._listed.append((channel, times))
+            self._listed.append((channel, counts))
         else:
-            self._compare(channel, times)
+            self._compare(channel, counts)
 
     def _compare(self, channel: int, times: Mapping[int, int]) -> None:
         for time, count in times.items():
@@ -334,16 +343,140 @@ def _total(found: tuple[int, Counter[int]] | None) -> float:
     return float("inf") if found is None else found[0]
 
 
-# ---------------------------------------------------------------- the reader
+# ---------------------------------------------------------------- readers
+
+
+def lost_by(error: DamageError) -> str:
+    """What is wrong with messages whose payload cannot be decompressed, a phrase."""
+    if isinstance(error, OversizeError):
+        return f"that decompress to too much ({DECOMPRESSED} is the limit)"
+    return "whose compressed data is damaged"
+
+
+class FilePass(ABC):
+    """One reading of a damaged file.
+
+    Args:
+        path: The file.
+        window: At its start.
+        log: Where losses are recorded.
+        framing: Of its records.
+        channels: The known ones by their id in the file; grows while reading.
+        index: Byte where the index at the end of the file begins, after which no messages are lost;
+            None if unknown.
+
+    Attributes:
+        found: Number of valid records found.
+        count: Number of messages that the file states; None if unknown.
+        earliest: Earliest log time, ns, of messages from here on, by the file's index; None if no
+            message follows.
+    """
+
+    magic: bytes
+    kind: str
+
+    def __init__(
+        self,
+        path: Path,
+        window: Window,
+        log: LossLog,
+        framing: Framing,
+        channels: Mapping[int, Channel],
+        index: int | None,
+    ) -> None:
+        self._path = path
+        self._window = window
+        self._log = log
+        self._tally = Tally(log, self._topic_of)
+        self._framing = framing
+        self._scan = Scan(window, framing, self._lose)
+        self._channels = channels
+        self._index_offset = index
+        self.found = 0
+        self.count: int | None = None
+        self.earliest: int | None = None
+
+    @abstractmethod
+    def records(self) -> Iterator[Record | None]:
+        """All records in the order of the file; None where `earliest` may be later than before."""
+
+    def _topic_of(self, channel_id: int) -> str | None:
+        channel = self._channels.get(channel_id)
+        return channel.topic if channel else None
+
+    def _begins(self) -> bool:
+        """Whether the file begins with its magic bytes, which are consumed."""
+        if bytes(self._window.peek(len(self.magic))) == self.magic:
+            self._window.skip(len(self.magic))
+            return True
+        self._scan.resync(0, f"the first bytes are not those of {self.kind}", passed=0)
+        return False
+
+    def _lose(self, offset: int, size: int, problem: str) -> None:
+        if self._index_offset is not None and offset >= self._index_offset:
+            self._log.lost(offset, size, problem).add(0, ())
+        else:
+            self._tally.lost(offset, size, problem)
+
+    def _peek_chunk(self, frame: RecordFrame) -> tuple[memoryview, bool]:
+        """What there is of a chunk, and whether it is certainly all of it."""
+        proven = self._scan.is_proven(frame)
+        size = frame.size if proven else min(frame.size, MAX_UNPROVEN)
+        return self._window.peek(size), proven
+
+    def _inside(
+        self, content: bytes | memoryview, problems: list[str]
+    ) -> Iterator[tuple[RecordFrame, bytes]]:
+        """The records of a decompressed chunk; what is wrong with it is added to `problems`."""
+        scan = Scan(
+            Window.of_content(bytes(content), self._path),
+            self._framing,
+            lambda _offset, _size, problem: problems.append(f"in a chunk, {problem}"),
+        )
+        while frame := scan.next():
+            body = scan.body(frame)
+            if body is not None:
+                yield frame, body
+
+    def _leave_chunk(
+        self, frame: RecordFrame, used: int, problems: Sequence[str], *, proven: bool, whole: bool
+    ) -> None:
+        """Advance past a chunk, and record what is lost of it.
+
+        Args:
+            frame: The chunk.
+            used: Bytes of it up to the end of its content, as far as known.
+            problems: What is wrong with it.
+            proven: Whether it is certainly all there.
+            whole: Whether all of its content could be decompressed.
+        """
+        window, scan = self._window, self._scan
+        offset = window.offset
+        if whole and used != frame.size and scan.is_followed(used):
+            window.skip(used)  # the content is complete: the record's length is wrong
+        elif proven and (whole or scan.is_followed(frame.size)):
+            window.skip(frame.size)
+        else:
+            scan.resync(
+                offset if problems else offset + used,
+                problems[0] if problems else scan.cut_or_damaged(frame),
+                passed=used,
+                kinds=self._framing.outer,
+            )
+            return
+        if problems:
+            self._lose(offset, window.offset - offset, problems[0])
+        else:
+            self._tally.verified()
 
 
 class FileSalvage(BagReader):
     """Reads what is readable of a file, in one pass, and records what is not.
 
     It never fails because of damage. For an intact recording, it gives the same as the usual
-    reader. Messages come in log-time order if the index at the end of the file is readable,
-    otherwise in file order. Some doubtful messages are included: if a checksum shows that a chunk
-    is damaged but not where, the loss says so.
+    reader. Messages come in log-time order if the index at the end of the file is readable, and
+    they are not too far out of it; otherwise in file order. Some doubtful messages are included: if
+    a checksum shows that a chunk is damaged but not where, the loss says so.
 
     Args:
         path: The file.
@@ -359,40 +492,35 @@ class FileSalvage(BagReader):
         self._shown = shown or path
         self.files = [self._shown]
         self._is_alone = is_alone
-
-    @abstractmethod
-    def _pass(self, log: LossLog) -> Iterator[Record]:
-        """Read everything once, recording what is lost."""
-
-    @property
-    def _usual(self) -> Callable[[], BagReader] | None:
-        """Opens the usual reader, if the file is more out of order than can be held back.
-
-        If the file is intact, that reader can still sort it.
-        """
-        return None
-
-    def _lost_in_all(self) -> int | None:
-        """Messages lost in the last pass, if the file states how many there were."""
-        return None
+        self._lost_in_all: int | None = None
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Everything readable, of which all but the excerpt is dropped."""
         self.losses = []
         log = LossLog(self._shown.name)
-        if self._usual is not None and self._is_intact():
-            with self._usual() as usual:
-                for record in usual.records():
-                    self.position = usual.position
-                    if excerpt.has(record):
-                        yield record
-                self.position = usual.position
-            return
         yield from filter(excerpt.has, self._pass(log))
-        self.losses = log.finish(self._lost_in_all())
+        self.losses = log.finish(self._lost_in_all)
 
-    def _is_intact(self) -> bool:
-        log = LossLog(self._shown.name)
-        for _ in self._pass(log):
-            pass
-        return not log.finish()
+    @abstractmethod
+    def _pass(self, log: LossLog) -> Iterator[Record]:
+        """Read everything once, recording what is lost."""
+
+    def _in_order(self, window: Window, reading: FilePass, *, is_indexed: bool) -> Iterator[Record]:
+        """The records of a pass, messages by log time if the file's index tells when to wait."""
+        held = HoldBack()
+        given = 0
+        for record in reading.records():
+            self.position = window.position
+            given += isinstance(record, Message)
+            if record is None:
+                if is_indexed:
+                    yield from held.release(reading.earliest)
+            elif is_indexed and isinstance(record, Message):
+                held.add(record)
+            else:
+                yield record
+        yield from held.release(None)
+        self.position = window.position
+        self._lost_in_all = None if reading.count is None else max(0, reading.count - given)
+        if self._is_alone and not reading.found and not self.channels:
+            raise SourceError(self.path, f"holds no records of {reading.kind}")

@@ -7,7 +7,6 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,23 +14,109 @@ import numpy as np
 from mcap import records as mcap_records
 from mcap.opcode import Opcode
 
-from mp4ds.bags.files import DamageError, ZstdStream, open_source
-from mp4ds.bags.mcap import McapReader
+from mp4ds.bags.files import DamageError, ZstdStream, open_source, recover
+from mp4ds.bags.mcap_index import ChunkTable, McapSummary
 from mp4ds.bags.mcap_records import (
+    FOOTER_BYTES,
     MAGIC,
     MAX_RECORD_BYTES,
+    OF_SUMMARY,
     Declared,
     chunk_records,
     parse,
     parse_message,
     unpack_chunk,
 )
-from mp4ds.bags.protocols import HOLD_BYTES, BagReader, HoldBack
-from mp4ds.bags.salvage.losses import Draft, FileSalvage, LossLog, Tally
-from mp4ds.bags.salvage.mcap_summary import McapFraming, SalvagedSummary, read_summary
-from mp4ds.bags.salvage.scan import MAX_UNPROVEN, RecordFrame, Scan, Window, lost_by, unpack
-from mp4ds.errors import SourceError
+from mp4ds.bags.salvage.losses import Draft, FilePass, FileSalvage, LossLog, lost_by
+from mp4ds.bags.salvage.scan import McapFraming, RecordFrame, Scan, Window
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
+
+# ---------------------------------------------------------------- the summary
+
+_MAX_SEARCHED = 256 * 2**20
+
+
+@dataclass
+class SalvagedSummary(McapSummary):
+    """The readable part of a summary section.
+
+    Attributes:
+        is_verified: Whether it matches its checksum, if it has one.
+        is_whole: Whether all of it could be read.
+    """
+
+    is_verified: bool = True
+    is_whole: bool = True
+
+    @property
+    def doubtful(self) -> dict[int, mcap_records.Channel]:
+        """Channels by id, if the summary does not match its checksum."""
+        return {} if self.is_verified else self.channels
+
+    def finish(self) -> None:
+        """Finish after everything was added, and drop what depends on its being complete."""
+        if not self.is_whole or not self.is_verified:
+            self.chunks = ChunkTable()
+            self.statistics = None
+        self.chunks.finish()
+
+
+def read_summary(path: Path) -> SalvagedSummary:
+    """Read the summary of a file; empty if it has none or its place is unknown.
+
+    Raises:
+        SourceError: It cannot be read.
+    """
+    summary = SalvagedSummary()
+    with Window.of_file(path) as window:
+        size = window.size or 0
+        tail = window.look(size - FOOTER_BYTES, FOOTER_BYTES) if size > FOOTER_BYTES else None
+    if tail and tail[0] == Opcode.FOOTER and tail[-len(MAGIC) :] == MAGIC:
+        (start,) = struct.unpack_from("<Q", tail, 9)
+        if len(MAGIC) < start < size - FOOTER_BYTES:
+            summary.is_verified = _matches(path, start, size - len(MAGIC) - 4)
+            _read_from(path, start, summary)
+    summary.finish()
+    return summary
+
+
+def _matches(path: Path, start: int, end: int) -> bool:
+    """Whether the bytes of a summary, up to its checksum, match that."""
+    if end - start > _MAX_SEARCHED:
+        return True  # checking would take long
+    with Window.of_file(path, start) as window:
+        covered = window.peek(end - start)
+        (told,) = struct.unpack("<I", window.look(end - start, 4) or bytes(4))
+        return told in (0, zlib.crc32(covered))
+
+
+def _read_from(path: Path, start: int, summary: SalvagedSummary) -> None:
+    framing = McapFraming({})
+    with Window.of_file(path, start) as window:
+        is_there = framing.frame(window.peek(framing.lookahead)) is not None
+        if not is_there and (window.left or 0) > _MAX_SEARCHED:
+            return  # the rest may be anything
+        summary.offset = start
+
+        def lose(*_: object) -> None:
+            summary.is_whole = False
+
+        scan = Scan(window, framing, lose)
+        while frame := scan.next():
+            if frame.kind == Opcode.FOOTER:
+                return
+            if frame.kind not in OF_SUMMARY:
+                break
+            body = scan.body(frame)
+            if body is not None:
+                try:
+                    summary.add(frame.kind, body)
+                except DamageError:
+                    summary.is_whole = False
+        summary.is_whole = False
+
+
+# ---------------------------------------------------------------- a pass
 
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _TIME_END = 14  # of the log time in a message
@@ -39,7 +124,7 @@ _MARGIN = 600 * 10**9  # ns; a damaged chunk may seem to end where the next one 
 Found = Message | Attachment | MetadataRecord | None
 
 
-class McapPass:
+class McapPass(FilePass):
     """One reading of an MCAP file.
 
     Args:
@@ -49,12 +134,10 @@ class McapPass:
         declared: Schemas and channels, those of the summary at first.
         summary: Its readable part.
         decompress: Decompresses the payload of a message, if necessary.
-
-    Attributes:
-        offset: Byte where the record being read begins.
-        found: Number of valid MCAP records found.
-        count: Number of messages by the file's statistics; None if unknown.
     """
+
+    magic = MAGIC
+    kind = "an MCAP file"
 
     def __init__(
         self,
@@ -65,35 +148,26 @@ class McapPass:
         summary: SalvagedSummary,
         decompress: Callable[[memoryview], bytes] | None,
     ) -> None:
-        self._path = path
-        self._window = window
-        self._log = log
+        framing = McapFraming(declared.channels)
+        super().__init__(path, window, log, framing, declared.channels, summary.offset or None)
         self._declared = declared
         self._summary = summary
         self._decompress = decompress
-        self._tally = Tally(log, self._topic_of)
-        self._framing = McapFraming(declared.channels)
-        self._scan = Scan(window, self._framing, self._lose)
         self._schemas = set[int]()
         if summary.is_verified:
             self._schemas.update(summary.schemas)
         self._undefined: dict[int, int] = {}
         self._plain: _Plain | None = None
-        self.offset = 0
-        self.found = 0
         self.count = _message_count(summary.statistics)
-
-    def _topic_of(self, channel_id: int) -> str | None:
-        channel = self._declared.channels.get(channel_id)
-        return channel.topic if channel else None
 
     def records(self) -> Iterator[Found]:
         """All records in the order of the file; None after each of the file's own records."""
-        yield from self._begin()
+        if self._begins():
+            self._read_header()
         ended = False
         while frame := self._scan.next():
             self.found += 1
-            self.offset = self._window.offset
+            self.earliest = self._summary.chunks.later.after(self._window.offset)
             if frame.kind == Opcode.FOOTER:
                 ended = True
                 self._end(frame)
@@ -115,13 +189,8 @@ class McapPass:
                 problem = f"the definition of its messages, schema {schema_id}, is missing"
                 self._log.lost(None, None, problem).add(0, [topic])
 
-    def _begin(self) -> Iterator[Found]:
+    def _read_header(self) -> None:
         window = self._window
-        if bytes(window.peek(len(MAGIC))) == MAGIC:
-            window.skip(len(MAGIC))
-        else:
-            self._scan.resync(0, "the first bytes are not those of an MCAP file", passed=0)
-            return
         frame = self._framing.frame(window.peek(self._framing.lookahead))
         if frame is None or frame.kind != Opcode.HEADER or not self._scan.is_followed(frame.size):
             self._scan.resync(window.offset, "the header is damaged", passed=0)
@@ -132,9 +201,8 @@ class McapPass:
             parse(mcap_records.Header, body or b"")
         except DamageError:
             self._lose(len(MAGIC), frame.size, "the header is damaged")
-        yield None
 
-    def _end(self, frame: RecordFrame[int]) -> None:
+    def _end(self, frame: RecordFrame) -> None:
         self._scan.body(frame)
         window = self._window
         if bytes(window.peek(len(MAGIC))) == MAGIC:
@@ -144,7 +212,7 @@ class McapPass:
             window.skip(len(MAGIC))
             self._lose(start, window.offset - start, "the last bytes are not those of an MCAP file")
 
-    def _record(self, frame: RecordFrame[int]) -> Iterator[Found]:
+    def _record(self, frame: RecordFrame) -> Iterator[Found]:
         self._leave_plain(frame.kind)
         if frame.kind != Opcode.MESSAGE_INDEX and self._plain is None:
             yield from self._tally.settle()
@@ -240,35 +308,22 @@ class McapPass:
         loss.add(1, ())
         return loss
 
-    def _chunk(self, frame: RecordFrame[int]) -> Iterator[Found]:
+    def _chunk(self, frame: RecordFrame) -> Iterator[Found]:
         """The messages of a chunk, as far as it can be decompressed."""
-        window, scan = self._window, self._scan
-        offset = window.offset
-        proven = scan.is_proven(frame)
-        have = window.peek(frame.size if proven else min(frame.size, MAX_UNPROVEN))
+        offset = self._window.offset
+        have, proven = self._peek_chunk(frame)
         chunk = _Chunk.unpacked(have[frame.head :])
         self._tally.open(None, offset + frame.size, chunk.span)
         if chunk.is_plain and chunk.problem:
             # Its records are in the file like any other: damage to one does not hide the others.
             if chunk.is_doubtful:
                 self._plain = _Plain(offset, offset + frame.size, chunk.problem)
-            window.skip(frame.head + chunk.head)
+            self._window.skip(frame.head + chunk.head)
             return
         problems = [chunk.problem] if chunk.problem else []
         yield from self._content(chunk, offset, problems)
-        end = frame.head + chunk.used
-        if proven and (not problems or scan.is_followed(frame.size)):
-            window.skip(frame.size)
-        elif not problems and scan.is_followed(end):
-            window.skip(end)  # the content is complete: the record's length is wrong
-        else:
-            problem = problems[0] if problems else scan.cut_or_damaged(frame)
-            scan.resync(offset, problem, passed=frame.head, kinds=self._framing.outer)
-            return
-        if problems:
-            self._lose(offset, window.offset - offset, problems[0])
-        else:
-            self._tally.verified()
+        used = frame.head + chunk.used
+        self._leave_chunk(frame, used, problems, proven=proven, whole=not chunk.problem)
 
     def _leave_plain(self, kind: int) -> None:
         """At the end of a damaged uncompressed chunk, record the damage if nothing else did."""
@@ -284,7 +339,8 @@ class McapPass:
 
     def _content(self, chunk: _Chunk, offset: int, problems: list[str]) -> Iterator[Found]:
         """The records of a chunk."""
-        for kind, body in chunk.records or self._scanned(chunk.content, problems):
+        scanned = ((frame.kind, body) for frame, body in self._inside(chunk.content, problems))
+        for kind, body in chunk.records or scanned:
             try:
                 if kind != Opcode.MESSAGE:
                     self._other(kind, body)
@@ -293,34 +349,12 @@ class McapPass:
             except DamageError as error:
                 problems.append(f"in a chunk, {error}")
 
-    def _scanned(
-        self, content: bytes | memoryview, problems: list[str]
-    ) -> Iterator[tuple[int, bytes]]:
-        """Opcodes and bodies of an unverified chunk."""
-        inner = Scan(
-            Window.of_content(bytes(content), self._path),
-            self._framing,
-            lambda _offset, _size, problem: problems.append(f"in a chunk, {problem}"),
-        )
-        while frame := inner.next():
-            body = inner.body(frame)
-            if body is not None:
-                yield frame.kind, body
-
     def _listed(self, body: bytes, offset: int) -> None:
         """Process a message index: what it lists was read, or is lost."""
         channel_id, length = struct.unpack_from("<HI", body)
         pairs = np.frombuffer(body, "<u8", count=min(length, len(body) - 6) // 8, offset=6)
         if not self._tally.count_matches(channel_id, len(pairs) // 2, offset):
-            times, counts = np.unique(pairs[::2], return_counts=True)
-            listed = dict(zip(times.tolist(), counts.tolist(), strict=True))
-            self._tally.listed(channel_id, listed)
-
-    def _lose(self, offset: int, size: int, problem: str) -> None:
-        if 0 < self._summary.offset <= offset:
-            self._log.lost(offset, size, problem).add(0, ())
-        else:
-            self._tally.lost(offset, size, problem)
+            self._tally.listed(channel_id, pairs[::2])
 
 
 class _Plain(NamedTuple):
@@ -374,7 +408,7 @@ class _Chunk:
                 used = records + 8 + length
                 span = (start, end)
                 return cls(content, is_plain, records + 8, used, "", False, span, found)
-        unpacked = unpack(compression, body[records + 8 :][:length], min(size, MAX_RECORD_BYTES))
+        unpacked = recover(compression, body[records + 8 :][:length], min(size, MAX_RECORD_BYTES))
         problem = unpacked.problem
         if crc and zlib.crc32(unpacked.content) == crc:
             problem = ""
@@ -410,7 +444,7 @@ class McapSalvage(FileSalvage):
 
     Args:
         path: The file.
-        is_alone: See `FileSalvage`.
+        is_alone: Whether it is an error, not just a loss, if nothing can be read.
         is_compressed: Whether it is compressed with zstd as a whole. Offsets of losses then refer
             to its content.
         message_decompress: Decompresses the payload of a message; raises `DamageError` if it
@@ -435,8 +469,6 @@ class McapSalvage(FileSalvage):
         self._is_compressed = is_compressed
         self._decompress = message_decompress
         self._declared = Declared()
-        self._given = 0
-        self._count: int | None = None
         self._summary = SalvagedSummary() if is_compressed else read_summary(path)
         if is_compressed:
             self._summary.finish()
@@ -494,43 +526,11 @@ class McapSalvage(FileSalvage):
         """Counts and spans from the summary, including lost messages; otherwise empty."""
         return self._summary.stats()
 
-    def _lost_in_all(self) -> int | None:
-        return None if self._count is None else max(0, self._count - self._given)
-
-    @property
-    def _usual(self) -> Callable[[], BagReader] | None:
-        if self._summary.chunks.held_in_file_order() <= HOLD_BYTES:
-            return None
-        return partial(McapReader, self.path, message_decompress=self._decompress)
-
     def _pass(self, log: LossLog) -> Iterator[Record]:
         self._declared.skipped.clear()
-        self._given = 0
-        chunks = self._summary.chunks
-        held = HoldBack() if chunks.has_messages else None
         with self._window() as window:
             reading = McapPass(
                 self.path, window, log, self._declared, self._summary, self._decompress
             )
-            others: list[Record] = []
-            for record in reading.records():
-                self.position = window.position
-                if isinstance(record, Message):
-                    self._given += 1
-                    if held is None:
-                        yield record
-                    else:
-                        held.add(record)
-                elif record is not None:
-                    others.append(record)
-                else:
-                    if held is not None:
-                        yield from held.release(chunks.later_start(reading.offset))
-                    yield from others
-                    others.clear()
-            if held is not None:
-                yield from held.release(None)
-            self.position = window.position
-            self._count = reading.count
-            if self._is_alone and not reading.found and not self._declared.channels:
-                raise SourceError(self.path, "holds no MCAP records")
+            is_indexed = self._summary.chunks.has_messages
+            yield from self._in_order(window, reading, is_indexed=is_indexed)

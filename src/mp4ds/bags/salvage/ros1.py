@@ -2,134 +2,32 @@
 
 from __future__ import annotations
 
-import bisect
 import re
-import struct
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from mp4ds.bags.files import DamageError, open_source
-from mp4ds.bags.protocols import HOLD_BYTES, BagReader, HoldBack
-from mp4ds.bags.ros1 import Ros1Reader
+from mp4ds.bags.files import DamageError, open_source, recover
+from mp4ds.bags.protocols import LaterStarts
 from mp4ds.bags.ros1_records import (
+    CHUNK_COUNT,
+    INDEX_ENTRY,
     MAGIC,
     MAX_TIME,
     UINT32,
+    Fields,
     Op,
     make_channel,
     other_format,
     split_header,
 )
-from mp4ds.bags.salvage.losses import FileSalvage, LossLog, Tally
-from mp4ds.bags.salvage.scan import MAX_UNPROVEN, RecordFrame, Scan, Window, unpack
+from mp4ds.bags.salvage.losses import FilePass, FileSalvage, LossLog
+from mp4ds.bags.salvage.scan import RecordFrame, Ros1Framing, Scan, Window
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record
 
-MAX_HEADER = 2**16
-"""Maximum size of a record's header: a few fields, and the topic of a connection."""
-
-_OP = re.compile(rb"\x04\x00\x00\x00op=[\x02\x04-\x07]")
-_MAX_BEFORE_OP = 512
-_MAX_FOUND_HEADER = 4096
-_TIME = struct.Struct("<II")
-
-# Sizes of the fields that a record of a kind must have.
-_FIELDS: Mapping[int, Mapping[bytes, int]] = {
-    Op.MESSAGE: {b"conn": 4, b"time": 8},
-    Op.BAG: {b"index_pos": 8},
-    Op.INDEX: {b"ver": 4, b"conn": 4, b"count": 4},
-    Op.CHUNK: {b"size": 4},
-    Op.CHUNK_INFO: {b"chunk_pos": 8, b"count": 4, b"start_time": 8, b"end_time": 8},
-    Op.CONNECTION: {b"conn": 4},
-}
-
-
-class Ros1Framing:
-    """Finds records by the fields of their headers. See `Framing`.
-
-    An uncompressed chunk is framed by its header alone, so that its records are read like any other
-    in the file: damage to one does not hide the others.
-    """
-
-    lookahead = MAX_HEADER + 8
-    outer: Collection[int] = frozenset({Op.CHUNK, Op.INDEX, Op.CHUNK_INFO})
-
-    def frame(self, view: memoryview) -> RecordFrame[int] | None:
-        """See `Framing.frame`."""
-        if len(view) < 8:
-            return None
-        (length,) = UINT32.unpack_from(view)
-        if length > MAX_HEADER or length + 8 > len(view):
-            return None
-        try:
-            fields = dict(split_header(bytes(view[4 : 4 + length])))
-        except DamageError:
-            return None
-        op = fields.get(b"op", b"")
-        needed = _FIELDS.get(op[0]) if len(op) == 1 else None
-        if needed is None:
-            return None
-        if any(len(fields.get(name, b"")) != size for name, size in needed.items()):
-            return None
-        head = length + 8
-        (body,) = UINT32.unpack_from(view, length + 4)
-        if op[0] == Op.CHUNK:
-            if b"compression" not in fields:
-                return None
-            if fields[b"compression"] == b"none":
-                body = 0
-        return RecordFrame(op[0], head, head + body, fields)
-
-    def find(
-        self,
-        view: memoryview,
-        end: int,
-        is_followed: Callable[[int], bool],
-        kinds: Collection[int] | None = None,
-    ) -> int | None:
-        """See `Framing.find`; a header with all its fields is proof enough."""
-        for match in _OP.finditer(view):
-            if kinds is None or view[match.end() - 1] in kinds:
-                start = self._start(view, match.start())
-                if start is not None and start < end:
-                    return start
-            if match.start() > end + _MAX_BEFORE_OP:
-                break
-        return None
-
-    def _start(self, view: memoryview, op: int) -> int | None:
-        """The start of the record whose field ``op`` is at a byte."""
-        first = max(0, op - _MAX_BEFORE_OP)
-        before = bytes(view[first:op])
-        for start in range(len(before) - 4, -1, -1):
-            if before[start + 2] or before[start + 3]:
-                continue
-            (length,) = UINT32.unpack_from(before, start)
-            if not op - first - start + 4 <= length <= _MAX_FOUND_HEADER:
-                continue
-            if self.frame(view[first + start :]):
-                return first + start
-        return None
-
-
-def number(field: bytes) -> int:
-    """The value of an unsigned number field."""
-    return int.from_bytes(field, "little")
-
-
-def time(field: bytes) -> int:
-    """The value of a time field, nanoseconds."""
-    seconds, nanoseconds = _TIME.unpack(field)
-    return int(seconds) * 10**9 + int(nanoseconds)
-
-
-# ---------------------------------------------------------------- the index
-
-_COUNT = struct.Struct("<II")
 _SEARCHED = 16 * 2**20
 _OF_INDEX = (Op.CONNECTION, Op.CHUNK_INFO)
 
@@ -142,6 +40,7 @@ class BagIndex:
         chunks: Byte offsets of the chunks, sorted.
         due: Byte where the index should begin according to the bag's header; None if unknown.
         offset: Byte where the index was found.
+        later: When the chunks from a byte on begin.
     """
 
     def __init__(self) -> None:
@@ -150,23 +49,16 @@ class BagIndex:
         self.due: int | None = None
         self.offset: int | None = None
         self._infos: dict[int, tuple[int, int, bytes]] = {}
-        self._places: list[int] = []
-        self._later: list[int] = []
 
-    def add(self, frame: RecordFrame[int], body: bytes) -> None:
+    def add(self, frame: RecordFrame, body: bytes) -> None:
         """Add a record of the index."""
+        fields = frame.fields
         if frame.kind == Op.CHUNK_INFO:
-            fields = frame.fields
-            span = time(fields[b"start_time"]), time(fields[b"end_time"])
-            self._infos[number(fields[b"chunk_pos"])] = (*span, body[: len(body) // 8 * 8])
-            return
-        connection = number(frame.fields[b"conn"])
-        try:
-            header = dict(split_header(body))
-        except DamageError:
-            return
-        topic = frame.fields.get(b"topic", header.get(b"topic", b""))
-        self.channels.setdefault(connection, make_channel(connection, topic, header))
+            span = fields.time(b"start_time"), fields.time(b"end_time")
+            counts = body[: len(body) // CHUNK_COUNT.size * CHUNK_COUNT.size]
+            self._infos[fields.number(b"chunk_pos", 8)] = (*span, counts)
+        elif channel := _connection(frame, body):
+            self.channels.setdefault(channel.id, channel)
 
     def finish(self, *, chunks: int | None) -> bool:
         """Finish after everything was added; an incomplete list of chunks is dropped.
@@ -181,9 +73,9 @@ class BagIndex:
         if not is_whole:
             self._infos.clear()
         self.chunks = sorted(self._infos)
-        self._places = [chunk for chunk in self.chunks if self._infos[chunk][2]]
-        starts = [self._infos[chunk][0] for chunk in self._places]
-        self._later = np.minimum.accumulate(starts[::-1])[::-1].tolist() if starts else []
+        places = [chunk for chunk in self.chunks if self._infos[chunk][2]]
+        starts = [self._infos[chunk][0] for chunk in places]
+        self.later = LaterStarts(np.array(places, np.uint64), np.array(starts, np.uint64))
         return is_whole
 
     def counts(self, chunk: int) -> dict[int, int] | None:
@@ -191,7 +83,7 @@ class BagIndex:
         if chunk not in self._infos:
             return None
         found: dict[int, int] = {}
-        for connection, count in _COUNT.iter_unpack(self._infos[chunk][2]):
+        for connection, count in CHUNK_COUNT.iter_unpack(self._infos[chunk][2]):
             found[connection] = found.get(connection, 0) + count
         return found
 
@@ -200,36 +92,25 @@ class BagIndex:
         info = self._infos.get(chunk)
         return (info[0], info[1]) if info else None
 
-    def held_in_file_order(self) -> int:
-        """Maximum bytes of chunks, as stored, held back for earlier messages."""
-        if not self._places:
-            return 0
-        ends = np.array([self._infos[chunk][1] for chunk in self._places])
-        sizes = np.diff([*self._places, self.offset or self._places[-1]])
-        by_end = np.argsort(ends)
-        gone = np.concatenate(([0], np.cumsum(sizes[by_end])))
-        past = gone[np.searchsorted(ends[by_end], np.array(self._later[1:], np.int64))]
-        return int((np.cumsum(sizes)[:-1] - past).max(initial=0))
-
-    def start_from(self, offset: int) -> int | None:
-        """The earliest log time of the chunks from a byte on, ns; None after the last."""
-        position = bisect.bisect_left(self._places, offset)
-        return self._later[position] if position < len(self._later) else None
-
     def stats(self, connections: Iterable[int]) -> dict[int, ChannelStats]:
         """Counts and spans by connection, from the chunks; empty if no chunk is listed."""
         total = {connection: ChannelStats(0, 0, 0) for connection in connections}
         for chunk in self.chunks:
             start, end, _ = self._infos[chunk]
             for connection, count in (self.counts(chunk) or {}).items():
-                old = total.get(connection)
-                if old is None or not count:
-                    continue
-                first, last = (old.start, old.end) if old.count else (start, end)
-                total[connection] = ChannelStats(
-                    old.count + count, min(first, start), max(last, end)
-                )
+                if connection in total and count:
+                    total[connection] = total[connection].plus(ChannelStats(count, start, end))
         return total if self.chunks else {}
+
+
+def _connection(frame: RecordFrame, body: bytes) -> Channel | None:
+    """The channel that a connection record declares; None if it is damaged."""
+    try:
+        header = dict(split_header(body))
+    except DamageError:
+        return None
+    topic = frame.fields.get(b"topic", header.get(b"topic", b""))
+    return make_channel(frame.fields.number(b"conn"), topic, header)
 
 
 def read_index(path: Path) -> BagIndex:
@@ -248,8 +129,8 @@ def read_index(path: Path) -> BagIndex:
     if header and header.kind == Op.BAG:
         if header.fields.get(b"encryptor"):
             raise SourceError(path, "is encrypted", "Decrypt it with `rosbag decrypt` first.")
-        index.due = number(header.fields[b"index_pos"])
-        chunks = number(header.fields.get(b"chunk_count", b""))
+        index.due = header.fields.number(b"index_pos", 8)
+        chunks = int.from_bytes(header.fields.get(b"chunk_count", b""), "little")
         if len(MAGIC) + header.size <= index.due < size:
             _read_records(path, index.due, index)
     if not index.finish(chunks=chunks) and index.due != 0:
@@ -288,9 +169,6 @@ def _search_connections(path: Path, offset: int, index: BagIndex) -> None:
 
 # ---------------------------------------------------------------- the reader
 
-_MOST_PACKED = 16  # maximum assumed compression ratio of a chunk
-_INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
-
 
 class Ros1Salvage(FileSalvage):
     """Reads what is left of a ROS 1 bag.
@@ -306,8 +184,7 @@ class Ros1Salvage(FileSalvage):
         super().__init__(path, is_alone=is_alone)
         with open_source(path) as stream:
             start = stream.read(32)
-        self._has_magic = start.startswith(MAGIC)
-        if not self._has_magic and re.match(rb"#ROS(BAG|RECORD|LOG) V1\.\d\n", start):
+        if re.match(rb"#ROS(BAG|RECORD|LOG) V1\.\d\n", start):
             raise other_format(path, start)
         self._index = read_index(path)
         self._channels: dict[int, Channel] = dict(self._index.channels)
@@ -321,39 +198,17 @@ class Ros1Salvage(FileSalvage):
         """Counts and spans from the bag's index, including lost messages; otherwise empty."""
         return self._index.stats(self._channels)
 
-    @property
-    def _usual(self) -> Callable[[], BagReader] | None:
-        is_far_out = self._index.held_in_file_order() > HOLD_BYTES // _MOST_PACKED
-        return partial(Ros1Reader, self.path) if is_far_out else None
-
     def _pass(self, log: LossLog) -> Iterator[Record]:
         with Window.of_file(self.path) as window:
             reading = _Pass(self.path, window, log, self._index, self._channels)
-            held = HoldBack() if self._index.chunks else None
-            for message in reading.messages():
-                self.position = window.offset
-                if held is None:
-                    yield message
-                    continue
-                if reading.is_at_new_chunk:
-                    reading.is_at_new_chunk = False
-                    yield from held.release(reading.earliest)
-                held.add(message)
-            if held:
-                yield from held.release(None)
-            self.position = window.offset
-            if self._is_alone and not reading.found and not self._channels:
-                raise SourceError(self.path, "holds no ROS 1 bag records")
+            yield from self._in_order(window, reading, is_indexed=bool(self._index.chunks))
 
 
-class _Pass:
-    """One reading of a bag.
+class _Pass(FilePass):
+    """One reading of a bag."""
 
-    Attributes:
-        found: Number of valid records found.
-        is_at_new_chunk: Whether a chunk began since this was last reset.
-        earliest: Earliest log time, ns, of messages from here on, by the bag's index.
-    """
+    magic = MAGIC
+    kind = "a ROS 1 bag"
 
     def __init__(
         self,
@@ -363,32 +218,16 @@ class _Pass:
         index: BagIndex,
         channels: dict[int, Channel],
     ) -> None:
-        self._path = path
-        self._window = window
-        self._log = log
+        super().__init__(path, window, log, Ros1Framing(), channels, index.offset)
+        self._channels: dict[int, Channel] = channels
         self._index = index
-        self._channels = channels
-        self._tally = Tally(log, self._topic_of)
-        self._framing = Ros1Framing()
-        self._scan = Scan(window, self._framing, self._lose)
         self._next_listed = 0
         self._contradicted: set[int] = set()
         self._others: dict[tuple[object, ...], Channel] = {}
-        self.found = 0
-        self.is_at_new_chunk = False
-        self.earliest: int | None = None
 
-    def _topic_of(self, connection: int) -> str | None:
-        channel = self._channels.get(connection)
-        return channel.topic if channel else None
-
-    def messages(self) -> Iterator[Message]:
-        """All messages, in the order of the file."""
-        start = bytes(self._window.peek(len(MAGIC)))
-        if start == MAGIC:
-            self._window.skip(len(MAGIC))
-        else:
-            self._scan.resync(0, "the first bytes are not those of a ROS 1 bag", passed=0)
+    def records(self) -> Iterator[Record | None]:
+        """All messages, in the order of the file; None at each chunk."""
+        self._begins()
         while frame := self._scan.next():
             self.found += 1
             if frame.kind != Op.INDEX:
@@ -402,38 +241,36 @@ class _Pass:
             self._tally.lost(self._window.offset, None, problem)
         self._tally.close()
 
-    def _record(self, frame: RecordFrame[int]) -> Iterator[Message]:
+    def _record(self, frame: RecordFrame) -> Iterator[Message | None]:
         offset = self._window.offset
         if frame.kind == Op.CHUNK:
             (length,) = UINT32.unpack(self._window.peek(frame.head)[-4:])
             self._enter(offset, offset + frame.head + length)
+            yield None
             if frame.fields[b"compression"] == b"none":
                 self._window.skip(frame.size)
             else:
                 yield from self._compressed(frame)
-        elif frame.kind == Op.MESSAGE:
-            body = self._scan.body(frame)
-            if body is not None:
-                message = self._message(frame, body, offset)
-                if message:
-                    self._tally.gave(number(frame.fields[b"conn"]), message.log_time)
-                    yield message
-        elif frame.kind == Op.CONNECTION:
-            body = self._scan.body(frame)
-            if body is not None and not self._connect(frame, body):
-                self._lose(offset, frame.size, "a connection record is damaged")
-        elif frame.kind == Op.INDEX:
-            body = self._scan.body(frame)
-            if body is not None:
-                self._listed(frame, body, offset)
-        elif frame.kind == Op.BAG and not self._scan.is_followed(frame.size):
+            return
+        if frame.kind == Op.BAG and not self._scan.is_followed(frame.size):
             self._scan.resync(offset, "the header of the bag is damaged", passed=frame.head)
-        else:
-            self._scan.body(frame)
+            return
+        body = self._scan.body(frame)
+        if body is None:
+            return
+        if frame.kind == Op.MESSAGE:
+            message = self._message(frame, body, offset)
+            if message:
+                self._tally.gave(frame.fields.number(b"conn"), message.log_time)
+                yield message
+        elif frame.kind == Op.CONNECTION and not self._connect(frame, body):
+            self._lose(offset, frame.size, "a connection record is damaged")
+        elif frame.kind == Op.INDEX:
+            self._listed(frame.fields, body, offset)
 
-    def _message(self, frame: RecordFrame[int], body: bytes, offset: int) -> Message | None:
+    def _message(self, frame: RecordFrame, body: bytes, offset: int) -> Message | None:
         """A message; None if it is lost."""
-        connection, log_time = number(frame.fields[b"conn"]), time(frame.fields[b"time"])
+        connection, log_time = frame.fields.number(b"conn"), frame.fields.time(b"time")
         channel = self._channels.get(connection)
         if log_time >= MAX_TIME:
             self._lose(
@@ -450,14 +287,12 @@ class _Pass:
             return None
         return Message(channel, log_time, log_time, 0, body)
 
-    def _connect(self, frame: RecordFrame[int], body: bytes, *, is_sure: bool = False) -> bool:
-        connection = number(frame.fields[b"conn"])
-        try:
-            header = dict(split_header(body))
-        except DamageError:
-            return connection in self._channels
-        topic = frame.fields.get(b"topic", header.get(b"topic", b""))
-        channel = make_channel(connection, topic, header)
+    def _connect(self, frame: RecordFrame, body: bytes, *, is_sure: bool = False) -> bool:
+        """Take a connection record; False if it is damaged."""
+        channel = _connection(frame, body)
+        if channel is None:
+            return frame.fields.number(b"conn") in self._channels
+        connection = channel.id
         if self._channels.setdefault(connection, channel).identity != channel.identity:
             # a separate channel: messages of the other one may have been yielded already
             if is_sure:
@@ -470,61 +305,34 @@ class _Pass:
                 self._log.lost(None, None, problem).add(0, ())
         return True
 
-    def _compressed(self, frame: RecordFrame[int]) -> Iterator[Message]:
+    def _compressed(self, frame: RecordFrame) -> Iterator[Message]:
         """The messages of a compressed chunk, as far as it can be decompressed."""
-        window, scan = self._window, self._scan
-        offset = window.offset
-        proven = scan.is_proven(frame)
-        have = window.peek(frame.size if proven else min(frame.size, MAX_UNPROVEN))
+        offset = self._window.offset
+        have, proven = self._peek_chunk(frame)
         compression = frame.fields[b"compression"].decode(errors="replace")
-        unpacked = unpack(compression, have[frame.head :], number(frame.fields[b"size"]))
-        problems = [unpacked.problem] if unpacked.problem else []
-        inner = Scan(
-            Window.of_content(unpacked.content, self._path),
-            self._framing,
-            lambda _offset, _size, problem: problems.append(problem),
-        )
-        while part := inner.next():
-            body = inner.body(part)
-            if body is None:
-                continue
+        found = recover(compression, have[frame.head :], frame.fields.number(b"size"))
+        problems = [found.problem] if found.problem else []
+        for part, body in self._inside(found.content, problems):
             if part.kind == Op.MESSAGE:
                 message = self._message(part, body, offset)
-                connection = number(part.fields[b"conn"])
-                if message and unpacked.is_sound:
+                connection = part.fields.number(b"conn")
+                if message and found.is_sound:
                     self._tally.gave(connection, message.log_time)
                     yield message
                 elif message:
                     self._tally.hold(connection, message)
             elif part.kind == Op.CONNECTION and not self._connect(part, body, is_sure=not problems):
                 problems.append("a connection record is damaged")
-        end = frame.head + unpacked.used
-        if not unpacked.problem and end != frame.size and scan.is_followed(end):
-            window.skip(end)  # the content is complete: the record's length is wrong
-        elif proven and (not unpacked.problem or scan.is_followed(frame.size)):
-            window.skip(frame.size)
-        else:
-            whole = unpacked.used and not problems
-            scan.resync(
-                offset + end if whole else offset,
-                problems[0] if problems else scan.cut_or_damaged(frame),
-                passed=end,
-                kinds=self._framing.outer,
-            )
-            return
-        if problems:
-            self._lose(offset, window.offset - offset, problems[0])
-        else:
-            self._tally.verified()
+        used = frame.head + found.used
+        self._leave_chunk(frame, used, problems, proven=proven, whole=not found.problem)
 
-    def _listed(self, frame: RecordFrame[int], body: bytes, offset: int) -> None:
-        connection, count = number(frame.fields[b"conn"]), number(frame.fields[b"count"])
+    def _listed(self, fields: Fields, body: bytes, offset: int) -> None:
+        connection, count = fields.number(b"conn"), fields.number(b"count")
         if self._tally.count_matches(connection, count, offset):
             return
-        entries = np.frombuffer(body, _INDEX_ENTRY, count=len(body) // _INDEX_ENTRY.itemsize)
+        entries = np.frombuffer(body, INDEX_ENTRY, count=len(body) // INDEX_ENTRY.itemsize)
         times = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
-        found, counts = np.unique(times, return_counts=True)
-        self._tally.listed(connection, dict(zip(found.tolist(), counts.tolist(), strict=True)))
+        self._tally.listed(connection, times)
 
     def _enter(self, offset: int, end: int) -> None:
         """Begin a chunk that should end at a byte."""
@@ -533,8 +341,7 @@ class _Pass:
         if self._next_listed < len(starts) and starts[self._next_listed] == offset:
             self._next_listed += 1
         self._tally.open(self._index.counts(offset), end, self._index.span(offset))
-        self.is_at_new_chunk = True
-        self.earliest = self._index.start_from(offset)
+        self.earliest = self._index.later.after(offset - 1)
 
     def _pass_listed(self, end: int) -> None:
         """Record as lost the chunks that the index lists before a byte but that were not found."""
@@ -544,8 +351,6 @@ class _Pass:
             self._next_listed += 1
 
     def _lose(self, offset: int, size: int, problem: str) -> None:
-        if self._index.offset is not None and offset >= self._index.offset:
-            self._log.lost(offset, size, problem).add(0, ())
-            return
-        self._tally.lost(offset, size, problem)
-        self._pass_listed(offset + size)
+        super()._lose(offset, size, problem)
+        if self._index.offset is None or offset < self._index.offset:
+            self._pass_listed(offset + size)

@@ -1,32 +1,24 @@
-"""A damaged file, read once: records, resuming after damage, and recovering chunks."""
+"""The records of a damaged file, read once, resuming after damage."""
 
 from __future__ import annotations
 
 import io
-from bz2 import BZ2Decompressor
-from collections.abc import Callable, Collection, Iterator
+import re
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Generic, NamedTuple, Protocol, TypeVar
+from typing import BinaryIO
 
-import lz4.frame
-import zstandard
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
-from mp4ds.bags.files import (
-    DECOMPRESSED,
-    ZSTD_MAGIC,
-    ZSTD_PIECE,
-    DamageError,
-    OversizeError,
-    ZstdStream,
-    most_held,
-    open_source,
-)
+from mp4ds.bags.files import DamageError, ZstdStream, open_source
+from mp4ds.bags.mcap_records import MAGIC, PRIVATE_OPCODE
+from mp4ds.bags.ros1_records import UINT32, Fields, Op, split_header
 from mp4ds.errors import SourceError
-
-if TYPE_CHECKING:
-    from mp4ds.bags.files import Decompressor
 
 BLOCK = 2**20
 _PIECE = 16 * 2**20
@@ -164,27 +156,25 @@ class Window:
 MAX_UNPROVEN = 64 * 2**20
 """Maximum size of a record accepted although no other record follows it."""
 
-_KindT = TypeVar("_KindT")
-
 
 @dataclass(frozen=True, slots=True)
-class RecordFrame(Generic[_KindT]):
+class RecordFrame:
     """A record's extent, from its first bytes.
 
     Attributes:
         kind: Its kind in the format.
         head: Bytes before its body.
         size: Total bytes.
-        fields: The fields in its head.
+        fields: The fields in the header of a ROS 1 record.
     """
 
-    kind: _KindT
+    kind: int
     head: int
     size: int
-    fields: dict[bytes, bytes] = field(default_factory=dict)
+    fields: Fields = field(default_factory=Fields)
 
 
-class Framing(Protocol):
+class Framing(ABC):
     """How a format frames its records.
 
     Attributes:
@@ -195,10 +185,11 @@ class Framing(Protocol):
     lookahead: int
     outer: Collection[int]
 
-    def frame(self, view: memoryview) -> RecordFrame[int] | None:
+    @abstractmethod
+    def frame(self, view: memoryview) -> RecordFrame | None:
         """The record at the start of these bytes, if they look like one."""
-        ...
 
+    @abstractmethod
     def find(
         self,
         view: memoryview,
@@ -214,7 +205,6 @@ class Framing(Protocol):
             is_followed: Whether a record, or the end, is at a byte of the view or past it.
             kinds: Only records of these kinds; None for all.
         """
-        ...
 
 
 class Scan:
@@ -233,7 +223,7 @@ class Scan:
         self._framing = framing
         self._lose = lose
 
-    def next(self) -> RecordFrame[int] | None:
+    def next(self) -> RecordFrame | None:
         """The next record, without consuming it; None at the end."""
         while True:
             view = self._window.peek(self._framing.lookahead)
@@ -244,7 +234,7 @@ class Scan:
                 return frame
             self.resync(self._window.offset, "no valid record here")
 
-    def body(self, frame: RecordFrame[int]) -> bytes | None:
+    def body(self, frame: RecordFrame) -> bytes | None:
         """Consume a record. None if it is damaged; the scan has then advanced past it."""
         if not self.is_proven(frame):
             self.resync(self._window.offset, self.cut_or_damaged(frame))
@@ -260,7 +250,7 @@ class Scan:
         self._window.skip(frame.size)
         return bytes(whole[frame.head : frame.size])
 
-    def is_cut(self, frame: RecordFrame[int]) -> bool:
+    def is_cut(self, frame: RecordFrame) -> bool:
         """Whether the file ends before the record does."""
         left = self._window.left
         if left is None:
@@ -268,7 +258,7 @@ class Scan:
             return left < min(frame.size, MAX_UNPROVEN)
         return left < frame.size
 
-    def is_proven(self, frame: RecordFrame[int]) -> bool:
+    def is_proven(self, frame: RecordFrame) -> bool:
         """Whether a record is complete and, if it is large, followed by another one."""
         if self.is_cut(frame):
             return False
@@ -284,7 +274,7 @@ class Scan:
     def _follows(self, start: int) -> Callable[[int], bool]:
         return lambda distance: self.is_followed(start + distance)
 
-    def cut_or_damaged(self, frame: RecordFrame[int]) -> str:
+    def cut_or_damaged(self, frame: RecordFrame) -> str:
         """What is wrong with an unproven record, in words."""
         if self.is_cut(frame):
             return "the file ends within a record"
@@ -323,183 +313,251 @@ class Scan:
             self._lose(start, window.offset - start, problem)
 
 
-# ---------------------------------------------------------------- damaged chunks
+# ---------------------------------------------------------------- ROS 1
 
-_UNPACKED_PIECE = 2**12
-_SMALL_PIECE = 64
-"""Bytes decompressed at a time from damaged data: the piece with the damage yields nothing."""
+MAX_HEADER = 2**16
+"""Maximum size of a record's header: a few fields, and the topic of a connection."""
 
-_CLOSE = 16
-"""Bytes at the end, of a marker and a checksum, that are decompressed one by one."""
+_ROS1_OP = re.compile(rb"\x04\x00\x00\x00op=[\x02\x04-\x07]")
+_MAX_BEFORE_OP = 512
+_MAX_FOUND_HEADER = 4096
+_TIME = struct.Struct("<II")
 
-_LZ4_RATIO = 255
-_LZ4_BLOCK = 2**23  # the largest is 4 MiB, and one may be pending
+# Sizes of the fields that a record of a kind must have.
+_FIELDS: Mapping[int, Mapping[bytes, int]] = {
+    Op.MESSAGE: {b"conn": 4, b"time": 8},
+    Op.BAG: {b"index_pos": 8},
+    Op.INDEX: {b"ver": 4, b"conn": 4, b"count": 4},
+    Op.CHUNK: {b"size": 4},
+    Op.CHUNK_INFO: {b"chunk_pos": 8, b"count": 4, b"start_time": 8, b"end_time": 8},
+    Op.CONNECTION: {b"conn": 4},
+}
 
-_MAX_AT_ONCE = 64 * 2**20
 
-_MAGIC = {b"BZh": "bz2", b"\x04\x22\x4d\x18": "lz4", ZSTD_MAGIC: "zstd"}
+class Ros1Framing(Framing):
+    """Finds records by the fields of their headers.
 
-
-class Unpacked(NamedTuple):
-    """Content of a chunk.
-
-    Attributes:
-        content: The recovered content, from the beginning.
-        used: Bytes of the data that belong to it; 0 if unknown.
-        problem: What is wrong, a phrase; empty if nothing is.
-        is_sound: Whether the content is correct, though some of it may be missing.
+    An uncompressed chunk is framed by its header alone, so that its records are read like any other
+    in the file: damage to one does not hide the others.
     """
 
-    content: bytes
-    used: int
-    problem: str
-    is_sound: bool = True
+    lookahead = MAX_HEADER + 8
+    outer: Collection[int] = frozenset({Op.CHUNK, Op.INDEX, Op.CHUNK_INFO})
+
+    def frame(self, view: memoryview) -> RecordFrame | None:
+        """The record at the start of these bytes; its header has all fields of its kind."""
+        if len(view) < 8:
+            return None
+        (length,) = UINT32.unpack_from(view)
+        if length > MAX_HEADER or length + 8 > len(view):
+            return None
+        try:
+            fields = Fields(split_header(bytes(view[4 : 4 + length])))
+        except DamageError:
+            return None
+        op = fields.get(b"op", b"")
+        needed = _FIELDS.get(op[0]) if len(op) == 1 else None
+        if needed is None:
+            return None
+        if any(len(fields.get(name, b"")) != size for name, size in needed.items()):
+            return None
+        head = length + 8
+        (body,) = UINT32.unpack_from(view, length + 4)
+        if op[0] == Op.CHUNK:
+            if b"compression" not in fields:
+                return None
+            if fields[b"compression"] == b"none":
+                body = 0
+        return RecordFrame(op[0], head, head + body, fields)
+
+    def find(
+        self,
+        view: memoryview,
+        end: int,
+        is_followed: Callable[[int], bool],
+        kinds: Collection[int] | None = None,
+    ) -> int | None:
+        """The start of the first record: a header with all its fields is proof enough."""
+        for match in _ROS1_OP.finditer(view):
+            if kinds is None or view[match.end() - 1] in kinds:
+                start = self._start(view, match.start())
+                if start is not None and start < end:
+                    return start
+            if match.start() > end + _MAX_BEFORE_OP:
+                break
+        return None
+
+    def _start(self, view: memoryview, op: int) -> int | None:
+        """The start of the record whose field ``op`` is at a byte."""
+        first = max(0, op - _MAX_BEFORE_OP)
+        before = bytes(view[first:op])
+        for start in range(len(before) - 4, -1, -1):
+            if before[start + 2] or before[start + 3]:
+                continue
+            (length,) = UINT32.unpack_from(before, start)
+            if not op - first - start + 4 <= length <= _MAX_FOUND_HEADER:
+                continue
+            if self.frame(view[first + start :]):
+                return first + start
+        return None
 
 
-def lost_by(error: DamageError) -> str:
-    """What is wrong with messages whose payload cannot be decompressed, a phrase."""
-    if isinstance(error, OversizeError):
-        return f"that decompress to too much ({DECOMPRESSED} is the limit)"
-    return "whose compressed data is damaged"
+# ---------------------------------------------------------------- MCAP
+
+_FRAME = struct.Struct("<BQ")
+_HEAD = _FRAME.size
+_MAX_LENGTH = 2**40
+_COMPRESSIONS = (b"", b"lz4", b"zstd")
+
+# Bytes of the fields in the bodies of records, a string or map as the format of its length.
+_LAYOUTS: Mapping[int, tuple[int | str, ...]] = {
+    Opcode.SCHEMA: (2, "<I", "<I", "<I"),
+    Opcode.CHANNEL: (4, "<I", "<I", "<I"),
+    Opcode.CHUNK: (28, "<I", "<Q"),
+    Opcode.MESSAGE_INDEX: (2, "<I"),
+    Opcode.ATTACHMENT: (16, "<I", "<I", "<Q", 4),
+    Opcode.METADATA: ("<I", "<I"),
+}
+_SHORTEST = {
+    Opcode.FOOTER: 20,
+    Opcode.MESSAGE: 22,
+    Opcode.DATA_END: 4,
+    **{
+        kind: sum(struct.calcsize(part) if isinstance(part, str) else part for part in layout)
+        for kind, layout in _LAYOUTS.items()
+    },
+}
 
 
-def unpack(compression: str, data: memoryview, size: int) -> Unpacked:
-    """Decompress as much as possible.
+def _table(known: Mapping[int, int], other: int) -> NDArray[np.int64]:
+    table = np.full(256, other, np.int64)
+    for opcode, value in known.items():
+        table[opcode] = value
+    return table
+
+
+# Records that are not searched for have no possible length.
+_SHORTEST_OF = _table(_SHORTEST, _MAX_LENGTH)
+_LONGEST_OF = _table(
+    {**dict.fromkeys(_SHORTEST, _MAX_LENGTH), Opcode.DATA_END: 4, Opcode.FOOTER: 20}, 0
+)
+
+
+def _fields_end(kind: int, body: memoryview) -> int | None:
+    """Bytes of a record's body by its fields; None if they are not those of its kind."""
+    at = 0
+    ends = []
+    try:
+        for part in _LAYOUTS[kind]:
+            at += part if isinstance(part, int) else 0
+            if isinstance(part, str):
+                at += struct.calcsize(part) + int(struct.unpack_from(part, body, at)[0])
+            ends.append(at)
+    except (KeyError, struct.error):
+        return None
+    if kind == Opcode.MESSAGE_INDEX and (at - _SHORTEST[kind]) % 16:
+        return None
+    if kind == Opcode.CHUNK and bytes(body[32 : ends[1]]) not in _COMPRESSIONS:
+        return None
+    return at
+
+
+class McapFraming(Framing):
+    """Finds records by opcode and length; MCAP has no sync markers.
+
+    In sequence, anything the format allows is a record. After damage, it must be of a kind whose
+    fields match the length of its frame, or a message of a known channel followed by another
+    record.
 
     Args:
-        compression: Its name: ``none`` or empty, ``bz2``, ``lz4`` or ``zstd``; if damaged, it is
-            inferred from the data.
-        data: As stored; may be cut short.
-        size: Expected size; no more is decompressed, and no more than data of this length can hold.
+        channels: Ids of the known channels; may grow.
     """
-    if compression in ("", "none"):
-        content = bytes(data[:size])
-        problem = "" if len(content) == size else "a chunk is cut short"
-        return Unpacked(content, len(content), problem)
-    most = most_held(len(data))
-    limit = f", the limit ({DECOMPRESSED} sets another)" if size > most else ""
-    size = min(size, most)
-    start = bytes(data[:4])
-    found = next((name for magic, name in _MAGIC.items() if start.startswith(magic)), compression)
-    if found not in _MACHINES:
-        return Unpacked(
-            b"", 0, f"a chunk is compressed with {compression!r}, which is not supported"
-        )
-    gathered = io.BytesIO()  # pieces in a list would need the memory twice
-    left = size + 1
-    machine = _MACHINES[found]()
-    step = len(data) if size <= _MAX_AT_ONCE else _UNPACKED_PIECE
-    at = 0
-    try:
-        while at < len(data) and left > 0 and not machine.eof:
-            for piece in machine.pieces(data[at : at + step], left):
-                left -= gathered.write(piece)
-            at += step
-    except _DAMAGE:
-        if step > _UNPACKED_PIECE:
-            gathered, left = _by_pieces(found, data, size)
-        problem = f"the {found} data of a chunk is damaged"
-        gathered.truncate(size)
-        return Unpacked(gathered.getvalue(), 0, problem, found == "bz2")
-    if not machine.eof and left <= 0:
-        problem = f"the {found} data of a chunk unpacks to more than {size} bytes{limit}"
-        # bz2 verifies a block at its end, which was not reached here
-        gathered.truncate(0 if found == "bz2" else size)
-        return Unpacked(gathered.getvalue(), 0, problem, False)
-    content = gathered.getvalue()
-    if not machine.eof:
-        return Unpacked(content, 0, f"the {found} data of a chunk is cut short")
-    used = min(at, len(data)) - machine.unused
-    if len(content) != size:
-        problem = f"a chunk holds {len(content)} bytes instead of {size}"
-        return Unpacked(content, used, problem, found == "bz2")
-    return Unpacked(content, used, "")
 
+    lookahead = 2**16
+    outer: Collection[int] = frozenset(
+        {
+            Opcode.CHUNK,
+            Opcode.MESSAGE_INDEX,
+            Opcode.ATTACHMENT,
+            Opcode.METADATA,
+            Opcode.DATA_END,
+            Opcode.FOOTER,
+        }
+    )
 
-def _by_pieces(compression: str, data: memoryview, size: int) -> tuple[io.BytesIO, int]:
-    """What can be decompressed before the damage."""
-    machine = _MACHINES[compression]()
-    gathered = io.BytesIO()
-    left = size
-    try:
-        for start, end in _small_pieces(len(data)):
-            piece = b"".join(machine.pieces(data[start:end], left))
-            left -= len(piece)
-            if compression == "bz2" and left <= 0 and not machine.eof:
-                break  # its last block was not verified
-            gathered.write(piece)
-            if left <= 0 or machine.eof:
-                break
-    except _DAMAGE:
-        pass
-    return gathered, left
+    def __init__(self, channels: Collection[int]) -> None:
+        self._channels = channels
 
+    def frame(self, view: memoryview) -> RecordFrame | None:
+        """The record at the start of these bytes: any that the format allows."""
+        if len(view) < _HEAD:
+            return None
+        opcode, length = _FRAME.unpack_from(view)
+        if length >= _MAX_LENGTH or length < _SHORTEST.get(opcode, 0):
+            return None
+        if not 1 <= opcode <= Opcode.DATA_END and opcode < PRIVATE_OPCODE:
+            return None
+        if opcode == Opcode.CHUNK:
+            needed = _fields_end(opcode, view[_HEAD:])
+            if needed is None or needed > length:
+                return None
+        return RecordFrame(opcode, _HEAD, _HEAD + length)
 
-def _small_pieces(length: int) -> Iterator[tuple[int, int]]:
-    body = max(0, length - _CLOSE)
-    for start in range(0, body, _SMALL_PIECE):
-        yield start, min(start + _SMALL_PIECE, body)
-    for start in range(body, length):
-        yield start, start + 1
+    def find(
+        self,
+        view: memoryview,
+        end: int,
+        is_followed: Callable[[int], bool],
+        kinds: Collection[int] | None = None,
+    ) -> int | None:
+        """The start of the first certain record."""
+        for start in self._candidates(view, end):
+            if kinds is not None and view[start] not in kinds:
+                continue
+            size = self._sure_size(view[start:])
+            if size == 0 or (size and is_followed(start + size)):
+                return start
+        return None
 
+    def _candidates(self, view: memoryview, end: int) -> list[int]:
+        """Places of an opcode followed by a plausible length."""
+        data = np.frombuffer(view, np.uint8)[: end + _HEAD]
+        if len(data) < _HEAD:
+            return []
+        kinds = data[: -_HEAD + 1]
+        mask = (data[7 : len(data) - 1] == 0) & (data[8:] == 0)
+        mask &= (kinds - np.uint8(Opcode.FOOTER)) <= Opcode.DATA_END - Opcode.FOOTER
+        places = np.flatnonzero(mask)
+        if not len(places):
+            return []
+        lengths = np.zeros(len(places), np.int64)
+        for byte in range(6):
+            lengths |= data[places + 1 + byte].astype(np.int64) << (8 * byte)
+        found = kinds[places]
+        keep = (lengths >= _SHORTEST_OF[found]) & (lengths <= _LONGEST_OF[found])
+        keep[found == Opcode.MESSAGE] &= self._is_known(data, places[found == Opcode.MESSAGE])
+        result: list[int] = places[keep & (places < end)].tolist()
+        return result
 
-_DAMAGE = (OSError, RuntimeError, EOFError, ValueError, zstandard.ZstdError)
+    def _is_known(self, data: NDArray[np.uint8], places: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Whether messages at these places are of known channels."""
+        low = np.minimum(places + _HEAD, len(data) - 1)
+        high = np.minimum(places + _HEAD + 1, len(data) - 1)
+        ids = data[low].astype(np.int64) | data[high].astype(np.int64) << 8
+        # the last few may extend beyond the view: the strict check decides
+        return np.isin(ids, list(self._channels)) | (places + _HEAD + 1 >= len(data))
 
-
-class _BlockMachine:
-    """A decompressor of bz2 or lz4, which have the same methods."""
-
-    def __init__(self, make: Callable[[], Decompressor]) -> None:
-        self._machine = make()
-
-    @property
-    def eof(self) -> bool:
-        return self._machine.eof
-
-    @property
-    def unused(self) -> int:
-        return len(self._machine.unused_data or b"")
-
-    def pieces(self, data: memoryview, size: int) -> Iterator[bytes]:
-        # lz4 allocates the given maximum: the data cannot yield more than this at once.
-        room = min(_LZ4_RATIO * len(data) + _LZ4_BLOCK, _PIECE)
-        left: bytes | memoryview = data
-        while size > 0:
-            piece = self._machine.decompress(left, max_length=min(size, room))
-            yield piece
-            size -= len(piece)
-            if not piece or self._machine.eof or self._machine.needs_input:
-                break
-            left, room = b"", _LZ4_BLOCK
-
-
-class _Zstd:
-    def __init__(self) -> None:
-        self._machine = zstandard.ZstdDecompressor().decompressobj()
-        self._not_fed = 0
-
-    @property
-    def eof(self) -> bool:
-        return self._machine.eof
-
-    @property
-    def unused(self) -> int:
-        return len(self._machine.unused_data) + self._not_fed
-
-    def pieces(self, data: memoryview, size: int) -> Iterator[bytes]:
-        # It has no limit: small pieces bound the output of each.
-        for at in range(0, len(data), ZSTD_PIECE):
-            if size < 0 or self._machine.eof:
-                self._not_fed = len(data) - at
-                break
-            piece = self._machine.decompress(data[at : at + ZSTD_PIECE])
-            yield piece
-            size -= len(piece)
-
-
-_Machine = _BlockMachine | _Zstd
-_MACHINES: dict[str, Callable[[], _Machine]] = {
-    "bz2": partial(_BlockMachine, BZ2Decompressor),
-    "lz4": partial(_BlockMachine, lz4.frame.LZ4FrameDecompressor),
-    "zstd": _Zstd,
-}
+    def _sure_size(self, view: memoryview) -> int | None:
+        """0 for a certain record, its size if another must follow, None for no record."""
+        frame = self.frame(view)
+        if frame is None:
+            return None
+        body, length = view[_HEAD:], frame.size - _HEAD
+        if frame.kind == Opcode.MESSAGE:
+            is_known = int.from_bytes(body[:2], "little") in self._channels
+            return frame.size if is_known else None
+        if frame.kind == Opcode.FOOTER:
+            return 0 if bytes(body[20 : 20 + len(MAGIC)]) == MAGIC else None
+        if frame.kind == Opcode.DATA_END:
+            return frame.size
+        return 0 if _fields_end(frame.kind, body) == length else None

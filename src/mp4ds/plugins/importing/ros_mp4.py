@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mp4ds.bags.convert import Converter
-from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import Format
 from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.outputs import digest_file, staged

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from mp4ds.bags.mcap_write import McapWriter
+from mp4ds.bags.mcap import McapWriter
 from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.inspection import begins_anew, depends_on_others
 from mp4ds.packing.spool import SpoolFolder
