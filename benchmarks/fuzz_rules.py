@@ -468,9 +468,9 @@ def _look_into(path: Path) -> None:
         info(path)
     with suppress(Mp4dsError), mp4ds.open(path) as dataset:
         dataset.times()
-        for stream in dataset.streams:
+        for topic in dataset.topics:
             with suppress(Mp4dsError):
-                _ = stream[-1]
+                _ = dataset[topic][-1]
         with suppress(Mp4dsError):
             times = [record.log_time for record in dataset.records() if isinstance(record, Message)]
             for _ in dataset.records(start=times[len(times) // 2] if times else 0):

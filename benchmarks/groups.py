@@ -92,7 +92,7 @@ def read(dataset: Path, reads: int) -> tuple[float, float]:
     numbers = random.Random(0)
     with mp4ds.open(dataset) as opened:
         stream = opened[TOPIC]
-        size = stream.video_path.stat().st_size / len(stream)
+        size = stream.streams[0].video_path.stat().st_size / len(stream)
         stream.read([0])
         begun = time.process_time()
         for _ in range(reads):

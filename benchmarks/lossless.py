@@ -134,7 +134,7 @@ def check(clip: NDArray[Any], dataset: Path, name: str) -> None:
     stamps = (stamp for stamp, _ in times(HERTZ))
     missing = dict(zip(stamps, clip, strict=False))
     with mp4ds.open(dataset) as opened:
-        found = {frame.stamp_ns: frame.data for stream in opened.streams for frame in stream}
+        found = {frame.stamp_ns: frame.data for topic in opened for frame in topic}
         for record in opened.recorded_records():
             if isinstance(record, Message) and record.channel.topic == TOPIC:
                 image: Any = store.deserialize_cdr(record.data, IMAGE)

@@ -14,7 +14,7 @@ import mp4ds
 def main(path: str) -> None:
     """Print a line for three random frames of each camera."""
     with mp4ds.open(path) as dataset:
-        for stream in dataset.streams:
+        for stream in dataset:
             for index in sorted(random.sample(range(len(stream)), min(3, len(stream)))):
                 frame = stream[index]
                 focal = frame.intrinsics.k[0] if frame.intrinsics else float("nan")

@@ -60,7 +60,7 @@ def steps(options: argparse.Namespace) -> Iterator[tuple[str, str]]:
         for stream in dataset.streams:
             count, (width, height) = len(stream), stream.image_size
             yield f"{stream.topic}", f"{count} frames, {stream.encoding} {width}x{height}"
-        pixels = sum(stream[0].data.nbytes * len(stream) for stream in dataset.streams)
+        pixels = sum(frame.data.nbytes for topic in dataset for frame in topic)
     source = size_of(options.source)
     yield "pixels", f"{pixels / 1e6:.1f} MB"
     yield "source", f"{source / 1e6:.1f} MB"

@@ -114,9 +114,9 @@ def _read(path: str, _deep: bool, found: dict[str, Any]) -> None:
     import mp4ds
 
     with mp4ds.open(path) as dataset:
-        for stream in dataset.streams:
-            _ = stream[-1]
-            for _ in stream:
+        for topic in dataset:
+            _ = topic[-1]
+            for _ in topic:
                 found["frames"] += 1
         for _ in dataset.records():
             found["messages"] += 1

@@ -432,7 +432,7 @@ def test_images_for_colmap_are_a_plain_folder(dataset: Path, tmp_path: Path) -> 
     images = mp4ds.PackOptions(images=mp4ds.ImageFolder())
     mp4ds.pack(tmp_path / "out/images/front_image_raw", tmp_path / "again", images)
     with mp4ds.open(tmp_path / "again") as again:
-        (stream,) = again.streams
+        (stream,) = again
         assert [frame.stamp_ns for frame in stream] == stamps_of(MADE, COLOUR)
         assert (stream[3].data == pixels_of(COLOUR, 3)).all()
 
@@ -651,7 +651,7 @@ def test_lerobot_videos_have_the_range_that_its_decoder_takes_them_for(tmp_path:
         context = container.streams.video[0].codec_context
         assert (context.name, context.color_range, context.colorspace) == ("libdav1d", 1, 1)
     with mp4ds.open(path) as video, mp4ds.open(dataset) as own:
-        shown = [video.videos[0].read([4])]
+        shown = [next(iter(video)).read([4])]
         expected = own["/cam/image_raw"].read([4])
     with contextlib.suppress(ImportError, RuntimeError, OSError):
         from torchcodec.decoders import VideoDecoder
@@ -731,7 +731,7 @@ def test_a_video_is_copied_where_its_frames_are_even(tmp_path: Path) -> None:
     assert any("copied" in note for note in summary.notes)
     path = "videos/observation.images.cam_image_raw/chunk-000/file-000.mp4"
     with mp4ds.open(tmp_path / "out" / path) as video, mp4ds.open(dataset) as own:
-        copied, stream = video.videos[0], own["/cam/image_raw"]
+        copied, stream = next(iter(video)), own["/cam/image_raw"]
         assert len(copied) == summary.messages["/cam/image_raw"]
         apart = copied.read([4]).astype(int) - stream.read([4])
         assert np.abs(apart).max() <= 4, "others' colours are made by libswscale"

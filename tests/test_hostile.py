@@ -437,7 +437,7 @@ def test_a_newer_minor_version_is_read_with_a_warning(pair: Path, jail: Jail) ->
     before = load(pair)
     changed(pair, newer)
     with pytest.warns(UserWarning, match=r"1\.7.*video\.sparkle") as caught:
-        stream = mp4ds.open(pair).streams[0]
+        (stream,) = mp4ds.open(pair)
     assert len(caught) == 1
     assert len(list(stream)) == before["frames"]
     outcome = jail.validate(pair)
@@ -867,7 +867,7 @@ def test_a_folder_whose_name_looks_like_something_else(
     monkeypatch.chdir(tmp_path)
     assert mp4ds.validate(folder, deep=True) == []
     with mp4ds.open(folder) as dataset:
-        assert len(list(dataset.streams[0])) == FRAMES
+        assert len(list(next(iter(dataset)))) == FRAMES
 
 
 # ---------------------------------------------------------------- coded pictures and packets
@@ -1336,8 +1336,8 @@ def _read_all(path: Path) -> None:
     with mp4ds.open(path) as dataset:
         for _ in dataset.records():
             pass
-        for stream in dataset.streams:
-            _ = stream[-1].intrinsics
+        for topic in dataset:
+            _ = topic[-1].intrinsics
 
 
 @pytest.mark.one_in(3)

@@ -891,7 +891,7 @@ def test_a_pair_becomes_a_dataset(tmp_path: Path) -> None:
     with mp4ds.open(dataset) as opened, mp4ds.open(FIXTURE / "drive.yaml") as pair:
         stream, before = opened[TOPICS[1]], pair[TOPICS[1]]
         assert stream.stamps.tolist() == due
-        assert stream.sidecar.stamps == "record-float"
+        assert opened.streams[0].sidecar.stamps == "record-float"
         for frame, old in zip(stream, before, strict=True):
             assert np.array_equal(frame.data, old.data)
             assert frame.intrinsics == old.intrinsics

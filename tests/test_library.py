@@ -175,7 +175,7 @@ PNG_ENCODINGS = {
 def test_frames_of_png_files_are_their_pixels(name: str, tmp_path: Path) -> None:
     source = CODED[name](frames=6)
     with mp4ds.open(packed(tmp_path, source)) as dataset:
-        (stream,) = dataset.streams
+        (stream,) = dataset
         for number, (frame, message) in enumerate(zip(stream, camera(source), strict=True)):
             data = bytes(message.values["data"])
             data = data[data.index(b"\x89PNG") :]
@@ -196,7 +196,7 @@ def test_frames_of_rvl_are_those_of_png(encoding: str, tmp_path: Path) -> None:
     for codec in ("png", "rvl"):
         dataset = packed(tmp_path / codec, CODED[f"depth-{encoding}-{codec}"](frames=6))
         with mp4ds.open(dataset) as opened:
-            found.append([frame.data for frame in opened.streams[0]])
+            found.append([frame.data for frame in next(iter(opened))])
     assert len(found[0]) == 6
     assert np.array_equal(*found)
 
@@ -208,7 +208,7 @@ JPEGS = ["jpeg-rgb", "jpeg-gray", "jpeg-444", "jpeg-422", "jpeg-progressive", "j
 def test_frames_of_jpeg_files(name: str, tmp_path: Path) -> None:
     source = CODED[name](frames=5)
     with mp4ds.open(packed(tmp_path, source)) as dataset:
-        (stream,) = dataset.streams
+        (stream,) = dataset
         assert len(stream) == 5
         for number, (frame, message) in enumerate(zip(stream, camera(source), strict=True)):
             data = np.frombuffer(bytes(message.values["data"]), np.uint8)
@@ -240,7 +240,7 @@ def test_frames_of_packets(name: str, tmp_path: Path) -> None:
     codec = "h265" if "265" in name else name.split("-")[1]
     context: Any = av.CodecContext.create(DECODERS.get(codec, codec), "r")
     with mp4ds.open(packed(tmp_path, source)) as dataset:
-        (stream,) = dataset.streams
+        (stream,) = dataset
         recorded = camera(source)[-len(stream) :]
         decoded = [
             frame
@@ -317,7 +317,7 @@ def test_columns(colour: tuple[Path, Scene]) -> None:
         assert stream.stamps.tolist() == [m.values["header"]["stamp"] for m in recorded]
         assert stream.log_times.tolist() == [m.log_time for m in recorded]
         assert stream.topic == TOPIC
-        assert stream.video_path == colour[0] / "cam_image_raw.mp4"
+        assert stream.streams[0].video_path == colour[0] / "cam_image_raw.mp4"
 
 
 # ---------------------------------------------------------------- opening
@@ -335,6 +335,7 @@ def test_all_that_can_be_opened(
         assert isinstance(dataset, mp4ds.Dataset)
         assert dataset.topics == [TOPIC]
         assert [type(stream) for stream in dataset.streams] == [mp4ds.Stream]
+        assert type(dataset[TOPIC]) is mp4ds.Topic
         assert isinstance(dataset[TOPIC][0], mp4ds.Frame)
         assert dataset["cam_image_raw"] is dataset[TOPIC]
 
@@ -414,7 +415,7 @@ def test_closing_closes_all_files(colour: tuple[Path, Scene]) -> None:
     dataset = mp4ds.open(colour[0])
     stream = dataset[TOPIC]
     assert stream[3].index == 3
-    assert open_files() == [str(stream.video_path)]
+    assert open_files() == [str(stream.streams[0].video_path)]
     iterator = iter(stream)
     next(iterator)
     iterator.close()  # type: ignore[attr-defined]
@@ -504,7 +505,7 @@ def test_a_topic_that_changes_its_size(variant: str, tmp_path: Path) -> None:
         assert max(large.stamps) < min(small.stamps)
 
         whole = dataset["/odd/image"]
-        assert isinstance(whole, mp4ds.TopicFrames)
+        assert isinstance(whole, mp4ds.Topic)
         assert whole is dataset["/odd/image"]
         assert whole.encoding == "mono8", "all have it in common"
         for name in ("image_size", "shape"):
@@ -648,7 +649,7 @@ def test_a_pair_without_its_video(tmp_path: Path, colour: tuple[Path, Scene]) ->
     problems = mp4ds.validate(tmp_path / "cam_image_raw.yaml")
     assert [problem.code for problem in problems] == ["file-missing"]
     with mp4ds.open(tmp_path / "cam_image_raw.yaml") as pair:
-        assert pair[TOPIC].sidecar.frames == 12
+        assert len(pair[TOPIC]) == 12
         with pytest.raises(mp4ds.FormatError, match=r"cam_image_raw\.mp4"):
             pair[TOPIC][0]
 
@@ -674,7 +675,7 @@ def test_several_topics_and_a_choice_of_them(tmp_path: Path) -> None:
             "b_image",
             "A_image-2",
         ]
-        for stream in opened.streams:
+        for stream in opened:
             assert [int(frame.data[0, 0]) for frame in stream] == [0, 1, 2, 3, 4]
     mp4ds.unpack(dataset, "mcap", tmp_path / "b.mcap", UnpackOptions(topics=["/[bA]/*"]))
     found = payloads_of_mcap(tmp_path / "b.mcap")

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED
-from mp4ds.dataset.stamps import StampIndex
 from mp4ds.dataset.views import Placement
 from mp4ds.format.models import Calibration, Roi
 from mp4ds.messages.encodings import ENCODINGS as KNOWN
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.demo import demo
+from mp4ds.times import StampIndex
 from mp4ds.unpacking.options import UnpackOptions
 from mp4ds.video.images import Renderer
 from pictures import YUV, picture, pixels
@@ -51,7 +51,7 @@ def recorded(source: Scene) -> list[Any]:
 
 
 @pytest.fixture(scope="module")
-def colour(tmp_path_factory: pytest.TempPathFactory) -> Iterator[mp4ds.Stream]:
+def colour(tmp_path_factory: pytest.TempPathFactory) -> Iterator[mp4ds.Topic]:
     """A stream of rgb8 images, of several groups of pictures."""
     folder = tmp_path_factory.mktemp("colour")
     with mp4ds.open(packed(folder, scene("rgb8", frames=12), codec="h264", gop=5)) as dataset:
@@ -89,7 +89,7 @@ def test_frames_of_every_encoding(encoding: str, tmp_path: Path) -> None:
                                   "video-h265", "video-av1", "video-vp9"])  # fmt: skip
 def test_frames_of_coded_messages(name: str, tmp_path: Path) -> None:
     with mp4ds.open(packed(tmp_path, CODED[name](frames=FRAMES))) as dataset:
-        (stream,) = dataset.streams
+        (stream,) = dataset
         every = [frame.data for frame in stream]
         order = [number % len(every) for number in ORDER]
         assert len(every) >= 7
@@ -118,7 +118,7 @@ def test_frames_of_a_lossy_video_are_those_of_unpack(
             assert same(lossy[TOPIC].read(ORDER), np.stack([expected[i] for i in ORDER]))
 
 
-def test_any_sequence_of_integers(colour: mp4ds.Stream) -> None:
+def test_any_sequence_of_integers(colour: mp4ds.Topic) -> None:
     every = [frame.data for frame in colour]
     for indices in ([], (3,), range(11, -1, -4), np.array([7, -2, 7]), np.arange(4, dtype="u1")):
         numbers = [int(i) for i in indices]
@@ -129,7 +129,7 @@ def test_any_sequence_of_integers(colour: mp4ds.Stream) -> None:
 
 
 @pytest.mark.parametrize("index", [12, -13, 2**70])
-def test_numbers_out_of_range(index: int, colour: mp4ds.Stream) -> None:
+def test_numbers_out_of_range(index: int, colour: mp4ds.Topic) -> None:
     for ask in (colour.get, colour.read):
         with pytest.raises(
             IndexError, match=rf"{TOPIC} has no frame {index}: its 12 frames are 0 to 11"
@@ -140,20 +140,20 @@ def test_numbers_out_of_range(index: int, colour: mp4ds.Stream) -> None:
 @pytest.mark.parametrize(
     "indices", [["1"], [1.0], [None], np.array([0.5]), 3, np.array(3), np.array([True, False])]
 )
-def test_what_is_no_number(indices: Any, colour: mp4ds.Stream) -> None:
+def test_what_is_no_number(indices: Any, colour: mp4ds.Topic) -> None:
     for ask in (colour.get, colour.read):
         with pytest.raises(TypeError):
             ask(indices)
 
 
-def test_frames_are_ones_own(colour: mp4ds.Stream) -> None:
+def test_frames_are_ones_own(colour: mp4ds.Topic) -> None:
     one, other = colour.get([4, 4])
     one.data[...] = 0
     assert np.array_equal(other.data, colour[4].data)
     assert other.data.any()
 
 
-def test_reading_amid_reading(colour: mp4ds.Stream) -> None:
+def test_reading_amid_reading(colour: mp4ds.Topic) -> None:
     """Each has its own order, whatever else is asked of the stream meanwhile."""
     every = [frame.data for frame in colour]
     first, last = int(colour.stamps.min()), int(colour.stamps.max()) + 1
@@ -166,7 +166,7 @@ def test_reading_amid_reading(colour: mp4ds.Stream) -> None:
             assert np.array_equal(found.data, every[found.index])
 
 
-def test_into_an_array_of_ones_own(colour: mp4ds.Stream) -> None:
+def test_into_an_array_of_ones_own(colour: mp4ds.Topic) -> None:
     expected = colour.read([2, 9, 2])
     whole = np.full((7, 48, 64, 3), 7, np.uint8)
     out = whole[1:6:2]
@@ -194,7 +194,7 @@ def test_into_an_array_of_ones_own(colour: mp4ds.Stream) -> None:
         (np.broadcast_to(np.zeros(3, np.uint8), (2, 48, 64, 3)), "not writeable"),
     ],
 )
-def test_an_array_that_does_not_suit(out: Any, problem: str, colour: mp4ds.Stream) -> None:
+def test_an_array_that_does_not_suit(out: Any, problem: str, colour: mp4ds.Topic) -> None:
     with pytest.raises(mp4ds.OptionError, match=problem):
         colour.read([0, 1], out=out)
 
@@ -299,13 +299,13 @@ def test_depths_in_metres(encoding: str, tmp_path: Path) -> None:
         assert same(frame.data, expected[1][3:20:2, 5:28:2].astype(np.float32))
 
 
-def test_colours_are_no_depths(colour: mp4ds.Stream) -> None:
+def test_colours_are_no_depths(colour: mp4ds.Topic) -> None:
     with pytest.raises(mp4ds.OptionError, match=r"rgb8 images, which are not depths.*16UC1"):
         colour.read([0], format="depth_m")
 
 
 @pytest.mark.parametrize("name", ["BGR", "", "rgb8", None])
-def test_no_such_format(name: Any, colour: mp4ds.Stream) -> None:
+def test_no_such_format(name: Any, colour: mp4ds.Topic) -> None:
     with pytest.raises(mp4ds.OptionError, match="native, rgb, bgr, gray"):
         colour.get([0], format=name)
 
@@ -316,7 +316,7 @@ def test_no_such_format(name: Any, colour: mp4ds.Stream) -> None:
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("size", [(16, 12), (32, 24), (40, 30), (7, 48), (64, 5)])
 @pytest.mark.parametrize("name", ["native", "rgb", "bgr", "gray"])
-def test_smaller(size: tuple[int, int], name: str, colour: mp4ds.Stream) -> None:
+def test_smaller(size: tuple[int, int], name: str, colour: mp4ds.Topic) -> None:
     """By area, as OpenCV does it."""
     (whole,) = colour.read([3], format=name)
     (small,) = colour.read([3], format=name, resize=size)
@@ -352,7 +352,7 @@ def test_a_lossy_video_gives_sizes_at_once(
 
 
 @pytest.mark.parametrize("factor", [2, 1.5, 3.25])
-def test_larger(factor: float, colour: mp4ds.Stream) -> None:
+def test_larger(factor: float, colour: mp4ds.Topic) -> None:
     (whole,), (large,) = colour.read([3]), colour.read([3], resize=factor)
     assert large.shape == (round(48 * factor), round(64 * factor), 3)
     expected = cv2.resize(whole, large.shape[1::-1], interpolation=cv2.INTER_CUBIC)
@@ -369,7 +369,7 @@ def test_sixteen_bits_are_resized_as_such(tmp_path: Path) -> None:
     assert np.abs(small.astype(int) - expected).max() < 64
 
 
-def test_parts(colour: mp4ds.Stream) -> None:
+def test_parts(colour: mp4ds.Topic) -> None:
     (whole,) = colour.read([3])
     for crop in ((0, 0, 64, 48), (3, 5, 20, 11), (63, 47, 1, 1), np.array([1, 0, 63, 48])):
         x, y, width, height = (int(value) for value in crop)
@@ -440,7 +440,7 @@ def test_mosaics_of_odd_sizes(encoding: str, width: int, height: int) -> None:
                                         (60, 0, 5, 1), 3, "abcd", (0, 0, 2.5, 2), (0, 47, 1, 2))),
     ],
 )  # fmt: skip
-def test_no_such_size_or_part(options: Any, colour: mp4ds.Stream) -> None:
+def test_no_such_size_or_part(options: Any, colour: mp4ds.Topic) -> None:
     for ask in (colour.get, colour.read):
         with pytest.raises(mp4ds.OptionError, match=r"crop|resized"):
             ask([0], **options)
@@ -461,26 +461,26 @@ MISTAKES: dict[str, tuple[type[Exception], str]] = {
     "stream.get_frames_at([1])": (AttributeError, "here it is dataset[topic].get([0, 5])"),
     "stream.get_batch([1])": (AttributeError, "here it is dataset[topic].read([0, 5])"),
     "dataset.get_frame_at(1)": (AttributeError, "here it is dataset[topic][7]"),
-    "stream.frames": (AttributeError, "'Stream' object has no attribute 'frames'"),
+    "stream.frames": (AttributeError, "'Topic' object has no attribute 'frames'"),
     "dataset.frames": (AttributeError, "'Dataset' object has no attribute 'frames'"),
 }
 
 
 @pytest.mark.parametrize("code", MISTAKES)
-def test_what_to_write_instead(code: str, colour: mp4ds.Stream) -> None:
+def test_what_to_write_instead(code: str, colour: mp4ds.Topic) -> None:
     kind, words = MISTAKES[code]
-    with mp4ds.open(colour.path) as dataset, pytest.raises(kind, match=re.escape(words)):
+    with mp4ds.open(colour.streams[0].path) as dataset, pytest.raises(kind, match=re.escape(words)):
         eval(code, {"stream": colour, "dataset": dataset, "np": np})
 
 
-def test_an_error_in_a_property_is_its_own(colour: mp4ds.Stream) -> None:
-    class Other(mp4ds.Stream):
+def test_an_error_in_a_property_is_its_own(colour: mp4ds.Topic) -> None:
+    class Other(mp4ds.Topic):
         @property
         def shape(self) -> tuple[int, ...]:
             return self.encoding.shape  # type: ignore[attr-defined,no-any-return]
 
     with pytest.raises(AttributeError, match="'str' object has no attribute 'shape'"):
-        _ = Other(colour.path).shape
+        _ = Other(colour.parts).shape
 
 
 def test_what_it_is_in_a_line(tmp_path: Path) -> None:
@@ -490,20 +490,21 @@ def test_what_it_is_in_a_line(tmp_path: Path) -> None:
             rf"<Dataset '{dataset}': {TOPIC}; 9 frames; \d+ messages; 0\.\d s; \d\.\d MB>",
             repr(found),
         )
-        assert repr(found[TOPIC]) == f"<Stream '{TOPIC}': 9 frames, 64x48 rgb8, 0.3 s>"
-        pair = mp4ds.open(found[TOPIC].path)
-        assert repr(pair) == f"<Dataset '{found[TOPIC].path}': {TOPIC}; 9 frames>"
-        video = shutil.copy(found[TOPIC].video_path, tmp_path / "clip.mp4")
+        assert repr(found[TOPIC]) == f"<Topic '{TOPIC}': 9 frames, 64x48 rgb8, 0.3 s>"
+        (stream,) = found.streams
+        assert repr(stream) == f"<Stream '{TOPIC}': 9 frames, 64x48 rgb8>"
+        pair = mp4ds.open(stream.path)
+        assert repr(pair) == f"<Dataset '{stream.path}': {TOPIC}; 9 frames>"
+        video = shutil.copy(stream.video_path, tmp_path / "clip.mp4")
     with mp4ds.open(video) as found:
         assert repr(found) == f"<Dataset '{video}': clip; 9 frames>"
-        assert repr(found["clip"]) == "<Video 'clip': 9 frames, 64x48 rgb8, 0.3 s>"
+        assert repr(found["clip"]) == "<Topic 'clip': 9 frames, 64x48 rgb8, 0.3 s>"
     with mp4ds.open(packed(tmp_path / "odd", odd_scene("size-change"))) as found:
-        assert re.fullmatch(
-            r"<TopicFrames '/odd/image': 8 frames, \d\.\d s>", repr(found["/odd/image"])
-        )
+        assert re.fullmatch(r"<Topic '/odd/image': 8 frames, \d\.\d s>", repr(found["/odd/image"]))
         first = found.streams[0]
         first.video_path.unlink()
-    assert repr(mp4ds.Stream(first.path)) == "<Stream '/odd/image': 4 frames, 32x24 mono8>"
+    damaged = mp4ds.Topic([mp4ds.Stream(first.path)])
+    assert repr(damaged) == "<Topic '/odd/image': 4 frames, 32x24 mono8>"
 
 
 # ---------------------------------------------------------------- intrinsics
@@ -565,7 +566,7 @@ def test_cameras_without_calibration_stay_without() -> None:
     assert made.p == zeros.p
 
 
-def test_the_intrinsics_of_frames(colour: mp4ds.Stream) -> None:
+def test_the_intrinsics_of_frames(colour: mp4ds.Topic) -> None:
     own = colour.intrinsics_at(0)
     assert own is not None
     for options in ({}, {"format": "bgr"}, {"crop": (0, 0, 64, 48)}, {"resize": 1}):
@@ -631,7 +632,7 @@ def test_any_span(stamps: list[int], start: int, end: int) -> None:
     assert found.tolist() == [number for _, number in sorted(due)]
 
 
-def test_frames_by_stamp(colour: mp4ds.Stream) -> None:
+def test_frames_by_stamp(colour: mp4ds.Topic) -> None:
     stamps = colour.stamps.tolist()
     for number, stamp in enumerate(stamps):
         for mode in ("nearest", "before", "after", "exact"):
@@ -656,7 +657,7 @@ def test_frames_by_stamp(colour: mp4ds.Stream) -> None:
         colour.at(7.5)  # type: ignore[arg-type]
 
 
-def test_spans_of_time(colour: mp4ds.Stream) -> None:
+def test_spans_of_time(colour: mp4ds.Topic) -> None:
     stamps = colour.stamps.tolist()
     found = list(colour.between(stamps[2], stamps[7]))
     assert [frame.index for frame in found] == [2, 3, 4, 5, 6]

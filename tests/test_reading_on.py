@@ -240,7 +240,7 @@ def test_pictures_of_any_frames(codec: str, tmp_path: Path) -> None:
     folder = packed(tmp_path, made, codec=codec, gop=6, **options)
     rng = np.random.default_rng(1)
     with Dataset(folder) as dataset:
-        stream = dataset[TOPIC]
+        (stream,) = dataset.streams
         with stream.open_video(sequential=True) as decoder:
             whole = [picture[0].copy() for picture in decoder.pictures()]
             chances = (0.02, 0.1, 0.3, 0.9, 1.0)
@@ -264,7 +264,7 @@ def test_far_key_frames_are_sought(long: Path, monkeypatch: pytest.MonkeyPatch) 
         original(self, tick, index)
 
     monkeypatch.setattr(VideoDecoder, "_seek", spied)
-    with Dataset(long) as dataset, dataset[TOPIC].open_video(sequential=True) as decoder:
+    with Dataset(long) as dataset, dataset.streams[0].open_video(sequential=True) as decoder:
         for chosen, wanted in (
             (range(20, 60), [20]),
             (range(0, 200, 3), [0]),
@@ -277,7 +277,7 @@ def test_far_key_frames_are_sought(long: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_video_that_ends_early(long: Path, tmp_path: Path) -> None:
     with Dataset(long) as dataset:
-        stream = dataset[TOPIC]
+        (stream,) = dataset.streams
         decoder = VideoDecoder(stream.video_path, **{**stream._promises, "frames": 199})
         with decoder, pytest.raises(VideoError) as caught:
             list(decoder.pictures_at([0]))
@@ -289,7 +289,7 @@ def test_a_video_that_ends_early(long: Path, tmp_path: Path) -> None:
 
 def test_digests_are_compared_from_a_time_on(long: Path, tmp_path: Path) -> None:
     with Dataset(long) as dataset:
-        stream = dataset[TOPIC]
+        (stream,) = dataset.streams
         assert stream.rebuilder._digests
         stream.rebuilder._digests[150] ^= 1
         times = stream.log_times
@@ -316,7 +316,7 @@ def test_the_whole_video_is_hashed_for_everything_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("choose", [everything, every(2)])
 def test_messages_that_are_in_no_file(choose: Any, long: Path) -> None:
     with Dataset(long) as dataset:
-        ordinal = dataset[TOPIC].columns.ordinal
+        ordinal = dataset.streams[0].columns.ordinal
         ordinal[100:] += 1
         with pytest.raises(FormatError, match=rf"message 100 of topic {TOPIC}") as caught:
             rows(dataset.records(choose=choose))

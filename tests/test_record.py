@@ -110,7 +110,7 @@ def test_quality(tmp_path: Path, compare: Compare) -> None:
     found = compare(paths, again(tmp_path / "live", tmp_path), ignore_pixels=["/cam/image_raw"])
     assert found == []
     with mp4ds.open(tmp_path / "live") as dataset:
-        assert dataset["/cam/image_raw"].sidecar.video.codec == "av1"
+        assert dataset.streams[0].sidecar.video.codec == "av1"
 
 
 def test_topics_that_are_wanted() -> None:

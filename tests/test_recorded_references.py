@@ -16,6 +16,7 @@ import mp4ds
 from in_parts import InlineEngine
 from mp4ds import yamlio
 from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.topic import Topic
 from mp4ds.errors import FormatError, VideoError
 from mp4ds.format.models import References, video_facts
 from mp4ds.format.sidecars import load_stream
@@ -322,7 +323,7 @@ def test_without_them_all_is_the_same(packed: Path, tmp_path: Path) -> None:
     path = edited(packed, tmp_path, without)
     assert mp4ds.validate(path, deep=True) == []
     with mp4ds.open(packed) as dataset, mp4ds.open(path) as other:
-        (one,), (two,) = dataset.streams, other.streams
+        (one,), (two,) = dataset, other
         every = [frame.data for frame in one]
         for number in (49, 3, 17, 16, 30):
             assert np.array_equal(one[number].data, every[number])
@@ -392,7 +393,10 @@ def test_references_of_another_video(name: str, packed: Path, tmp_path: Path) ->
     (found,) = mp4ds.validate(path)
     assert found.code == "references-invalid"
     assert problem in found.message
-    with closing(Stream(path)) as stream, pytest.raises(FormatError, match=problem) as raised:
+    with (
+        closing(Topic([Stream(path)])) as stream,
+        pytest.raises(FormatError, match=problem) as raised,
+    ):
         stream.get([3])
     assert raised.value.code == "references-invalid"
 
@@ -403,7 +407,7 @@ def test_references_of_another_video(name: str, packed: Path, tmp_path: Path) ->
 def test_distances_that_contradict_themselves(change: Change, packed: Path, tmp_path: Path) -> None:
     path = edited(packed, tmp_path, change)
     assert [problem.code for problem in mp4ds.validate(path)] == ["references-invalid"]
-    with closing(Stream(path)) as stream:
+    with closing(Topic([Stream(path)])) as stream:
         with pytest.raises(FormatError, match="does not match the references") as raised:
             stream.get([3])
         assert raised.value.code == "references-invalid"
@@ -437,7 +441,7 @@ def test_lies_are_found_and_do_no_harm(name: str, packed: Path, tmp_path: Path) 
     assert found.code == "references-invalid"
     assert "group of pictures 0 show others" in found.message
     codes, right = set(), 0
-    with closing(Stream(path)) as stream:
+    with closing(Topic([Stream(path)])) as stream:
         every = [frame.data for frame in stream]
         for number in range(48):
             try:
@@ -462,7 +466,7 @@ def test_damage_is_told_as_such(packed: Path, tmp_path: Path) -> None:
     assert codes[0] == "hash-mismatch"
     assert "references-invalid" not in codes
     with (
-        closing(Stream(path)) as stream,
+        closing(Topic([Stream(path)])) as stream,
         pytest.raises(FormatError, match=r"frame 17 of /cam/image_raw .*: is damaged") as raised,
     ):
         stream.get([17])
@@ -487,7 +491,7 @@ def test_what_is_fetched_of_a_remote_video(tmp_path: Path) -> None:
         for name in ("with", "without"):
             server.forget()
             with mp4ds.open(f"{server.url}/{name}/cam_image_raw.yaml") as dataset:
-                pictures.append(dataset.streams[0].get([59])[0].data)
+                pictures.append(next(iter(dataset))[59].data)
             ranges = server.fetched("cam_image_raw.mp4")
             fetched[name] = sum(end - start for start, end in ranges)
     assert np.array_equal(*pictures)

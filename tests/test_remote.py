@@ -658,7 +658,7 @@ def test_a_frame_costs_its_group_of_pictures(tmp_path: Path) -> None:
     mp4ds.pack(path, tmp_path / "drive", PackOptions(codec="h264", gop=4))
     with web_server(tmp_path) as web, mp4ds.open(f"{web.url}/drive") as dataset:
         stream = dataset[TOPIC]
-        name = f"drive/{stream.video_path.name}"
+        name = f"drive/{stream.streams[0].video_path.name}"
         with mp4ds.open(tmp_path / "drive") as here:
             expected = [here[TOPIC][number].data for number in (25, 26)]
         size = (tmp_path / name).stat().st_size

@@ -323,7 +323,7 @@ def test_the_report_of_a_dataset(copy: Path) -> None:
             assert count == len(stream) == camera["frames"]
             assert unpacked(columns["stamp"], count) == stream.stamps.tolist()
             assert unpacked(columns["log_time"], count) == stream.log_times.tolist()
-            with av.open(str(stream.video_path)) as container:
+            with av.open(str(stream.streams[0].video_path)) as container:
                 ticks = [p.pts for p in container.demux(video=0) if p.pts is not None]
             assert unpacked(columns["ticks"], count) == ticks
     depth, colour = data["cameras"]
@@ -367,7 +367,7 @@ def test_a_second_report_takes_the_proxies_of_the_first(copy: Path) -> None:
     assert "in false colour" in data_of(copy)["cameras"][0]["caption"]
     report(copy, ReportOptions(proxy_width=64))
     with mp4ds.open(proxy) as opened:
-        assert opened.videos[0].image_size == (64, 44)
+        assert next(iter(opened)).image_size == (64, 44)
     none = report(copy, ReportOptions(proxies="none"))
     assert [camera.plays for camera in none.cameras] == ["nothing", "video"]
     assert not proxy.exists()
@@ -551,11 +551,11 @@ def assert_proxy_shows(dataset: Path, width: int) -> None:
         proxy = dataset / "report" / "proxies" / f"{stream.path.stem}.mp4"
         size = proxy_size(stream.image_size, width)
         with mp4ds.open(proxy) as video, av.open(str(stream.video_path)) as container:
-            (shown,) = video.videos
+            (shown,) = video
             ticks = [p.pts for p in container.demux(video=0) if p.pts is not None]
             assert (shown.stamps // 1000).tolist() == ticks
             assert shown.image_size == size
-            look = Look(stream, size)
+            look = Look(opened[stream.topic], size)
             for index, pixels in pictures_in_order(stream):
                 if pixels is not None:
                     found = blocks(shown[index].data)
@@ -835,7 +835,7 @@ def test_serving_until_interrupted(copy: Path) -> None:
 
 def test_what_a_camera_tells_of_its_calibrations(drive: Path) -> None:
     with mp4ds.open(drive) as dataset:
-        facts = ReportedCamera(dataset[COLOUR], COLOUR).facts(0, None, "")
+        facts = ReportedCamera(dataset[COLOUR].streams[0], COLOUR).facts(0, None, "")
     (listed,) = facts["calibrations"]
     assert listed["from_frame"] == 0
     assert listed["distortion_model"] == "plumb_bob"

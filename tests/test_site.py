@@ -166,7 +166,7 @@ def test_every_public_name_is_in_the_reference(site: Path) -> None:
     anchors = {name for page in pages for name in re.findall(r'id="(mp4ds\.[\w.]+)"', page)}
     names = {f"mp4ds.{name}" for name in mp4ds.__all__ if not name.startswith("__")}
     assert names <= anchors
-    assert {"mp4ds.torch.FrameDataset", "mp4ds.Frames.read", "mp4ds.Dataset.sync"} <= anchors
+    assert {"mp4ds.torch.FrameDataset", "mp4ds.Topic.read", "mp4ds.Dataset.sync"} <= anchors
     for kind in (mp4ds.PackOptions, mp4ds.ExportOptions):
         fields = kind.__dataclass_fields__
         assert all(any(f"<code>{name}</code>" in page for page in pages) for name in fields), kind

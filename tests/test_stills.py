@@ -146,7 +146,7 @@ def test_every_encoding_can_be_looked_at(encoding: str, tmp_path: Path) -> None:
     for name in ("out.png", "out.jpg"):
         summaries[name] = frames(dataset, tmp_path / name, StillOptions(at="#2"))
     with mp4ds.open(dataset) as opened:
-        stream = opened.streams[0]
+        (stream,) = opened
         frame = stream[2].data
         seen = Look(stream, stream.image_size).picture(frame)
     jpeg = read(tmp_path / "out.jpg")
@@ -164,7 +164,7 @@ def test_exact_samples(encoding: str, tmp_path: Path) -> None:
     dataset = pack_cameras(tmp_path, scene(encoding, frames=4), quality="lossless")
     frames(dataset, tmp_path / "out.png", StillOptions(at="#3", exact=True))
     with mp4ds.open(dataset) as opened:
-        assert np.array_equal(read(tmp_path / "out.png"), opened.streams[0][3].data)
+        assert np.array_equal(read(tmp_path / "out.png"), next(iter(opened))[3].data)
 
 
 def test_exact_floats_have_no_image(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 import mp4ds
-from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.topic import Topic
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.demo import demo
 from scenes import PERIOD, Scene, odd_scene, scene
@@ -190,13 +190,13 @@ def test_a_video_without_sidecar(drives: list[Path], tmp_path: Path) -> None:
 
 def test_many_samples_are_read_at_once(drives: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[list[int]] = []
-    read = Stream.read
+    read = Topic.read
 
-    def counted(self: Stream, indices: Any, **options: Any) -> Any:
+    def counted(self: Topic, indices: Any, **options: Any) -> Any:
         calls.append(list(indices))
         return read(self, indices, **options)
 
-    monkeypatch.setattr(Stream, "read", counted)
+    monkeypatch.setattr(Topic, "read", counted)
     wanted = [20, 3, 3, -1, 0]
     samples = FrameDataset(drives[0], topics=[LEFT]).__getitems__(wanted)
     frames = frames_of(drives[0], LEFT)
@@ -222,7 +222,7 @@ def test_one_camera_is_opened_lazily(drives: list[Path], monkeypatch: pytest.Mon
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("opened")
 
-    monkeypatch.setattr(Stream, "__init__", refuse)
+    monkeypatch.setattr(mp4ds.Stream, "__init__", refuse)
     assert len(FrameDataset(drives, topics=[LEFT])) == 3 * FRAMES
     assert FrameStream(drives, topics=[LEFT]).samples == 3 * FRAMES
 
@@ -591,7 +591,7 @@ def test_what_was_dropped_does_not_stop_workers(drives: list[Path]) -> None:
     """A worker that collects the parent's garbage must not wait for threads of its decoders."""
     dataset = FrameDataset(drives[0], topics=BOTH)
     frames = mp4ds.open(drives[0])[LEFT]
-    video = av.open(frames.video_path)
+    video = av.open(frames.streams[0].video_path)
     video.streams.video[0].thread_type = "SLICE"
     video.streams.video[0].thread_count = 2
     next(video.decode(video=0))

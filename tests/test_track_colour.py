@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from conftest import real
-from mp4ds.dataset.video import Video
+from mp4ds.dataset.images import VideoImages
+from mp4ds.dataset.topic import Topic
 from mp4ds.video.access import FrameAccess
 from mp4ds.video.mp4 import SampleEntry, TrackColour, read_sample_entry, track_colour
 from test_access import opened
@@ -71,7 +72,7 @@ def test_decoders_know_what_the_track_says(
     if name != "mjpeg":  # which libjpeg decodes, whatever the track says
         with FrameAccess(path, codec=recipe.codec, frames=FRAMES, maker=maker) as access:
             assert [found for _, found in access.pictures_of(range(FRAMES))] == expected
-    video = Video(path)
+    video = Topic([VideoImages(path)])
     every = [frame.data for frame in video]
     assert np.array_equal(video.read([7, 30]), [every[7], every[30]])
     video.close()
@@ -88,7 +89,7 @@ def test_a_track_without_colours(tmp_path: Path) -> None:
 def test_a_real_one() -> None:
     path = real("video/bt709_full_range.mp4")
     colour = track_colour(read_sample_entry(path))
-    video = Video(path)
+    video = Topic([VideoImages(path)])
     every = [frame.data for frame in video]
     numbers = [len(every) - 1, 0, len(every) // 2]
     assert np.array_equal(video.read(numbers), [every[number] for number in numbers])

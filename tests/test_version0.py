@@ -143,8 +143,8 @@ def test_it_opens(pair: Path, suffix: str) -> None:
         assert dataset.topics == [TOPICS[1]]
         stream = dataset[TOPICS[1]]
         assert len(stream) == 12
-        assert stream.sidecar.stamps == "record-float"
-        assert stream.sidecar.profile == "crf=22"
+        assert dataset.streams[0].sidecar.stamps == "record-float"
+        assert dataset.streams[0].sidecar.profile == "crf=22"
         expected = [nanoseconds(stamp) for stamp in STAMPS]
         assert stream.stamps.tolist() == expected
         assert stream.log_times.tolist() == expected

@@ -92,9 +92,9 @@ def test_frames_of_every_kind(kind: str, tmp_path: Path) -> None:
         assert (dataset.topics, dataset.streams, dataset.manifest) == (["a walk"], [], None)
         assert "a walk" in dataset
         assert len(dataset) == 1
-        (video,) = dataset.videos
+        (video,) = dataset
         assert dataset["a walk"] is video
-        assert isinstance(video, mp4ds.Video)
+        assert isinstance(video, mp4ds.Topic)
         assert (video.topic, video.encoding, len(video)) == ("a walk", "rgb8", FRAMES)
         assert (video.shape, video.dtype) == ((48, 64, 3), np.uint8)
         assert video.stamps.tolist() == video.log_times.tolist() == times
@@ -167,7 +167,7 @@ def test_videos_of_a_dataset_need_their_sidecars(tmp_path: Path) -> None:
     with pytest.raises(mp4ds.FormatError, match=r"cam_image_raw\.yaml"):
         mp4ds.open(tmp_path / "drive" / "cam_image_raw.mp4")
     with mp4ds.open(tmp_path / "alone.mp4") as dataset:
-        assert dataset.videos == []
+        assert len(dataset.streams) == 1
         with pytest.raises(mp4ds.FormatError, match=r"cam_image_raw\.mp4.* \[file-missing\]"):
             dataset["/cam/image_raw"][0]
 
@@ -216,7 +216,7 @@ def test_one_of_several_tracks(encoders: list[str], in_fragments: bool, tmp_path
         mp4ds.open(path)
     for track in (0, 1):
         with mp4ds.open(path, track=track) as dataset:
-            (video,) = dataset.videos
+            (video,) = dataset
             assert video.image_size == (64 << track, 48 << track)
             assert len(video) == 12 << track
             for index in (7, 2, len(video) - 1):

@@ -130,7 +130,7 @@ def test_a_lossy_profile(
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     assert compare(paths, unpacked(tmp_path, "bag"), ignore_pixels=[TOPIC]) == []
     with mp4ds.open(tmp_path / "dataset") as dataset:
-        (stream,) = dataset.streams
+        (stream,) = dataset
         assert len(stream) == 10
         error = [
             np.abs(

@@ -116,7 +116,7 @@ def page(dataset: Path) -> Path:
 def brightness(path: str) -> list[tuple[int, float]]:
     """Stamp and mean of every frame of the first stream."""
     with mp4ds.open(path) as dataset:
-        stream: mp4ds.Frames = dataset["/cam/image_raw"]
+        stream: mp4ds.Topic = dataset["/cam/image_raw"]
         last: mp4ds.Frame = stream[-1]
         some: list[mp4ds.Frame] = stream[2:7:2]
         stamps: NDArray[np.int64] = stream.stamps
@@ -134,7 +134,7 @@ def batches(path: str) -> NDArray[Any]:
         sync: mp4ds.Sync = dataset.sync(["/left", "/right"], tolerance_ns=5_000_000)
         pairs: NDArray[np.int64] = sync.indices
         use(len(sync), sync.stamps[0], sync.topics[0].upper(), sync.unmatched["/left"].tolist())
-        frames: mp4ds.Frames = dataset["/left"]
+        frames: mp4ds.Topic = dataset["/left"]
         height, width = frames.shape[:2]
         out: NDArray[Any] = np.empty((len(pairs), height, width, 3), frames.dtype)
         frames.read(pairs[:, 0], format="bgr", out=out)
@@ -154,12 +154,9 @@ def batches(path: str) -> NDArray[Any]:
             found: mp4ds.RecordedMessage = message
             use(found.topic, found.type_name, found.log_time_ns - found.publish_time_ns)
             use(found.decoded.angular_velocity, len(found.raw))
-        for whole in (dataset[topic] for topic in dataset.topics):
-            if isinstance(whole, mp4ds.TopicFrames):
-                parts: list[mp4ds.Stream] = whole.streams
-                use(parts, whole.read([0, -1], resize=(32, 24)))
-        videos: list[mp4ds.Video] = dataset.videos
-        use([video.topic for video in videos])
+        for whole in dataset:
+            parts: list[mp4ds.Stream] = whole.streams
+            use(parts, whole.read([0, -1], resize=(32, 24)), whole.topic)
         return out
 
 

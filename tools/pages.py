@@ -40,11 +40,8 @@ API = {
 MEMBERS = {
     "Dataset": ("topics", "messages", "sync", "channels", "profile", "close"),
     "Stream": ("topic", "video_path", "columns"),
-    "TopicFrames": (),
-    "Video": ("video_path",),
 }
-"""Class -> what programs need of it, besides what it has of `Frames`; the rest is for the package
-itself."""
+"""Class -> what programs need of it; the rest is for the package itself."""
 _HIDDEN = ("repack",)  # another name of `pack`
 _COMMANDS = "docs/commands/"
 _API = "docs/api/"

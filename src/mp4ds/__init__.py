@@ -30,11 +30,9 @@ if TYPE_CHECKING:
     from mp4ds.dataset.checks import Problem, validate
     from mp4ds.dataset.dataset import Dataset
     from mp4ds.dataset.dataset import open_dataset as open
-    from mp4ds.dataset.frames import Frame, Frames
     from mp4ds.dataset.messages import RecordedMessage
     from mp4ds.dataset.stream import Stream
-    from mp4ds.dataset.topic_frames import TopicFrames
-    from mp4ds.dataset.video import Video
+    from mp4ds.dataset.topic import Frame, Topic
     from mp4ds.errors import (
         ClusterError,
         ConversionError,
@@ -81,14 +79,9 @@ _HOMES = {
         "validate",
     ),
     "dataset.dataset": ("Dataset",),
-    "dataset.frames": (
-        "Frame",
-        "Frames",
-    ),
     "dataset.messages": ("RecordedMessage",),
     "dataset.stream": ("Stream",),
-    "dataset.topic_frames": ("TopicFrames",),
-    "dataset.video": ("Video",),
+    "dataset.topic": ("Frame", "Topic"),
     "packing.options": (
         "ImageFolder",
         "PackOptions",
@@ -132,7 +125,6 @@ __all__ = [
     "FormatError",
     "Frame",
     "FrameNotFoundError",
-    "Frames",
     "ImageFolder",
     "Mp4dsError",
     "OptionError",
@@ -160,11 +152,10 @@ __all__ = [
     "Sync",
     "TargetError",
     "TargetExistsError",
-    "TopicFrames",
+    "Topic",
     "UnpackOptions",
     "UnpackSummary",
     "VersionError",
-    "Video",
     "VideoError",
     "WriteError",
     "__version__",

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from mp4ds.bags.formats import limits_of
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.messages import recorded_storage
+from mp4ds.dataset.messages import MessagesFile, recorded_storage
 from mp4ds.dataset.salvage import damages_of
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError, VideoError
@@ -190,7 +190,11 @@ def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem
             streams.append(Stream(folder / entry.sidecar, sidecar=sidecar))
             problems += _check_stream(streams[-1])
     problems += _check_listed(folder, manifest)
-    dataset = None if problems else Dataset.of(folder, manifest, streams)
+    dataset = (
+        None
+        if problems
+        else Dataset.of(folder, manifest, streams, MessagesFile(folder / MESSAGES_NAME))
+    )
     if dataset is not None:
         problems += _check_messages(dataset, manifest)
     if deep:

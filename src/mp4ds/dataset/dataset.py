@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain, count
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,14 +26,20 @@ from mp4ds.dataset.channels import (
     log_times,
     when_asked,
 )
-from mp4ds.dataset.frames import Frames, missing, seconds_of
+from mp4ds.dataset.images import Images, VideoImages
 from mp4ds.dataset.messages import MessagesFile, RecordedMessage, SalvagedMessages, as_recorded
 from mp4ds.dataset.rebuild import Choice, everything, last_of, within
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.topic_frames import TopicFrames
-from mp4ds.dataset.verbatim import VerbatimFrames, verbatim_frames
-from mp4ds.dataset.video import Video
-from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError, counted
+from mp4ds.dataset.topic import Topic
+from mp4ds.dataset.verbatim import VerbatimImages, verbatim_images
+from mp4ds.errors import (
+    FormatError,
+    OptionError,
+    SourceError,
+    SourceNotFoundError,
+    counted,
+    missing,
+)
 from mp4ds.files.sources import HOW_TO_OPEN, is_folder, video_at
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
@@ -50,19 +56,16 @@ _MOST_TOPICS = 4  # named in a repr
 
 
 class Dataset:
-    """A folder made by `mp4ds pack`, or one video with its sidecar.
+    """A folder made by `mp4ds pack`, or one video.
 
-    ``dataset["/topic"]`` returns a topic's frames, ``"/topic" in dataset`` tells whether it has
-    any, and iteration yields all streams. If a topic changes its size or encoding and so has
-    several streams, or has images that are stored verbatim, ``dataset["/topic"]`` is a
-    `TopicFrames`: all its frames in recorded order. Each stream can also be looked up by its file
-    name without extension.
+    ``dataset["/topic"]`` returns the frames of a topic, ``"/topic" in dataset`` tells whether it
+    has any, and iteration yields the `Topic` of each of the `topics`. The frames of one stream
+    alone can also be looked up by its file name without extension.
 
     Attributes:
         path: The folder, or the video or sidecar.
         manifest: Of the folder; None for one video.
-        streams: Its streams.
-        videos: Third-party videos without a sidecar; see `mp4ds.open`.
+        streams: Its streams; none for a video without a sidecar, see `mp4ds.open`.
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams.
         unread: What is wrong with files that cannot be read, and that have nothing that is wanted.
         is_salvaged: Whether messages may be missing; see `mp4ds.dataset.salvage`.
@@ -111,9 +114,9 @@ class Dataset:
                 remedy = f"Open one of them, such as {inside[0].parent}."
             raise SourceError(self.path, problem, remedy)
         self.streams: list[Stream] = []
-        self.videos: list[Video] = []
         self.unread: list[str] = []
         self._selected = selected
+        self._video: VideoImages | None = None
         if self.path.is_dir():
             self.manifest = load_manifest(self.path / MANIFEST_NAME)
             for entry in self.manifest.streams:
@@ -183,17 +186,17 @@ class Dataset:
     @classmethod
     def of(
         cls,
-        folder: Path,
-        manifest: Manifest,
+        path: Path,
+        manifest: Manifest | None,
         streams: Sequence[Stream],
-        file: MessagesFile | None = None,
+        file: MessagesFile,
+        video: VideoImages | None = None,
     ) -> Dataset:
-        """A folder whose sidecars, and perhaps its messages.mcap, have already been read."""
+        """A folder whose sidecars have already been read, or a video without a sidecar."""
         dataset = cls.__new__(cls)
-        dataset.path, dataset.manifest, dataset.jpeg_quality = folder, manifest, 95
-        dataset.streams, dataset.videos, dataset.unread = list(streams), [], []
-        dataset._selected = None
-        dataset._file = file or MessagesFile(folder / MESSAGES_NAME)
+        dataset.path, dataset.manifest, dataset.jpeg_quality = path, manifest, 95
+        dataset.streams, dataset.unread = list(streams), []
+        dataset._selected, dataset._file, dataset._video = None, file, video
         return dataset
 
     if not TYPE_CHECKING:  # else every name would pass for known
@@ -205,40 +208,42 @@ class Dataset:
         topics = ", ".join(self.topics[:_MOST_TOPICS]) or "no camera"
         if len(self.topics) > _MOST_TOPICS:
             topics += f" and {len(self.topics) - _MOST_TOPICS} more"
-        parts = [topics, f"{sum(map(len, self._all))} frames"]
+        parts = [topics, f"{sum(map(len, self.parts))} frames"]
         if manifest := self.manifest:
             parts.append(f"{manifest.messages} messages")
             if span := manifest.time_range:
-                parts.append(seconds_of(span.start, span.end))
+                parts.append(f"{(span.end - span.start) / 1e9:.1f} s")
             parts.append(f"{sum(file.size for file in manifest.files) / 1e6:.1f} MB")
         return f"<Dataset {str(self.path)!r}: {'; '.join(parts)}>"
 
     @property
-    def _all(self) -> list[Stream | Video]:
-        return [*self.streams, *self.videos]
+    def parts(self) -> Sequence[Images]:
+        """Its streams; of a video without a sidecar, its images."""
+        return [self._video] if self._video else self.streams
 
     @property
     def topics(self) -> list[str]:
         """Topics with frames in videos."""
-        return list(dict.fromkeys(stream.topic for stream in self._all))
+        return list(dict.fromkeys(part.topic for part in self.parts))
 
     @cached_property
-    def _looked_up(self) -> dict[str, Frames | None]:
+    def _looked_up(self) -> dict[str, Topic | None]:
         return {}
 
-    def _frames_of(self, name: str) -> Frames | None:
+    def _topic(self, name: str) -> Topic | None:
         """The frames of a topic, or of the stream with a file name; None if there are none."""
         if name not in self._looked_up:
-            parts: list[Stream | VerbatimFrames] = [
+            parts: list[Images] = [
                 stream for stream in self.streams if stream.topic == name and not stream.is_lost
             ]
             parts += self.verbatim(name)[0]
-            named = (one for one in self._all if name in (one.path.stem, one.topic))
-            found = TopicFrames(parts) if len(parts) > 1 else next(chain(parts, named), None)
-            self._looked_up[name] = found
+            named = (one for one in self.parts if name in (one.path.stem, one.topic))
+            found = parts or list(islice(named, 1))
+            known = (topic for topic in self._looked_up.values() if topic and topic.parts == found)
+            self._looked_up[name] = next(known, Topic(found)) if found else None
         return self._looked_up[name]
 
-    def verbatim(self, topic: str) -> tuple[list[VerbatimFrames], Counter[str]]:
+    def verbatim(self, topic: str) -> tuple[list[VerbatimImages], Counter[str]]:
         """A topic's frames that are stored verbatim in messages.mcap; they are read once.
 
         Returns:
@@ -248,7 +253,7 @@ class Dataset:
             FormatError: messages.mcap is damaged.
         """
         if topic not in self._verbatim:
-            frames: list[VerbatimFrames] = []
+            frames: list[VerbatimImages] = []
             without = Counter[str]()
             for channel in self._verbatim_cameras(topic):
                 found, others = self._verbatim_of(channel)
@@ -258,7 +263,7 @@ class Dataset:
         return self._verbatim[topic]
 
     @cached_property
-    def _verbatim(self) -> dict[str, tuple[list[VerbatimFrames], Counter[str]]]:
+    def _verbatim(self) -> dict[str, tuple[list[VerbatimImages], Counter[str]]]:
         return {}
 
     def _verbatim_cameras(self, topic: str) -> list[Channel]:
@@ -268,7 +273,7 @@ class Dataset:
             return []
         return [item for item in self.channels if item.topic == topic and is_camera(item)]
 
-    def _verbatim_of(self, channel: Channel) -> tuple[list[VerbatimFrames], Counter[str]]:
+    def _verbatim_of(self, channel: Channel) -> tuple[list[VerbatimImages], Counter[str]]:
         group = next((item for item in self._groups if item.channel.id == channel.id), None)
         ids = group.recorded_ids if group else {channel.id}
 
@@ -287,29 +292,31 @@ class Dataset:
         with_info = (item for item in self.streams if item.topic == channel.topic)
         calibrated = next((item for item in with_info if item.calibrations), None)
         path = self._file.path or self.path
-        return verbatim_frames(path, channel, numbered, recorded, calibrated)
+        return verbatim_images(path, channel, numbered, recorded, calibrated)
 
-    def __getitem__(self, topic: str) -> Frames:
-        found = self._frames_of(topic)
+    def __getitem__(self, topic: str) -> Topic:
+        found = self._topic(topic)
         if found is None:
             known = ", ".join(self.topics) or "none"
             raise KeyError(f"{self.path} has no stream {topic!r}; there are: {known}")
         return found
 
     def __contains__(self, topic: object) -> bool:
-        return isinstance(topic, str) and self._frames_of(topic) is not None
+        return isinstance(topic, str) and self._topic(topic) is not None
 
-    def __iter__(self) -> Iterator[Stream | Video]:
-        return iter(self._all)
+    def __iter__(self) -> Iterator[Topic]:
+        return (self[topic] for topic in self.topics)
 
     def __len__(self) -> int:
-        return len(self._all)
+        return len(self.topics)
 
     @property
     def profile(self) -> str:
-        """MCAP profile of the recording: ``ros1``, ``ros2`` or another."""
+        """MCAP profile of the recording: ``ros1``, ``ros2`` or another; empty if there is none."""
         if self.manifest:
             return self.manifest.recording_profile
+        if not self.streams:
+            return ""
         return "ros1" if self.streams[0].sidecar.wire == "ros1" else "ros2"
 
     @cached_property
@@ -614,8 +621,8 @@ class Dataset:
 
     def close(self) -> None:
         """Close all videos."""
-        for stream in self._all:
-            stream.close()
+        for topic in filter(None, self._looked_up.values()):
+            topic.close()
 
     def __enter__(self) -> Dataset:
         return self
@@ -624,28 +631,12 @@ class Dataset:
         self.close()
 
 
-class _VideoDataset(Dataset):
-    """A third-party video."""
-
-    def __init__(self, path: Path, track: int | None) -> None:
-        self.path = path
-        self.manifest = None
-        self.streams = []
-        self.videos = [Video(path, track)]
-        self.unread = []
-        self._file = MessagesFile(None)
-
-    @property
-    def profile(self) -> str:
-        """Empty: there is no recording."""
-        return ""
-
-
 def open_dataset(path: Path | str, *, track: int | None = None) -> Dataset:
     """Open a dataset, or one video with its sidecar. See `Dataset`.
 
-    A video without a sidecar or dataset can be opened, too: it is then in `Dataset.videos`, and its
-    topic is the file name without extension.
+    A video without a sidecar or dataset can be opened, too: its topic is the file name without
+    extension, its frames are ``rgb8``, converted by the video's colour tags and in coded
+    orientation, and their stamps are presentation times, the first usually 0.
 
     Args:
         path: See `Dataset`.
@@ -658,7 +649,7 @@ def open_dataset(path: Path | str, *, track: int | None = None) -> Dataset:
     if place.suffix.lower() in _VIDEOS and place.is_file():
         beside = (place.with_suffix(".yaml"), place.parent / MANIFEST_NAME)
         if not any(path.exists() for path in beside):
-            return _VideoDataset(place, track)
+            return Dataset.of(place, None, [], MessagesFile(None), VideoImages(place, track))
     dataset = Dataset(place)
     if track is not None:
         dataset.close()

@@ -12,7 +12,7 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from mp4ds.dataset.frames import DecodedFrames
+from mp4ds.dataset.images import Images
 from mp4ds.dataset.rebuild import (
     CameraInfoRebuilder,
     Choice,
@@ -267,10 +267,11 @@ def _inflated(text: str, most: int) -> bytes:
 # ---------------------------------------------------------------- the reader
 
 
-class Stream(DecodedFrames):
-    """One camera topic (of one geometry), as a sequence of frames. See `Frames`.
+class Stream(Images):
+    """A video with its sidecar: images of one size and encoding, and their messages.
 
     Attributes:
+        sidecar: The contents of its sidecar.
         sound: Which frames are read of a damaged video: those that `damages` does not name, shape
             (frames,). None: all, and damage is an error.
 
@@ -290,19 +291,15 @@ class Stream(DecodedFrames):
         sidecar: StreamSidecar | None = None,
         jpeg_quality: int = 95,
     ) -> None:
-        super().__init__()
         self.path = path
         self.sound: NDArray[np.bool_] | None = None
         self._jpeg_quality = jpeg_quality
         self.sidecar = sidecar or load_stream(path)
-
-    @property
-    def topic(self) -> str:
-        """Topic of the images."""
-        return self.sidecar.channel.topic
+        self.topic = self.sidecar.channel.topic
+        self.video_path = path.parent / self.sidecar.video.file
 
     @cached_property
-    def channel(self) -> Channel:
+    def channel(self) -> Channel:  # type: ignore[override]
         """The channel of the images; its id has no meaning."""
         return self.sidecar.channel.to_record(0)
 
@@ -316,11 +313,6 @@ class Stream(DecodedFrames):
         """Topic of the images, and that of the calibrations if there are any."""
         info = self.sidecar.camera_info
         return [self.topic, *([info.channel.topic] if info and info.messages else [])]
-
-    @cached_property
-    def video_path(self) -> Path:
-        """The stream's video."""
-        return self.path.parent / self.sidecar.video.file
 
     @cached_property
     def columns(self) -> DecodedColumns:
@@ -392,16 +384,8 @@ class Stream(DecodedFrames):
             return None
         return CameraInfoRebuilder(info, columns, str(self.path))
 
-    def intrinsics_at(self, index: int) -> Calibration | None:
-        """The calibration that applied to a frame: the last recorded before it, else the first.
-
-        Args:
-            index: 0 <= index < frames.
-        """
-        return self.calibration_at(int(self.log_times[index]))
-
     def calibration_at(self, log_time: int) -> Calibration | None:
-        """The calibration that applied at a log time, nanoseconds. See `intrinsics_at`."""
+        """The calibration that applied at a log time: the last one before it, else the first."""
         if not self.calibrations:
             return None
         columns = self.camera_info_columns
@@ -439,36 +423,45 @@ class Stream(DecodedFrames):
     def __len__(self) -> int:
         return self.sidecar.frames
 
-    def _open_reader(self) -> FrameReader:
+    def open_reader(self) -> FrameReader:
+        """A separate decoder for frames by number."""
         return open_frames(
             self.video_path,
             **self._promises,
             references=self.sidecar.video.references,
         )
 
-    def _pictures(self, scale: Scale | None) -> Iterator[Picture]:
+    def pictures(self, scale: Scale | None) -> Iterator[Picture]:
+        """All pictures in order, from a separate decoder that uses all cores."""
         with self.open_video(sequential=True) as decoder:
             for _, picture in self.pictures_in_order(decoder, scale=scale):
                 yield picture
 
     @property
-    def _shows_colours(self) -> bool:
+    def shows_colours(self) -> bool:  # type: ignore[override]
+        """Whether the decoder can make RGB directly, in any size."""
         return self.sidecar.shows_colours
 
-    def _write_pixels(self, picture: Picture, out: Pixels) -> None:
+    def write_pixels(self, picture: Picture, out: Pixels) -> None:
+        """Write the pixels of a picture, as recorded."""
         self.rebuilder.write_pixels(picture, out)
 
-    def _metres(self, index: int, pixels: Pixels) -> NDArray[np.float32]:
+    def depth_header(self, index: int) -> bytes:
+        """What gives the quantised depths of a frame in metres; empty for all others.
+
+        Raises:
+            OptionError: It is not in the sidecar.
+        """
         header = self.sidecar.headers[int(self.columns.variant[index])]
         prefix = bytes.fromhex(header.prefix)
         if not depth.is_quantised(header.format, prefix):
-            return depth.metres_of(pixels)
+            return b""
         if len(prefix) != depth.HEADER_BYTES:
             raise OptionError(
                 f"frame {index} of {self.topic} holds quantised depths without their parameters: "
                 "only format='native' is available"
             )
-        return depth.metres_of(pixels, prefix)
+        return prefix
 
     def frame_id(self, index: int) -> str:
         """The coordinate frame of a frame's header; empty if unknown."""

@@ -10,26 +10,22 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mp4ds.dataset.frames import DecodedFrames
+from mp4ds.dataset.images import Images, Integers
 from mp4ds.dataset.rebuild import MessageSplitter
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Refused, VideoError
 from mp4ds.format.models import Calibration
 from mp4ds.messages import depth, png
 from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.coded import UnknownStructure
 from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view
 from mp4ds.messages.layouts import why_not
 from mp4ds.messages.wire import CodedFields, ImageFields, Parts
 from mp4ds.records import Channel, Excerpt, Message
-from mp4ds.video.access import FrameAccess
 from mp4ds.video.images import coded_pixels
 from mp4ds.video.pixels import Scale
 from mp4ds.video.reader import FrameReader
 
-Integers = NDArray[np.int64]
 Recorded = Callable[[Excerpt], Iterator[Message]]
 """Yields the messages of a channel within an excerpt, by log time."""
 
@@ -54,7 +50,7 @@ class Shown:
 
     @property
     def kind(self) -> tuple[str, tuple[int, ...], bool]:
-        """What frames have in common that are given as one `VerbatimFrames`."""
+        """What frames have in common that are together in one `VerbatimImages`."""
         return self.encoding, self.pixels.shape, self.file is not None
 
 
@@ -114,8 +110,8 @@ class _Entry:
     frame_id: str
 
 
-class VerbatimFrames(DecodedFrames):
-    """Frames of a channel in messages.mcap, all of one size and encoding. See `Frames`.
+class VerbatimImages(Images):
+    """Images of a channel in messages.mcap, all of one size and encoding.
 
     Args:
         path: messages.mcap.
@@ -126,6 +122,8 @@ class VerbatimFrames(DecodedFrames):
         calibrated: A stream of the topic that has its calibrations, if any.
     """
 
+    channel: Channel
+
     def __init__(
         self,
         path: Path,
@@ -135,17 +133,11 @@ class VerbatimFrames(DecodedFrames):
         recorded: Recorded,
         calibrated: Stream | None,
     ) -> None:
-        super().__init__()
-        self.path = path
-        self.channel = channel
+        self.path = self.video_path = path
+        self.channel, self.topic = channel, channel.topic
         self._kind, self._entries = kind, entries
         self._recorded, self._calibrated = recorded, calibrated
-        self._header: tuple[int, bytes] = (-1, b"")
-
-    @property
-    def topic(self) -> str:
-        """Topic of the images."""
-        return self.channel.topic
+        self._last: tuple[int, Shown] | None = None
 
     @cached_property
     def stamps(self) -> Integers:
@@ -183,15 +175,9 @@ class VerbatimFrames(DecodedFrames):
         """Those of the topic's streams; none if they are in messages.mcap, too."""
         return self._calibrated.calibrations if self._calibrated else []
 
-    def intrinsics_at(self, index: int) -> Calibration | None:
-        """The calibration that applied to a frame.
-
-        Args:
-            index: 0 <= index < frames.
-        """
-        if self._calibrated is None:
-            return None
-        return self._calibrated.calibration_at(self._entries[index].log_time)
+    def calibration_at(self, log_time: int) -> Calibration | None:
+        """The calibration that applied at a log time, nanoseconds; None if unknown."""
+        return self._calibrated.calibration_at(log_time) if self._calibrated else None
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -237,55 +223,37 @@ class VerbatimFrames(DecodedFrames):
             except Refused as error:
                 raise VideoError("decode-failed", self.path, str(error), frame=index) from None
 
+    # ------------------------------------------------------------ as a decoder
+
+    def open_reader(self) -> FrameReader:
+        """A reader that gives the pixels as recorded; they are decoded by `picture`."""
+        return FrameReader(None, lambda: self)
+
     def picture(self, index: int, scale: Scale | None = None) -> Picture:
-        """The pixels of a frame, as recorded. See `FrameReader.pictures_of`."""
-        shown = self.shown(index)
-        self._header = index, shown.header
-        return (shown.pixels,)
+        """The pixels of a frame, as recorded."""
+        self._last = index, self.shown(index)
+        return (self._last[1].pixels,)
 
-    def _open_reader(self) -> FrameReader:
-        return FrameReader(_no_access, lambda: _Seeking(self.picture))
+    def close(self) -> None:
+        """Nothing stays open."""
 
-    def _pictures(self, scale: Scale | None) -> Iterator[Picture]:
-        return map(self.picture, range(len(self)))
-
-    @property
-    def _shows_colours(self) -> bool:
-        return False
-
-    def _write_pixels(self, picture: Picture, out: Pixels) -> None:
-        np.copyto(out, picture[0])
-
-    def _metres(self, index: int, pixels: Pixels) -> NDArray[np.float32]:
-        number, header = self._header
-        return depth.metres_of(pixels, header if number == index else self.shown(index).header)
+    def depth_header(self, index: int) -> bytes:
+        """What gives the quantised depths of a frame in metres; empty for all others."""
+        number, shown = self._last or (-1, None)
+        return shown.header if shown and number == index else self.shown(index).header
 
     def frame_id(self, index: int) -> str:
         """The coordinate frame of a frame's header; empty if unknown."""
         return self._entries[index].frame_id
 
 
-@dataclass(frozen=True, slots=True)
-class _Seeking:
-    """See `mp4ds.video.reader.Seeking`."""
-
-    picture: Callable[..., Picture]
-
-    def close(self) -> None:
-        """Nothing stays open."""
-
-
-def _no_access() -> FrameAccess:
-    raise UnknownStructure("its frames are not in a video")
-
-
-def verbatim_frames(
+def verbatim_images(
     path: Path,
     channel: Channel,
     numbered: Iterable[tuple[int, Message]],
     recorded: Recorded,
     calibrated: Stream | None,
-) -> tuple[list[VerbatimFrames], Counter[str]]:
+) -> tuple[list[VerbatimImages], Counter[str]]:
     """The frames that the messages of a channel in messages.mcap are; each is decoded once.
 
     Args:
@@ -313,7 +281,7 @@ def verbatim_frames(
             entries.setdefault(kind, []).append(entry)
         ties[time] += 1
     made = [
-        VerbatimFrames(path, channel, kind, found, recorded, calibrated)
+        VerbatimImages(path, channel, kind, found, recorded, calibrated)
         for kind, found in entries.items()
     ]
     return made, without

@@ -19,6 +19,7 @@ from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.rebuild import MessageSplitter, fields_of
 from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import Matrix, effective
 from mp4ds.errors import Refused, counted
 from mp4ds.files.urls import location
@@ -157,19 +158,21 @@ def reading_speeds(path: Path | str) -> list[ReadingSpeed]:
 def _reading_speed(dataset: Dataset, topic: str) -> ReadingSpeed:
     streams = [stream for stream in dataset.streams if stream.topic == topic]
     stream = max(streams, key=len)
+    frames = Topic([stream])
     numbers = random.Random(0)
-    stream.read([0], format="native")
+    frames.read([0], format="native")
     times = []
     for _ in range(_READS):
         number = numbers.randrange(len(stream))
         begun = time.perf_counter()
-        stream.read([number], format="native")
+        frames.read([number], format="native")
         times.append(time.perf_counter() - begun)
     count = min(_IN_ORDER, len(stream))
     begun = time.perf_counter()
-    for _ in islice(stream, count):
+    for _ in islice(frames, count):
         pass
     in_order = (time.perf_counter() - begun) / count
+    frames.close()
     size = stream.video_path.stat().st_size / len(stream)
     return ReadingSpeed(topic, size, 1e3 * statistics.median(times), 1e3 * in_order)
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import open_dataset
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.video import Video
+from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import FORMATS, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
 from mp4ds.files.urls import location, spelled
@@ -306,8 +306,8 @@ class Collection:
         return Recording(str(path), chosen, sync.indices, sync.unmatched)
 
 
-def open_source(source: CameraSource) -> Stream | Video:
-    """The stream or video of a camera; others of its dataset are not touched.
+def open_source(source: CameraSource) -> Topic:
+    """The frames of a camera; others of its dataset are not touched.
 
     Args:
         source: Which.
@@ -317,8 +317,8 @@ def open_source(source: CameraSource) -> Stream | Video:
     """
     path = location(source.place)
     if path.suffix == ".yaml":
-        return Stream(path)
-    return open_dataset(path).videos[0]
+        return Topic([Stream(path)])
+    return Topic(open_dataset(path).parts)
 
 
 def _sources(path: Path | str) -> list[CameraSource]:
@@ -334,7 +334,10 @@ def _sources(path: Path | str) -> list[CameraSource]:
             for entry, place in zip(entries, places, strict=True)
         ]
     with open_dataset(path) as dataset:
-        return [CameraSource(s.topic, s.path.stem, spelled(s.path), len(s)) for s in dataset]
+        parts = dataset.parts
+        return [
+            CameraSource(one.topic, one.path.stem, spelled(one.path), len(one)) for one in parts
+        ]
 
 
 def _check_topics(topics: Sequence[str], path: Path | str) -> None:
@@ -368,51 +371,8 @@ def _choose(sources: list[CameraSource], topic: str, path: Path | str) -> Camera
 # ---------------------------------------------------------------- cameras
 
 
-class TensorReader(Protocol):
-    """Decodes frames of a stream."""
-
-    def read(self, frames: list[int]) -> Tensor:
-        """Frames in the requested order, with repetitions; (N, H, W) or (N, H, W, C)."""
-        ...
-
-    def close(self) -> None:
-        """Close the video."""
-        ...
-
-
-class StreamReader:
-    """Decodes with a stream's ``read``; see `TensorReader`.
-
-    Args:
-        stream: The stream.
-        view: How its frames are wanted.
-    """
-
-    def __init__(self, stream: Stream | Video, view: TensorView) -> None:
-        self._stream = stream
-        self._view = view
-
-    def read(self, frames: list[int]) -> Tensor:
-        """Like `TensorReader.read`."""
-        view = self._view
-        pixels = self._stream.read(frames, format=view.format, resize=view.resize, crop=view.crop)
-        return torch.from_numpy(pixels)  # shares the memory
-
-    def read_into(self, frames: list[int], outs: Sequence[Tensor]) -> None:
-        """Read each frame into its own tensor, of shape (H, W) or (H, W, C)."""
-        view = self._view
-        arrays = [out.numpy() for out in outs]  # which share the memory
-        self._stream.read_into(
-            frames, arrays, format=view.format, resize=view.resize, crop=view.crop
-        )
-
-    def close(self) -> None:
-        """Like `TensorReader.close`."""
-        self._stream.close()
-
-
 class OpenCamera:
-    """An open stream: its frames as tensors, and its stamps.
+    """An open camera: its frames as tensors, and its stamps.
 
     Args:
         source: Which.
@@ -427,23 +387,26 @@ class OpenCamera:
         self.source = source
         self._view = view
         self._pictures = pictures
-        self.stream = open_source(source)
-        if len(self.stream) != source.frames:
+        self.topic = open_source(source)
+        if len(self.topic) != source.frames:
             raise FormatError(
                 "frame-count",
                 source.place,
-                f"has {len(self.stream)} frames, not {source.frames}",
+                f"has {len(self.topic)} frames, not {source.frames}",
             )
-        self._reader: TensorReader = (
-            TorchcodecReader(self.stream, view.crop, pictures.device)
-            if pictures.backend == "torchcodec"
-            else StreamReader(self.stream, view)
-        )
+        self._torchcodec = None
+        if pictures.backend == "torchcodec":
+            self._torchcodec = TorchcodecReader(self.topic, view.crop, pictures.device)
+        self._options: dict[str, Any] = {
+            "format": view.format,
+            "resize": view.resize,
+            "crop": view.crop,
+        }
 
     @property
     def stamps(self) -> NDArray[np.int64]:
         """Header stamps, nanoseconds, by frame."""
-        return self.stream.stamps
+        return self.topic.stamps
 
     @cached_property
     def _order(self) -> NDArray[np.intp]:
@@ -467,12 +430,12 @@ class OpenCamera:
         Raises:
             VideoError: The video's index is damaged.
         """
-        path = self.stream.video_path
+        path = self.topic.parts[0].video_path
         try:
             with path.open("rb") as file:
                 table = read_sample_table(file, path.stat().st_size, str(path))
         except Refused:
-            return np.arange(len(self.stream), dtype=np.int64)
+            return np.arange(len(self.topic), dtype=np.int64)
         except OSError as error:
             raise VideoError("file-missing", path, f"cannot be read: {error.strerror}") from None
         keys = np.flatnonzero(table.sync[table.order])
@@ -492,8 +455,14 @@ class OpenCamera:
             OptionError: They cannot be returned as requested.
         """
         numbers: list[int] = frames.tolist()
-        pixels = self._decoded(numbers, lambda: self._reader.read(numbers))
+        pixels = self._decoded(numbers, lambda: self._read(numbers))
         return self._pictures.tensor(pixels, self.source.topic, self._view.format)
+
+    def _read(self, numbers: list[int]) -> Tensor:
+        """Pixels of frames, shape (N, H, W) or (N, H, W, C)."""
+        if self._torchcodec is not None:
+            return self._torchcodec.read(numbers)
+        return torch.from_numpy(self.topic.read(numbers, **self._options))  # shares the memory
 
     def empty(self, shape: tuple[int, ...]) -> Tensor | None:
         """A tensor for frames, such as `read_into` takes.
@@ -507,9 +476,9 @@ class OpenCamera:
         Raises:
             OptionError: The frames cannot be returned as requested.
         """
-        if not isinstance(self._reader, StreamReader):
+        if self._torchcodec is not None:
             return None
-        row = self._reader.read([])
+        row = self._read([])
         self._pictures.check(row.dtype, self.source.topic)
         dtype = torch.float32 if self._pictures.dtype == "float32" else row.dtype
         channels = row.shape[3:] or (1,)
@@ -525,18 +494,16 @@ class OpenCamera:
         Raises:
             SampleError: One of them cannot be decoded.
         """
-        reader = self._reader
-        if not isinstance(reader, StreamReader):
-            raise TypeError("the frames are not decoded into memory")
         numbers: list[int] = frames.tolist()
         if self._pictures.dtype == "float32":
-            pixels = self._decoded(numbers, lambda: reader.read(numbers))
+            pixels = self._decoded(numbers, lambda: self._read(numbers))
             for row, out in zip(pixels, outs, strict=True):
                 _floats(row.view(out.shape), scaled=self._view.format != "native", out=out)
             return
         is_grey = outs[0].shape[-1] == 1
-        rows = [out.squeeze(-1) for out in outs] if is_grey else list(outs)
-        self._decoded(numbers, lambda: reader.read_into(numbers, rows))
+        # arrays share the memory of tensors
+        rows = [(out.squeeze(-1) if is_grey else out).numpy() for out in outs]
+        self._decoded(numbers, lambda: self.topic.read_into(numbers, rows, **self._options))
 
     def _decoded(self, numbers: list[int], decode: Callable[[], _T]) -> _T:
         try:
@@ -550,15 +517,15 @@ class OpenCamera:
         """Which frame failed, since an error about many does not always say."""
         for number in sorted(set(numbers)):
             try:
-                self._reader.read([number])
+                self._read([number])
             except Mp4dsError as its:
                 return SampleError(f"frame {number}: {its}")
         return SampleError(f"one of {len(numbers)} frames: {error}")
 
     def close(self) -> None:
         """Close the video."""
-        self._reader.close()
-        self.stream.close()
+        self._torchcodec = None
+        self.topic.close()
 
 
 @dataclass(slots=True)

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from math import prod
 from operator import index as as_integer
 from reprlib import repr as shortened
-from typing import Any, Literal, NoReturn, Protocol, SupportsIndex
+from typing import Any, Literal, NoReturn, SupportsIndex
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
-from mp4ds.dataset.frames import absent
-from mp4ds.errors import Mp4dsError, OptionError, SampleError
+from mp4ds.errors import Mp4dsError, OptionError, SampleError, absent
 from mp4ds.torch.cameras import (
     Backend,
     Collection,
@@ -35,24 +34,6 @@ Unit = Literal["frames", "seconds"]
 _MOST_SECONDS = 10**9
 
 
-class Stamped(Protocol):
-    """The stamps of a camera."""
-
-    @property
-    def stamps(self) -> NDArray[np.int64]:
-        """Header stamps, nanoseconds, by frame."""
-        ...
-
-    @property
-    def period_ns(self) -> int:
-        """Median time between frames, nanoseconds."""
-        ...
-
-    def nearest(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The frames with the nearest stamps; the shape of `times`."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Offsets:
     """Offsets of a sample's frames from its own row, in rows or in nanoseconds.
@@ -68,7 +49,7 @@ class Offsets:
     tolerance_ns: int | None = None
 
     def frames(
-        self, recording: Recording, camera: int, timeline: Stamped, rows: NDArray[np.int64]
+        self, recording: Recording, camera: int, timeline: OpenCamera, rows: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Frame numbers of samples, and which of them are padding.
 

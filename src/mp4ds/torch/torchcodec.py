@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.video import Video
+from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import Crop
 from mp4ds.errors import OptionError, VideoError
 from mp4ds.files.urls import remote
@@ -23,7 +23,7 @@ class TorchcodecReader:
     """Decodes a stream's video by ``torchcodec.decoders.VideoDecoder``.
 
     Args:
-        stream: The stream.
+        topic: The stream's frames.
         crop: x, y, width, height, pixels; None: all.
         device: Such as ``cpu`` or ``cuda``.
 
@@ -33,9 +33,9 @@ class TorchcodecReader:
         VideoError: It cannot open the video.
     """
 
-    def __init__(self, stream: Stream | Video, crop: Crop | None, device: str) -> None:
-        self._path = stream.video_path
-        if isinstance(stream, Stream):
+    def __init__(self, topic: Topic, crop: Crop | None, device: str) -> None:
+        self._path = topic.parts[0].video_path
+        for stream in topic.streams:
             _check_layout(stream)
             if stream.hidden_frames:
                 raise OptionError(
@@ -45,13 +45,13 @@ class TorchcodecReader:
                 )
         if remote(self._path):
             raise OptionError(f"{self._path}: backend='torchcodec' only reads local files.")
-        columns, rows = stream.image_size
+        columns, rows = topic.image_size
         x, y, width, height = crop or (0, 0, columns, rows)
         if not (0 <= x < x + width <= columns and 0 <= y < y + height <= rows):
-            raise OptionError(f"topic {stream.topic}: crop {crop} is not inside {columns}x{rows}.")
+            raise OptionError(f"topic {topic.topic}: crop {crop} is not inside {columns}x{rows}.")
         self._rows, self._columns = slice(y, y + height), slice(x, x + width)
         self._decoder = self._opened(device)
-        self._check_range(stream)
+        self._check_range(topic)
 
     def _opened(self, device: str) -> Any:
         if find_spec("torchcodec") is None:
@@ -75,22 +75,20 @@ class TorchcodecReader:
         except (RuntimeError, ValueError) as error:
             raise self._refused(error) from None
 
-    def _check_range(self, stream: Stream | Video) -> None:
+    def _check_range(self, topic: Topic) -> None:
         """Refuse a video whose range torchcodec misinterprets.
 
         On a CPU, torchcodec 0.13 treats full-range AV1 as limited: contrast is then too high by 255
         / 219, and dark and bright details are clipped.
         """
-        if not len(stream):
-            return
-        with closing(stream):  # it reopens its video when needed
-            first = stream.read([0], format="rgb")[0]
+        with closing(topic):  # it reopens its video when needed
+            first = topic.read([0], format="rgb")[0]
         ours = first[self._rows, self._columns].astype(np.int16)
         mistaken = ((ours - 16) * (255 / 219)).clip(0, 255)
         theirs = self.read([0])[0].cpu().numpy()
         if np.abs(theirs - mistaken).mean() < np.abs(theirs - ours).mean():
             raise OptionError(
-                f"topic {stream.topic}: torchcodec decodes its full-range video as limited-range, "
+                f"topic {topic.topic}: torchcodec decodes its full-range video as limited-range, "
                 "so the contrast would be wrong. Use backend='mp4ds', or a dataset packed with "
                 "`codec` h264."
             )
@@ -110,10 +108,6 @@ class TorchcodecReader:
         except (RuntimeError, IndexError, ValueError) as error:
             raise self._refused(error) from None
         return pixels[:, self._rows, self._columns]
-
-    def close(self) -> None:
-        """Release the decoder."""
-        self._decoder = None
 
 
 def _check_layout(stream: Stream) -> None:

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.frames import Frames
 from mp4ds.dataset.rebuild import marked
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.topic_frames import Part, TopicFrames
-from mp4ds.dataset.verbatim import VerbatimFrames
+from mp4ds.dataset.topic import Topic
+from mp4ds.dataset.verbatim import VerbatimImages
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import csv_cell
 from mp4ds.unpacking.pictures import (
@@ -42,7 +41,7 @@ class _Files:
     """How frames of one size and encoding become files.
 
     Attributes:
-        part: The frames.
+        part: The frames: a stream, or images stored verbatim.
         numbers: Their numbers in the topic, shape (frames,).
         is_kept: Which are written, shape (frames,).
         kind: ``png`` or ``jpeg``.
@@ -50,7 +49,7 @@ class _Files:
         file: Encodes them; None if their files are written as recorded.
     """
 
-    part: Part
+    part: Stream | VerbatimImages
     numbers: NDArray[np.int64]
     is_kept: NDArray[np.bool_]
     kind: str
@@ -59,7 +58,7 @@ class _Files:
 
     def all(self) -> Iterator[tuple[int, bytes | memoryview | None]]:
         """The files, each with its frame's number in the part; None: it has no picture."""
-        if isinstance(self.part, VerbatimFrames):
+        if isinstance(self.part, VerbatimImages):
             return self._verbatim(self.part)
         self.part.verify_video()
         if self.file is None:
@@ -73,7 +72,7 @@ class _Files:
                 made = file.encode(self.resizing.pixels(stream, picture))
             yield index, made
 
-    def _verbatim(self, part: VerbatimFrames) -> Iterator[tuple[int, bytes | memoryview | None]]:
+    def _verbatim(self, part: VerbatimImages) -> Iterator[tuple[int, bytes | memoryview | None]]:
         for index, shown in part.all_shown():
             if not self.is_kept[index]:
                 continue
@@ -95,7 +94,7 @@ class TopicImages:
     """
 
     topic: str
-    frames: Frames
+    frames: Topic
     thinned: int
     refused: Counter[str]
     _files: Sequence[_Files]
@@ -165,18 +164,13 @@ def topic_images(
     if topic not in dataset:
         return None
     frames = dataset[topic]
-    parts: list[Part] = []
-    if isinstance(frames, TopicFrames):
-        parts = frames.parts
-    elif isinstance(frames, Stream | VerbatimFrames):
-        parts = [frames]
     is_kept = reduction.kept(FrameTimes(frames.stamps, frames.log_times))
     refused, thinned = Counter[str](), 0
     made = []
-    for place, part in enumerate(parts):
-        numbers = (
-            frames.numbers_of(place) if isinstance(frames, TopicFrames) else np.arange(len(part))
-        )
+    for place, part in enumerate(frames.parts):
+        if not isinstance(part, Stream | VerbatimImages):
+            continue
+        numbers = frames.numbers_of(place)
         kept = is_kept[numbers]
         thinned += _readable(part, ~kept)
         size = reduction.size_of(part)
@@ -193,13 +187,13 @@ def topic_images(
     return TopicImages(topic, frames, thinned, refused, made)
 
 
-def _holds_jpeg(part: Part) -> bool:
+def _holds_jpeg(part: Stream | VerbatimImages) -> bool:
     if isinstance(part, Stream):
         return holds_files(part.sidecar, "jpeg")
     return part.are_jpeg_files
 
 
-def _readable(part: Part, is_wanted: NDArray[np.bool_]) -> int:
+def _readable(part: Stream | VerbatimImages, is_wanted: NDArray[np.bool_]) -> int:
     return part.count(is_wanted) if isinstance(part, Stream) else int(is_wanted.sum())
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.frames import Frames as AnyFrames
+from mp4ds.dataset.images import Images
 from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything, form_for, unbroken
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import size_after, view_of
@@ -77,7 +77,7 @@ class Reduction:
         ):
             raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
 
-    def size_of(self, frames: AnyFrames) -> tuple[int, int] | None:
+    def size_of(self, frames: Images) -> tuple[int, int] | None:
         """New width and height for images of one size; None if unchanged.
 
         Raises:
@@ -290,7 +290,7 @@ class Resizing:
         return self.resize(stream.rebuilder.pixels(picture))
 
 
-def resizing_of(frames: AnyFrames, size: tuple[int, int] | None) -> Resizing:
+def resizing_of(frames: Images, size: tuple[int, int] | None) -> Resizing:
     """How to resize the pixels of frames of one size and encoding. See `resizer`."""
     if isinstance(frames, Stream):
         return resizer(frames.sidecar, frames.encoding, size)

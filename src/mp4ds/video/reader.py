@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -40,7 +41,7 @@ class FrameReader:
     A context manager. One thread at a time may use it, in the process that opened it.
 
     Args:
-        open_access: Opens the decoder of single frames and their references.
+        open_access: Opens the decoder of single frames and their references; None if there is none.
         open_decoder: Opens the decoder from key frames, used where that is impossible.
 
     Raises:
@@ -48,15 +49,17 @@ class FrameReader:
     """
 
     def __init__(
-        self, open_access: Callable[[], FrameAccess], open_decoder: Callable[[], Seeking]
+        self, open_access: Callable[[], FrameAccess] | None, open_decoder: Callable[[], Seeking]
     ) -> None:
         self._open_decoder = open_decoder
         self._access: FrameAccess | None = None
         self._decoder: Seeking | None = None
-        try:
-            self._access = open_access()
-        except (UnknownStructure, VideoError, OSError):
-            self._decoder = open_decoder()  # ffmpeg reads more, and tells what it does not
+        if open_access is not None:
+            # ffmpeg reads more, and tells what it does not
+            with suppress(UnknownStructure, VideoError, OSError):
+                self._access = open_access()
+        if self._access is None:
+            self._decoder = open_decoder()
 
     def pictures_of(
         self,

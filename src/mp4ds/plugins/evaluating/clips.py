@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain, product
 from pathlib import Path
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import open_dataset
-from mp4ds.dataset.frames import Frames
-from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.topic import Topic
 from mp4ds.errors import Refused, SourceNotFoundError
 from mp4ds.files.urls import remote
 from mp4ds.format.sidecars import MANIFEST_NAME
@@ -101,8 +100,10 @@ def open_cameras(place: Path, fps: float) -> Iterator[tuple[list[Camera], dict[s
     if not place.exists():
         raise SourceNotFoundError(place)
     if (place / MANIFEST_NAME).exists() or place.suffix.lower() in _VIDEOS:
-        with open_dataset(place) as dataset:
-            yield [_of_frames(frames) for frames in dataset if len(frames)], {}
+        with open_dataset(place) as dataset, ExitStack() as topics:
+            # stream by stream: an encoder takes images of one size
+            opened = [topics.enter_context(closing(Topic([part]))) for part in dataset.parts]
+            yield list(map(_of_topic, opened)), {}
         return
     with _reader_of(place, fps) as reader:
         yield _of_recording(reader)
@@ -161,24 +162,25 @@ def _of_channel(
     return Camera(channel.topic, times, read, lossy)
 
 
-def _of_frames(frames: Frames) -> Camera:
+def _of_topic(topic: Topic) -> Camera:
     lossy, form = "", "native"
-    if isinstance(frames, Stream) and frames.sidecar.video.codec == "mjpeg":
-        lossy = _JPEG
-    if isinstance(frames, Stream) and frames.sidecar.profile != LOSSLESS:
-        lossy = f"a dataset of {frames.sidecar.profile}"
-        # a lossy video has already been demosaiced; doing it again would not help
-        form = "rgb" if ENCODINGS[frames.encoding].mosaic else "native"
-    order = np.argsort(frames.log_times, kind="stable")
+    for stream in topic.streams:
+        if stream.sidecar.video.codec == "mjpeg":
+            lossy = _JPEG
+        if stream.sidecar.profile != LOSSLESS:
+            lossy = f"a dataset of {stream.sidecar.profile}"
+            # a lossy video has already been demosaiced; doing it again would not help
+            form = "rgb" if ENCODINGS[stream.encoding].mosaic else "native"
+    order = np.argsort(topic.log_times, kind="stable")
 
     def read(indices: Sequence[int]) -> Iterator[Shot]:
         for at in range(0, len(indices), _AT_ONCE):
             numbers = [int(order[index]) for index in indices[at : at + _AT_ONCE]]
-            for frame in frames.get(numbers, format=form):
-                kind = (frame.encoding, *frames.image_size)
+            for frame in topic.get(numbers, format=form):
+                kind = (frame.encoding, *topic.image_size)
                 yield Shot(kind, frame.data, frame.stamp_ns, frame.log_time_ns)
 
-    return Camera(frames.topic, frames.log_times[order], read, lossy)
+    return Camera(topic.topic, topic.log_times[order], read, lossy)
 
 
 # ---------------------------------------------------------------- clips

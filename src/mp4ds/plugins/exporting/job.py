@@ -224,7 +224,7 @@ class ExportedCamera:
         """The calibration of the exported images at the first frame; None if unknown."""
         if not len(self):
             return None
-        found = self.stream.intrinsics_at(int(self.numbers[0]))
+        found = self.stream.calibration_at(int(self.stream.log_times[self.numbers[0]]))
         if found is None or not found.k[0]:  # an uncalibrated camera has zeros
             return None
         return Placement((0, 0, *self.stream.image_size), self.size).calibration(found)
@@ -376,7 +376,7 @@ def hold_calibration(camera: ExportedCamera, stats: ExportStats) -> Calibration 
     topic = info.channel.topic
     columns = camera.stream.camera_info_columns
     if columns is not None:
-        used = camera.stream.intrinsics_at(int(camera.numbers[0]))
+        used = camera.stream.calibration_at(int(camera.stream.log_times[camera.numbers[0]]))
         same = [number for number, item in enumerate(info.calibrations) if item is used]
         is_same = np.isin(columns.variant, same)
         stats.add_exported(topic)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from mp4ds.dataset.topic import Topic
 from mp4ds.errors import OptionError
 from mp4ds.messages.encodings import Pixels
 from mp4ds.plan import FileNames
@@ -393,11 +395,10 @@ class _Maker:
         count = min(_SAMPLES, len(camera))
         chosen = np.unique(np.linspace(0, len(camera) - 1, count).astype(np.int64))
         found = []
-        for number in camera.numbers[chosen].tolist():
-            (frame,) = camera.stream.get(
-                [number], format="rgb", resize=self._job.options.reduction.resize
-            )
-            found.append(Statistics.of_picture(frame.data))
+        with closing(Topic([camera.stream])) as topic:
+            for number in camera.numbers[chosen].tolist():
+                pixels = topic.read([number], resize=self._job.options.reduction.resize)[0]
+                found.append(Statistics.of_picture(pixels))
         return merged(found)
 
     def _vector(self, vectors: Vectors) -> NDArray[np.float32]:

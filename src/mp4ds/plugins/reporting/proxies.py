@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.frames import Frames
 from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import view_of
 from mp4ds.errors import Refused, VideoError
 from mp4ds.messages.encodings import ENCODINGS, Pixels
@@ -72,20 +72,20 @@ class Look:
     other measurements are shown in false colour, using the first of several channels.
 
     Args:
-        stream: Its frames are sampled if their range is needed.
+        topic: Its frames are sampled if their range is needed.
         size: Width and height of the pictures.
 
     Attributes:
         caption: How the pictures differ from the image; empty if they do not.
     """
 
-    def __init__(self, stream: Frames, size: tuple[int, int]) -> None:
-        encoding = ENCODINGS[stream.encoding]
+    def __init__(self, topic: Topic, size: tuple[int, int]) -> None:
+        encoding = ENCODINGS[topic.encoding]
         self._is_light = encoding_as(encoding, "rgb") is not None
         self._view = view_of(
-            stream.topic,
+            topic.topic,
             encoding,
-            stream.image_size,
+            topic.image_size,
             format="rgb" if self._is_light else "native",
             resize=size,
             crop=None,
@@ -93,11 +93,11 @@ class Look:
         self.caption = ""
         self._low, self._high = 0.0, 255.0
         if not self._is_light:
-            self._low, self._high = _range(_sampled(stream), _LOW, _HIGH)
+            self._low, self._high = _range(_sampled(topic), _LOW, _HIGH)
             first = "the first of its channels, " if encoding.channels > 1 else ""
             self.caption = f"in false colour: {first}{self._low:.4g} to {self._high:.4g}"
         elif self._view.dtype != np.uint8:
-            self._high = _range(_sampled(stream), _LOW, _WHITE)[1]
+            self._high = _range(_sampled(topic), _LOW, _WHITE)[1]
             self.caption = f"16 bits: white is {self._high:.0f}"
 
     def picture(self, pixels: Pixels) -> Bytes:
@@ -140,13 +140,13 @@ def pictures_in_order(stream: Stream) -> Iterator[tuple[int, Pixels | None]]:
                 yield index, make(found)
 
 
-def _sampled(stream: Frames) -> list[Pixels]:
+def _sampled(topic: Topic) -> list[Pixels]:
     """Pixels of a few frames, subsampled."""
-    numbers = sorted(set(np.linspace(0, len(stream) - 1, _SAMPLES).astype(int).tolist()))
+    numbers = sorted(set(np.linspace(0, len(topic) - 1, _SAMPLES).astype(int).tolist()))
     found = []
     for number in numbers:
         try:
-            frame = stream.get([number])[0].data
+            frame = topic.get([number])[0].data
         except VideoError:
             continue
         steps = [max(1, side // _SIDE) for side in frame.shape[:2]]
@@ -272,7 +272,8 @@ def make_proxy(
         VideoError: The stream's video cannot be decoded.
         OSError: It cannot be written.
     """
-    look = Look(stream, size)
+    with closing(Topic([stream])) as topic:
+        look = Look(topic, size)
     recipe = recipe_for("rgb24", lossless=False, codec="h264", crf=_CRF, preset=_PRESET)
     span = int(times[-1] - times[0])
     encoder = VideoEncoder(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.frames import Frames
-from mp4ds.dataset.topic_frames import TopicFrames
+from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import Resize, size_after
 from mp4ds.errors import FrameNotFoundError, OptionError
 from mp4ds.files.outputs import begins_with, staged
@@ -149,17 +149,16 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
     if kind is None:
         raise OptionError(f"{target} is not a .png or .jpg: give a name with one of these endings.")
     with Dataset(dataset) as opened:
-        stream = _chosen(opened, options.topic)
+        topic = _chosen(opened, options.topic)
         if options.at is not None:
-            numbers = [number_at(stream, options.at)]
-            source = (stream, numbers[0])
-            if isinstance(stream, TopicFrames):
-                source = stream.place_of(numbers[0])
-            pixels, encoding = _still(*source, kind, options)
+            numbers = [number_at(topic, options.at)]
+            part, number = topic.place_of(numbers[0])
+            with closing(Topic([part])) as alone:  # which has one size and encoding
+                pixels, encoding = _still(alone, number, kind, options)
         elif options.sheet:
-            first, end = _places(stream, options.slice)
+            first, end = _places(topic, options.slice)
             numbers = [first + n for n in spread(end - first, options.sheet[0] * options.sheet[1])]
-            pixels, encoding = _sheet(stream, numbers, options.sheet, options.resize), "rgb8"
+            pixels, encoding = _sheet(topic, numbers, options.sheet, options.resize), "rgb8"
         data = ImageFile(encoding, kind, quality=_QUALITY).encode(pixels)
         with staged(
             target.absolute(),
@@ -169,9 +168,9 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
             path.write_bytes(data)
         return StillSummary(
             output=target,
-            topic=stream.topic,
+            topic=topic.topic,
             frames=[
-                SavedFrame(number, int(stream.stamps[number]), int(stream.log_times[number]))
+                SavedFrame(number, int(topic.stamps[number]), int(topic.log_times[number]))
                 for number in numbers
             ],
             size=(pixels.shape[1], pixels.shape[0]),
@@ -182,7 +181,7 @@ def _image_names(path: Path) -> set[str] | None:
     return {""} if begins_with(path, b"\x89PNG", b"\xff\xd8\xff") else None
 
 
-def _chosen(dataset: Dataset, topic: str) -> Frames:
+def _chosen(dataset: Dataset, topic: str) -> Topic:
     if topic:
         try:
             return dataset[topic]
@@ -209,21 +208,21 @@ def spread(count: int, wanted: int) -> list[int]:
     return [(2 * number + 1) * count // (2 * wanted) for number in range(wanted)]
 
 
-def _places(stream: Frames, asked: Slice) -> tuple[int, int]:
+def _places(topic: Topic, asked: Slice) -> tuple[int, int]:
     """The first frame of a slice, by header stamps, and the one after its last."""
-    stamps = stream.stamps
+    stamps = topic.stamps
     first, last = int(stamps.min()), int(stamps.max())
-    start, end = asked.times(first, last, stream.topic)
+    start, end = asked.times(first, last, topic.topic)
     inside = np.ones(len(stamps), np.bool_)
     inside &= True if start is None else stamps >= start
     inside &= True if end is None else stamps < end
     numbers = np.flatnonzero(inside)
     if not len(numbers):
-        raise OptionError(f"{stream.topic} has no frame in the slice.")
+        raise OptionError(f"{topic.topic} has no frame in the slice.")
     return int(numbers[0]), int(numbers[-1]) + 1
 
 
-def number_at(stream: Frames, at: Time | int) -> int:
+def number_at(topic: Topic, at: Time | int) -> int:
     """Number of the frame nearest to a time, or given by number.
 
     Raises:
@@ -232,45 +231,43 @@ def number_at(stream: Frames, at: Time | int) -> int:
             last one.
     """
     if isinstance(at, int):
-        if at >= len(stream):
-            raise OptionError(
-                f"`at` '#{at}': frames of {stream.topic} are #0 to #{len(stream) - 1}."
-            )
+        if at >= len(topic):
+            raise OptionError(f"`at` '#{at}': frames of {topic.topic} are #0 to #{len(topic) - 1}.")
         return at
-    time = at.after(int(stream.stamps[0]))
-    index = stream.index_at(time)
-    nearest = int(stream.stamps[index])
-    is_beyond = not int(stream.stamps.min()) <= time <= int(stream.stamps.max())
+    time = at.after(int(topic.stamps[0]))
+    index = topic.index_at(time)
+    nearest = int(topic.stamps[index])
+    is_beyond = not int(topic.stamps.min()) <= time <= int(topic.stamps.max())
     if is_beyond and abs(nearest - time) > _BEYOND_NS:
-        raise FrameNotFoundError(stream.topic, time, "near", nearest)
+        raise FrameNotFoundError(topic.topic, time, "near", nearest)
     return index
 
 
 # ---------------------------------------------------------------- how
 
 
-def _still(stream: Frames, number: int, kind: str, options: StillOptions) -> tuple[Pixels, str]:
+def _still(topic: Topic, number: int, kind: str, options: StillOptions) -> tuple[Pixels, str]:
     """Pixels of one frame, and their encoding."""
     if options.exact:
-        return stream.get([number])[0].data, stream.encoding
-    encoding = ENCODINGS[stream.encoding]
+        return topic.get([number])[0].data, topic.encoding
+    encoding = ENCODINGS[topic.encoding]
     if encoding_as(encoding, "rgb") and (encoding.bytes_per_sample == 1 or kind == "png"):
-        frame = stream.get([number], format="rgb", resize=options.resize)[0]
+        frame = topic.get([number], format="rgb", resize=options.resize)[0]
         return frame.data, frame.encoding
-    size = stream.image_size
+    size = topic.image_size
     if options.resize is not None:
-        size = size_after(stream.topic, size, options.resize)
-    look = Look(stream, size)
-    return look.picture(stream.get([number])[0].data), "rgb8"
+        size = size_after(topic.topic, size, options.resize)
+    look = Look(topic, size)
+    return look.picture(topic.get([number])[0].data), "rgb8"
 
 
 def _sheet(
-    stream: Frames, numbers: list[int], sheet: tuple[int, int], resize: Resize
+    topic: Topic, numbers: list[int], sheet: tuple[int, int], resize: Resize
 ) -> NDArray[np.uint8]:
     """All frames in one picture, each with its number and time."""
-    width, height = stream.image_size
+    width, height = topic.image_size
     factor = min(1.0, _SHEET_WIDTH / width)
-    size = size_after(stream.topic, (width, height), factor if resize is None else resize)
+    size = size_after(topic.topic, (width, height), factor if resize is None else resize)
     cell = size[0] + _GAP, size[1] + _GAP + _LABEL
     columns, rows = sheet
     rows = -(-len(numbers) // columns)
@@ -279,13 +276,13 @@ def _sheet(
         raise OptionError(
             f"A sheet of {whole[0]}x{whole[1]} pixels exceeds {_MOST_SIDE} a side: give `resize`."
         )
-    look = Look(stream, size)
+    look = Look(topic, size)
     page = Page(whole, paper=_PAGE, ink=_INK, text_size=_TEXT)
-    title = f"{stream.topic}  {look.caption}".strip()
+    title = f"{topic.topic}  {look.caption}".strip()
     page.write((_GAP, 3), _printable(title))
-    start = int(stream.stamps[0])
+    start = int(topic.stamps[0])
     for place, number in enumerate(numbers):
-        frame = stream.get([number])[0]
+        frame = topic.get([number])[0]
         x = _GAP + place % columns * cell[0]
         y = _LABEL + _GAP + place // columns * cell[1]
         page.put((x, y), look.picture(frame.data))
