@@ -102,6 +102,11 @@ class StaticTransform(Model):
             rotation=list(transform.rotation),
         )
 
+    def to_record(self) -> Transform:
+        """The transform."""
+        (x, y, z), (qx, qy, qz, qw) = self.translation, self.rotation
+        return Transform(self.parent, self.child, (x, y, z), (qx, qy, qz, qw))
+
 
 class LossEntry(Model):
     """Something of the recording that could not be read when it was packed."""

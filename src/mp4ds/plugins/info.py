@@ -584,15 +584,7 @@ def _of_dataset(dataset: Dataset) -> Intrinsics:
         camera.sizes.append((image.width, image.height))
         _add_intrinsics(camera, stream)
     manifest = dataset.manifest
-    transforms = [
-        Transform(
-            parent=item.parent,
-            child=item.child,
-            translation=(item.translation[0], item.translation[1], item.translation[2]),
-            rotation=(item.rotation[0], item.rotation[1], item.rotation[2], item.rotation[3]),
-        )
-        for item in (manifest.transforms if manifest else [])
-    ]
+    transforms = [item.to_record() for item in (manifest.transforms if manifest else [])]
     return Intrinsics(
         dataset.path,
         "dataset" if manifest else "stream",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -19,30 +20,17 @@ from mp4ds.errors import OptionError, advising
 from mp4ds.files.outputs import listed_names, staged
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import document_of
-from mp4ds.plugins.exporting.job import ExportedDataset, ExportJob, ExportOptions, ExportSummary
+from mp4ds.plugins.exporting.folders import write_colmap, write_euroc, write_tum
+from mp4ds.plugins.exporting.job import ExportJob, ExportOptions, ExportSource, ExportSummary
 
 NOTE_NAME = "mp4ds_export.json"
 """File in an exported folder that lists what it holds and leaves out."""
 
-FORMATS = {
-    "euroc": "EuRoC",
-    "tum": "TUM",
-    "colmap": "COLMAP",
-    "lerobot": "LeRobot",
-}
-"""Formats, each written by the module of that name -> display name."""
+FORMATS = {"euroc": "EuRoC", "tum": "TUM", "colmap": "COLMAP", "lerobot": "LeRobot"}
+"""Formats -> display name."""
 
-_LIBRARIES = {"lerobot": "pyarrow"}
-_SEVERAL = ("lerobot",)  # formats that hold several datasets
-_OPTIONS_OF = {
-    "poses": ("euroc", "tum", "colmap"),
-    "fps": ("lerobot",),
-    "state": ("lerobot",),
-    "action": ("lerobot",),
-    "task": ("lerobot",),
-    "codec": ("lerobot",),
-    "crf": ("lerobot",),
-}
+_WRITERS = {"euroc": write_euroc, "tum": write_tum, "colmap": write_colmap}
+_OF_LEROBOT = ("fps", "state", "action", "task", "codec", "crf")
 
 
 def export(
@@ -81,12 +69,7 @@ def export(
     if remote(location(output)):
         raise OptionError(f"{output} is a URL: export to a local folder, then upload it.")
     target = Path(os.path.abspath(output))  # noqa: PTH100
-    try:
-        writer: Callable[[ExportJob], None] = import_module(f"mp4ds.plugins.exporting.{to}").write
-    except ImportError as error:
-        raise OptionError(
-            f"{FORMATS[to]} needs {_LIBRARIES[to]} ({error}). Install it: pip install 'mp4ds[{to}]'"
-        ) from None
+    write = _WRITERS[to] if to in _WRITERS else _lerobot_writer()
     with ExitStack() as stack, advising(HOW_TO_SALVAGE):
         opened = [stack.enter_context(Dataset(path, selected=chosen.uses)) for path in paths]
         path = stack.enter_context(
@@ -103,14 +86,15 @@ def export(
         ]
         if to == "lerobot":  # whose videos are in colour
             chosen = replace(chosen, pixels="rgb")
-        sources = [ExportedDataset(dataset, chosen) for dataset in opened]
-        job = ExportJob(path, target, chosen, sources, progress or (lambda *_: None))
-        writer(job)
-        summary = _summary(job, to)
+        sources = [ExportSource(dataset, chosen) for dataset in opened]
+        job = ExportJob(path, chosen, sources, progress or (lambda *_: None))
+        write(job)
+        summary = _summary(job, target, to)
         if not any(summary.messages.values()):
+            why = [f"{topic}: {next(iter(found))}" for topic, found in summary.left_out.items()]
             raise OptionError(
                 f"{FORMATS[to]} cannot hold any topic of {opened[0].path}: "
-                f"{_first_reason(summary) or 'it has no messages'}."
+                f"{why[0] if why else 'it has no messages'}."
             )
         if path.is_dir():
             files = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
@@ -123,6 +107,16 @@ def export(
         return summary
 
 
+def _lerobot_writer() -> Callable[[ExportJob], None]:
+    try:
+        found: Callable[[ExportJob], None] = import_module("mp4ds.plugins.exporting.lerobot").write
+    except ImportError as error:
+        raise OptionError(
+            f"LeRobot needs pyarrow ({error}). Install it: pip install 'mp4ds[lerobot]'"
+        ) from None
+    return found
+
+
 def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
     """Refuse options that are unknown or contradict each other.
 
@@ -131,13 +125,14 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
     """
     if to not in FORMATS:
         raise OptionError(f"format {to!r} is not known. Use {', '.join(FORMATS)}.")
-    if len(paths) > 1 and to not in _SEVERAL:
+    if len(paths) > 1 and to != "lerobot":
         raise OptionError(
             f"{FORMATS[to]} holds a single dataset, but {len(paths)} were given: export them "
             "one by one."
         )
     usual = ExportOptions()
-    for name, formats in _OPTIONS_OF.items():
+    for name in ("poses", *_OF_LEROBOT):
+        formats = ("lerobot",) if name in _OF_LEROBOT else tuple(_WRITERS)
         if getattr(options, name) != getattr(usual, name) and to not in formats:
             raise OptionError(f"`{name}` works with {', '.join(formats)}, not with {to}.")
     if to == "lerobot" and options.pixels not in ("seen", "rgb"):
@@ -147,28 +142,18 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
     _ = options.reduction  # refuses invalid ones
 
 
-def _summary(job: ExportJob, to: str) -> ExportSummary:
-    summary = ExportSummary(job.target, to, job.places)
+def _summary(job: ExportJob, target: Path, to: str) -> ExportSummary:
+    messages, left_out, notes = Counter[str](), dict[str, Counter[str]](), list[str]()
     for source in job.sources:
-        stats = source.stats
-        stats.add_rest(source.chosen, FORMATS[to])
-        for topic, count in stats.exported.items():
-            summary.messages[topic] = summary.messages.get(topic, 0) + count
-        for topic, reasons in stats.left_out.items():
-            into = summary.left_out.setdefault(topic, {})
-            for reason, count in reasons.items():
-                into[reason] = into.get(reason, 0) + count
-        several = len(job.sources) > 1
-        where = f"{source.dataset.path.name}: " if several else ""
-        summary.notes.extend(where + note for note in source.notes)
-    return summary
-
-
-def _first_reason(summary: ExportSummary) -> str:
-    for topic, reasons in summary.left_out.items():
-        for reason in reasons:
-            return f"{topic}: {reason}"
-    return ""
+        source.leave_out_rest(FORMATS[to])
+        messages.update(source.exported)
+        for topic, reasons in source.left_out.items():
+            left_out.setdefault(topic, Counter()).update(reasons)
+        where = f"{source.dataset.path.name}: " if len(job.sources) > 1 else ""
+        notes += [where + note for note in source.notes]
+    kept = {topic: count for topic, count in messages.items() if count}
+    rest = {topic: dict(reasons) for topic, reasons in left_out.items()}
+    return ExportSummary(target, to, job.places, kept, rest, notes)
 
 
 def _export_names(path: Path) -> set[str] | None:

@@ -1,9 +1,9 @@
-"""The basis of an export: its cameras, and the account of what is kept and left out."""
+"""The basis of an export: its options, cameras, and the account of what is kept and left out."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,7 @@ from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import WHAT, Parsed, SliceOptions, force, option
-from mp4ds.records import Channel
+from mp4ds.plugins.exporting.motion import ros_type
 from mp4ds.times import intervals, synchronize, usual_interval
 from mp4ds.unpacking.pictures import ReductionOptions, is_inverse_depth, times_of
 from mp4ds.video.codecs import MAX_CRF
@@ -117,63 +117,6 @@ class ExportSummary:
     notes: list[str] = field(default_factory=list)
 
 
-# ---------------------------------------------------------------- stats
-
-AS_RECORDED = "stored as recorded in messages.mcap, not as video"
-NOT_CHOSEN = "not selected"
-
-
-class ExportStats:
-    """Counts the messages of a dataset, by topic.
-
-    Attributes:
-        exported: Messages exported, by topic.
-        left_out: Topic -> reason -> messages.
-    """
-
-    def __init__(self, dataset: Dataset) -> None:
-        self._totals: Counter[str] = Counter()
-        counts = dataset.counts()
-        self._channels: dict[str, Channel] = {}
-        for channel in dataset.channels:
-            self._channels[channel.topic] = channel
-            self._totals[channel.topic] += counts.get(channel.id, 0)
-        self.exported: dict[str, int] = {}
-        self.left_out: dict[str, dict[str, int]] = {}
-
-    def total(self, topic: str) -> int:
-        """Number of the dataset's messages on a topic."""
-        return self._totals[topic]
-
-    def add_exported(self, topic: str, count: int = 1) -> None:
-        """Count kept messages."""
-        self.exported[topic] = self.exported.get(topic, 0) + count
-
-    def add_left_out(self, topic: str, reason: str, count: int) -> None:
-        """Count messages that are left out."""
-        if count:
-            reasons = self.left_out.setdefault(topic, {})
-            reasons[reason] = reasons.get(reason, 0) + count
-
-    def add_rest(self, chosen: Callable[[str], bool], name: str) -> None:
-        """Count the remaining messages with their reason.
-
-        Args:
-            chosen: Whether a topic was selected.
-            name: Of the format.
-        """
-        for topic, total in self._totals.items():
-            told = self.exported.get(topic, 0) + sum(self.left_out.get(topic, {}).values())
-            channel = self._channels[topic]
-            if not chosen(topic):
-                reason = NOT_CHOSEN
-            elif is_camera(channel):
-                reason = AS_RECORDED
-            else:
-                reason = f"{name} has no place for {channel.type_name or 'such messages'}"
-            self.add_left_out(topic, reason, total - told)
-
-
 # ---------------------------------------------------------------- cameras
 
 _THINNED = "left out on request (--every, --max-rate)"
@@ -257,50 +200,6 @@ class ExportedCamera:
                 self.view.give(self.stream.rebuilder.pixels(picture), pixels)
                 yield int(place_of[index]), pixels
 
-    def png_files(self) -> Iterator[tuple[int, bytes]]:
-        """PNG files of the frames; see `pictures`."""
-        file = ImageFile(self.view.encoding.name, "png")
-        for place, pixels in self.pictures():
-            yield place, file.encode(pixels)
-
-
-def chosen_cameras(
-    streams: Sequence[Stream], options: ExportOptions, stats: ExportStats, notes: list[str]
-) -> list[ExportedCamera]:
-    """The cameras of some streams: calibrated ones first, then by topic.
-
-    Args:
-        streams: The streams.
-        options: Which frames, and how.
-        stats: Counts those that are left out.
-        notes: Receives what frames are converted to.
-
-    Raises:
-        OptionError: Frames of a stream cannot be converted that way.
-    """
-    reduction = options.reduction
-    cameras = []
-    for stream in streams:
-        sidecar = stream.sidecar
-        if any(is_inverse_depth(sidecar, header) for header in sidecar.headers):
-            stats.add_left_out(stream.topic, _INVERSE, len(stream))
-            continue
-        columns = stream.columns
-        kept = np.flatnonzero(reduction.kept(columns))
-        stats.add_left_out(stream.topic, _THINNED, len(stream) - len(kept))
-        times = times_of(columns)
-        if times is not columns.stamp:
-            notes.append(
-                f"{stream.topic}: its stamps do not increase, so log times are used instead"
-            )
-        kept = kept[np.argsort(times[kept], kind="stable")]
-        view = _view(stream, options, notes)
-        cameras.append(ExportedCamera(stream, kept, times[kept], view))
-    cameras.sort(key=lambda camera: (camera.calibration is None, camera.topic))
-    if options.tolerance_ns is not None and len(cameras) > 1:
-        cameras = _matched(cameras, options.tolerance_ns, stats)
-    return [camera for camera in cameras if len(camera)]
-
 
 def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:
     known = ENCODINGS[stream.encoding]
@@ -330,92 +229,148 @@ def is_plain(encoding: Encoding) -> bool:
     return not encoding.mosaic and encoding.rows == 1 and encoding.even == (1, 1)
 
 
-def _matched(
-    cameras: list[ExportedCamera], tolerance_ns: int, stats: ExportStats
-) -> list[ExportedCamera]:
-    """The frames that every camera has, frame n of each taken at the same time."""
-    times = {str(number): camera.times for number, camera in enumerate(cameras)}
-    matches = synchronize(times, tolerance_ns=tolerance_ns)
-    for number, camera in enumerate(cameras):
-        reason = "not every camera has a frame at this time (--sync)"
-        stats.add_left_out(camera.topic, reason, len(matches.unmatched[str(number)]))
-    columns = zip(cameras, matches.indices.T, strict=True)
-    return [camera.at(places) for camera, places in columns]
+# ---------------------------------------------------------------- source
 
 
-def that_png_holds(cameras: Sequence[ExportedCamera], stats: ExportStats) -> list[ExportedCamera]:
-    """The cameras whose images PNG files can hold; the others are left out."""
-    found = []
-    for camera in cameras:
-        name = camera.view.encoding.name
-        try:
-            ImageFile(name, "png")
-        except OptionError:
-            stats.add_left_out(camera.topic, f"PNG cannot hold {name} images", len(camera))
-        else:
-            found.append(camera)
-    return found
+class ExportSource:
+    """A dataset being exported, which counts its messages.
 
-
-def of_different_times(camera: ExportedCamera, stats: ExportStats) -> ExportedCamera:
-    """The camera with one frame per time, for formats that name files by time."""
-    is_new = np.diff(camera.times, prepend=camera.times[:1] - 1) != 0
-    stats.add_left_out(
-        camera.topic,
-        "another frame has the same time, and therefore the same name",
-        int((~is_new).sum()),
-    )
-    return camera.at(np.flatnonzero(is_new))
-
-
-def hold_calibration(camera: ExportedCamera, stats: ExportStats) -> Calibration | None:
-    """The calibration of a camera, counted as kept once: formats cannot hold its times."""
-    info = camera.stream.sidecar.camera_info
-    if info is None or camera.calibration is None:
-        return None
-    topic = info.channel.topic
-    columns = camera.stream.camera_info_columns
-    if columns is not None:
-        used = camera.stream.calibration_at(int(camera.stream.log_times[camera.numbers[0]]))
-        same = [number for number, item in enumerate(info.calibrations) if item is used]
-        is_same = np.isin(columns.variant, same)
-        stats.add_exported(topic)
-        stats.add_left_out(topic, "repeats the exported calibration", int(is_same.sum()) - 1)
-        stats.add_left_out(
-            topic, "a different calibration: only one per camera is exported", int((~is_same).sum())
-        )
-    return camera.calibration
-
-
-# ---------------------------------------------------------------- job
-
-_TELL_EVERY = 16  # frames
-
-
-class ExportedDataset:
-    """A dataset being exported.
+    Args:
+        dataset: The dataset.
+        options: How.
 
     Attributes:
         dataset: The dataset.
-        stats: Counts its messages.
-        chosen: Whether a topic was selected.
-        cameras: Its selected streams.
-        notes: Deviations from the recording.
+        cameras: Its selected streams: calibrated ones first, then by topic.
+        exported: Messages exported, by topic.
+        left_out: Topic -> reason -> messages.
+        notes: Other deviations from the recording.
+
+    Raises:
+        OptionError: No topic matches, or frames of a stream cannot be converted that way.
+        FormatError: The dataset is damaged.
     """
 
     def __init__(self, dataset: Dataset, options: ExportOptions) -> None:
         dataset.verify_messages()
         self.dataset = dataset
-        self.stats = ExportStats(dataset)
+        self.exported: Counter[str] = Counter()
+        self.left_out: dict[str, Counter[str]] = {}
         self.notes = [
             f"damaged, but not needed for the selected topics: {problem}"
             for problem in dataset.unread
         ]
         options.selected.check(dataset.all_topics)
-        self.chosen = options.chosen
-        dataset.verify_sidecars(self.chosen)
+        self._options = options
+        dataset.verify_sidecars(options.chosen)
         streams = [stream for stream in dataset.streams if options.selected(stream.topic)]
-        self.cameras = chosen_cameras(streams, options, self.stats, self.notes)
+        found = [camera for stream in streams for camera in self._camera(stream)]
+        found.sort(key=lambda camera: (camera.calibration is None, camera.topic))
+        if options.tolerance_ns is not None and len(found) > 1:
+            found = self._matched(found, options.tolerance_ns)
+        self.cameras = [camera for camera in found if len(camera)]
+
+    def leave_out(self, topic: str, reason: str, count: int) -> None:
+        """Count messages that are left out."""
+        if count:
+            self.left_out.setdefault(topic, Counter())[reason] += count
+
+    def note(self, sentence: str) -> None:
+        """Note a deviation from the recording, once."""
+        if sentence not in self.notes:
+            self.notes.append(sentence)
+
+    def leave_out_rest(self, name: str) -> None:
+        """Count the remaining messages with their reason.
+
+        Args:
+            name: Of the format.
+        """
+        counts, totals = self.dataset.counts(), Counter[str]()
+        channels = {channel.topic: channel for channel in self.dataset.channels}
+        for channel in self.dataset.channels:
+            totals[channel.topic] += counts.get(channel.id, 0)
+        for topic, total in totals.items():
+            if not self._options.chosen(topic):
+                reason = "not selected"
+            elif is_camera(channels[topic]):
+                reason = "stored as recorded in messages.mcap, not as video"
+            else:
+                reason = f"{name} has no place for {channels[topic].type_name or 'such messages'}"
+            known = self.exported[topic] + sum(self.left_out.get(topic, {}).values())
+            self.leave_out(topic, reason, total - known)
+
+    def topics_of(self, type_name: str) -> list[str]:
+        """The selected topics with a ROS type, such as ``sensor_msgs/Imu``."""
+        topics = dict.fromkeys(channel.topic for channel in self.dataset.channels)
+        return [
+            topic
+            for topic in topics
+            if self._options.chosen(topic) and ros_type(self.dataset, topic) == type_name
+        ]
+
+    # ------------------------------------------------ cameras
+
+    def _camera(self, stream: Stream) -> Iterator[ExportedCamera]:
+        """The camera of a stream; none if its images cannot be exported."""
+        sidecar = stream.sidecar
+        if any(is_inverse_depth(sidecar, header) for header in sidecar.headers):
+            self.leave_out(stream.topic, _INVERSE, len(stream))
+            return
+        columns = stream.columns
+        kept = np.flatnonzero(self._options.reduction.kept(columns))
+        self.leave_out(stream.topic, _THINNED, len(stream) - len(kept))
+        times = times_of(columns)
+        if times is not columns.stamp:
+            self.note(f"{stream.topic}: its stamps do not increase, so log times are used instead")
+        kept = kept[np.argsort(times[kept], kind="stable")]
+        yield ExportedCamera(stream, kept, times[kept], _view(stream, self._options, self.notes))
+
+    def _matched(self, cameras: list[ExportedCamera], tolerance_ns: int) -> list[ExportedCamera]:
+        """The frames that every camera has, frame n of each taken at the same time."""
+        times = {str(number): camera.times for number, camera in enumerate(cameras)}
+        matches = synchronize(times, tolerance_ns=tolerance_ns)
+        for number, camera in enumerate(cameras):
+            reason = "not every camera has a frame at this time (--sync)"
+            self.leave_out(camera.topic, reason, len(matches.unmatched[str(number)]))
+        columns = zip(cameras, matches.indices.T, strict=True)
+        return [camera.at(places) for camera, places in columns]
+
+    def png_cameras(self) -> Iterator[ExportedCamera]:
+        """The cameras whose images PNG files can hold, with one frame per time to name it by."""
+        for camera in self.cameras:
+            name = camera.view.encoding.name
+            try:
+                ImageFile(name, "png")
+            except OptionError:
+                self.leave_out(camera.topic, f"PNG cannot hold {name} images", len(camera))
+                continue
+            is_new = np.diff(camera.times, prepend=camera.times[:1] - 1) != 0
+            reason = "another frame has the same time, and therefore the same name"
+            self.leave_out(camera.topic, reason, int((~is_new).sum()))
+            yield camera.at(np.flatnonzero(is_new))
+
+    def export_calibration(self, camera: ExportedCamera) -> Calibration | None:
+        """The calibration of a camera, counted as exported once: formats cannot hold its times."""
+        info = camera.stream.sidecar.camera_info
+        if info is None or camera.calibration is None:
+            return None
+        topic = info.channel.topic
+        columns = camera.stream.camera_info_columns
+        if columns is not None:
+            used = camera.stream.calibration_at(int(camera.stream.log_times[camera.numbers[0]]))
+            same = [number for number, item in enumerate(info.calibrations) if item is used]
+            is_same = np.isin(columns.variant, same)
+            self.exported[topic] += 1
+            self.leave_out(topic, "repeats the exported calibration", int(is_same.sum()) - 1)
+            reason = "a different calibration: only one per camera is exported"
+            self.leave_out(topic, reason, int((~is_same).sum()))
+        return camera.calibration
+
+
+# ---------------------------------------------------------------- job
+
+_TELL_EVERY = 16  # frames
 
 
 @dataclass
@@ -424,7 +379,6 @@ class ExportJob:
 
     Attributes:
         path: Where to make it.
-        target: Its final name.
         options: How.
         sources: The datasets, one except for formats that hold several.
         tell: Called now and then with a phrase, and the share of frames done.
@@ -432,22 +386,16 @@ class ExportJob:
     """
 
     path: Path
-    target: Path
     options: ExportOptions
-    sources: Sequence[ExportedDataset]
+    sources: Sequence[ExportSource]
     tell: Callable[[str, float | None], None]
     places: dict[str, str] = field(default_factory=dict)
-    _given: int = 0
+    _written: int = 0
 
     @property
-    def source(self) -> ExportedDataset:
+    def source(self) -> ExportSource:
         """The dataset, for formats that hold only one."""
         return self.sources[0]
-
-    def note(self, sentence: str) -> None:
-        """Note a deviation from the recording."""
-        if sentence not in self.source.notes:
-            self.source.notes.append(sentence)
 
     def write_png_files(self, camera: ExportedCamera, place: str, names: Sequence[str]) -> None:
         """Write the frames of a camera as PNG files, and count them.
@@ -457,21 +405,31 @@ class ExportJob:
             place: The part of the output they are listed under.
             names: Path of each frame's file from the output's folder.
         """
-        folder = self.path / names[0].rpartition("/")[0] if names else self.path
-        folder.mkdir(parents=True, exist_ok=True)
-        files = camera.png_files()
-        for position, data in self.counted(files, f"{camera.topic} as {place}", len(camera)):
-            (self.path / names[position]).write_bytes(data)
-        self.places[place] = camera.topic
-        self.source.stats.add_exported(camera.topic, len(camera))
-
-    def counted(
-        self, items: Iterator[tuple[int, bytes]], what: str, total: int
-    ) -> Iterator[tuple[int, bytes]]:
-        """The same items, with progress reported now and then."""
-        for number, item in enumerate(items):
+        (self.path / names[0]).parent.mkdir(parents=True, exist_ok=True)
+        file = ImageFile(camera.view.encoding.name, "png")
+        due = sum(len(camera) for camera in self.source.cameras)
+        for number, (position, pixels) in enumerate(camera.pictures()):
             if number % _TELL_EVERY == 0:
-                due = sum(len(camera) for source in self.sources for camera in source.cameras)
-                self.tell(f"{what}: frame {number} of {total}", (self._given + number) / due)
-            yield item
-        self._given += total
+                done = (self._written + number) / due
+                self.tell(f"{camera.topic} as {place}: frame {number} of {len(camera)}", done)
+            (self.path / names[position]).write_bytes(file.encode(pixels))
+        self._written += len(camera)
+        self.places[place] = camera.topic
+        self.source.exported[camera.topic] += len(camera)
+
+    def write_lines(self, place: str, topic: str, name: str, lines: Iterable[str]) -> None:
+        """Write a text file; each line but those that begin with # is a message of a topic.
+
+        Args:
+            place: The part of the output it is listed under.
+            topic: The topic.
+            name: Path of the file from the output's folder.
+            lines: Its lines.
+        """
+        path = self.path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", encoding="utf-8") as file:
+            for line in lines:
+                file.write(f"{line}\n")
+                self.source.exported[topic] += not line.startswith("#")
+        self.places[place] = topic

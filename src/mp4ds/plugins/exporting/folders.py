@@ -1,0 +1,347 @@
+"""EuRoC, TUM RGB-D and COLMAP: folders of PNG files and text."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.views import lens_of
+from mp4ds.errors import OptionError
+from mp4ds.format.models import Calibration
+from mp4ds.messages.transforms import quaternion_of
+from mp4ds.options import seconds_text
+from mp4ds.plan import FileNames
+from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob
+from mp4ds.plugins.exporting.motion import (
+    IMU,
+    Measures,
+    Pose,
+    Row,
+    StaticTree,
+    inverse,
+    pose_matrix,
+)
+from mp4ds.video.images import encoding_as
+
+
+def _poses(job: ExportJob) -> Measures | None:
+    """The requested poses: before any frame is decoded, as the topic may be unsuitable."""
+    topic = job.options.poses
+    return Measures(job.source.dataset, topic, "poses", "poses") if topic else None
+
+
+def _imus(job: ExportJob) -> list[Measures]:
+    return [Measures(job.source.dataset, topic, "imu") for topic in job.source.topics_of(IMU)]
+
+
+# ---------------------------------------------------------------- euroc
+
+_IMU_HEAD = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+)
+_POSE_HEAD = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+)
+
+
+def write_euroc(job: ExportJob) -> None:
+    """Write mav0/cam0, imu0 ... with data.csv and sensor.yaml: the format of the ASL data sets."""
+    poses, cameras, imus = _poses(job), [*job.source.png_cameras()], _imus(job)
+    frames = [*(imu.frame_id for imu in imus), *(camera.frame_id for camera in cameras)]
+    body = frames[0] if frames else ""
+    tree = StaticTree(job.source.dataset)
+    root = job.path / "mav0"
+    root.mkdir(parents=True)
+    (root / "body.yaml").write_text(f"comment: {json.dumps(body)}\n", encoding="utf-8")
+
+    def write_sensor(
+        place: str, kind: str, topic: str, pose: Pose | None, lines: Sequence[str] = ()
+    ) -> None:
+        text = [f"sensor_type: {kind}", f"comment: {json.dumps(topic)}"]
+        if pose is not None:
+            text += ["T_BS:", "  cols: 4", "  rows: 4", f"  data: {pose.ravel().tolist()}"]
+        path = job.path / place / "sensor.yaml"
+        path.write_text("\n".join([*text, *lines, ""]), encoding="utf-8")
+
+    def pose_of(frame: str, topic: str) -> Pose | None:
+        pose = tree.pose(frame, body)
+        if pose is None:
+            job.source.note(f"{topic}: no static transforms give T_BS of {frame!r} in {body!r}")
+        return pose
+
+    for number, camera in enumerate(cameras):
+        place = f"mav0/cam{number}"
+        pose = pose_of(camera.frame_id, camera.topic)
+        names = [f"{time}.png" for time in camera.times.tolist()]
+        job.write_png_files(camera, place, [f"{place}/data/{name}" for name in names])
+        lines = [f"{time},{name}" for time, name in zip(camera.times.tolist(), names, strict=True)]
+        text = "\n".join(["#timestamp [ns],filename", *lines, ""])
+        (job.path / place / "data.csv").write_text(text, encoding="utf-8")
+        write_sensor(place, "camera", camera.topic, pose, _described(job, camera))
+    for number, imu in enumerate(imus):
+        place = f"mav0/imu{number}"
+        pose = pose_of(imu.frame_id, imu.topic)
+        rows = _csv(_IMU_HEAD, imu.rows())
+        job.write_lines(place, imu.topic, f"{place}/data.csv", rows)
+        write_sensor(place, "imu", imu.topic, pose)
+        job.source.note(
+            f"{imu.topic}: orientation and covariances have no place in an IMU's data.csv"
+        )
+    if poses is not None:
+        job.source.note(f"{poses.topic}: only position and orientation are kept")
+        place = "mav0/pose0"
+        turned = ((time, (*v[:3], v[6], *v[3:6])) for time, v in poses.rows())
+        job.write_lines(place, poses.topic, f"{place}/data.csv", _csv(_POSE_HEAD, turned))
+        write_sensor(place, "pose", poses.topic, tree.pose(poses.body, body))
+
+
+def _csv(head: str, rows: Iterable[Row]) -> Iterator[str]:
+    yield head
+    for time, values in rows:
+        yield f"{time},{','.join(map(repr, values))}"
+
+
+def _described(job: ExportJob, camera: ExportedCamera) -> list[str]:
+    """What a sensor.yaml says of a camera."""
+    width, height = camera.size
+    lines = [f"rate_hz: {camera.rate:.6g}", f"resolution: [{width}, {height}]"]
+    calibration = job.source.export_calibration(camera)
+    if calibration is None:
+        job.source.note(f"{camera.topic}: not calibrated")
+        return lines
+    model, coefficients = euroc_distortion(calibration)
+    if model not in ("radial-tangential", "equidistant"):
+        job.source.note(f"{camera.topic}: EuRoC has no distortion {model}; it is given by its name")
+    k = calibration.k
+    return [
+        *lines,
+        "camera_model: pinhole",
+        f"intrinsics: {[k[0], k[4], k[2], k[5]]} # fu, fv, cu, cv",
+        f"distortion_model: {json.dumps(model)}",
+        f"distortion_coefficients: {coefficients}",
+    ]
+
+
+def euroc_distortion(calibration: Calibration) -> tuple[str, list[float]]:
+    """Name and coefficients of a distortion, in EuRoC's terms if it has them."""
+    model, d = lens_of(calibration)
+    if model == "none":
+        return "radial-tangential", [0.0] * 4
+    if model == "plumb_bob" and not d[4]:
+        return "radial-tangential", d[:4]
+    return model, d
+
+
+# ---------------------------------------------------------------- tum
+
+
+def write_tum(job: ExportJob) -> None:
+    """Write rgb, depth, and lists of files by time: the format of the TUM RGB-D benchmark."""
+    poses, cameras, imus = _poses(job), [*job.source.png_cameras()], _imus(job)
+    for kind, wanted in (("rgb", False), ("depth", True)):
+        alike = [camera for camera in cameras if _is_depth(camera) is wanted]
+        for camera in alike[:1]:
+            _write_tum_images(job, kind, camera)
+        for camera in alike[1:]:
+            reason = f"TUM has one {kind} camera, here {alike[0].topic} (select with --topics)"
+            job.source.leave_out(camera.topic, reason, len(camera))
+    for imu in imus[:1]:
+        rows = ((time, values[3:]) for time, values in imu.rows())
+        _write_tum_rows(job, "accelerometer.txt", imu.topic, "timestamp ax ay az", rows)
+        job.source.note(f"{imu.topic}: TUM only keeps an IMU's acceleration")
+    if poses is not None:
+        job.source.note(f"{poses.topic}: only position and orientation are kept")
+        head = "timestamp tx ty tz qx qy qz qw"
+        _write_tum_rows(job, "groundtruth.txt", poses.topic, head, poses.rows())
+    if any(camera.calibration for camera in cameras):
+        job.source.note("TUM has no place for calibrations")
+
+
+def _is_depth(camera: ExportedCamera) -> bool:
+    """Whether images are depths: by their encoding, or by topic name if mono16."""
+    encoding = camera.view.encoding
+    has_light = encoding_as(encoding, "rgb") is not None
+    return not has_light or (encoding.name == "mono16" and "depth" in camera.topic.lower())
+
+
+def _write_tum_images(job: ExportJob, kind: str, camera: ExportedCamera) -> None:
+    times = [seconds_text(time) for time in camera.times.tolist()]
+    names = [f"{kind}/{time}.png" for time in times]
+    job.write_png_files(camera, kind, names)
+    heads = ["color images" if kind == "rgb" else "depth maps", f"file: {camera.topic}"]
+    if kind == "depth":
+        unit = "as recorded, in ROS one millimetre (depth factor 1000, not TUM's 5000)"
+        heads.append(f"unit: {unit}")
+        job.source.note(f"{camera.topic}: depths are in units {unit}")
+    lines = map(" ".join, zip(times, names, strict=True))
+    text = "\n".join([*_commented(*heads, "timestamp filename"), *lines, ""])
+    (job.path / f"{kind}.txt").write_text(text, encoding="utf-8")
+
+
+def _write_tum_rows(job: ExportJob, name: str, topic: str, head: str, rows: Iterable[Row]) -> None:
+    def lines() -> Iterator[str]:
+        yield from _commented(f"file: {topic}", head)
+        for time, values in rows:
+            yield " ".join([seconds_text(time), *map(repr, values)])
+
+    job.write_lines(name, topic, name, lines())
+
+
+def _commented(*heads: str) -> list[str]:
+    # a topic may be of several lines
+    return [f"# {' '.join(head.splitlines())}" for head in heads]
+
+
+# ---------------------------------------------------------------- colmap
+
+_MODEL = "sparse/0"
+_HALF_PIXEL = 0.5  # COLMAP counts from the corner of a pixel, ROS and OpenCV from its centre
+
+
+def write_colmap(job: ExportJob) -> None:
+    """Write images, and a sparse model of cameras, and of poses if known."""
+    poses = _poses(job)
+    if poses is not None and not poses.body:
+        raise OptionError(
+            f"`poses` {poses.topic} does not say whose pose it gives, which is needed for a "
+            "camera's pose. Use an Odometry or TransformStamped topic."
+        )
+    folder, names = job.path / _MODEL, FileNames()
+    folder.mkdir(parents=True)
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    known: list[tuple[ExportedCamera, Sequence[str]]] = []
+    for camera in job.source.png_cameras():
+        place, _ = names.name_for(camera.topic)
+        files = [f"{place}/{time}.png" for time in camera.times.tolist()]
+        job.write_png_files(camera, f"images/{place}", [f"images/{file}" for file in files])
+        model = colmap_model(camera.calibration) if camera.calibration else None
+        if model is None:
+            why = "not calibrated"
+            if camera.calibration:
+                distortion = camera.calibration.distortion_model
+                why = f"COLMAP has no model for distortion {distortion!r}"
+            job.source.note(f"{camera.topic}: {why}, so it is not in cameras.txt")
+            continue
+        job.source.export_calibration(camera)
+        known.append((camera, files))
+        width, height = camera.size
+        lines.append(f"{len(known)} {model[0]} {width} {height} {' '.join(map(repr, model[1]))}")
+    (folder / "cameras.txt").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    # COLMAP refuses a model without these two
+    (folder / "points3D.txt").write_text("# no points\n", encoding="utf-8")
+    with (folder / "images.txt").open("w", encoding="utf-8") as file:
+        file.write("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# no points\n")
+        if poses is None:
+            job.source.note("images.txt is empty: it needs the pose of each image (--poses TOPIC)")
+        else:
+            file.writelines(_image_lines(job, known, poses))
+
+
+def colmap_model(calibration: Calibration) -> tuple[str, list[float]] | None:
+    """COLMAP's camera model and its parameters, the simplest that is equal; None if it has none."""
+    k = calibration.k
+    values = [k[0], k[4], k[2] + _HALF_PIXEL, k[5] + _HALF_PIXEL]
+    model, d = lens_of(calibration)
+    if model == "none":
+        return "PINHOLE", values
+    if model == "equidistant":
+        return "OPENCV_FISHEYE", [*values, *d]
+    if model == "plumb_bob" and not d[4]:
+        return "OPENCV", [*values, *d[:4]]
+    if model in ("plumb_bob", "rational_polynomial") and len(d) <= 8:
+        return "FULL_OPENCV", [*values, *(d + [0.0] * 3)[:8]]
+    return None
+
+
+def _image_lines(
+    job: ExportJob, cameras: Sequence[tuple[ExportedCamera, Sequence[str]]], poses: Measures
+) -> Iterator[str]:
+    tree, track = StaticTree(job.source.dataset), PoseTrack.of(poses.rows())
+    image = 0
+    for number, (camera, files) in enumerate(cameras, start=1):
+        place = tree.pose(camera.frame_id, poses.body)
+        if place is None:
+            job.source.note(
+                f"{camera.topic}: no static transforms connect {camera.frame_id!r} to "
+                f"{poses.body!r}, so its images are not in images.txt"
+            )
+            continue
+        missing = 0
+        for time, name in zip(camera.times.tolist(), files, strict=True):
+            pose = track.at(time)
+            if pose is None:
+                missing += 1
+                continue
+            image += 1
+            seen = inverse(pose @ place)
+            x, y, z, w = quaternion_of(seen[:3, :3])
+            values = [w, x, y, z, *seen[:3, 3].tolist()]
+            yield f"{image} {' '.join(map(repr, values))} {number} {name}\n\n"
+        if missing:
+            job.source.note(
+                f"{camera.topic}: {missing} of {len(camera)} images are before the first or "
+                "after the last pose, so they are not in images.txt"
+            )
+    job.source.exported[poses.topic] += len(track.times)
+    job.places[f"{_MODEL}/images.txt"] = poses.topic
+    job.source.note(f"{poses.topic}: poses of images are interpolated between the recorded ones")
+
+
+@dataclass(frozen=True)
+class PoseTrack:
+    """Poses of a body over time, for interpolation.
+
+    Attributes:
+        times: Nanoseconds, increasing, shape (poses,).
+        values: Position x, y, z and quaternion x, y, z, w; shape (poses, 7).
+    """
+
+    times: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rows: Iterable[Row]) -> PoseTrack:
+        """The poses of rows by time: the first of several with the same time.
+
+        Those without an orientation are left out: a quaternion that nobody set is all zeros.
+        """
+        found = [(time, row) for time, row in rows if np.isfinite(row).all() and any(row[3:])]
+        times = np.array([time for time, _ in found], np.int64)
+        values = np.array([row for _, row in found], np.float64).reshape(-1, 7)
+        times, places = np.unique(times, return_index=True)
+        return cls(times, values[places])
+
+    def at(self, time: int) -> Pose | None:
+        """The interpolated pose at a time; None outside the first and last."""
+        after = int(np.searchsorted(self.times, time))
+        if after < len(self.times) and self.times[after] == time:
+            return pose_matrix(self.values[after, :3], self.values[after, 3:])
+        if not 0 < after < len(self.times):
+            return None
+        start, end = int(self.times[after - 1]), int(self.times[after])
+        share = (time - start) / (end - start)
+        before, later = self.values[after - 1], self.values[after]
+        position = (1 - share) * before[:3] + share * later[:3]
+        return pose_matrix(position, _between(before[3:], later[3:], share))
+
+
+def _between(
+    start: NDArray[np.float64], end: NDArray[np.float64], share: float
+) -> NDArray[np.float64]:
+    """The rotation at a fraction of the shorter way from one quaternion to another."""
+    start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
+    cosine = float(start @ end)
+    if cosine < 0:
+        end, cosine = -end, -cosine
+    angle = float(np.arccos(min(1.0, cosine)))
+    if angle < 1e-6:
+        return start + share * (end - start)
+    found: NDArray[np.float64] = (
+        np.sin((1 - share) * angle) * start + np.sin(share * angle) * end
+    ) / np.sin(angle)
+    return found
