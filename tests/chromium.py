@@ -121,11 +121,12 @@ class Tab:
 
 
 @contextmanager
-def chromium(profile: Path, *, width: int = 1280, height: int = 900) -> Iterator[Tab]:
+def chromium(profile: Path, *flags: str, width: int = 1280, height: int = 900) -> Iterator[Tab]:
     """A browser with an empty page.
 
     Args:
         profile: An empty folder.
+        flags: More words of its command line.
         width: Of the window, pixels.
         height: Of the window, pixels.
     """
@@ -138,7 +139,8 @@ def chromium(profile: Path, *, width: int = 1280, height: int = 900) -> Iterator
             *("--no-first-run", "--disable-background-networking", "--disable-sync"),
             *("--disable-component-update", "--disable-dev-shm-usage", "--mute-audio"),
             *("--hide-scrollbars", "--force-color-profile=srgb", "--remote-debugging-port=0"),
-            *(f"--window-size={width},{height}", f"--user-data-dir={profile}", "about:blank"),
+            *(f"--window-size={width},{height}", f"--user-data-dir={profile}", *flags),
+            "about:blank",
         ],
         stdin=subprocess.DEVNULL,
         stdout=log,
@@ -180,3 +182,75 @@ def _tab(socket: Any) -> Tab:
     for domain in ("Page", "Runtime", "Log", "Network"):
         tab.command(f"{domain}.enable")
     return tab
+
+
+# ---------------------------------------------------------------- videos
+
+PAGE = """<!doctype html><meta charset="utf-8"><title>player</title><script>
+const once = (node, name) => new Promise((resolve, reject) => {
+  node.addEventListener(name, resolve, {once: true});
+  node.addEventListener("error", () => reject(
+    new Error(`${name}: ${node.error && node.error.code} ${node.error && node.error.message}`)));
+});
+async function load(url) {
+  const video = document.createElement("video");
+  video.muted = true;
+  video.preload = "auto";
+  document.body.replaceChildren(video);
+  const loaded = once(video, "loadeddata");
+  video.src = url;
+  await loaded;
+  return video;
+}
+// the metadata of the next frame that is shown: "seeked" comes before the picture is there
+const presented = video => new Promise(
+  resolve => video.requestVideoFrameCallback((_, metadata) => resolve(metadata)));
+function means(video) {
+  const canvas = document.createElement("canvas");
+  canvas.width = video.videoWidth;
+  canvas.height = video.videoHeight;
+  const context = canvas.getContext("2d", {willReadFrequently: true});
+  context.drawImage(video, 0, 0);
+  const w = Math.floor(canvas.width / 8), h = Math.floor(canvas.height / 6), found = [];
+  for (let row = 0; row < 6; row++) for (let column = 0; column < 8; column++) {
+    const data = context.getImageData(column * w, row * h, w, h).data, sum = [0, 0, 0];
+    for (let i = 0; i < data.length; i += 4) for (let c = 0; c < 3; c++) sum[c] += data[i + c];
+    found.push(sum.map(value => value / (w * h)));
+  }
+  return found;
+}
+async function test(url, times) {
+  const video = await load(url);
+  const size = [video.videoWidth, video.videoHeight];
+  const result = {duration: video.duration, size, frames: []};
+  for (const time of times) {
+    const seeked = once(video, "seeked"), shown = presented(video);
+    video.currentTime = time;
+    await seeked;
+    const mediaTime = (await shown).mediaTime;
+    result.frames.push({mediaTime, means: means(video)});
+  }
+  const fresh = await load(url), ended = once(fresh, "ended");
+  await fresh.play();
+  await ended;
+  result.decoded = fresh.getVideoPlaybackQuality().totalVideoFrames;
+  result.ended = fresh.currentTime;
+  return result;
+}
+</script><body></body>"""
+
+
+@contextmanager
+def video_player(folder: Path) -> Iterator[Tab]:
+    """A browser that plays videos from the disk, whose pixels a page there may see."""
+    (folder / "page.html").write_text(PAGE)
+    (folder / "profile").mkdir()
+    flags = ("--allow-file-access-from-files", "--autoplay-policy=no-user-gesture-required")
+    with chromium(folder / "profile", *flags) as tab:
+        tab.open((folder / "page.html").as_uri(), ready="typeof test === 'function'")
+        yield tab
+
+
+def played(player: Tab, video: Path, times: list[float]) -> dict[str, Any]:
+    """What a browser says of a video: of the frames at some times, and when it is played."""
+    return dict(player.evaluate(f"test({json.dumps(video.as_uri())}, {times})"))

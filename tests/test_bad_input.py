@@ -35,7 +35,6 @@ from commands import (
     unchanged,
     without_progress,
 )
-from conftest import real
 from mp4ds.plugins import demo as demo_of
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
@@ -226,34 +225,6 @@ def test_info_on_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None
         refused(call("info", path), 2, word)
 
 
-@pytest.mark.parametrize("name", ["missing", "half.mcap", "split-missing"])
-def test_the_real_command_says_the_same(name: str, tmp_path: Path) -> None:
-    make, word = BAD_SOURCES[name]
-    path = make(tmp_path)
-    with unchanged(tmp_path):
-        refused(run("pack", path, "-o", tmp_path / "dataset"), 2, word)
-
-
-@pytest.mark.parametrize(
-    ("name", "word"),
-    [
-        ("truncated.bag", "rosbag reindex"),
-        ("unindexed.bag", "rosbag reindex"),
-        ("truncated_a.mcap", "ends before its footer"),
-        ("zero_bytes.bag", "is empty"),
-        ("lfs_pointer.bag", "git lfs pull"),
-        ("header_only_dummy_600chunks.bag", "header_only_dummy_600chunks.bag"),
-    ],
-)
-def test_real_recordings_that_cannot_be_read(name: str, word: str, tmp_path: Path) -> None:
-    path = real(f"corrupt/{name}")
-    before = path.read_bytes()
-    for arguments in (("pack", path, "-o", tmp_path / "dataset"), ("info", path)):
-        refused(call(*arguments), 2, word)
-    assert path.read_bytes() == before
-    assert tree(tmp_path) == {}
-
-
 def test_one_bad_part_of_several(small_bag: Path, tmp_path: Path) -> None:
     (tmp_path / "second").mkdir()
     second = cut("bag", 0.5)(tmp_path / "second")
@@ -310,11 +281,6 @@ def test_nothing_for_a_video(content: str, kind: str, tmp_path: Path, compare: C
     packed = round_trip(source, kind, tmp_path, compare)
     assert "no topic became a video" in packed.out
     assert not list(tmp_path.glob("dataset/*.mp4"))
-
-
-def test_a_real_bag_without_messages(tmp_path: Path, compare: Compare) -> None:
-    packed = round_trip(real("bags/no_messages.bag"), "bag", tmp_path, compare)
-    assert "no topic became a video" in packed.out
 
 
 def with_short_images() -> Scene:
@@ -488,34 +454,6 @@ def test_pack_replaces_a_dataset_with_force_only(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["dataset", "drive.bag"]
 
 
-def test_pack_replaces_an_empty_folder_with_force_only(small_bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    with unchanged(tmp_path):
-        refused(call("pack", small_bag, "-o", tmp_path / "empty"), 2, "already exists")
-    assert call("pack", small_bag, "-o", tmp_path / "empty", "--force").code == 0
-    assert mp4ds.validate(tmp_path / "empty") == []
-
-
-@pytest.mark.parametrize("what", ["folder", "file", "rosbag2", "link"])
-def test_pack_never_replaces_what_it_did_not_make(
-    what: str, small_bag: Path, tmp_path: Path
-) -> None:
-    target = tmp_path / "target"
-    if what == "folder":
-        target.mkdir()
-        (target / "thesis.tex").write_text("ten years of work")
-    elif what == "file":
-        target.write_text("ten years of work")
-    elif what == "rosbag2":
-        write_rosbag2(target, scene("mono8", frames=2))
-    else:
-        (tmp_path / "elsewhere").write_text("ten years of work")
-        target.symlink_to("elsewhere")
-    with unchanged(tmp_path):
-        result = call("pack", small_bag, "-o", target, "--force")
-        refused(result, 2, str(target), "--force does not replace")
-
-
 @pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
 def test_unpack_replaces_its_own_output_with_force_only(
     to: str, small_dataset: Path, tmp_path: Path
@@ -531,22 +469,6 @@ def test_unpack_replaces_its_own_output_with_force_only(
     if to == "images":
         assert tree(target) == first
     assert len(list(tmp_path.iterdir())) == 2
-
-
-@pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
-@pytest.mark.parametrize("what", ["folder", "dataset"])
-def test_unpack_never_replaces_a_folder_it_did_not_make(
-    what: str, to: str, small_dataset: Path, tmp_path: Path
-) -> None:
-    target = tmp_path / "target"
-    if what == "folder":
-        target.mkdir()
-        (target / "thesis.tex").write_text("ten years of work")
-    else:
-        shutil.copytree(small_dataset, target)
-    with unchanged(tmp_path):
-        result = call("unpack", small_dataset, "--to", to, "-o", target, "--force")
-        refused(result, 2, str(target), "--force does not replace it")
 
 
 def test_what_is_replaced_stays_until_the_new_one_is_whole(
@@ -575,23 +497,8 @@ def test_packing_onto_the_source(kind: str, force: bool, tmp_path: Path) -> None
         refused(call("pack", source, "-o", source, *["--force"] * force), 2, str(source))
 
 
-def test_packing_into_the_source(tmp_path: Path) -> None:
-    source = SOURCES["rosbag2-sqlite3-v9"](tmp_path, scene("mono8", frames=3))[0]
-    with unchanged(tmp_path):
-        refused(call("pack", source, "-o", source / "dataset"), 2, str(source))
-
-
 def test_packing_a_part_of_a_dataset_onto_it(small_dataset: Path, tmp_path: Path) -> None:
     source = small_dataset / "messages.mcap"
-    with unchanged(tmp_path):
-        refused(call("pack", source, "-o", small_dataset, "--force"), 2, str(small_dataset))
-
-
-def test_packing_onto_a_dataset_that_holds_the_source(
-    small_bag: Path, small_dataset: Path, tmp_path: Path
-) -> None:
-    source = small_dataset / "drive.bag"
-    shutil.move(str(small_bag), source)
     with unchanged(tmp_path):
         refused(call("pack", source, "-o", small_dataset, "--force"), 2, str(small_dataset))
 
@@ -605,18 +512,6 @@ def test_unpacking_into_the_dataset(
     with unchanged(tmp_path):
         result = call("unpack", small_dataset, "--to", to, "-o", target, "--force")
         refused(result, 2, str(small_dataset))
-
-
-def test_unpacking_onto_a_folder_that_holds_the_dataset(
-    small_dataset: Path, tmp_path: Path
-) -> None:
-    recording = tmp_path / "drive"
-    write_rosbag2(recording, scene("mono8", frames=2))
-    inside = recording / "dataset"
-    shutil.move(str(small_dataset), inside)
-    with unchanged(tmp_path):
-        result = call("unpack", inside, "--to", "rosbag2", "-o", recording, "--force")
-        refused(result, 2, str(recording))
 
 
 @pytest.mark.parametrize("name", ["cam_image_raw.mp4", "cam_image_raw.yaml"])
@@ -658,21 +553,6 @@ def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> N
             result = call("unpack", demo / "drive", *options, disk / name)
         refused(result, 1, str(disk / "x"), "No space left")
         assert tree(disk) == {}
-
-
-def test_the_real_command_on_a_full_disk(demo: Path, tmp_path: Path) -> None:
-    with mounted(tmp_path / "disk", "size=512k") as disk:
-        result = run("pack", demo / "drive.bag", "-o", disk / "x")
-        refused(result, 1, str(disk / "x"), "No space left")
-        assert tree(disk) == {}
-
-
-def test_a_full_disk_leaves_what_was_there(demo: Path, small_dataset: Path, tmp_path: Path) -> None:
-    with mounted(tmp_path / "disk", "size=512k") as disk:
-        shutil.copytree(small_dataset, disk / "x")
-        with unchanged(disk):
-            result = call("pack", demo / "drive.bag", "-o", disk / "x", "--force")
-            refused(result, 1, "No space left")
 
 
 CODED_KINDS = ["jpeg-444", "png-16-bit-cv2", "depth-32FC1-rvl", "video-h264", "video-vp9"]
@@ -737,17 +617,6 @@ def test_interrupting_a_pack(long_demo: Path, tmp_path: Path) -> None:
     with unchanged(tmp_path), unchanged(long_demo.parent):
         result = interrupted(tmp_path, "pack", long_demo, "-o", tmp_path / "x", *SLOW)
         refused(result, 130, "interrupted")
-
-
-def test_interrupting_a_pack_leaves_what_was_there(
-    long_demo: Path, small_dataset: Path, tmp_path: Path
-) -> None:
-    with unchanged(tmp_path):
-        target = small_dataset
-        result = interrupted(tmp_path, "pack", long_demo, "-o", target, *SLOW, "--force", "--json")
-        assert result.code == 130
-        assert "Traceback" not in result.err
-        assert parsed(result)["exit_code"] == 130
 
 
 @pytest.mark.parametrize(
@@ -877,7 +746,10 @@ def test_a_jpeg_quality_that_is_wrong(quality: int, small_dataset: Path, tmp_pat
         result = call("unpack", small_dataset, *options)
         assert result.code == 2
         assert "--jpeg-quality" in result.err
-    with unchanged(tmp_path), pytest.raises(mp4ds.OptionError, match=f"{quality} is not from 1"):
+    with (
+        unchanged(tmp_path),
+        pytest.raises(mp4ds.OptionError, match=f"{quality} is (below|above) 1"),
+    ):
         mp4ds.unpack(small_dataset, "mcap", None, mp4ds.UnpackOptions(jpeg_quality=quality))
 
 
@@ -1017,15 +889,6 @@ def test_json_of_success(
     assert keys[command] in parsed(result)
 
 
-@pytest.mark.parametrize("what", ["DATASET", "SIDECAR"])
-def test_json_of_info_on_a_dataset(what: str, small_dataset: Path) -> None:
-    path = small_dataset if what == "DATASET" else small_dataset / "cam_image_raw.yaml"
-    result = call("info", path, "--json")
-    assert (result.code, result.err) == (0, "")
-    topics = {topic["topic"]: topic for topic in parsed(result)["topics"]}
-    assert topics["/cam/image_raw"]["messages"] == 8
-
-
 @pytest.mark.parametrize(
     ("arguments", "code"),
     [
@@ -1057,13 +920,6 @@ def test_json_of_problems(small_dataset: Path) -> None:
     problems = parsed(result)["problems"]
     assert [problem["code"] for problem in problems] == ["file-missing"]
     assert set(problems[0]) >= {"code", "place", "message"}
-
-
-def test_json_of_the_real_command(small_bag: Path, tmp_path: Path) -> None:
-    packed = run("pack", small_bag, "-o", tmp_path / "x", "--json")
-    assert packed.code == 0
-    assert all(json.loads(line)["event"] for line in packed.err.splitlines())
-    assert parsed(packed)["dataset"] == str(tmp_path / "x")
 
 
 def test_a_newer_minor_version_is_told_in_one_line(small_dataset: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -179,13 +178,6 @@ def test_tiles_are_where_the_spec_says(width: int, height: int) -> None:
         for x in range(width):
             assert picture[(y % 2) * h + y // 2, (x % 2) * w + x // 2] == pixels[y, x]
     assert set(picture.ravel().tolist()) == set(pixels.ravel().tolist())  # no stray samples
-
-
-def test_tiles_hold_one_colour_each() -> None:
-    mosaic = np.array([[10, 20] * 3, [30, 40] * 3] * 2, np.uint8)
-    (picture,) = bind("mosaic8", ENCODINGS["bayer_rggb8"]).to_picture(mosaic)
-    quarters = (picture[:2, :3], picture[:2, 3:], picture[2:, :3], picture[2:, 3:])
-    assert [np.unique(quarter).tolist() for quarter in quarters] == [[10], [20], [30], [40]]
 
 
 def test_signed_samples_keep_their_order() -> None:
@@ -494,26 +486,6 @@ def test_images_of_few_values_have_palettes(encoding: str, count: int) -> None:
     layout.to_pixels((picture | 0xF0,), np.empty_like(images[0]))  # damaged: no error
 
 
-@pytest.mark.parametrize("encoding", ["mono16", "32FC1"])
-def test_numbers_beyond_a_table_are_no_error(encoding: str) -> None:
-    """A damaged video must not do more than give other pixels."""
-    known = ENCODINGS[encoding]
-    layout = bind("table", known, Parameters(table=(5, 9)))
-    out = np.zeros((1, 3), known.dtype)
-    layout.to_pixels((np.array([[0, 1, 255]], np.uint8),), out)
-    assert out.view(f"u{out.itemsize}").tolist() == [[5, 9, 9]]
-
-
-@pytest.mark.parametrize("name", ["gray_bits", "fold", "metres16", "metres_fold"])
-def test_any_picture_gives_some_pixels(name: str) -> None:
-    encoding = ENCODINGS["32FC1" if name.startswith("metres") else "16SC1"]
-    layout = bound(name, encoding)
-    sample = np.uint8 if layout.pixel_format == "gray" else np.uint16
-    width, height = layout.picture_size(5, 4)
-    picture = np.full((height, width), np.iinfo(sample).max, sample)
-    layout.to_pixels((picture,), np.empty((4, 5), encoding.dtype))
-
-
 COUNTS = np.arange(1, 65536, dtype=np.float32).reshape(255, 257)
 
 
@@ -528,15 +500,6 @@ def test_all_millimetres_come_back(name: str, hole: int, scale: str) -> None:
     assert layout.parameters == Parameters(hole=hole, scale=scale)
     assert layout.refuses(pixels) is None
     assert bits_of(through(layout, pixels)) == bits_of(pixels)
-
-
-def test_the_usual_ways_to_metres_are_two() -> None:
-    """In double precision and rounded, both are the quotient."""
-    counts = COUNTS.astype(np.float64)
-    quotient = bits_of(COUNTS / np.float32(1000))
-    assert bits_of((counts / 1000).astype(np.float32)) == quotient
-    assert bits_of((counts * 0.001).astype(np.float32)) == quotient
-    assert bits_of(COUNTS * np.float32(0.001)) != quotient
 
 
 @pytest.mark.parametrize(
@@ -621,24 +584,6 @@ def test_layouts_that_cannot_be(
         bind(layout, ENCODINGS[encoding], Parameters.from_values(parameters))
 
 
-def test_parameters_are_plain_values() -> None:
-    for name, layout in PAIRS:
-        parameters = bound(layout, ENCODINGS[name]).parameters
-        plain = parameters.to_values()
-        assert Parameters.from_values(plain) == parameters
-        assert set(plain) == LAYOUTS[layout].parameters
-        assert all(isinstance(value, (int, str, list)) for value in plain.values())
-        assert (parameters == NO_PARAMETERS) == (not plain)
-        if plain:
-            with pytest.raises(ValueError, match="needs the parameters"):
-                bind(layout, ENCODINGS[name], replace(parameters, **{next(iter(plain)): None}))
-
-
-def test_unknown_parameters() -> None:
-    with pytest.raises(ValueError, match="'colour'"):
-        Parameters.from_values({"bits": 12, "colour": 3})
-
-
 # ---------------------------------------------------------------- views
 
 
@@ -679,14 +624,6 @@ def test_a_view_of_bytes_is_read_only_and_not_a_copy() -> None:
     assert np.shares_memory(view, np.frombuffer(data, np.uint8))
 
 
-@pytest.mark.parametrize("name", ["mono8", "mono16", "rgb8", "bgra8", "16UC1", "nv12"])
-def test_plain_pictures_are_no_copies(name: str) -> None:
-    encoding = ENCODINGS[name]
-    pixels = as_message(values(encoding, "random", 6, 4), encoding, pad=4)
-    for plane in layout_for(encoding, lossless=True).to_picture(pixels)[:1]:
-        assert np.shares_memory(plane, pixels)
-
-
 @steady
 @given(
     st.sampled_from(["mono8", "rgb8", "nv12", "nv24"]),
@@ -718,16 +655,6 @@ def test_padding(name: str, pad: int, last: bool, value: int | None) -> None:
 
 
 # ---------------------------------------------------------------- what has no layout
-
-
-@pytest.mark.parametrize("name", ENCODINGS)
-def test_ordinary_images_have_one(name: str) -> None:
-    for width, height in [(2, 2), (640, 480), (1920, 1080)]:
-        for pad in [0, 5, MAX_ROW_PADDING]:
-            encoding = ENCODINGS[name]
-            step = width * encoding.pixel_bytes + pad
-            size = encoding.size(step, height)
-            assert why_not(name, width=width, height=height, step=step, size=size) is None
 
 
 def test_the_largest_image_is_the_one_of_the_largest_picture() -> None:

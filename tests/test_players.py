@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 import subprocess
-import threading
-import time
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +19,7 @@ from av.video.reformatter import ColorRange
 from numpy.typing import NDArray
 
 import mp4ds
+from chromium import Tab, played, video_player
 from coded_scenes import CODED
 from definitions import PICTURES
 from mp4ds.packing.options import PackOptions
@@ -31,12 +27,8 @@ from mp4ds.video.decoder import VideoDecoder
 from pictures import CAREFUL
 from scenes import Record, Scene
 from sources import SOURCES, scene
-from waiting import WATCHDOG_S
 
 WIDTH, HEIGHT, FRAMES = 96, 66, 12
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
-)
 
 
 @dataclass(frozen=True)
@@ -146,19 +138,25 @@ CASES: dict[str, Case] = {
 PLAYED = [name for name, case in CASES.items() if case.browser]
 
 
-@pytest.fixture(scope="module")
-def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A dataset of each kind."""
-    folder = tmp_path_factory.mktemp("players")
-    found = {}
-    for name, case in CASES.items():
-        place = folder / name.replace(" ", "_")
+class Datasets(dict[str, Path]):
+    """A dataset of each kind, made when it is asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._folder = folder
+
+    def __missing__(self, name: str) -> Path:
+        case, place = CASES[name], self._folder / name.replace(" ", "_")
         (place / "source").mkdir(parents=True)
         paths = SOURCES["bag-none"](place / "source", case.scene())
         options = PackOptions(topics=["/cam/*"], **case.options)
-        mp4ds.pack(paths, place / "dataset", options)
-        found[name] = place / "dataset"
-    return found
+        self[name] = mp4ds.pack(paths, place / "dataset", options).dataset
+        return self[name]
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory) -> Datasets:
+    return Datasets(tmp_path_factory.mktemp("players"))
 
 
 def video_of(dataset: Path) -> Path:
@@ -230,7 +228,7 @@ def ffprobe(path: Path, *options: str) -> Any:
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", CASES)
-def test_ffprobe_knows_all(name: str, datasets: dict[str, Path]) -> None:
+def test_ffprobe_knows_all(name: str, datasets: Datasets) -> None:
     case, path = CASES[name], video_of(datasets[name])
     found = ffprobe(path, "-count_frames", "-show_streams", "-show_format")
     (stream,) = found["streams"]
@@ -251,7 +249,7 @@ def test_ffprobe_knows_all(name: str, datasets: dict[str, Path]) -> None:
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", CASES)
-def test_ffprobe_reads_the_times(name: str, datasets: dict[str, Path]) -> None:
+def test_ffprobe_reads_the_times(name: str, datasets: Datasets) -> None:
     path = video_of(datasets[name])
     frames = ffprobe(path, "-show_entries", "frame=best_effort_timestamp,pict_type")["frames"]
     assert [frame["best_effort_timestamp"] for frame in frames] == expected_ticks(datasets[name])
@@ -291,7 +289,7 @@ def untile(picture: NDArray[Any]) -> NDArray[Any]:
 
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", [name for name in CASES if CASES[name].raw])
-def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: dict[str, Path]) -> None:
+def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: Datasets) -> None:
     """Without mp4ds: by ffmpeg, and the words of the spec."""
     case, path = CASES[name], video_of(datasets[name])
     video = yaml.safe_load(path.with_suffix(".yaml").read_bytes())["video"]
@@ -312,7 +310,7 @@ DECODERS = {"h265": "hevc", "ffmpeg": "h264", "av1": "libdav1d"}
     "name", [name for name, case in CASES.items() if case.is_packets and not case.options]
 )
 def test_ffmpeg_decodes_packets_as_if_they_had_just_been_recorded(
-    name: str, datasets: dict[str, Path]
+    name: str, datasets: Datasets
 ) -> None:
     case, path = CASES[name], video_of(datasets[name])
     codec = name.split()[1] if name.startswith("packets") else "mjpeg"
@@ -330,7 +328,7 @@ SHOWN = [name for name, case in CASES.items() if case.codec != "ffv1" and not ca
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", SHOWN)
-def test_ffmpeg_shows_the_same_colours(name: str, datasets: dict[str, Path]) -> None:
+def test_ffmpeg_shows_the_same_colours(name: str, datasets: Datasets) -> None:
     """Nearly, where it is told in which way to interpolate: its weights are not to a 32nd.
 
     It decodes JPEG in another way than libjpeg, and mp4ds as libjpeg does.
@@ -359,7 +357,7 @@ def blocks(picture: NDArray[Any]) -> NDArray[np.float64]:
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", CASES)
-def test_pyav_plays_and_seeks(name: str, datasets: dict[str, Path]) -> None:
+def test_pyav_plays_and_seeks(name: str, datasets: Datasets) -> None:
     ticks = expected_ticks(datasets[name])
     with av.open(str(video_of(datasets[name]))) as container:
         stream = container.streams.video[0]
@@ -376,189 +374,11 @@ def test_pyav_plays_and_seeks(name: str, datasets: dict[str, Path]) -> None:
 
 # ---------------------------------------------------------------- a browser
 
-PAGE = """<!doctype html><meta charset="utf-8"><title>player</title><script>
-const once = (node, name) => new Promise((resolve, reject) => {
-  node.addEventListener(name, resolve, {once: true});
-  node.addEventListener("error", () => reject(
-    new Error(`${name}: ${node.error && node.error.code} ${node.error && node.error.message}`)));
-});
-async function load(name) {
-  const video = document.createElement("video");
-  video.muted = true;
-  video.preload = "auto";
-  document.body.replaceChildren(video);
-  const loaded = once(video, "loadeddata");
-  video.src = "/video/" + encodeURIComponent(name);
-  await loaded;
-  return video;
-}
-// the metadata of the next frame that is shown: "seeked" comes before the picture is there
-const presented = video => new Promise(
-  resolve => video.requestVideoFrameCallback((_, metadata) => resolve(metadata)));
-function means(video) {
-  const canvas = document.createElement("canvas");
-  canvas.width = video.videoWidth;
-  canvas.height = video.videoHeight;
-  const context = canvas.getContext("2d", {willReadFrequently: true});
-  context.drawImage(video, 0, 0);
-  const w = Math.floor(canvas.width / 8), h = Math.floor(canvas.height / 6), found = [];
-  for (let row = 0; row < 6; row++) for (let column = 0; column < 8; column++) {
-    const data = context.getImageData(column * w, row * h, w, h).data, sum = [0, 0, 0];
-    for (let i = 0; i < data.length; i += 4) for (let c = 0; c < 3; c++) sum[c] += data[i + c];
-    found.push(sum.map(value => value / (w * h)));
-  }
-  return found;
-}
-async function test(name, times) {
-  const video = await load(name);
-  const size = [video.videoWidth, video.videoHeight];
-  const result = {duration: video.duration, size, frames: []};
-  for (const time of times) {
-    const seeked = once(video, "seeked"), shown = presented(video);
-    video.currentTime = time;
-    await seeked;
-    const mediaTime = (await shown).mediaTime;
-    result.frames.push({mediaTime, means: means(video)});
-  }
-  const fresh = await load(name), ended = once(fresh, "ended");
-  await fresh.play();
-  await ended;
-  result.decoded = fresh.getVideoPlaybackQuality().totalVideoFrames;
-  result.ended = fresh.currentTime;
-  return result;
-}
-(async () => {
-  for (const [name, times] of Object.entries(await (await fetch("/jobs")).json())) {
-    let result;
-    const late = new Promise((_, reject) => setTimeout(reject, 20000, new Error("takes too long")));
-    try { result = await Promise.race([test(name, times), late]); }
-    catch (error) { result = {error: String(error)}; }
-    const body = JSON.stringify(result);
-    await fetch("/result/" + encodeURIComponent(name), {method: "POST", body});
-  }
-})();
-</script><body></body>"""
-
-
-class Server(ThreadingHTTPServer):
-    """Serves the page, the videos by byte ranges, and takes the results."""
-
-    daemon_threads = True
-
-    def __init__(self, videos: dict[str, Path], jobs: dict[str, list[float]]) -> None:
-        super().__init__(("127.0.0.1", 0), Handler)
-        self.videos = videos
-        self.jobs = jobs
-        self.results: dict[str, Any] = {}
-        self.done = threading.Event()
-
-
-class Handler(BaseHTTPRequestHandler):
-    """Of one request."""
-
-    server: Server
-    protocol_version = "HTTP/1.1"
-
-    def log_message(self, *_: object) -> None:
-        """Say nothing."""
-
-    def do_GET(self) -> None:
-        kind, _, name = self.path.lstrip("/").partition("/")
-        if kind == "video":
-            self._send_video(self.server.videos[name.replace("%20", " ")].read_bytes())
-        elif kind == "jobs":
-            self._send(200, "application/json", json.dumps(self.server.jobs).encode())
-        elif kind == "":
-            self._send(200, "text/html", PAGE.encode())
-        else:
-            self._send(404, "text/plain", b"")
-
-    def do_POST(self) -> None:
-        name = self.path.rpartition("/")[2].replace("%20", " ")
-        body = self.rfile.read(int(self.headers["Content-Length"]))
-        self.server.results[name] = json.loads(body)
-        self._send(200, "text/plain", b"ok")
-        if len(self.server.results) == len(self.server.jobs):
-            self.server.done.set()
-
-    def _send_video(self, data: bytes) -> None:
-        first, last = 0, len(data) - 1
-        asked = self.headers.get("Range", "")
-        if asked.startswith("bytes="):
-            start, _, end = asked.removeprefix("bytes=").partition("-")
-            first, last = int(start), min(int(end or last), last)
-        extra = {"Accept-Ranges": "bytes"}
-        if asked:
-            extra["Content-Range"] = f"bytes {first}-{last}/{len(data)}"
-        self._send(206 if asked else 200, "video/mp4", data[first : last + 1], extra)
-
-    def _send(
-        self, status: int, kind: str, body: bytes, extra: dict[str, str] | None = None
-    ) -> None:
-        self.send_response(status)
-        for key, value in {
-            "Content-Type": kind,
-            "Content-Length": str(len(body)),
-            "Cache-Control": "no-store",
-            **(extra or {}),
-        }.items():
-            self.send_header(key, value)
-        self.end_headers()
-        self.wfile.write(body)
-
-
-def browse(videos: dict[str, Path], jobs: dict[str, list[float]], profile: Path) -> dict[str, Any]:
-    """What a browser says of each video.
-
-    Args:
-        videos: By name.
-        jobs: For each the times to be sought, in seconds.
-        profile: An empty folder.
-    """
-    if not CHROMIUM:
-        pytest.skip("there is no Chromium")
-    with Server(videos, jobs) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
-        thread.start()
-        log = (profile / "log.txt").open("wb")
-        browser = subprocess.Popen(
-            [
-                *(CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic"),
-                *("--no-first-run", "--disable-background-networking", "--disable-sync"),
-                *("--disable-component-update", "--disable-dev-shm-usage", "--mute-audio"),
-                *("--autoplay-policy=no-user-gesture-required", "--hide-scrollbars"),
-                *("--force-color-profile=srgb", "--remote-debugging-port=0"),
-                *(f"--user-data-dir={profile}", f"http://127.0.0.1:{server.server_port}/"),
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,  # a group of its own, to be ended as a whole
-        )
-        try:
-            end = time.monotonic() + WATCHDOG_S
-            while not server.done.wait(0.1) and time.monotonic() < end and browser.poll() is None:
-                pass
-        finally:
-            with suppress(ProcessLookupError):
-                os.killpg(browser.pid, signal.SIGKILL)
-            browser.wait()
-            log.close()
-            server.shutdown()
-            thread.join()
-        if not server.results:
-            pytest.fail(f"the browser played nothing: {(profile / 'log.txt').read_text()[-2000:]}")
-        results = server.results
-    shutil.rmtree(profile, ignore_errors=True)
-    return results
-
 
 @pytest.fixture(scope="module")
-def played(datasets: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What a browser says of each video."""
-    videos = {name: video_of(datasets[name]) for name in PLAYED}
-    jobs = {name: middle_times(datasets[name]) for name in PLAYED}
-    return browse(videos, jobs, tmp_path_factory.mktemp("profile"))
+def player(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with video_player(tmp_path_factory.mktemp("player")) as tab:
+        yield tab
 
 
 CHOSEN = (0, 7, 3, FRAMES - 2)
@@ -571,29 +391,20 @@ def middle_times(dataset: Path) -> list[float]:
 
 
 @pytest.mark.browser
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("name", PLAYED)
-def test_a_browser_plays_it(name: str, played: dict[str, Any], datasets: dict[str, Path]) -> None:
-    assert name in played, "the browser did not come to this video in time"
-    result = played[name]
-    assert "error" not in result, result["error"]
-    assert result["size"] == [WIDTH, HEIGHT]
-    span = expected_ticks(datasets[name])[-1] / 1e6
-    assert span < result["duration"] < span + 0.2
-    assert result["ended"] == pytest.approx(result["duration"], abs=0.05)
-    assert result["decoded"] == FRAMES
-
-
 @pytest.mark.one_in(5)
-@pytest.mark.browser
 @pytest.mark.parametrize("name", PLAYED)
 def test_a_browser_shows_the_right_frames_in_the_right_colours(
-    name: str, played: dict[str, Any], datasets: dict[str, Path]
+    name: str, player: Tab, datasets: Datasets
 ) -> None:
-    pictures = shown_pictures(datasets[name], centred=CASES[name].is_left)
+    result = played(player, video_of(datasets[name]), middle_times(datasets[name]))
+    assert result["size"] == [WIDTH, HEIGHT]
     ticks = expected_ticks(datasets[name])
-    assert len(played[name]["frames"]) == len(CHOSEN)
-    for number, found in zip(CHOSEN, played[name]["frames"], strict=True):
+    assert ticks[-1] / 1e6 < result["duration"] < ticks[-1] / 1e6 + 0.2
+    assert result["ended"] == pytest.approx(result["duration"], abs=0.05)
+    assert result["decoded"] == FRAMES
+    pictures = shown_pictures(datasets[name], centred=CASES[name].is_left)
+    assert len(result["frames"]) == len(CHOSEN)
+    for number, found in zip(CHOSEN, result["frames"], strict=True):
         assert found["mediaTime"] == pytest.approx(ticks[number] / 1e6, abs=2e-6)
         shown = np.array(found["means"]).reshape(6, 8, 3)
         distances = [np.abs(shown - blocks(picture)).max() for picture in pictures]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import itertools
 import json
 import os
 import pty
@@ -12,7 +11,6 @@ import re
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from datetime import datetime, timedelta, timezone
@@ -33,9 +31,6 @@ from mp4ds.cli.progress import (
     duration_text,
     left_text,
     on_terminal,
-    pack_progress,
-    percent_text,
-    plain,
     progress_to,
 )
 from mp4ds.packing.options import PackProgress
@@ -108,11 +103,6 @@ def test_the_time_left_is_by_what_this_run_did(begin: float, before: int) -> Non
     assert job.share == pytest.approx(begin + 0.4 * (1 - begin))
 
 
-def test_a_pace_that_changes_is_followed() -> None:
-    job = paced(lambda n: n / 1000 if n < 500 else 0.5 + (n - 500) / 4000, 700)
-    assert job.seconds_left == pytest.approx(0.45 * 4000, rel=0.05)
-
-
 @pytest.mark.parametrize(
     "state",
     [told(None, parts=0), told(0.5, phase="planning"), told(None, phase="planning", parts=0)],
@@ -128,36 +118,10 @@ def test_nothing_is_told_that_is_not_known(state: PackProgress) -> None:
     assert job.share in (None, 0.0)
 
 
-def test_the_least_share_that_there_is() -> None:
-    clock = Clock(0.0)
-    job = PackState(clock=clock)
-    for seconds, share in ((0.0, 0.0), (5.0, 0.0), (6.0, 5e-324), (7.0, 1e-323), (8.0, 1e-9)):
-        clock.seconds = seconds
-        job.take(told(share))
-        assert job.seconds_left is None or job.seconds_left > 0
-
-
-def test_no_time_left_is_told_of_a_share_of_a_job() -> None:
-    clock = Clock()
-    job = PackState(whole=False, clock=clock)
-    for n in range(100):
-        clock.seconds = 1000.0 + n
-        job.take(told(n / 200))
-    assert job.seconds_left is None
-    assert job.share == 99 / 200
-
-
 def test_parts_tell_where_the_work_does_not() -> None:
     job = PackState()
     job.take(told(None, tasks_done=119))
     assert job.share == 119 / 240
-
-
-def test_datasets_count_by_their_size() -> None:
-    job = PackState()
-    job.take(told(1.0, dataset="a", gigabytes=10, phase="joining"))
-    job.take(told(0.5, dataset="b", gigabytes=30))
-    assert job.share == pytest.approx(25 / 40)
 
 
 # ---------------------------------------------------------------- anything at all
@@ -247,34 +211,6 @@ def test_the_log_of_a_pack() -> None:
     assert [line[:8] for line in lines[2:-1]] == [f"12:0{n}:10" for n in range(1, 5)]
 
 
-@pytest.mark.parametrize("outcome", ["done", "failed", "interrupted"])
-def test_the_last_line_tells_how_it_ended(outcome: str) -> None:
-    assert (
-        f" packing drive: {outcome} after 60 s | "
-        in logged(lambda n: n / 200, 60, outcome=outcome)[-1]
-    )
-
-
-def test_the_lines_of_a_long_pack_become_rare() -> None:
-    lines = logged(lambda now: now / (60 * HOUR), 60 * HOUR, step=5.0)
-    times = []
-    day, last = 0, -1.0
-    for line in lines[1:]:
-        hours, minutes, seconds = map(int, line[:8].split(":"))
-        at = day * 86_400 + hours * 3600 + minutes * 60 + seconds
-        if at < last:
-            day, at = day + 1, at + 86_400
-        times.append(at - 12 * HOUR)
-        last = at
-    gaps = [b - a for a, b in itertools.pairwise(times)]
-    assert times[0] == 10
-    assert gaps[0] == 60
-    assert max(gaps) == 600
-    assert all(b >= a for a, b in itertools.pairwise(gaps[:50]))
-    assert len(lines) < 500
-    assert re.search(r"\| 2 d 1\d h left$|\| \d+ h \d+ min left$", lines[40])
-
-
 def test_a_resumed_pack_tells_what_was_done_before() -> None:
     clock, stream = Clock(), io.StringIO()
     log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
@@ -282,21 +218,6 @@ def test_a_resumed_pack_tells_what_was_done_before() -> None:
         clock.seconds = 1000.0 + n
         log.take(told(0.8 + n / 10_000, before=192))
     assert "192 parts were already done" in stream.getvalue().splitlines()[0]
-
-
-def test_silence_is_logged_too() -> None:
-    clock, stream = Clock(), io.StringIO()
-    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
-    for n in range(100):
-        clock.seconds = 1000.0 + n
-        log.take(told(n / 1000))
-    for n in range(100, 700):
-        clock.seconds = 1000.0 + n
-        log.tick()
-    lines = stream.getvalue().splitlines()
-    assert len(lines) >= 12
-    assert lines[2].endswith(" | 16 min left")
-    assert re.search(r"/cam0 3564/36000, .* 15 min left$", lines[-1])
 
 
 def test_the_log_of_several_datasets() -> None:
@@ -331,12 +252,6 @@ def test_hostile_names_reach_no_log() -> None:
     assert len(lines) == 2
     assert all(re.fullmatch(r"[ -~]{1,4000}", line) for line in lines)
     assert "and 980 more" in lines[1]
-
-
-def test_lines_are_written_at_once() -> None:
-    stream = io.TextIOWrapper(raw := io.BytesIO(), encoding="ascii", write_through=False)
-    Lines(stream).write("one")
-    assert raw.getvalue() == b"one\n"
 
 
 class _Broken(io.StringIO):
@@ -375,18 +290,6 @@ def test_a_pack_does_not_fail_for_want_of_a_log() -> None:
 def test_durations(seconds: float, text: str) -> None:
     assert duration_text(seconds) == text
     assert left_text(seconds) == (f"{text} left" if seconds else "")
-
-
-@pytest.mark.parametrize(
-    ("share", "text"), [(None, ""), (0, "0 %"), (0.29, "29 %"), (0.9999, "99 %"), (1, "100 %")]
-)
-def test_percents(share: float | None, text: str) -> None:
-    assert percent_text(share) == text
-
-
-def test_long_names_keep_their_end() -> None:
-    assert plain("/robot" * 20 + "/front") == "..." + ("/robot" * 20 + "/front")[-57:]
-    assert plain("/caméra") == "/cam\\xe9ra"
 
 
 # ---------------------------------------------------------------- --json
@@ -467,57 +370,6 @@ def test_the_events_of_a_pack() -> None:
     assert found[-1]["seconds"] == 100.0
 
 
-def test_the_last_event_is_not_lost_and_none_is_told_twice() -> None:
-    clock, stream = Clock(), io.StringIO()
-    events = Events(PackState(clock=clock), Lines(stream), now=clock.now)
-    for n in range(5):
-        clock.seconds = 1000.0 + n / 10
-        events.take(told(n / 4))
-    events.end("done")
-    assert [event.get("done") for event in parsed(stream.getvalue())] == [None, 0.0, 1.0, None]
-
-
-def test_each_dataset_is_told_of_once_a_second() -> None:
-    clock, stream = Clock(), io.StringIO()
-    events = Events(PackState(clock=clock), Lines(stream), now=clock.now)
-    for n in range(81):
-        clock.seconds = 1000.0 + n / 8
-        for name in ("a", "b"):
-            events.take(told(n / 80, dataset=name))
-            events.tick()
-    events.end("interrupted")
-    found = parsed(stream.getvalue())[1:-1]
-    for name in ("a", "b"):
-        own = [event for event in found if event["dataset"].endswith(name)]
-        times = [datetime.fromisoformat(event["time"]).timestamp() for event in own]
-        assert 11 <= len(own) <= 12
-        assert min(b - a for a, b in itertools.pairwise(times[:-1])) >= 1  # and a last one
-        assert own[-1]["done"] == 1.0
-
-
-def test_silence_is_told_of() -> None:
-    clock, stream = Clock(), io.StringIO()
-    events = Events(PackState(clock=clock), Lines(stream), now=clock.now)
-    for n in range(100):
-        clock.seconds = 1000.0 + n
-        events.take(told(n / 1000))
-    for n in range(100, 200):
-        clock.seconds = 1000.0 + n
-        events.tick()
-    events.end("failed")
-    found = parsed(stream.getvalue())
-    assert len(found[101:-1]) == 10
-    assert found[-1]["outcome"] == "failed"
-
-
-def test_a_pack_that_does_not_begin_has_no_events() -> None:
-    stream = io.StringIO()
-    events = Events(PackState(), Lines(stream))
-    events.tick()
-    events.end("failed")
-    assert stream.getvalue() == ""
-
-
 # ---------------------------------------------------------------- while a pack runs
 
 
@@ -564,29 +416,6 @@ def test_the_end_is_told_however_it_comes(error: type[BaseException] | None, out
     assert threading.active_count() == threads
 
 
-@pytest.mark.parametrize("as_json", [False, True])
-def test_a_short_pack_without_a_terminal(as_json: bool, capsys: pytest.CaptureFixture[str]) -> None:
-    with pack_progress(as_json) as take:
-        take(told(0.0))
-        take(told(1.0))
-    out, err = capsys.readouterr()
-    assert out == ""
-    found = parsed(err)
-    assert [event["event"] for event in found] == ["start", "progress", "progress", "end"] * as_json
-
-
-def test_a_short_pack_does_not_import_rich() -> None:
-    program = (
-        "import sys, mp4ds.cli.progress as p\n"
-        "with p.pack_progress(False) as take, p.pack_progress(True): pass\n"
-        "print([name for name in sys.modules if name.split('.')[0] == 'rich'])"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert (result.stdout, result.stderr) == ("[]\n", "")
-
-
 # ---------------------------------------------------------------- other commands
 
 
@@ -625,22 +454,6 @@ def test_a_terminal_shows_each_topic() -> None:
         assert re.search(rf"  /cam{n} .* 30% 10800/36000", text)
 
 
-def test_a_terminal_shows_each_dataset() -> None:
-    joining = told(1.0, dataset="a", phase="joining", note="cam0.mp4")
-    text = screen(told(0.5, dataset="b"), joining)
-    assert re.search(r"packing 2 datasets .* 75% parts 360/480", text)
-    assert re.search(r"  a .*100% joining cam0\.mp4  parts 240/240  50\.0 GB -> 5\.0 GB", text)
-    assert re.search(r"  b .* 50% parts 120/240  25\.0 GB -> 2\.5 GB", text)
-
-
-def test_a_terminal_shows_hostile_names_harmlessly() -> None:
-    topics = {HOSTILE: (1, None), "[red]/[/red]": (2, 3), "{task.id}": (3, 4)}
-    text = screen(told(0.5, topics=topics, phase="joining", note=HOSTILE))
-    assert "\x1b[31m" not in text
-    assert "[red]/[/red]" in text
-    assert "{task.id}" in text
-
-
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, Any]]:
     """The two ends of a terminal: what is shown, and where to write."""
@@ -648,31 +461,6 @@ def terminal() -> Iterator[tuple[int, Any]]:
     with os.fdopen(write_to, "w") as stream:
         yield shown_at, stream
     os.close(shown_at)
-
-
-def test_a_live_terminal(terminal: tuple[int, Any]) -> None:
-    shown_at, stream = terminal
-    console = Console(file=stream, width=100, height=24, _environ={"TERM": "xterm"})
-    read: list[bytes] = []
-    reader = threading.Thread(target=lambda: read.append(_until(shown_at, b"/cam1")), daemon=True)
-    reader.start()
-    threads = threading.active_count()
-    with on_terminal(console) as take:
-        for n in range(10):
-            take(told(n / 10))
-            time.sleep(0.01)
-        reader.join(WATCHDOG_S)
-    until(lambda: threading.active_count() < threads)
-    text = b"".join(read).decode()
-    assert "packing" in text
-    assert "/cam0" in text
-
-
-def _until(file: int, word: bytes) -> bytes:
-    found = b""
-    while word not in found:
-        found += os.read(file, 4096)
-    return found
 
 
 # ---------------------------------------------------------------- the command
@@ -717,18 +505,6 @@ def test_events_of_the_command(drives: list[Path], tmp_path: Path) -> None:
         assert last["tasks_done"] == last["tasks_total"] > 1
         counts = [(topic["done"], topic["total"]) for topic in last["topics"].values()]
         assert counts == [(frames, frames)] * 2
-
-
-def test_events_of_a_pack_in_one_go(drives: list[Path], tmp_path: Path) -> None:
-    result = subprocess.run(
-        command(drives[0], "--output", tmp_path / "x", "--json"),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    found = parsed(result.stderr)
-    assert found[-2]["done"] == found[-2]["job_done"] == 1.0
-    assert found[-2]["tasks_total"] == 0
 
 
 @pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])

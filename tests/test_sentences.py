@@ -308,11 +308,3 @@ def test_what_an_option_may_be(words: str, said: str, tmp_path: Path) -> None:
     assert said in done.err
     assert not re.search("Input should|source is untouched", done.err)
     assert not (tmp_path / "out").exists()
-
-
-def test_h265_is_also_called_hevc(tmp_path: Path) -> None:
-    write_bag(tmp_path / "drive.bag", scene("mono8", frames=2))
-    options = mp4ds.PackOptions(codec="hevc", quality="crf=30", preset="ultrafast")
-    mp4ds.pack(tmp_path / "drive.bag", tmp_path / "drive", options)
-    with mp4ds.open(tmp_path / "drive") as opened:
-        assert [stream.sidecar.video.codec for stream in opened.streams] == ["h265"]

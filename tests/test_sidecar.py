@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,13 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
 from mp4ds import yamlio
-from mp4ds.errors import FormatError, VersionError
+from mp4ds.errors import FormatError
 from mp4ds.format.fields import (
     FORMAT_VERSION,
     MAX_CAMERA_INFOS,
     MAX_FRAMES,
     decode_base64,
     document_of,
-    parse_version,
 )
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.models import ChannelModel, LayoutParameters, SchemaModel, StreamSidecar
@@ -675,16 +673,6 @@ def test_a_missing_file(tmp_path: Path) -> None:
         assert caught.value.code == "file-missing"
 
 
-@pytest.mark.parametrize("version", ["2.0", "10.3", "999999999999.0"])
-def test_a_newer_major_version_is_refused(version: str, tmp_path: Path) -> None:
-    path = write(tmp_path, {"mp4ds": version, "kind": "who knows"})
-    with pytest.raises(VersionError) as caught:
-        load_document(path)
-    assert caught.value.code == "version-unsupported"
-    assert version in str(caught.value)
-    assert FORMAT_VERSION in str(caught.value)
-
-
 @pytest.mark.parametrize("kind", WHOLE)
 def test_a_newer_minor_version_is_read_with_a_warning(kind: str, tmp_path: Path) -> None:
     document = edited(WHOLE[kind](), "mp4ds", "1.7")
@@ -698,26 +686,6 @@ def test_a_newer_minor_version_is_read_with_a_warning(kind: str, tmp_path: Path)
     assert document_of(model) == edited(WHOLE[kind](), "mp4ds", "1.7")
 
 
-def test_a_newer_minor_version_must_keep_the_rest(tmp_path: Path) -> None:
-    document = edited(edited(stream(), "mp4ds", "1.7"), "frames", -1)
-    with (
-        pytest.warns(UserWarning, match="1.7"),
-        pytest.raises(FormatError) as caught,
-    ):
-        load_stream(write(tmp_path, edited(document, "surprise", 1)))
-    assert caught.value.code == "model-invalid"
-
-
-@pytest.mark.parametrize(
-    "version", [1.0, 1, None, "1", "1.0.0", "01.0", "1.00", " 1.0", "", "one", [], ["1.0"], "0.9",
-                "\u0661.\u0660", ...]
-)  # fmt: skip
-def test_what_is_no_version(version: Any, tmp_path: Path) -> None:
-    with pytest.raises(FormatError) as caught:
-        load_document(write(tmp_path, edited(stream(), "mp4ds", version)))
-    assert caught.value.code == "version-unsupported"
-
-
 def test_the_files_kinds_are_told_apart(tmp_path: Path) -> None:
     with pytest.raises(FormatError):
         load_stream(write(tmp_path, dataset()))
@@ -726,14 +694,6 @@ def test_the_files_kinds_are_told_apart(tmp_path: Path) -> None:
     with pytest.raises(FormatError) as caught:
         load_document(write(tmp_path, edited(stream(), "kind", "movie")))
     assert caught.value.code == "kind-unknown"
-
-
-def test_versions() -> None:
-    assert parse_version("1.0") == (1, 0)
-    assert parse_version("12.345") == (12, 345)
-    for text in ("1", "1.0 ", "1.0\n", "a.b", "1.-1"):
-        with pytest.raises(ValueError, match=re.escape(repr(text))):
-            parse_version(text)
 
 
 @pytest.mark.parametrize("text", ["AAA", "A", "=", "AA==A", "AA=A"])

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from itertools import islice, pairwise
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,7 @@ import pytest
 import mp4ds
 from mp4ds.dataset.topic import Topic
 from mp4ds.packing.options import PackOptions
-from mp4ds.plugins.demo import demo
-from scenes import PERIOD, Scene, odd_scene, scene
+from scenes import PERIOD, Scene, scene
 from sources import SOURCES
 from test_examples import ROOT, run
 
@@ -35,7 +34,6 @@ torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader, default_collate  # noqa: E402
 
 from mp4ds.torch import FrameDataset, FrameStream, SampleError  # noqa: E402
-from mp4ds.torch.streams import mixed, window_count, window_starts  # noqa: E402
 from waiting import WATCHDOG_S  # noqa: E402
 
 LEFT, RIGHT = BOTH = ["/left/image_raw", "/right/image_raw"]
@@ -148,30 +146,6 @@ def test_bits_beyond_bytes_are_kept(grey: Path) -> None:
     assert np.array_equal(image.numpy(), frames_of(grey, LEFT)[5].data)
     with pytest.raises(mp4ds.OptionError, match=f"{LEFT}: has frames of uint16, not uint8"):
         FrameDataset(grey, format="native", dtype="uint8")[5]
-
-
-def test_views_of_frames(drives: list[Path]) -> None:
-    with mp4ds.open(drives[0]) as drive:
-        options: dict[str, Any] = {"crop": (8, 4, 32, 24), "resize": (16, 12)}
-        expected = drive[LEFT].read([9], format="bgr", **options)[0]
-        half = drive[RIGHT].read([9 - 1], format="gray", resize=0.5)[0]
-    left = FrameDataset(drives[0], topics=[LEFT], format="bgr", **options)[9][LEFT]
-    assert np.array_equal(left.permute(1, 2, 0).numpy(), expected)
-    both = FrameDataset(
-        drives[0],
-        format={LEFT: "bgr", RIGHT: "gray"},
-        resize={LEFT: (16, 12), RIGHT: 0.5},
-        crop={LEFT: (8, 4, 32, 24)},
-    )[9 - 1]
-    assert torch.equal(both[LEFT], left)
-    assert np.array_equal(both[RIGHT][0].numpy(), half)
-
-
-def test_a_transform_makes_the_sample(drives: list[Path]) -> None:
-    dataset = FrameDataset(drives[0], topics=[LEFT], transform=lambda s: (s["index"], s[LEFT][0]))
-    number, red = dataset[4]
-    assert number == 4
-    assert np.array_equal(red.numpy(), frames_of(drives[0], LEFT)[4].data[..., 0])
 
 
 def test_a_video_without_sidecar(drives: list[Path], tmp_path: Path) -> None:
@@ -296,25 +270,6 @@ def test_a_tolerance_decides_what_is_padding(
     assert dataset[5][f"{LEFT}_is_pad"].tolist() == [padded, False]
 
 
-@pytest.mark.parametrize("trait", ["stamp-repeated", "stamp-backward", "stamp-zero"])
-def test_odd_stamps(tmp_path: Path, trait: str) -> None:
-    """Of equally near frames the earlier one, of equal stamps the first; itself without offset."""
-    sources = SOURCES["mcap-ros2-none"](tmp_path, odd_scene(trait))
-    mp4ds.pack(sources, tmp_path / "drive")
-    frames = frames_of(tmp_path / "drive", "/odd/image")
-    stamps = [frame.stamp_ns for frame in frames]
-    dataset = FrameDataset(
-        tmp_path / "drive", format="native", offsets=(-0.05, 0, 0.034), offsets_in="seconds"
-    )
-    for row in range(len(frames)):
-        wanted = []
-        for step in (-50_000_000, 0, 34_000_000):
-            away = [(abs(s - stamps[row] - step), s, n) for n, s in enumerate(stamps)]
-            wanted.append(min(away)[2] if step else row)
-        images = dataset[row]["/odd/image"][:, 0]
-        assert np.array_equal(images.numpy(), np.stack([frames[n].data for n in wanted]))
-
-
 # ---------------------------------------------------------------- several cameras
 
 
@@ -333,16 +288,6 @@ def test_cameras_are_matched(drives: list[Path]) -> None:
         LEFT: [LOST],
         RIGHT: [],
     }
-
-
-def test_windows_of_several_cameras(drives: list[Path]) -> None:
-    """Offsets in frames go from match to match."""
-    sample = FrameDataset(drives[0], topics=BOTH, offsets=(-1, 0))[LOST]
-    before, now = matched(drives[0])[LOST - 1 : LOST + 1]
-    for place, topic in enumerate(BOTH):
-        expected = torch.stack([first(before[place]), first(now[place])])
-        assert torch.equal(sample[topic], expected)
-        assert sample[f"{topic}_is_pad"].tolist() == [False, False]
 
 
 def test_nothing_matches(tmp_path: Path) -> None:
@@ -415,13 +360,6 @@ def test_what_is_no_path(drives: list[Path]) -> None:
                 FrameDataset(several)  # type: ignore[arg-type]
 
 
-def test_samples_in_a_line(drives: list[Path]) -> None:
-    dataset = FrameDataset(drives[:2], topics=[LEFT, RIGHT])
-    assert repr(dataset) == f"<FrameDataset: {len(dataset)} samples of 2 datasets, {LEFT}, {RIGHT}>"
-    stream = FrameStream(drives[0], topics=[LEFT])
-    assert repr(stream) == f"<FrameStream: {stream.samples} samples of 1 dataset, {LEFT}>"
-
-
 def test_wrong_options_of_streams(drives: list[Path]) -> None:
     for options, sentence in [
         ({"window": 0}, "window is 0"),
@@ -434,13 +372,6 @@ def test_wrong_options_of_streams(drives: list[Path]) -> None:
             FrameStream(drives[0], **options)
     with pytest.raises(mp4ds.OptionError, match="epoch is -1"):
         FrameStream(drives[0]).set_epoch(-1)
-
-
-def test_no_datasets(tmp_path: Path) -> None:
-    with pytest.raises(mp4ds.OptionError, match="list of paths is empty"):
-        FrameDataset([])
-    with pytest.raises(mp4ds.SourceNotFoundError):
-        FrameDataset(tmp_path / "none")
 
 
 def test_without_torch() -> None:
@@ -483,29 +414,6 @@ def test_batches_are_collated_as_usual(
     dataset.close()
 
 
-def test_what_is_not_of_one_batch_is_copied(drives: list[Path]) -> None:
-    dataset = FrameDataset(drives, topics=[LEFT])
-    samples = dataset.__getitems__([1, 2, 3, 4])
-    for some in (samples[::-1], [samples[0], samples[0]], [samples[0], dataset[2]], samples[::2]):
-        assert torch.equal(dataset.collate(some)[LEFT], default_collate(some)[LEFT])
-    collate = dataset.collate
-    assert torch.equal(collate([[one] for one in samples])[0][LEFT], collate(samples)[LEFT])
-    changed = FrameDataset(drives, topics=[LEFT], transform=lambda sample: sample[LEFT] + 1)
-    assert torch.equal(collate(changed.__getitems__([1, 2])), collate(samples[:2])[LEFT] + 1)
-    with pytest.raises(KeyError):
-        collate([samples[0], {}])
-
-
-def test_frames_of_several_sizes_are_no_batch(drives: list[Path], grey: Path) -> None:
-    dataset = FrameDataset([drives[0], grey], topics=[LEFT], format="native")
-    one, other = dataset.__getitems__([0, FRAMES + 1])
-    assert one[LEFT].dtype == torch.uint8
-    assert other[LEFT].dtype == torch.uint16
-    assert other[LEFT].shape[0] == 1
-    with pytest.raises(RuntimeError):
-        dataset.collate([one, other])
-
-
 def loader(dataset: Any, workers: int, method: str | None, **options: Any) -> Any:
     return DataLoader(
         dataset,
@@ -543,16 +451,6 @@ def test_an_epoch(drives: list[Path], workers: int, method: str | None) -> None:
     assert sorted(seen) == list(range(len(dataset)))
     assert batch["stamp_ns"].dtype == torch.int64
     assert torch.equal(dataset[3][LEFT], expected[3][LEFT]), "and in the parent afterwards"
-
-
-def test_a_copy_has_no_open_videos(drives: list[Path]) -> None:
-    dataset = FrameDataset(drives[0])
-    sample = dataset[6]
-    data = pickle.dumps(dataset)
-    assert len(data) < 4096
-    again = pickle.loads(data)
-    assert len(again._reader.cameras) == 0
-    assert torch.equal(again[6][RIGHT], sample[RIGHT])
 
 
 def test_threads_that_share_a_dataset(drives: list[Path]) -> None:
@@ -699,15 +597,6 @@ def test_a_missing_video_is_named(damaged: Path) -> None:
         next(iter(FrameStream(damaged, topics=[RIGHT])))
 
 
-def test_a_wrong_count_is_named(damaged: Path) -> None:
-    manifest = damaged / "dataset.yaml"
-    text = manifest.read_text()
-    lines = [line for line in text.splitlines() if not line.startswith("checksum")]
-    manifest.write_text("\n".join(lines).replace(f"frames: {FRAMES}", "frames: 9") + "\n")
-    with pytest.raises(SampleError, match=f"topic {LEFT}: .*has {FRAMES} frames, not 9"):
-        FrameDataset(damaged, topics=[LEFT])[0]
-
-
 # ---------------------------------------------------------------- streams
 
 
@@ -780,12 +669,6 @@ def test_processes_of_a_training_get_equal_numbers(
         assert max(seen.values()) <= 2
 
 
-def test_more_processes_than_samples(drives: list[Path]) -> None:
-    share: dict[str, Any] = {"topics": [LEFT], "rank": 50, "world_size": 60}
-    assert len(list(FrameStream(drives[0], **share))) == 1
-    assert not list(FrameStream(drives[0], **share, drop_last=True))
-
-
 @pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_workers_of_one_process_share_an_epoch(drives: list[Path], workers: int) -> None:
     stream = FrameStream(drives, topics=[LEFT], window=GOP)
@@ -819,12 +702,6 @@ def test_an_epoch_goes_on_where_it_stood(
         assert indices(other) == [index for index, _ in whole]  # from the beginning again
 
 
-def test_a_state_of_another_order_is_refused(drives: list[Path]) -> None:
-    state = FrameStream(drives[0], topics=[LEFT], seed=1).state_dict()
-    with pytest.raises(mp4ds.OptionError, match="from a stream with seed 1, but this one has 2"):
-        FrameStream(drives[0], topics=[LEFT], seed=2).load_state_dict(state)
-
-
 @pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")  # torchdata still calls it
 @pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_torchdata_keeps_where_an_epoch_stands(drives: list[Path], workers: int) -> None:
@@ -847,25 +724,6 @@ def test_torchdata_keeps_where_an_epoch_stands(drives: list[Path], workers: int)
     assert given + numbers(second) == whole
 
 
-def test_what_was_given_is_not_read_again() -> None:
-    read: list[int] = []
-
-    def reading(item: int) -> int:
-        read.append(item)
-        return item
-
-    def samples(skip: int) -> list[int]:
-        read.clear()
-        random = np.random.default_rng(0)
-        return list(mixed(range(100), reading, size=10, random=random, skip=skip))
-
-    whole = samples(0)
-    assert sorted(whole) == list(range(100)) != whole
-    for skip in (1, 50, 95, 100):
-        assert samples(skip) == whole[skip:]
-        assert sorted(read) == sorted(whole[skip:])
-
-
 def test_workers_that_stay_learn_of_the_epoch(drives: list[Path]) -> None:
     stream = FrameStream(drives, topics=[LEFT], window=GOP)
     batches = loader(stream, 1, "fork", batch_size=None, persistent_workers=True)
@@ -882,21 +740,6 @@ def test_a_kept_sample_does_not_keep_others(drives: list[Path]) -> None:
         image = sample[LEFT]
         assert image.untyped_storage().nbytes() == image.numel()
         assert image.permute(1, 2, 0).is_contiguous()
-
-
-@pytest.mark.parametrize("length", [1, 4, 7, 100])
-@pytest.mark.parametrize("keys", [[0], [0, 1, 2, 3], [0, 6, 12, 18], [0, 5, 6, 20], []])
-def test_windows_are_a_partition(drives: list[Path], length: int, keys: list[int]) -> None:
-    for topics in ([LEFT], BOTH):
-        collection = FrameDataset(drives[:2], topics=topics)._collection
-        found: list[list[int]] = [[], []]
-        for number, recording in enumerate(collection.recordings):
-            starts = window_starts(recording, length, np.array(keys, np.int64)).tolist()
-            assert len(starts) == window_count(recording, length) + 1
-            for first, end in pairwise(starts):
-                found[number] += range(first, end)
-                assert recording.matches is not None or first in (0, end, *keys)
-        assert found == [list(range(recording.rows)) for recording in collection.recordings]
 
 
 # ---------------------------------------------------------------- torchcodec
@@ -982,14 +825,3 @@ def test_the_example_learns(drives: list[Path]) -> None:
     errors = [float(line.split("error ")[1].split(",")[0]) for line in out.splitlines()[1:]]
     assert len(errors) == 3
     assert errors[2] < errors[0]
-
-
-@pytest.mark.slow
-def test_the_tutorial_runs(tmp_path: Path) -> None:
-    demo(tmp_path / "demo.bag", seconds=1.2)
-    for name in ("drive", "drive2"):
-        mp4ds.pack(tmp_path / "demo.bag", tmp_path / name)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/training.md").read_text(), re.DOTALL)
-    assert len(blocks) >= 6
-    out = run(sys.executable, "-W", "error", "-c", "\n".join(blocks), cwd=tmp_path)
-    assert out.splitlines()[0] == "36 [18, 18]"
