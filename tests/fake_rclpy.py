@@ -330,6 +330,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
         "rosbag2_interfaces": {},
         "rosbag2_interfaces.srv": {name: SimpleNamespace(name=name) for name in services},
     }
+    monkeypatch.delitem(sys.modules, "mp4ds.plugins.ros.rclpy_node", raising=False)
     for name, content in modules.items():
         module = ModuleType(name)
         vars(module).update(content)

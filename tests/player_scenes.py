@@ -48,7 +48,7 @@ class RecordingPublisher:
     clocks: list[Sent] = field(default_factory=list)
     on_time: Callable[[int], None] | None = None
     on_message: Callable[[int | None], None] | None = None
-    controls: Any = None
+    services: dict[str, Any] = field(default_factory=dict)
     subscriber_count: int = 1
     on_sent: Callable[[Sent], None] | None = None
     not_installed: frozenset[str] = frozenset()
@@ -80,8 +80,8 @@ class RecordingPublisher:
     def listen(self, _: str, on_message: Callable[[int | None], None]) -> None:
         self.on_message = on_message
 
-    def serve(self, controls: Any) -> None:
-        self.controls = controls
+    def serve(self, services: Any) -> None:
+        self.services = {service.name: service.answer for service in services}
 
     def close(self) -> None:
         self.is_alive = False

@@ -18,14 +18,14 @@ from typing import Any
 
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.protocols import Format
-from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.record import RecordSummary, open_recorder
-from mp4ds.plugins.recording.source import RecorderControls, SourceState, Wanted
+from mp4ds.plugins.recording.source import Source
 from mp4ds.records import Message
 
 
-class PlayedSource:
-    """The messages of a recording, then the end. See `mp4ds.plugins.recording.source.Source`.
+class PlayedSource(Source):
+    """The messages of a recording, then the end.
 
     Args:
         paths: The recording.
@@ -44,7 +44,7 @@ class PlayedSource:
         before: Callable[[int], object] = lambda number: None,
         altered: Mapping[str, Callable[[Message, int], Message]] = {},
     ) -> None:
-        self.state = SourceState()
+        self.warnings, self.topics, self.waiting_for = {}, {}, ""
         self.stop: Callable[[], None] = lambda: None
         self._paths = list(paths)
         self._rate = rate
@@ -70,13 +70,17 @@ class PlayedSource:
                     due = begun + (record.log_time - first) / 1e9 / self._rate
                     time.sleep(max(0.0, due - time.monotonic()))
                 topic = record.channel.topic
-                self.state.topics[topic] = None
+                self.topics[topic] = None
                 alter = self._altered.get(topic, lambda message, number: message)
                 take(alter(replace(record, data=bytes(record.data)), counts[topic]))
                 counts[topic] += 1
         self.stop()
 
-    def serve(self, controls: RecorderControls) -> None:
+    @property
+    def lost(self) -> Counter[str]:
+        return Counter()
+
+    def serve(self, services: object) -> None:
         pass
 
     def close(self) -> None:

@@ -2,7 +2,7 @@
 
     ros1_driver.py RECORDING [OPTIONS]
 
-OPTIONS are those of `RospyPublisher` in JSON. Each line of the input is a call of a method of
+OPTIONS are those of `NodeOptions` in JSON. Each line of the input is a call of a method of
 `Driver` with its arguments, each line of the output what it returns.
 """
 
@@ -17,7 +17,8 @@ from typing import Any
 
 from mp4ds.bags.formats import open_reader
 from mp4ds.errors import Mp4dsError
-from mp4ds.plugins.publishing.ros1 import RospyPublisher, Sender
+from mp4ds.plugins.ros.node import NodeOptions, Service, action
+from mp4ds.plugins.ros.ros1 import Ros1Node, Sender
 from mp4ds.records import Channel, Message
 
 
@@ -55,7 +56,7 @@ class Driver:
             if not any(message.channel is channel for channel in self.channels):
                 self.channels.append(message.channel)
         self.player = Standing()
-        self.publisher = RospyPublisher(**options)
+        self.publisher = Ros1Node(NodeOptions(**{"node": "mp4ds_play", **options}))
         self.waited = 0
         wait = Sender._wait_for_room
 
@@ -118,7 +119,10 @@ class Driver:
         self.publisher.listen(topic, lambda stamp: say(["heard", topic, stamp]))
 
     def serve(self) -> None:
-        self.publisher.serve(self.player)  # type: ignore[arg-type]
+        player = self.player
+        paused = Service("is_paused", "", "", lambda _: {"paused": player.is_paused})
+        changes = (action("pause", player.pause), action("resume", player.resume))
+        self.publisher.serve((paused, *changes))
 
     def is_paused(self) -> bool:
         return self.player.is_paused

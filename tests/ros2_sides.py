@@ -21,6 +21,7 @@ from rosbags.convert.converter import default_message
 from rosbags.typesys import Stores, get_typestore
 
 import fake_rclpy
+from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
 from mp4ds.records import Channel, Schema
 from waiting import WATCHDOG_S
 
@@ -161,13 +162,13 @@ class DdsPeer:
 
 
 class Side:
-    """One way into ROS 2: how a publisher is made, and who is on the other side."""
+    """One way into ROS 2: how a node is made, and who is on the other side."""
 
-    def __init__(self, kind: Any, options: dict[str, Any], peer: Any) -> None:
-        self._kind, self.options, self.peer = kind, options, peer
+    def __init__(self, peer: Any) -> None:
+        self.peer = peer
 
-    def open(self, **options: Any) -> Any:
-        return self._kind(**self.options, **options)
+    def open(self, **options: Any) -> Node:
+        return open_node("ros2", NodeOptions(**{"node": "rosbag2_player", **options}))
 
     @contextmanager
     def stopped(self, publisher: Any, recorded: Channel) -> Iterator[None]:
@@ -191,8 +192,6 @@ def alone_in_ros2(monkeypatch: pytest.MonkeyPatch) -> int:
 def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
     """Cyclone DDS on loopback, in a domain where no other test is."""
     pytest.importorskip("cyclonedds")
-    from mp4ds.plugins.publishing.dds import DdsPublisher
-
     domain = alone_in_ros2(monkeypatch)
     process = subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("dds_peer.py")), str(domain)],
@@ -203,7 +202,7 @@ def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
     with process:
         assert process.stdout
         assert json.loads(process.stdout.readline()) == "ready"
-        yield Side(DdsPublisher, {"domain": domain}, DdsPeer(process))
+        yield Side(DdsPeer(process))
         assert process.stdin
         process.stdin.close()
         process.wait(WATCHDOG_S)
@@ -212,10 +211,8 @@ def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
 @contextmanager
 def rclpy_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
     """rclpy as it would be with a ROS 2 that is sourced."""
-    from mp4ds.plugins.publishing.ros2 import RclpyPublisher
-
     bus = fake_rclpy.install(monkeypatch)
-    yield Side(RclpyPublisher, {}, fake_rclpy.FakePeer(bus))
+    yield Side(fake_rclpy.FakePeer(bus))
 
 
 SIDES = {"dds": dds_side, "rclpy": rclpy_side}

@@ -400,7 +400,7 @@ def test_what_an_export_or_a_player_does_not_need(
     assert summary.messages == expected.messages
     publisher = RecordingPublisher(world="ros1")
     play = mp4ds.PlayOptions(immediate=True, **options)
-    with open_player(dataset, play, publisher=publisher) as player:
+    with open_player(dataset, play, node=publisher) as player:
         player.run()
     assert Counter(sent.topic for sent in publisher.sent) == Counter(
         {"/right/image_raw": FRAMES, "/right/camera_info": FRAMES}
@@ -419,7 +419,7 @@ def test_errors_of_other_commands_say_where_the_damage_is(dataset: Path, tmp_pat
     play = mp4ds.PlayOptions(immediate=True)
     publisher = RecordingPublisher(world="ros1")
     with (
-        open_player(dataset, play, publisher=publisher) as player,
+        open_player(dataset, play, node=publisher) as player,
         pytest.raises(FormatError, match=words) as found,
     ):
         player.run()

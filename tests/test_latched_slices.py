@@ -16,7 +16,8 @@ from mp4ds.format.sidecars import load_manifest
 from mp4ds.options import Slice, parse_time
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.info import info
-from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.playing.options import PlayOptions
+from mp4ds.plugins.playing.play import open_player
 from mp4ds.records import Excerpt, Message, Record
 from mp4ds.unpacking.options import UnpackOptions
 from player_scenes import (
@@ -120,7 +121,7 @@ def test_a_slice_of_a_slice_and_its_beginning(tmp_path: Path) -> None:
 def test_it_is_played_from_its_beginning(tmp_path: Path) -> None:
     mp4ds.pack(made("bag", tmp_path), tmp_path / "slice", PackOptions(**SPAN))
     publisher = RecordingPublisher(world="ros1")
-    with open_player(tmp_path / "slice", PlayOptions(immediate=True), publisher=publisher) as one:
+    with open_player(tmp_path / "slice", PlayOptions(immediate=True), node=publisher) as one:
         one.run()
     topics = [sent.topic for sent in publisher.sent]
     assert topics[:2] == ["/tf_static"] * 2

@@ -18,7 +18,8 @@ import pytest
 
 import mp4ds
 from commands import call
-from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.playing.options import PlayOptions
+from mp4ds.plugins.playing.play import open_player
 from player_scenes import RecordingPublisher, make_drive, recorded
 from ros2_sides import alone_in_ros2
 from waiting import WATCHDOG_S
@@ -180,7 +181,7 @@ def test_errors_are_sentences(drive: Path, arguments: list[str], code: int, word
 
 def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_VERSION", raising=False)
-    monkeypatch.setattr("mp4ds.plugins.publishing.publisher.find_spec", lambda _: None)
+    monkeypatch.setattr("mp4ds.plugins.ros.node.find_spec", lambda _: None)
     with (
         pytest.raises(mp4ds.PublishError, match="no ROS is sourced"),
         open_player(drive, PlayOptions()),
@@ -201,11 +202,11 @@ def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_sourced(
     version: str, modules: list[str], kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mp4ds.plugins.publishing.publisher import sourced
+    from mp4ds.plugins.ros.node import sourced
 
     monkeypatch.setenv("ROS_VERSION", version)
     monkeypatch.setattr(
-        "mp4ds.plugins.publishing.publisher.find_spec",
+        "mp4ds.plugins.ros.node.find_spec",
         lambda name: object() if name in modules else None,
     )
     assert sourced() == kind
@@ -213,7 +214,7 @@ def test_what_is_sourced(
 
 def test_the_library_plays_as_the_command_does(drive: Path) -> None:
     publisher = RecordingPublisher(world="ros1")
-    with open_player(str(drive), PlayOptions(rate=4.0), publisher=publisher) as player:
+    with open_player(str(drive), PlayOptions(rate=4.0), node=publisher) as player:
         summary = player.run()
     assert [sent.payload for sent in publisher.sent] == [
         payload for _, payload, _ in recorded(drive.with_suffix(".bag"))

@@ -9,8 +9,9 @@ import pytest
 
 import mp4ds
 from mp4ds.bags.latched import LATCHED_QOS, LatchedMessages, latched_depth
-from mp4ds.plugins.playing.play import PlayOptions, open_player
-from mp4ds.plugins.publishing.ros2_writers import offered_qos
+from mp4ds.plugins.playing.options import PlayOptions
+from mp4ds.plugins.playing.play import open_player
+from mp4ds.plugins.ros.qos import offered_qos
 from mp4ds.records import Channel
 from player_scenes import (
     STATIC,
@@ -45,7 +46,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_came_before_the_start_is_sent_at_first(drive: Path) -> None:
     publisher = RecordingPublisher(world="ros2")
     options = PlayOptions(start_offset=0.5, immediate=True)
-    with open_player(drive, options, publisher=publisher) as player:
+    with open_player(drive, options, node=publisher) as player:
         player.run()
     first = [(sent.topic, sent.payload) for sent in publisher.sent[:6]]
     assert first == [

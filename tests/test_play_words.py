@@ -13,7 +13,7 @@ import typer
 from mp4ds.cli import app_for
 from mp4ds.cli.play_words import known_words, spelled
 from mp4ds.errors import OptionError
-from mp4ds.plugins.publishing.names import PLAIN, NodeNames, node_arguments
+from mp4ds.plugins.ros.names import PLAIN, NodeNames, node_arguments
 from roscore import PLAY
 from test_examples import ROOT
 

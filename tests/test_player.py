@@ -7,16 +7,18 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import mp4ds
 from mp4ds.errors import FormatError, OptionError
+from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import FollowedClock, Pace
-from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.playing.play import open_player
 from mp4ds.plugins.playing.player import Player, PlaySummary
-from mp4ds.plugins.publishing.names import NodeNames
+from mp4ds.plugins.ros.names import NodeNames
 from player_scenes import (
     MS,
     START,
@@ -48,7 +50,7 @@ def published(publisher: RecordingPublisher) -> list[Recorded]:
 
 def run(dataset: Path | list[Path], **options: Any) -> tuple[RecordingPublisher, PlaySummary]:
     publisher = RecordingPublisher(world="ros1")
-    with open_player(dataset, PlayOptions(**options), publisher=publisher) as player:
+    with open_player(dataset, PlayOptions(**options), node=publisher) as player:
         return publisher, player.run()
 
 
@@ -59,7 +61,7 @@ def running(
     """A player that runs in a thread, stopped at the end."""
     publisher = publisher or RecordingPublisher(world="ros1")
     failures: list[BaseException] = []
-    with open_player(dataset, PlayOptions(**options), publisher=publisher) as player:
+    with open_player(dataset, PlayOptions(**options), node=publisher) as player:
 
         def work() -> None:
             try:
@@ -165,7 +167,7 @@ def test_topics(
         ({"pause_topics": ["/none"]}, "`pause_topics` '/none'"),
         ({"clock_topics": ["/tf"], "clock": 5.0}, "`clock_topics` contradicts `clock`"),
         ({"clock_topics_all": True, "clock": 5.0}, "`clock_topics_all` contradicts `clock`"),
-        ({"clock_topics_all": True, "clock_topics": ["/tf"]}, "contradicts `clock_topics_all`"),
+        ({"clock_topics_all": True, "clock_topics": ["/tf"]}, "contradicts `clock_topics`"),
         ({"skip_empty": -1.0}, "`skip_empty` -1"),
         ({"until_sec": float("nan")}, "`until_sec` nan"),
         ({"wait_for_all_acked": -1}, "`wait_for_all_acked` -1"),
@@ -233,7 +235,7 @@ def test_it_ends_when_the_receiving_side_is_shut_down(
 ) -> None:
     publisher = RecordingPublisher(world="ros1")
     publisher.on_sent = lambda sent: setattr(publisher, "is_alive", len(publisher.sent) < 5)
-    with open_player(drive[0], PlayOptions(), publisher=publisher) as player:
+    with open_player(drive[0], PlayOptions(), node=publisher) as player:
         assert player.run().stopped
     assert len(publisher.sent) == 5
 
@@ -452,8 +454,13 @@ def test_stop(drive: tuple[Path, list[Recorded]]) -> None:
 
 
 def test_controls_are_served(drive: tuple[Path, list[Recorded]]) -> None:
-    publisher, _ = run(drive[0], immediate=True)
-    assert isinstance(publisher.controls, Player)
+    with running(drive[0], paused=True) as (player, publisher):
+        until(lambda: publisher.services)
+        assert publisher.services["is_paused"](None) == {"paused": True}
+        assert publisher.services["burst"](SimpleNamespace(num_messages=2)) == {"actually_burst": 2}
+        assert publisher.services["set_rate"](SimpleNamespace(rate=7.0)) == {"success": True}
+        assert player.rate == 7.0
+        assert publisher.services["stop"](None) == {}
 
 
 def test_waits_for_subscribers(drive: tuple[Path, list[Recorded]]) -> None:
@@ -493,7 +500,7 @@ def test_lock_step(drive: tuple[Path, list[Recorded]]) -> None:
 def test_late_frames_are_dropped_and_counted(drive: tuple[Path, list[Recorded]]) -> None:
     publisher = RecordingPublisher(world="ros1", busy_s=0.02)
     options = PlayOptions(rate=4.0, drop=True, read_ahead=1)
-    with open_player(drive[0], options, publisher=publisher) as player:
+    with open_player(drive[0], options, node=publisher) as player:
         summary = player.run()
     others = [item for item in drive[1] if item[0] != CAMERA]
     assert [item for item in published(publisher) if item[0] != CAMERA] == others
@@ -526,7 +533,7 @@ def test_restamp(drive: tuple[Path, list[Recorded]], monkeypatch: pytest.MonkeyP
 
 def test_publishing_as_ros2(drive: tuple[Path, list[Recorded]]) -> None:
     publisher = RecordingPublisher(world="ros2")
-    with open_player(drive[0], PlayOptions(immediate=True), publisher=publisher) as player:
+    with open_player(drive[0], PlayOptions(immediate=True), node=publisher) as player:
         player.run()
     assert {channel.message_encoding for channel in publisher.advertised} == {"cdr"}
     assert len(publisher.sent) == len(drive[1])

@@ -16,8 +16,9 @@ import mp4ds
 from mp4ds.bags.formats import open_writer
 from mp4ds.errors import PublishError
 from mp4ds.plugins.playing import pace, timeline
+from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import Lateness, Pace, Ticks
-from mp4ds.plugins.playing.play import PlayOptions, open_player
+from mp4ds.plugins.playing.play import open_player
 from mp4ds.plugins.playing.player import Player, PlaySummary
 from mp4ds.records import Message
 from player_scenes import MS, START, STEP, RecordingPublisher, make_ros2, ros2_channel, text
@@ -39,7 +40,7 @@ def run(
     drive: Path, publisher: RecordingPublisher | None = None, **options: Any
 ) -> tuple[RecordingPublisher, PlaySummary]:
     publisher = publisher or RecordingPublisher(world="ros2")
-    with open_player(drive, PlayOptions(**options), publisher=publisher) as player:
+    with open_player(drive, PlayOptions(**options), node=publisher) as player:
         return publisher, player.run()
 
 
@@ -191,7 +192,7 @@ def stalled(drive: Path, seconds: float) -> tuple[list[int], PlaySummary]:
             machine.now += round(seconds * NS) if len(late) == 5 else 0
 
     publisher.on_sent = on_sent
-    with open_player(drive, PlayOptions(), publisher=publisher) as made:
+    with open_player(drive, PlayOptions(), node=publisher) as made:
         player = Player(made._timeline, publisher, steady=machine)
         machine.drive(player)
         summary = player.run()
@@ -277,7 +278,7 @@ def test_the_last_time_that_is_played(drive: Path, options: dict[str, Any], last
 def running(
     drive: Path, publisher: RecordingPublisher, **options: Any
 ) -> Iterator[tuple[Player, threading.Thread]]:
-    with open_player(drive, PlayOptions(**options), publisher=publisher) as player:
+    with open_player(drive, PlayOptions(**options), node=publisher) as player:
         thread = threading.Thread(target=player.run)
         thread.start()
         try:
@@ -299,7 +300,7 @@ def test_it_pauses_before_messages_of_a_topic(drive: Path) -> None:
     assert len(publisher.sent) == 26
     publisher = RecordingPublisher(world="ros2")
     options = PlayOptions(rate=10.0, pause_topics=["/map"])
-    with open_player(drive, options, publisher=publisher) as player:
+    with open_player(drive, options, node=publisher) as player:
         player.toggle_topic_pauses()
         assert not player.run().stopped
     assert len(publisher.sent) == 26

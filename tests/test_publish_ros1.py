@@ -465,24 +465,18 @@ def test_wrong_master(roscore: Core, recording: Path) -> None:
     assert done.stderr == ""
 
 
-def test_wrong_options(roscore: Core, recording: Path) -> None:
-    for options in ('{"queue_size": -1}', '{"wait_s": -0.5}'):
-        process = roscore.script("ros1_driver.py", str(recording), options)
-        assert process.next()[0] == "OptionError"
-
-
 def test_no_rospy() -> None:
     program = (
         "import sys; sys.modules['rospy'] = None\n"
-        "from mp4ds.plugins.publishing.ros1 import RospyPublisher\n"
+        "from mp4ds.plugins.ros.node import NodeOptions, open_node\n"
         "from mp4ds.errors import PublishError\n"
-        "try: RospyPublisher()\n"
+        "try: open_node('ros1', NodeOptions('player'))\n"
         "except PublishError as error: print(error)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
-    assert done.stdout.startswith("rospy: ROS 1 is not available")
+    assert done.stdout.startswith("ros1: No module named 'ros")
     assert "python3-rospy" in done.stdout
     assert "--system-site-packages" in done.stdout
 
@@ -498,10 +492,10 @@ def test_leaves_the_process_alone(roscore: Core) -> None:
         "            {k: v for k, v in os.environ.items() if k != 'ROS_LOG_FILENAME'},\n"
         "            signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))\n"
         "before = state()\n"
-        "from mp4ds.plugins.publishing.ros1 import RospyPublisher\n"
-        "with RospyPublisher() as publisher:\n"
+        "from mp4ds.plugins.ros.node import NodeOptions, open_node\n"
+        "with open_node('ros1', NodeOptions('player')) as publisher:\n"
         "    during = state()\n"
-        "    try: RospyPublisher()\n"
+        "    try: open_node('ros1', NodeOptions('player'))\n"
         "    except OSError as error: print(error)\n"
         "print(before == during == state())\n"
     )

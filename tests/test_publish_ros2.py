@@ -17,9 +17,10 @@ import pytest
 import fake_rclpy
 from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
-from mp4ds.plugins.publishing.names import NodeNames
-from mp4ds.plugins.publishing.ros2 import RclpyPublisher
-from mp4ds.plugins.publishing.ros2_writers import Qos, load_overrides, offered_qos, recorded_qos
+from mp4ds.plugins.playing.player import player_services
+from mp4ds.plugins.ros.names import NodeNames
+from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
+from mp4ds.plugins.ros.qos import Qos, load_overrides, offered_qos, recorded_qos
 from mp4ds.records import Channel, Schema
 from ros2_sides import KINDS, SIDES, STORE, Side, channel, connect, message, padded, until
 from waiting import WATCHDOG_S
@@ -218,7 +219,7 @@ CALLS: dict[str, tuple[str, dict[str, Any], tuple[Any, ...] | None, dict[str, An
 def test_the_services_are_those_of_rosbag2(side: Side) -> None:
     player = Player()
     with side.open() as publisher:
-        publisher.serve(player)
+        publisher.serve(player_services(player))
         for name, (kind, request, _, reply) in CALLS.items():
             assert side.peer.call(f"/rosbag2_player/{name}", kind, request) == reply
     assert player.asked == [asked for _, _, asked, _ in CALLS.values() if asked]
@@ -226,14 +227,14 @@ def test_the_services_are_those_of_rosbag2(side: Side) -> None:
 
 def test_services_belong_to_the_node(side: Side) -> None:
     with side.open(node="other") as publisher:
-        publisher.serve(Player())
+        publisher.serve(player_services(Player()))
         assert side.peer.call("/other/get_rate", "GetRate", {}) == {"rate": 2.5}
 
 
 def test_ros_names_the_node_and_its_clock(side: Side) -> None:
     names = NodeNames("player", "/robot", (("/clock", "/sim"),))
     with side.open(names=names) as publisher:
-        publisher.serve(Player())
+        publisher.serve(player_services(Player()))
         publisher.clock(0)
         assert side.peer.call("/robot/player/get_rate", "GetRate", {}) == {"rate": 2.5}
         side.peer.subscribe("/sim", "rosgraph_msgs/msg/Clock", reliable=False)
@@ -296,9 +297,13 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> fake_rclpy.Bus:
     return fake_rclpy.install(monkeypatch)
 
 
+def rclpy_node(**options: Any) -> Node:
+    return open_node("ros2", NodeOptions("player", **options))
+
+
 def test_rclpy_has_to_have_the_whole_type(bus: fake_rclpy.Bus) -> None:
     bus.halves.add("sensor_msgs/msg/Imu")
-    with RclpyPublisher() as publisher:
+    with rclpy_node() as publisher:
         for kind, says in (("JointState", "not installed"), ("Imu", "typesupport_c")):
             with pytest.raises(Refused, match=says):
                 publisher.advertise(channel("/x", f"sensor_msgs/msg/{kind}"))
@@ -320,7 +325,7 @@ def test_an_installed_type_that_is_not_the_recorded_one_is_told(
     ):
         hashes = [{"type_name": STRING, "hash_string": installed}]
         described.write_text(json.dumps({"type_hashes": hashes}))
-        with RclpyPublisher() as publisher, warnings.catch_warnings(record=True) as said:
+        with rclpy_node() as publisher, warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             publisher.advertise(one)
             publisher.advertise(channel("/y", STRING))  # it is told once
@@ -334,7 +339,7 @@ def test_rclpy_tells_of_a_topic_whose_type_it_has_not(bus: fake_rclpy.Bus) -> No
     bus.kinds["own/msg/Own"] = SimpleNamespace(type_name="own/msg/Own")
     peer.advertise("/own", "own/msg/Own")
     del bus.kinds["own/msg/Own"]
-    with RclpyPublisher() as publisher:
+    with rclpy_node() as publisher:
         publisher.listen("/own", lambda _: None)
         assert until(lambda: bus.errors)
     assert "'own/msg/Own' is not installed" in bus.errors[0]
@@ -343,7 +348,7 @@ def test_rclpy_tells_of_a_topic_whose_type_it_has_not(bus: fake_rclpy.Bus) -> No
 def test_rclpy_reads_a_big_endian_clock(bus: fake_rclpy.Bus) -> None:
     heard: list[int] = []
     payload = b"\0\0\0\0" + (5).to_bytes(4, "big") + (6).to_bytes(4, "big")
-    with RclpyPublisher() as publisher:
+    with rclpy_node() as publisher:
         publisher.follow_clock(heard.append)
         fake_rclpy.FakePeer(bus).publish("/clock", "rosgraph_msgs/msg/Clock", payload)
         assert until(lambda: heard)
@@ -362,7 +367,7 @@ def test_rclpy_gets_the_whole_quality_of_service(bus: fake_rclpy.Bus) -> None:
         lease_ns=3,
         avoid_ros_namespace_conventions=True,
     )
-    with RclpyPublisher(overrides={"/x": qos}) as publisher:
+    with rclpy_node(overrides={"/x": qos}) as publisher:
         publisher.advertise(channel("/x", STRING))
         got = bus.publishers[0].qos
     assert (got.history.name, got.depth) == ("KEEP_ALL", 4)
@@ -377,7 +382,7 @@ def test_rclpy_passes_messages_on_as_they_are(bus: fake_rclpy.Bus) -> None:
     recorded = channel("/x", STRING)
     payload = message(STRING, 1, little_endian=False)[:-1]
     peer = fake_rclpy.FakePeer(bus)
-    with RclpyPublisher() as publisher:
+    with rclpy_node() as publisher:
         publisher.advertise(recorded)
         peer.subscribe("/x", STRING)
         publisher.publish(recorded, payload, 0)
@@ -385,7 +390,7 @@ def test_rclpy_passes_messages_on_as_they_are(bus: fake_rclpy.Bus) -> None:
 
 
 def test_rclpy_may_be_shut_down_from_outside(bus: fake_rclpy.Bus) -> None:
-    with RclpyPublisher() as publisher:
+    with rclpy_node() as publisher:
         publisher.advertise(channel("/x", STRING))
         bus.publishers[0].node.context.try_shutdown()
         assert not publisher.is_alive
@@ -395,15 +400,15 @@ def test_services_may_be_missing_in_a_ros(
     bus: fake_rclpy.Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rosbag2_interfaces.srv", None)
-    with RclpyPublisher() as publisher:
-        publisher.serve(Player())
+    with rclpy_node() as publisher:
+        publisher.serve(player_services(Player()))
     assert not bus.services
 
 
-def test_without_a_ros_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rclpy", None)
+def test_without_a_ros_that_is_told(bus: fake_rclpy.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rclpy.context", None)
     with pytest.raises(PublishError, match="source ROS 2"):
-        RclpyPublisher()
+        rclpy_node()
 
 
 INFINITE = (

@@ -26,17 +26,16 @@ from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsErro
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.spool import SpoolFolder
-from mp4ds.plugins.publishing.names import NodeNames
 from mp4ds.plugins.recording import spool
-from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.packing import PackingError, PackingProcess
 from mp4ds.plugins.recording.record import (
     Recorder,
     RecordProgress,
     open_recorder,
 )
-from mp4ds.plugins.recording.source import SourceOptions, Wanted
 from mp4ds.plugins.recording.spool import MessageBuffer
+from mp4ds.plugins.ros.names import NodeNames
 from mp4ds.records import Channel, Message, Schema
 from record_scenes import PlayedSource, recorded
 from scenes import Scene, scene
@@ -113,64 +112,69 @@ def test_quality(tmp_path: Path, compare: Compare) -> None:
         assert dataset.streams[0].sidecar.video.codec == "av1"
 
 
+def wanted(*topics: str, **options: Any) -> Wanted:
+    return Wanted(topics, RecordOptions(**options))
+
+
 def test_topics_that_are_wanted() -> None:
-    wanted = Wanted(("cam/*",), regex="imu$", exclude=["/cam/info"], exclude_regex="depth")
+    chosen = wanted("cam/*", regex="imu$", exclude=["/cam/info"], exclude_regex="depth")
     topics = ("/cam/image", "/cam/info", "/cam/depth", "/front/imu", "/imu/raw")
-    assert [*filter(wanted, topics)] == ["/cam/image", "/front/imu"]
-    assert all(map(Wanted(), topics))
+    assert [*filter(chosen, topics)] == ["/cam/image", "/front/imu"]
+    assert all(map(wanted(all=True), topics))
     with pytest.raises(OptionError, match="not a valid regular expression"):
-        Wanted(regex="(")
+        wanted(regex="(")
 
 
 @pytest.mark.parametrize(
-    ("options", "found"),
+    ("topics", "options", "found"),
     [
-        ({}, "image imu event"),
-        ({"all_topics": True}, "image imu"),
-        ({"all_services": True}, "event"),
-        ({"all_topics": True, "all_services": True}, "image imu event"),
-        ({"types": ["sensor_msgs/msg/Imu"]}, "imu"),
-        ({"topics": ["/cam/*"], "types": ["sensor_msgs/msg/Imu"]}, "image imu"),
-        ({"exclude_types": ["sensor_msgs/msg/Imu"]}, "image event"),
-        ({"topics": ["/arm/_service_event"]}, "event"),
-        ({"regex": "^/arm/"}, "event"),
-        ({"exclude": ["/arm/*"], "all_services": True}, ""),
+        ([], {"all": True}, "image imu event"),
+        ([], {"all_topics": True}, "image imu"),
+        ([], {"all_services": True}, "event"),
+        ([], {"topic_types": ["sensor_msgs/msg/Imu"]}, "imu"),
+        (["/cam/*"], {"topic_types": ["sensor_msgs/msg/Imu"]}, "image imu"),
+        ([], {"all": True, "exclude_topic_types": ["sensor_msgs/msg/Imu"]}, "image event"),
+        (["/arm/_service_event"], {}, "event"),
+        ([], {"regex": "^/arm/"}, "event"),
+        ([], {"exclude": ["/arm/*"], "all_services": True}, ""),
     ],
 )
-def test_topics_by_type_and_services(options: dict[str, Any], found: str) -> None:
+def test_topics_by_type_and_services(
+    topics: list[str], options: dict[str, Any], found: str
+) -> None:
     """As Jazzy's recorder chooses: events of services are not among `all_topics`."""
     there = {
         "image": ("/cam/image", "sensor_msgs/msg/Image"),
         "imu": ("/imu", "sensor_msgs/msg/Imu"),
         "event": ("/arm/_service_event", "std_srvs/srv/Trigger_Event"),
     }
-    wanted = Wanted(**options)
-    assert [name for name, topic in there.items() if wanted(*topic)] == found.split()
+    chosen = wanted(*topics, **options)
+    assert [name for name, topic in there.items() if chosen(*topic)] == found.split()
 
 
 def test_topics_that_ros_renames() -> None:
     """As for `rosbag record`: subscribed to by the new name, recorded by the one that was typed."""
     names = NodeNames("bag", "/robot", (("front", "/camera/image"), ("/tf", "tf"), ("imu", "/x")))
-    wanted = Wanted(("front", "/tf", "odom", "/gps/*"), exclude=("left",), names=names)
+    chosen = wanted("front", "/tf", "odom", "/gps/*", exclude=("left",), names=names)
     topics = ("/camera/image", "/robot/tf", "/robot/odom", "/gps/fix", "/tf", "/robot/front", "/x")
-    found = [topic for topic in topics if wanted(topic)]
+    found = [topic for topic in topics if chosen(topic)]
     assert found == [*topics[:4]]
-    assert [*map(wanted.recorded_as, found)] == ["/robot/front", "/tf", "/robot/odom", "/gps/fix"]
-    everything = Wanted(exclude=("left",), names=names)
+    assert [*map(chosen.recorded_as, found)] == ["/robot/front", "/tf", "/robot/odom", "/gps/fix"]
+    everything = wanted(all=True, exclude=("left",), names=names)
     assert everything("/camera/image")
     assert not everything("/robot/left")
     assert everything.recorded_as("/camera/image") == "/camera/image"
     with pytest.raises(
         OptionError, match="/robot/front and /camera/image are the same topic after remapping"
     ):
-        Wanted(("front", "/camera/image"), names=names)
+        wanted("front", "/camera/image", names=names)
 
 
 class Opened:
     """What the command opens instead of a source of ROS."""
 
     def __init__(self, source: PlayedSource, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.kind, self.options = "", SourceOptions("")
+        self.kind, self.options = "", RecordOptions()
         self._source = source
         monkeypatch.setattr("mp4ds.plugins.recording.record.open_source", self)
         make = Recorder.__init__
@@ -181,7 +185,7 @@ class Opened:
 
         monkeypatch.setattr(Recorder, "__init__", made)
 
-    def __call__(self, kind: str, options: SourceOptions) -> PlayedSource:
+    def __call__(self, kind: str, options: RecordOptions) -> PlayedSource:
         self.kind, self.options = kind, options
         return self._source
 
@@ -197,7 +201,7 @@ def test_what_launch_files_append(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert (told.code, told.err) == (0, "")
     names = opened.options.names
     assert (opened.kind, names.node, names.namespace) == ("ros2", "bag", "/robot")
-    assert opened.options.use_sim_time
+    assert names.use_sim_time
     with mp4ds.open(tmp_path / "live") as dataset:
         assert len(dataset["/cam/image_raw"]) == 2  # as the source calls it
     assert call("record", "--ros-args", "--nonsense").code == 2

@@ -18,22 +18,21 @@ import mp4ds
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.rosbag2_metadata import read_bag_info
 from mp4ds.errors import OptionError
-from mp4ds.plugins.publishing.names import NodeNames
-from mp4ds.plugins.publishing.ros2_writers import Qos, recorded_qos
-from mp4ds.plugins.recording.options import RecordOptions
-from mp4ds.plugins.recording.record import open_recorder
-from mp4ds.plugins.recording.ros2_channels import (
-    asked_qos,
-    installed_definition,
-    is_hidden,
-    qos_text,
-    ros_type,
-    standard_definition,
-)
-from mp4ds.plugins.recording.source import SourceOptions, Wanted, open_source
+from mp4ds.plugins.recording.options import RecordOptions, Wanted
+from mp4ds.plugins.recording.record import open_recorder, recorder_services
+from mp4ds.plugins.recording.source import Source, open_source
+from mp4ds.plugins.ros.names import NodeNames
+from mp4ds.plugins.ros.node import NodeOptions
+from mp4ds.plugins.ros.qos import Qos, asked_qos, qos_text, recorded_qos
+from mp4ds.plugins.ros.ros2 import installed_definition, is_hidden, standard_definition
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
 from ros2_sides import SIDES, STORE, Side, channel, message, padded, until
 from scenes import scene
+
+pytest.importorskip("cyclonedds")
+
+from mp4ds.plugins.ros.dds_node import DdsNode
+from mp4ds.plugins.ros.dds_types import ros_type
 
 STRING, IMAGE, TF = "std_msgs/msg/String", "sensor_msgs/msg/Image", "tf2_msgs/msg/TFMessage"
 LATCHED = "- {history: 1, depth: 5, reliability: 1, durability: 1}"
@@ -43,8 +42,15 @@ BEST_EFFORT = "- {history: 1, depth: 5, reliability: 2, durability: 2}"
 @pytest.fixture(params=SIDES)
 def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
     with SIDES[request.param](monkeypatch) as found:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(found.options.get("domain", 0)))
         yield found
+
+
+def recorder(**options: Any) -> Source:
+    return open_source("ros2", RecordOptions(**options))
+
+
+def wanted(*topics: str, **options: Any) -> Wanted:
+    return Wanted(topics, RecordOptions(all=not topics, **options))
 
 
 class Heard:
@@ -68,11 +74,11 @@ def test_every_message_is_received(side: Side) -> None:
     latched = channel("/robot/map", STRING, qos=LATCHED)
     sent = {one.topic: [message(one.type_name, n) for n in range(9)] for one in (strings, lossy)}
     heard = Heard()
-    source = open_source("ros2", SourceOptions("recorder"))
+    source = recorder()
     with side.open() as publisher:
         publisher.advertise(latched)
         publisher.publish(latched, message(STRING, 77), 0)
-        source.start(Wanted(), heard.take)
+        source.start(wanted(), heard.take)
         for one in (strings, lossy):
             publisher.advertise(one)
             assert until(lambda one=one: publisher.subscribers(one) == 1)
@@ -92,8 +98,8 @@ def test_every_message_is_received(side: Side) -> None:
     assert (told.is_reliable, told.is_latched) == (True, True)
     (told,) = recorded_qos(heard.channels["/robot/tf"].metadata[QOS_KEY])
     assert (told.is_reliable, told.is_latched) == (False, False)
-    assert not source.state.lost
-    assert not source.state.warnings
+    assert not source.lost
+    assert not source.warnings
 
 
 def ends_with(heard: Heard, topic: str, payload: bytes) -> bool:
@@ -191,13 +197,12 @@ def test_ros_renames_topics(side: Side) -> None:
     names = NodeNames("bag", "/robot", (("name", "/front/name"), ("/clock", "/sim")))
     found, clock = channel("/front/name", STRING), 1_700_000_000 * 10**9
     heard = Heard()
-    options = SourceOptions("recorder", use_sim_time=True, names=names)
     with side.open(names=names) as publisher:
         publisher.advertise(found)
         publisher.clock(clock)
-        source = open_source("ros2", options)
-        source.serve(Controls())
-        source.start(Wanted(("name",), names=names), heard.take)
+        source = recorder(use_sim_time=True, names=names)
+        source.serve(recorder_services(Controls()))
+        source.start(wanted("name", names=names), heard.take)
 
         def arrives() -> bool:
             publisher.clock(clock)
@@ -208,8 +213,8 @@ def test_ros_renames_topics(side: Side) -> None:
         asked = side.peer.call("/robot/bag/is_paused", "IsPaused", {})
         source.close()
     assert asked == {"paused": False}
-    assert {*heard.payloads} == {*source.state.topics} == {"/robot/name"}
-    assert source.address.endswith(("rclpy as bag", "Cyclone DDS"))
+    assert {*heard.payloads} == {*source.topics} == {"/robot/name"}
+    assert ("bag" in source.address) != source.address.endswith("(Cyclone DDS)")
 
 
 def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
@@ -220,9 +225,9 @@ def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
         for one in (plain, latched):
             publisher.advertise(one)
         publisher.publish(latched, message(STRING, 77), 0)
-        source = open_source("ros2", SourceOptions("recorder", use_sim_time=True, poll_s=0.01))
-        source.start(Wanted(("/robot/*",)), heard.take)
-        assert source.state.waiting_for == "/clock"
+        source = recorder(use_sim_time=True, polling_interval=10.0)
+        source.start(wanted("/robot/*"), heard.take)
+        assert source.waiting_for == "/clock"
         publisher.publish(plain, message(STRING, 1), 0)
         publisher.clock(0)  # as simulators do at first: no time yet
         publisher.publish(plain, message(STRING, 2), 0)
@@ -233,7 +238,7 @@ def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
             return bool(heard.payloads["/robot/map"]) and publisher.subscribers(plain) == 1
 
         assert until(arrives)
-        assert source.state.waiting_for == ""
+        assert source.waiting_for == ""
         publisher.publish(plain, message(STRING, 3), 0)
         assert until(lambda: heard.payloads["/robot/name"])
         source.close()
@@ -245,8 +250,8 @@ def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
 def test_the_clock_is_recorded_by_itself(side: Side) -> None:
     heard, clock = Heard(), 1_700_000_000 * 10**9
     with side.open() as publisher:
-        source = open_source("ros2", SourceOptions("recorder", use_sim_time=True, poll_s=0.01))
-        source.start(Wanted(), heard.take)
+        source = recorder(use_sim_time=True, polling_interval=10.0)
+        source.start(wanted(), heard.take)
 
         def arrives() -> bool:
             publisher.clock(clock + len(heard.times))
@@ -260,9 +265,9 @@ def test_the_clock_is_recorded_by_itself(side: Side) -> None:
 def test_services(side: Side) -> None:
     """Those of rosbag2's recorder."""
     controls = Controls()
-    source = open_source("ros2", SourceOptions("rosbag2_recorder"))
-    source.serve(controls)
-    source.start(Wanted(), Heard().take)
+    source = recorder()
+    source.serve(recorder_services(controls))
+    source.start(wanted(), Heard().take)
 
     def call(name: str, kind: str) -> dict[str, Any]:
         return side.peer.call(f"/rosbag2_recorder/{name}", kind, {})
@@ -287,19 +292,17 @@ def test_a_message_that_cannot_be_taken(side: Side) -> None:
             raise ValueError("no")
         taken.append(message)
 
-    source = open_source("ros2", SourceOptions("recorder"))
+    source = recorder()
     with side.open() as publisher:
         publisher.advertise(recorded)
-        source.start(Wanted(), take)
+        source.start(wanted(), take)
         assert until(lambda: publisher.subscribers(recorded) == 1)
         for number in range(3):
             publisher.publish(recorded, message(STRING, number), 0)
         assert until(lambda: len(taken) == 3)
         source.close()
-    assert source.state.lost == {"/robot/name": 1}
-    assert [*source.state.warnings] == [
-        "/robot/name: a message could not be recorded: ValueError('no')"
-    ]
+    assert source.lost == {"/robot/name": 1}
+    assert [*source.warnings] == ["/robot/name: a message could not be recorded: ValueError('no')"]
 
 
 def test_hidden_topics_are_left_out(side: Side) -> None:
@@ -308,11 +311,11 @@ def test_hidden_topics_are_left_out(side: Side) -> None:
     with side.open() as publisher:
         for one in (hidden, plain):
             publisher.advertise(one)
-        source = open_source("ros2", SourceOptions("recorder"))
-        source.start(Wanted(), heard.take)
+        source = recorder()
+        source.start(wanted(), heard.take)
         assert until(lambda: publisher.subscribers(plain) == 1)
         source.close()
-    assert [*source.state.topics] == ["/robot/name"]
+    assert [*source.topics] == ["/robot/name"]
 
 
 EVENT = "std_srvs/srv/Trigger_Event"
@@ -324,8 +327,8 @@ def test_events_of_services(side: Side) -> None:
     heard = Heard()
     with side.open() as publisher:
         publisher.advertise(events)
-        source = open_source("ros2", SourceOptions("recorder"))
-        source.start(Wanted(all_topics=True, all_services=True), heard.take)
+        source = recorder()
+        source.start(wanted(), heard.take)
         assert until(lambda: publisher.subscribers(events) == 1)
         publisher.publish(events, bytes([0, 1, 0, 0, *range(32)]), 0)
         assert until(lambda: heard.payloads["/arm/_service_event"])
@@ -336,23 +339,22 @@ def test_events_of_services(side: Side) -> None:
 def test_topics_that_nobody_listens_to(side: Side) -> None:
     heard_by, leaf = channel("/robot/name", STRING), channel("/robot/leaf", STRING)
     side.peer.subscribe("/robot/name", STRING)
-    options = SourceOptions("recorder", ignore_leaf=True)
     with side.open() as publisher:
         for one in (heard_by, leaf):
             publisher.advertise(one)
-        source = open_source("ros2", options)
-        source.start(Wanted(("/robot/*",)), Heard().take)
+        source = recorder(ignore_leaf=True)
+        source.start(wanted("/robot/*"), Heard().take)
         assert until(lambda: publisher.subscribers(heard_by) == 2)
         source.close()
-    assert [*source.state.topics] == ["/robot/name"]
+    assert [*source.topics] == ["/robot/name"]
 
 
 def test_topics_that_nobody_publishes_yet(monkeypatch: pytest.MonkeyPatch) -> None:
     plain, heard = channel("/robot/name", STRING), Heard()
     with SIDES["rclpy"](monkeypatch) as side:
         side.peer.subscribe("/robot/name", STRING)
-        source = open_source("ros2", SourceOptions("recorder", unpublished=True, poll_s=None))
-        source.start(Wanted(), heard.take)
+        source = recorder(unpublished=True, discover=False)
+        source.start(wanted(), heard.take)
         with side.open() as publisher:
             publisher.advertise(plain)
             assert publisher.subscribers(plain) == 2
@@ -361,7 +363,7 @@ def test_topics_that_nobody_publishes_yet(monkeypatch: pytest.MonkeyPatch) -> No
         source.close()
     assert [*map(padded, heard.payloads["/robot/name"])] == [padded(message(STRING, 1))]
     with pytest.raises(OptionError, match="source a ROS 2"):
-        open_source("dds", SourceOptions("recorder", unpublished=True))
+        DdsNode(NodeOptions("recorder", unpublished=True))
 
 
 def test_a_type_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -369,10 +371,10 @@ def test_a_type_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     with SIDES["rclpy"](monkeypatch) as side, side.open() as publisher:
         publisher.advertise(channel("/robot/name", STRING))
         del side.peer._bus.kinds[STRING]
-        source = open_source("ros2", SourceOptions("recorder"))
-        source.start(Wanted(), Heard().take)
+        source = recorder()
+        source.start(wanted(), Heard().take)
         source.close()
-    (warning,) = source.state.warnings
+    (warning,) = source.warnings
     assert "'std_msgs/msg/String' is not installed" in warning
 
 
@@ -390,10 +392,9 @@ def test_a_definition_that_is_announced(monkeypatch: pytest.MonkeyPatch) -> None
     store.register(get_types_from_msg(text, "my_msgs/msg/Whole"))
     heard = Heard()
     with SIDES["dds"](monkeypatch) as side, side.open() as publisher:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(side.options["domain"]))
         publisher.advertise(recorded)
-        source = open_source("dds", SourceOptions("recorder"))
-        source.start(Wanted(), heard.take)
+        source = recorder()
+        source.start(wanted(), heard.take)
         assert until(lambda: publisher.subscribers(recorded) == 1)
         payload = bytes(store.serialize_cdr(whole(store), "my_msgs/msg/Whole"))
         publisher.publish(recorded, payload, 0)
@@ -426,14 +427,13 @@ def test_a_definition_that_a_node_describes(
     payload = bytes(store.serialize_cdr(default_message(store, CUSTOM), CUSTOM))
     typename, heard = "my_msgs.msg.dds_.Part_", Heard()
     with SIDES["dds"](monkeypatch) as side:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(side.options["domain"]))
         if described == "wrong":
             texts[CUSTOM] = texts[CUSTOM].replace("int16", "int32")
         if described != "nobody":
             side.peer.ask("describe", "robot/other", {})
             side.peer.ask("describe", "robot/part", {} if described == "unknown" else texts)
-        source = open_source("dds", SourceOptions("recorder"))
-        source.start(Wanted(("/robot/part",)), heard.take)
+        source = recorder()
+        source.start(wanted("/robot/part"), heard.take)
 
         def arrives() -> bool:
             message = base64.b64encode(payload).decode()
@@ -448,7 +448,7 @@ def test_a_definition_that_a_node_describes(
     assert found.schema
     if described != "proven":
         assert (found.schema.encoding, found.schema.data) == ("", b"")
-        assert [*source.state.warnings] == [
+        assert [*source.warnings] == [
             f"/robot/part: recorded without the definition of {CUSTOM}, which was not found"
         ]
         return

@@ -64,7 +64,8 @@ if TYPE_CHECKING:
     from mp4ds.plugins.exporting.export import export
     from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
     from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
-    from mp4ds.plugins.playing.play import PlayOptions, play
+    from mp4ds.plugins.playing.options import PlayOptions
+    from mp4ds.plugins.playing.play import play
     from mp4ds.plugins.playing.player import PlaySummary
     from mp4ds.plugins.recording.options import RecordOptions
     from mp4ds.plugins.recording.record import RecordSummary, record
@@ -100,10 +101,8 @@ _HOMES = {
         "ExportSummary",
     ),
     "plugins.importing.ros_mp4": ("import_ros_mp4",),
-    "plugins.playing.play": (
-        "PlayOptions",
-        "play",
-    ),
+    "plugins.playing.options": ("PlayOptions",),
+    "plugins.playing.play": ("play",),
     "plugins.playing.player": ("PlaySummary",),
     "plugins.recording.options": ("RecordOptions",),
     "plugins.recording.record": ("RecordSummary", "record"),

@@ -11,7 +11,7 @@ from mp4ds.cli.options import Command
 from mp4ds.cli.output import be_quiet
 from mp4ds.cli.process import DEBUG, report_errors
 from mp4ds.errors import OptionError
-from mp4ds.plugins.publishing.names import PLAIN, NodeNames, node_arguments
+from mp4ds.plugins.ros.names import PLAIN, NodeNames, node_arguments
 
 _NAMES = "mp4ds.names"  # key of the ROS arguments in click's context
 _QUIET = {"error", "fatal"}

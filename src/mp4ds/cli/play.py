@@ -6,7 +6,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -17,31 +17,29 @@ from mp4ds.cli.output import be_quiet, complain, is_quiet, print_json, say, show
 from mp4ds.cli.play_words import STORAGES, spelled
 from mp4ds.cli.process import caught_signals, report_errors
 from mp4ds.errors import OptionError
-from mp4ds.plugins.playing.play import PlayOptions, open_player
-from mp4ds.plugins.publishing.publisher import Controls
-
-if TYPE_CHECKING:
-    from mp4ds.plugins.playing.player import PlayProgress, PlaySummary
-    from mp4ds.plugins.publishing.names import NodeNames
+from mp4ds.plugins.playing.options import PlayOptions
+from mp4ds.plugins.playing.play import open_player
+from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary
+from mp4ds.plugins.ros.names import NodeNames
 
 _FASTER = 1.1
 
 
-def player_keys(controls: Controls) -> Mapping[str, Callable[[], object]]:
+def player_keys(player: Player) -> Mapping[str, Callable[[], object]]:
     """The action of each key.
 
     Space: pause or resume; right or ``s``: next message; left or ``b``: previous message; up and
     down: 10 % faster and slower; ``t``: turn pausing for topics on or off.
     """
     return {
-        " ": controls.toggle_paused,
-        "right": controls.play_next,
-        "s": controls.play_next,
-        "left": controls.step_back,
-        "b": controls.step_back,
-        "t": controls.toggle_topic_pauses,
-        "up": lambda: controls.set_rate(_rounded(controls.rate * _FASTER)),
-        "down": lambda: controls.set_rate(_rounded(controls.rate / _FASTER)),
+        " ": player.toggle_paused,
+        "right": player.play_next,
+        "s": player.play_next,
+        "left": player.step_back,
+        "b": player.step_back,
+        "t": player.toggle_topic_pauses,
+        "up": lambda: player.set_rate(_rounded(player.rate * _FASTER)),
+        "down": lambda: player.set_rate(_rounded(player.rate / _FASTER)),
     }
 
 

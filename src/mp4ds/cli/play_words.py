@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 from mp4ds.errors import OptionError
-from mp4ds.plugins.publishing.names import SERVICE_EVENTS, NodeNames, node_arguments
+from mp4ds.plugins.ros.names import SERVICE_EVENTS, NodeNames, node_arguments
 
 STORAGES = ("sqlite3", "mcap")
 

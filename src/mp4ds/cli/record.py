@@ -18,13 +18,12 @@ from mp4ds.cli.record_words import spelled
 from mp4ds.errors import OptionError, counted, path_text
 from mp4ds.files.sources import salvage_command
 from mp4ds.plugins.recording.options import RecordOptions
-from mp4ds.plugins.recording.record import open_recorder
+from mp4ds.plugins.recording.record import RecordProgress, RecordSummary, open_recorder
+from mp4ds.plugins.ros.names import NodeNames
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from mp4ds.plugins.publishing.names import NodeNames
-    from mp4ds.plugins.recording.record import RecordProgress, RecordSummary
 
 _LOG_S = 10.0
 _SHOWN = 20  # topics

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 
 from mp4ds.errors import OptionError
-from mp4ds.plugins.publishing.names import SERVICE_EVENTS, NodeNames, node_arguments
+from mp4ds.plugins.ros.names import SERVICE_EVENTS, NodeNames, node_arguments
 
 _SAME = {
     **dict.fromkeys(("-O", "--output-name"), "--output"),

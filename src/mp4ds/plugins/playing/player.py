@@ -7,63 +7,17 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
-from mp4ds.errors import PublishError, Refused
+from mp4ds.errors import OptionError, PublishError, Refused
+from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Lateness, Pace, Ticks
 from mp4ds.plugins.playing.timeline import Due, Playback, Restamper, Timeline, quick_switches
-from mp4ds.plugins.publishing.publisher import Publisher
+from mp4ds.plugins.ros.node import Node, Service, action
 from mp4ds.records import Channel
-
-
-@dataclass(frozen=True)
-class PlayerOptions:
-    """How to play a timeline. Times are in nanoseconds of the recording, topics as published.
-
-    Attributes:
-        rate: Seconds of the recording per second.
-        start_ns: Where to start; None for the first message.
-        end_ns: The last time to play; None for the end.
-        loop: Start over at the end.
-        keep_alive: Keep running at the end, for late subscribers.
-        delay_s: Seconds to wait before playing.
-        delays_loops: Whether to wait before each loop, too.
-        paused: Start paused.
-        immediate: Publish as fast as possible.
-        clock_hz: Rate at which /clock is published; None: it is not.
-        clock_with: Topics whose messages /clock is published before; None for all.
-        follow: Play in step with another player's /clock.
-        wait_for_subscribers: Wait until every topic has a subscriber.
-        drop: Drop late frames instead of playing slower.
-        skip_empty_ns: Skip gaps between messages that are longer than this; None: skip none.
-        pause_topics: Topics to pause before each message of.
-        lock_step: Topic on which a message is awaited before the next frame; empty for none.
-        rate_control: Topic whose header stamps limit the pace; empty for none.
-        rate_control_ns: How far playback may be ahead of these stamps.
-        restamp: Set header stamps to the time of publishing.
-    """
-
-    rate: float = 1.0
-    start_ns: int | None = None
-    end_ns: int | None = None
-    loop: bool = False
-    keep_alive: bool = False
-    delay_s: float = 0.0
-    delays_loops: bool = False
-    paused: bool = False
-    immediate: bool = False
-    clock_hz: float | None = None
-    clock_with: frozenset[str] | None = frozenset()
-    follow: bool = False
-    wait_for_subscribers: bool = False
-    drop: bool = False
-    skip_empty_ns: int | None = None
-    pause_topics: frozenset[str] = frozenset()
-    lock_step: str = ""
-    rate_control: str = ""
-    rate_control_ns: int = NS
-    restamp: bool = False
 
 
 @dataclass(frozen=True)
@@ -141,7 +95,7 @@ class Player:
 
     Args:
         timeline: What to play.
-        publisher: Where to publish; not closed here.
+        node: Publishes; not closed here.
         options: How to play it.
         progress: Called a few times a second, by the thread of `run`.
         steady: The monotonic clock, nanoseconds.
@@ -150,20 +104,21 @@ class Player:
     def __init__(
         self,
         timeline: Timeline,
-        publisher: Publisher,
-        options: PlayerOptions | None = None,
+        node: Node,
+        options: PlayOptions | None = None,
         *,
         progress: Callable[[PlayProgress], None] | None = None,
         steady: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._timeline = timeline
-        self._publisher = publisher
-        self._options = options or PlayerOptions()
+        self._node = node
+        self._options = options = options or PlayOptions()
         self._progress = progress
-        self._pace = Pace(self._options.rate, steady=steady)
-        start, end = self._options.start_ns, self._options.end_ns
-        self._start = timeline.start_ns if start is None else max(start, timeline.start_ns)
-        self._end = timeline.end_ns if end is None else min(end, timeline.end_ns)
+        self._pace = Pace(options.rate, steady=steady)
+        self._start = _start(options, timeline)
+        self._end = _end(options, timeline, self._start)
+        self._clock_topics = timeline.named("clock_topics", options.clock_topics)
+        self._pause_topics = timeline.named("pause_topics", options.pause_topics)
         self._changed = threading.Condition(threading.RLock())
         self._playback: Playback | None = None
         self._read_ns: int | None = None  # where the playback starts, until it is used
@@ -184,7 +139,7 @@ class Player:
         self._last_frame: int | None = None  # log time of the last frame published
         self._history: deque[int] = deque(maxlen=10_000)
         self._reached = self._start  # log time of the last message published
-        self._ticks = Ticks(self._options.clock_hz)
+        self._ticks = Ticks(self._options.clock)
         self._next_report = 0.0
         self._missing: dict[int, Channel] = {}  # by id()
         self._done = PlaySummary()
@@ -193,12 +148,12 @@ class Player:
     @property
     def address(self) -> str:
         """Where it publishes, for display."""
-        return self._publisher.address
+        return self._node.address
 
     @property
     def follows_clock(self) -> bool:
         """Whether it plays in step with another player's /clock."""
-        return self._options.follow
+        return bool(self._options.follow_clock)
 
     # ------------------------------------------------------------ controls
 
@@ -328,7 +283,7 @@ class Player:
         with quick_switches():
             try:
                 self._begin()
-                while self._publisher.is_alive and not self._is_stopped and self._advance():
+                while self._node.is_alive and not self._is_stopped and self._advance():
                     pass
             finally:
                 self._is_over = True
@@ -337,35 +292,35 @@ class Player:
         self._report(is_last=True)
         self._done.seconds = time.monotonic() - began
         is_whole = self._is_resting or not self._is_stopped
-        self._done.stopped = not (is_whole and self._publisher.is_alive)
+        self._done.stopped = not (is_whole and self._node.is_alive)
         self._done.as_recorded = self._timeline.as_recorded
         self._done.thinned = self._timeline.thinned
         return self._done
 
     def _begin(self) -> None:
         self._advertise()
-        self._publisher.serve(self)
+        self._node.serve(player_services(self))
         if self._options.lock_step:
-            self._publisher.listen(self._options.lock_step, self._on_reply)
-        if self._options.rate_control:
-            self._publisher.listen(self._options.rate_control, self._on_stamp)
-        if self._options.follow:
-            self._publisher.follow_clock(self._on_clock)
+            self._node.listen(self._options.lock_step, self._on_reply)
+        if self._options.rate_control_topic:
+            self._node.listen(self._options.rate_control_topic, self._on_stamp)
+        if self.follows_clock:
+            self._node.follow_clock(self._on_clock)
         self._pace.jump(self._start)
-        if self._options.clock_with != frozenset():
-            self._publisher.clock(self._start)  # advertised before the first message
+        if self._options.clock_topics or self._options.clock_topics_all:
+            self._node.clock(self._start)  # advertised before the first message
         self._read_from(self._start)  # decode ahead while waiting
-        self._wait(max(_SETTLE_S, self._options.delay_s), "waiting")
+        self._wait(max(_SETTLE_S, self._options.delay), "waiting")
         channels = [one for one in self._timeline.channels if id(one) not in self._missing]
         while self._options.wait_for_subscribers and not self._is_stopped:
-            if all(self._publisher.subscribers(item) > 0 for item in channels):
+            if all(self._node.subscribers(item) > 0 for item in channels):
                 break
             self._wait(0.1, "waiting for subscribers")
 
     def _advertise(self) -> None:
         for channel in self._timeline.channels:
             try:
-                self._publisher.advertise(channel)
+                self._node.advertise(channel)
             except Refused:  # the message type is not installed
                 self._missing[id(channel)] = channel
                 self._done.not_installed.setdefault(channel.topic, 0)
@@ -377,7 +332,7 @@ class Player:
         named = ", ".join(sorted({f"{one.topic} ({one.type_name})" for one in missing}))
         if len(self._missing) == len(self._timeline.channels):
             problem = f"no message type of the recording is installed: {named}"
-            raise PublishError(self._publisher.address, problem)
+            raise PublishError(self._node.address, problem)
         warnings.warn(
             f"These topics are not played, as their message types are not installed: {named}; "
             "install their packages, or leave the topics out with `exclude`.",
@@ -393,7 +348,7 @@ class Player:
 
     def _tick(self) -> None:
         if self._ticks.is_due():
-            self._publisher.clock(self._time())
+            self._node.clock(self._time())
 
     def _advance(self) -> bool:
         """Publish the next message if it is due, else wait a little; returns False at the end."""
@@ -444,16 +399,16 @@ class Player:
         if due.is_frame and self._replies < 1 and due.time_ns != self._last_frame:
             return self._hold(due, self._options.lock_step)
         if self._is_ahead():
-            return self._hold(due, self._options.rate_control)
+            return self._hold(due, self._options.rate_control_topic)
         if self._options.immediate:
             return 0.0, "playing"
-        if self._options.follow:
+        if self.follows_clock:
             state = "waiting for" if self._followed.time_ns is None else "following"
             return self._followed.seconds_until(due.time_ns), f"{state} /clock"
         return self._until_due(due), "playing"
 
     def _pause_before(self, due: Due | None) -> None:
-        pauses = due is not None and due.channel.topic in self._options.pause_topics
+        pauses = due is not None and due.channel.topic in self._pause_topics
         if pauses and self._pauses_for_topics and due is not self._paused_at:
             self._paused_at = due
             if not self._is_paused:
@@ -461,7 +416,7 @@ class Player:
 
     def _hold(self, due: Due, topic: str) -> tuple[float, str]:
         """Stop the clock at a message that has to wait for a message on another topic."""
-        if self._pace.now() >= due.time_ns or topic == self._options.rate_control:
+        if self._pace.now() >= due.time_ns or topic == self._options.rate_control_topic:
             now = min(self._pace.now(), due.time_ns)
             self._pace.pause()
             self._pace.jump(now)
@@ -470,13 +425,15 @@ class Player:
 
     def _is_ahead(self) -> bool:
         ahead = self._pace.now() - self._controlled
-        return bool(self._options.rate_control) and ahead > self._options.rate_control_ns
+        return bool(self._options.rate_control_topic) and ahead > round(
+            self._options.rate_control_max_delay * NS
+        )
 
     def _until_due(self, due: Due) -> float:
         if not self._pace.is_running:
             self._pace.resume()
-        skip = self._options.skip_empty_ns
-        if skip is not None and due.time_ns - self._pace.now() > skip:
+        skip = self._options.skip_empty
+        if skip is not None and due.time_ns - self._pace.now() > skip * NS:
             self._pace.jump(due.time_ns)
         seconds = self._pace.seconds_until(due.time_ns)
         if not self._options.drop:
@@ -490,7 +447,7 @@ class Player:
 
     def _time(self) -> int:
         """The recording time; never later than a message that is still to be published."""
-        if self._options.follow:
+        if self.follows_clock:
             return max(self._reached, self._followed.time_ns or 0)
         if self._options.immediate:
             return self._reached
@@ -517,8 +474,8 @@ class Player:
             self._pace.pause()
             self._pace.jump(time_ns)
             self._lateness.clear()
-        if self._has_looped and self._options.delays_loops:
-            self._wait(self._options.delay_s, "waiting")
+        if self._has_looped and self._node.world == "ros2":
+            self._wait(self._options.delay, "waiting")
         self._has_looped = False
         for due in self._timeline.latched(time_ns):
             self._send(due, time_ns)
@@ -535,18 +492,18 @@ class Player:
         """Start over, or wait for a control that does; returns whether to continue. Locked."""
         self._burst = None  # no messages left
         self._changed.notify_all()
-        if self._options.loop and not self._options.follow and not self._is_paused:
+        if self._options.loop and not self.follows_clock and not self._is_paused:
             if self._target is None:
                 self._target, self._has_looped = self._start, True
                 self._done.loops += 1
             return True
         end = time.monotonic() + _FOLLOW_END_S
-        while not self._is_stopped and self._target is None and self._publisher.is_alive:
-            is_waiting = self._options.follow and (self._options.loop or time.monotonic() < end)
+        while not self._is_stopped and self._target is None and self._node.is_alive:
+            is_waiting = self.follows_clock and (self._options.loop or time.monotonic() < end)
             self._is_resting = self._options.keep_alive and not self._is_paused
             if not (is_waiting or self._is_paused or self._is_resting):
                 return False
-            if self._options.loop and not self._is_paused and not self._options.follow:
+            if self._options.loop and not self._is_paused and not self.follows_clock:
                 return True  # it was resumed
             self._burst = None
             self._report("at the end")
@@ -564,16 +521,15 @@ class Player:
             self._done.not_installed[due.channel.topic] += 1
         elif not (due.is_frame and self._is_late(due.time_ns)):
             if self._has_clock(due):
-                self._publisher.clock(due.time_ns)
+                self._node.clock(due.time_ns)
             self._send(due, due.time_ns)
             self._sent(due, burst)
         self._report("paused" if self._is_paused else "playing")
 
     def _has_clock(self, due: Due) -> bool:
         """Whether to publish /clock before a message: as requested, or when not paced by time."""
-        chosen, hertz = self._options.clock_with, self._options.clock_hz
-        is_chosen = chosen is None or due.channel.topic in chosen
-        return is_chosen or (hertz is not None and self._options.immediate)
+        is_chosen = self._options.clock_topics_all or due.channel.topic in self._clock_topics
+        return is_chosen or (self._options.clock is not None and self._options.immediate)
 
     def _sent(self, due: Due, burst: _Burst | None) -> None:
         with self._changed:
@@ -598,7 +554,7 @@ class Player:
         payload = due.payload
         if self._restamper is not None:
             payload = self._restamper.restamped(due.channel, payload, self._pace.wall_of)
-        self._publisher.publish(due.channel, payload, time_ns)
+        self._node.publish(due.channel, payload, time_ns)
         topic = due.channel.topic
         self._done.messages[topic] = self._done.messages.get(topic, 0) + 1
 
@@ -650,3 +606,81 @@ class Player:
             is_late = is_playing and self._pace.seconds_until(time_ns) * NS <= -CATCH_UP_NS
             self._done.dropped += is_late
         return is_late
+
+
+def _start(options: PlayOptions, timeline: Timeline) -> int:
+    """The first time to play."""
+    start = timeline.start_ns + round(options.start_offset * NS)
+    if start > timeline.end_ns:
+        length = (timeline.end_ns - timeline.start_ns) / NS
+        raise OptionError(
+            f"`start_offset` {options.start_offset:g} is past the end: the recording has "
+            f"{length:.3f} s."
+        )
+    return start
+
+
+def _end(options: PlayOptions, timeline: Timeline, start: int) -> int:
+    """The last time to play. Of several, the latest, as in `ros2 bag play`."""
+    ends = []
+    if options.duration is not None:
+        ends.append(start + round(options.duration * NS))
+    if options.until_sec is not None and options.until_sec >= 0:
+        ends.append(round(options.until_sec * NS))
+    if options.until_nsec is not None and options.until_nsec >= 0:
+        ends.append(options.until_nsec)
+    return min(max(ends, default=timeline.end_ns), timeline.end_ns)
+
+
+# ---------------------------------------------------------------- services
+
+_PLAY = (
+    "builtin_interfaces/Time start_offset\nbuiltin_interfaces/Duration playback_duration\n"
+    "builtin_interfaces/Time playback_until_timestamp"
+)
+
+
+def _nanoseconds(time: Any) -> int:
+    return int(time.sec * NS + time.nanosec)
+
+
+def player_services(player: Player) -> Sequence[Service]:
+    """Those of `ros2 bag play`. They respond when the request has been carried out."""
+    success = "bool success"
+    return (
+        action("pause", player.pause),
+        action("resume", player.resume),
+        action("toggle_paused", player.toggle_paused),
+        Service("is_paused", "", "bool paused", lambda _: {"paused": player.is_paused}),
+        Service("get_rate", "", "float64 rate", lambda _: {"rate": player.rate}),
+        Service(
+            "set_rate",
+            "float64 rate",
+            success,
+            lambda request: {"success": player.set_rate(request.rate)},
+        ),
+        Service("play_next", "", success, lambda _: {"success": player.play_next()}),
+        Service(
+            "burst",
+            "uint64 num_messages",
+            "uint64 actually_burst",
+            lambda request: {"actually_burst": player.burst(request.num_messages)},
+        ),
+        Service("play", _PLAY, success, partial(_play, player)),
+        Service("seek", "builtin_interfaces/Time time", success, partial(_seek, player)),
+        action("stop", player.stop),
+    )
+
+
+def _play(player: Player, request: Any) -> Mapping[str, Any]:
+    start = player.start_ns + _nanoseconds(request.start_offset)
+    length = _nanoseconds(request.playback_duration)
+    until = _nanoseconds(request.playback_until_timestamp)
+    # clients that leave out an end send 0
+    ends = [*([start + length] if length > 0 else []), *([until] if until > 0 else [])]
+    return {"success": player.play(start, max(ends, default=None))}
+
+
+def _seek(player: Player, request: Any) -> Mapping[str, Any]:
+    player.seek(_nanoseconds(request.time))
+    return {"success": True}

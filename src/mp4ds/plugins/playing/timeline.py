@@ -23,7 +23,7 @@ from mp4ds.dataset.rebuild import DecodedColumns, everything
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.plan import Selection
 from mp4ds.plugins.playing.stamps import HeaderStamps
-from mp4ds.plugins.publishing.names import PLAIN, NodeNames
+from mp4ds.plugins.ros.names import PLAIN, NodeNames
 from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import Reduction
 from mp4ds.unpacking.republish import Republisher

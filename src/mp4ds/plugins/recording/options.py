@@ -1,11 +1,13 @@
-"""The options of a recorder."""
+"""The options of a recorder, and the topics that they choose."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mp4ds.errors import OptionError
 from mp4ds.options import (
     WHAT,
     Options,
@@ -16,8 +18,8 @@ from mp4ds.options import (
     option,
     parse_size,
 )
-from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, parse_quality
-from mp4ds.plugins.publishing.names import PLAIN, NodeNames
+from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, Selection, parse_quality
+from mp4ds.plugins.ros.names import PLAIN, SERVICE_EVENTS, NodeNames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,3 +143,64 @@ class RecordOptions(Options):
     about: str | None = about()
     force: bool = force()
     names: NodeNames = argument("Name, namespace and remappings of the node.", PLAIN)
+
+
+class Wanted:
+    """Which topics are recorded: all that an option or `topics` includes, and none excludes.
+
+    Args:
+        topics: Names or globs. As in `rosbag record`, a topic is subscribed to under the name that
+            the node's remappings give it, and recorded under the name given here.
+        options: The others.
+
+    Raises:
+        OptionError: Nothing is chosen, a pattern is not valid, or two topics are remapped to the
+            same one.
+    """
+
+    def __init__(self, topics: Sequence[str], options: RecordOptions) -> None:
+        self._all_topics = options.all or options.all_topics
+        self._all_services = options.all or options.all_services
+        is_all = self._all_topics or self._all_services
+        if not (topics or is_all or options.regex or options.topic_types):
+            raise OptionError("Name topics, or give `all`, `regex` or `topic_types`.")
+        names = options.names
+        self._recorded: dict[str, str] = {}
+        for topic in topics:
+            asked = names.resolved(topic.strip())
+            first = self._recorded.setdefault(names.renamed(asked), asked)
+            if first != asked:
+                raise OptionError(
+                    f"{first} and {asked} are the same topic after remapping: name one of them."
+                )
+        self._named = Selection([*self._recorded]) if topics else None
+        self._types = {*options.topic_types}
+        self._regex = _compiled("regex", options.regex)
+        self._left_out = Selection((), [names.resolved(topic.strip()) for topic in options.exclude])
+        self._exclude_types = {*options.exclude_topic_types}
+        self._exclude_regex = _compiled("exclude_regex", options.exclude_regex)
+
+    def __call__(self, topic: str, type_name: str = "") -> bool:
+        """Whether a topic is recorded."""
+        if not self._left_out(topic) or type_name in self._exclude_types:
+            return False
+        if self._exclude_regex and self._exclude_regex.search(topic):
+            return False
+        if self._all_services if topic.endswith(SERVICE_EVENTS) else self._all_topics:
+            return True
+        is_named = self._named is not None and self._named(topic)
+        is_found = self._regex is not None and self._regex.search(topic) is not None
+        return is_named or is_found or type_name in self._types
+
+    def recorded_as(self, topic: str) -> str:
+        """The name under which a topic is recorded."""
+        return self._recorded.get(topic, topic)
+
+
+def _compiled(option: str, pattern: str) -> re.Pattern[str] | None:
+    try:
+        return re.compile(pattern) if pattern else None
+    except re.error as error:
+        raise OptionError(
+            f"`{option}` {pattern!r} is not a valid regular expression: {error}."
+        ) from None

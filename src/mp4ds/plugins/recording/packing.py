@@ -10,6 +10,8 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
@@ -28,12 +30,33 @@ class PackingError(Mp4dsError):
 
 
 class PackingProcess:
-    """Carries out orders, one at a time, in a process of low priority."""
+    """Carries out orders, one at a time, in a process of low priority. A context manager."""
 
     _ARGUMENTS = ("-m", "mp4ds.plugins.recording.packing")
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
+        self._thread = ThreadPoolExecutor(1, "packing")
+        self._jobs: list[Future[None]] = []
+
+    def submit(self, job: Callable[[], None]) -> None:
+        """Run a job that gives orders after all earlier ones, in another thread."""
+        self._jobs.append(self._thread.submit(job))
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until all jobs have run; returns whether they have."""
+        return not wait(self._jobs, seconds).not_done
+
+    def __enter__(self) -> PackingProcess:
+        return self
+
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
+        if exc_type is not None:
+            self._thread.shutdown(wait=False, cancel_futures=True)
+            if self._process is not None:
+                self._process.kill()  # in the middle of an order
+        self._thread.shutdown()
+        self._close()
 
     def pack(self, folder: Path, number: int) -> None:
         """See `SpoolFolder.pack`.
@@ -75,16 +98,11 @@ class PackingProcess:
             _pipe(self._process.stdin).flush()
             answer = _pipe(self._process.stdout).readline()
         if not answer:
-            raise PackingError(f"the process that packs ended with code {self.close()}")
+            raise PackingError(f"the process that packs ended with code {self._close()}")
         if problem := json.loads(answer):
             raise PackingError(problem)
 
-    def kill(self) -> None:
-        """End it in the middle of an order."""
-        if self._process is not None:
-            self._process.kill()
-
-    def close(self) -> int:
+    def _close(self) -> int:
         """End it; returns its exit code."""
         process, self._process = self._process, None
         if process is None:

@@ -8,24 +8,27 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
-from mp4ds.errors import OptionError
-from mp4ds.files.outputs import sync
+from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetError, WriteError
+from mp4ds.files.outputs import check_target, sync
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
+from mp4ds.packing.manifest import dataset_files, folder_size
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.pack import checked_codec
+from mp4ds.packing.spool import SpoolFolder, SpoolSettings, summary_of
 from mp4ds.plan import SPEED, Purpose
 from mp4ds.plugins.playing.timeline import quick_switches
-from mp4ds.plugins.publishing.publisher import sourced
-from mp4ds.plugins.recording.options import RecordOptions
-from mp4ds.plugins.recording.source import Source, SourceOptions, Wanted, open_source
-from mp4ds.plugins.recording.splits import Packing, Split
-from mp4ds.plugins.recording.spool import MessageBuffer
+from mp4ds.plugins.recording.options import RecordOptions, Wanted
+from mp4ds.plugins.recording.packing import PackingError, PackingProcess
+from mp4ds.plugins.recording.source import Source, open_source
+from mp4ds.plugins.recording.spool import MessageBuffer, SpoolWriter
+from mp4ds.plugins.ros.node import Service, action, sourced
 from mp4ds.records import Message, MetadataRecord
 from mp4ds.times import INT64_MAX
 
@@ -37,9 +40,6 @@ _BEHIND = 1 / 8
 
 _LAST_NS = {"ros1": 2**32 * _NS - 1, "ros2": INT64_MAX}
 """The latest time that a bag or rosbag2 can hold."""
-
-_NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
-"""Node names of ROS's own recorders."""
 
 
 @dataclass(frozen=True)
@@ -157,38 +157,12 @@ def open_recorder(
         progress: Called a few times a second.
     """
     chosen = options or RecordOptions()
-    is_all = chosen.all or chosen.all_topics or chosen.all_services
-    if not (topics or is_all or chosen.regex or chosen.topic_types):
-        raise OptionError("Name topics, or give `all`, `regex` or `topic_types`.")
     kind = source.profile if source else chosen.to or sourced("record")
-    names = chosen.names.in_world(kind)
-    wanted = Wanted(
-        topics,
-        types=chosen.topic_types,
-        regex=chosen.regex,
-        all_topics=chosen.all or chosen.all_topics,
-        all_services=chosen.all or chosen.all_services,
-        exclude=chosen.exclude,
-        exclude_types=chosen.exclude_topic_types,
-        exclude_regex=chosen.exclude_regex,
-        names=names,
-    )
+    chosen = replace(chosen, names=chosen.names.in_world(kind))
+    wanted = Wanted(topics, chosen)
     _check(chosen)
     others = _bag_info(chosen.custom_data) if kind == "ros2" else []
-    if source is None:
-        source = open_source(
-            kind,
-            SourceOptions(
-                chosen.node or _NODES[kind],
-                use_sim_time=chosen.use_sim_time or bool(names.use_sim_time),
-                poll_s=chosen.polling_interval / 1000 if chosen.discover else None,
-                hidden=chosen.hidden,
-                unpublished=chosen.unpublished,
-                ignore_leaf=chosen.ignore_leaf,
-                qos_overrides=chosen.qos_overrides,
-                names=names,
-            ),
-        )
+    source = source or open_source(kind, chosen)
     with ExitStack() as stack:
         stack.callback(source.close)
         target = (
@@ -239,6 +213,131 @@ def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:
     return [MetadataRecord(RECORD, content)]
 
 
+class Split:
+    """One dataset of a recording.
+
+    Args:
+        target: Where to make it.
+        options: How to record.
+        source: Where messages come from.
+        others: What the recording holds besides messages.
+        packing: Packs the pieces of its spool, and joins the parts.
+
+    Raises:
+        TargetError: It cannot be made there.
+        WriteError: The disk refused.
+    """
+
+    def __init__(
+        self,
+        target: Path,
+        options: RecordOptions,
+        source: Source,
+        others: Sequence[MetadataRecord],
+        packing: PackingProcess,
+    ) -> None:
+        self.target = target
+        self.made: PackSummary | None = None
+        self.error: Exception | None = None
+        self.folder = SpoolFolder(target.with_name(target.name + UNFINISHED))
+        self._options = options
+        self._source = source
+        self._packing = packing
+        self._most_ns = round((options.max_duration or 0) * _NS)
+        self._parts = 0
+        self._packed_bytes = 0  # of messages
+        self._parts_bytes = 0
+        check_target(target, force=options.force, owned=dataset_files)
+        settings = SpoolSettings(
+            format=source.format,
+            profile=source.profile,
+            quality=str(options.quality),
+            codec=options.codec,
+            preset=options.preset,
+            gop=options.gop,
+        )
+        try:
+            self.lock = self.folder.begin(settings)
+            self.spool = SpoolWriter(self.folder, source.profile, others, self._on_closed)
+        except FileExistsError:
+            raise TargetError(
+                self.folder.path,
+                "already exists: a recording of this name was not finished",
+                "Choose another name, or recover that one first: "
+                f"{salvage_command(self.folder.path)}",
+            ) from None
+        except OSError as error:
+            raise WriteError(target, error) from None
+
+    @property
+    def spool_bytes(self) -> int:
+        """Bytes of messages that are not packed yet."""
+        return self.spool.bytes - self._packed_bytes
+
+    @property
+    def size(self) -> int:
+        """Bytes so far."""
+        return self.spool_bytes + self._parts_bytes
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the next message belongs into another dataset."""
+        span = self.spool.span
+        if self._most_ns and span and span[1] - span[0] >= self._most_ns:
+            return True
+        return self._options.max_size is not None and self.size >= self._options.max_size
+
+    def _on_closed(self, number: int, size: int) -> None:
+        self._packing.submit(partial(self._pack, number, size))
+
+    def _pack(self, number: int, size: int) -> None:
+        if self.error is None:  # otherwise it is kept as it is
+            try:
+                self._packing.pack(self.folder.path, number)
+                self._parts_bytes += folder_size(self.folder.part(number))
+                self._packed_bytes += size
+                self._parts += 1
+            except (PackingError, OSError) as error:
+                self.error = error
+                self._source.warn(
+                    f"{self.folder.path}: no more is packed, what comes is still recorded: {error}"
+                )
+
+    def close(self) -> None:
+        """Complete the spool, and have the dataset made when all of it is packed.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        self.spool.close(filter(None, list(self._source.topics.values())))
+        self._packing.submit(self._join)
+
+    def _join(self) -> None:
+        if self.error is not None:
+            return
+        options, count = self._options, self._parts
+        try:
+            self._packing.join(
+                self.folder.path, count, self.target, force=options.force, about=options.about
+            )
+            self.made = self._summary()
+            self.lock.close()
+            self.folder.remove(count)
+        except (Mp4dsError, OSError) as error:
+            self.error = error
+
+    def _summary(self) -> PackSummary:
+        made, raw = summary_of(self.target), self.spool.raw_bytes
+        topics = [replace(topic, raw_bytes=raw[topic.topic]) for topic in made.topics]
+        return replace(made, topics=topics, source_bytes=raw.total(), is_copy=False)
+
+    def failure(self, error: Exception) -> Exception:
+        """What to raise because of an error; what was recorded stays where it is."""
+        if isinstance(error, Mp4dsError) and not isinstance(error, PackingError):
+            return error
+        return RecordError(self.folder.path, self.target, error)
+
+
 class Recorder:
     """Records until it is stopped; see `open_recorder`.
 
@@ -270,7 +369,7 @@ class Recorder:
         self._others = others
         self._progress = progress
         self._buffer = MessageBuffer(options.buffer * 10**6, _LAST_NS[source.profile])
-        self._packing = Packing()
+        self._packing = PackingProcess()
         self._changed = threading.Event()
         self._is_stopped = False
         self._is_paused = options.start_paused
@@ -341,12 +440,12 @@ class Recorder:
         writer = threading.Thread(target=self._write, name="spool", daemon=True)
         writer.start()
         try:
-            self._source.serve(self)
+            self._source.serve(recorder_services(self))
             self._source.start(self._wanted, self._take)
             while not self._is_stopped:
                 self._changed.wait(_REPORT_S)
                 self._changed.clear()
-                clock = self._source.state.waiting_for
+                clock = self._source.waiting_for
                 if clock:
                     begun = time.monotonic()
                 if self._options.duration and time.monotonic() - begun >= self._options.duration:
@@ -365,9 +464,9 @@ class Recorder:
         summary.datasets = [split.made for split in self._splits if split.made]
         summary.seconds = time.monotonic() - begun
         summary.dropped = dict(self._buffer.dropped)
-        summary.lost = dict(self._source.state.lost)
+        summary.lost = dict(self._source.lost)
         summary.untimed = dict(self._buffer.untimed)
-        summary.warnings = list(self._source.state.warnings)
+        summary.warnings = list(self._source.warnings)
         return summary
 
     def _take(self, message: Message) -> None:
@@ -430,7 +529,7 @@ class Recorder:
         split, now = self._splits[-1], time.monotonic()
         topics = {
             topic: self._topic(topic, now)
-            for topic in sorted({*self._source.state.topics, *self._buffer.received})
+            for topic in sorted({*self._source.topics, *self._buffer.received})
         }
         self._progress(
             RecordProgress(
@@ -441,7 +540,7 @@ class Recorder:
                 waiting_bytes=self._buffer.bytes,
                 spool_bytes=sum(split.spool_bytes for split in self._splits),
                 bytes_written=split.size,
-                warnings=list(self._source.state.warnings),
+                warnings=list(self._source.warnings),
             )
         )
 
@@ -457,7 +556,7 @@ class Recorder:
             hz=hz,
             bytes_per_s=rate,
             dropped=self._buffer.dropped[topic],
-            lost=self._source.state.lost[topic],
+            lost=self._source.lost[topic],
             untimed=self._buffer.untimed[topic],
         )
 
@@ -465,7 +564,7 @@ class Recorder:
         """Warn of unfinished recordings next to this one."""
         for folder in sorted(self._target.parent.glob(f"*{UNFINISHED}")):
             if is_unfinished(folder):
-                self._source.state.warn(
+                self._source.warn(
                     f"{folder}: unfinished recording; if no recorder is writing it any more, "
                     f"recover it: {salvage_command(folder)}"
                 )
@@ -475,3 +574,14 @@ def _sync(paths: Sequence[Path]) -> None:
     for path in paths:
         with suppress(OSError):  # what the disk refuses, its writer is told, too
             sync(path)
+
+
+def recorder_services(recorder: Recorder) -> Sequence[Service]:
+    """Those of `ros2 bag record`, except for snapshots."""
+    return (
+        action("pause", recorder.pause),
+        action("resume", recorder.resume),
+        Service("is_paused", "", "bool paused", lambda _: {"paused": recorder.is_paused}),
+        action("split_bagfile", recorder.split),
+        action("stop", recorder.stop),
+    )

@@ -1,183 +1,66 @@
-"""Where a recorder gets its messages from, and which topics it records."""
+"""Where a recorder gets its messages from: a node that subscribes to wanted topics."""
 
 from __future__ import annotations
 
-import re
+import threading
+import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
 
 from mp4ds.bags.protocols import Format
-from mp4ds.errors import OptionError
-from mp4ds.plan import Selection
-from mp4ds.plugins.publishing.names import PLAIN, SERVICE_EVENTS, NodeNames
+from mp4ds.errors import Mp4dsError, Refused
+from mp4ds.plugins.recording.options import RecordOptions, Wanted
+from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions, Service, open_node
+from mp4ds.plugins.ros.qos import load_overrides
+from mp4ds.plugins.ros.ros2 import is_hidden
 from mp4ds.records import Channel, Message
 
+_CLOCK_POLL_S = 0.01
+_NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
+"""Node names of ROS's own recorders."""
 
-class Wanted:
-    """Which topics are recorded.
 
-    Those that one of `topics`, `types`, `regex`, `all_topics` and `all_services` includes, or all
-    if none of these is given, except for those that are excluded.
+class Source:
+    """Receives the messages of wanted topics, including topics that appear later.
 
     Args:
-        topics: Names or globs.
-        types: Names of message types.
-        regex: A pattern, searched for in the topic's name; empty for none.
-        all_topics: Include all topics but those of service events.
-        all_services: Include those of service events (ROS 2).
-        exclude: Names or globs.
-        exclude_types: Names of message types.
-        exclude_regex: A pattern, searched for in the topic's name; empty for none.
-        names: Namespace and remappings of the node. As in `rosbag record`, a topic is subscribed
-            to under its new name and recorded under the name given here.
-
-    Raises:
-        OptionError: A pattern is not valid, or two topics are remapped to the same one.
-    """
-
-    def __init__(
-        self,
-        topics: Sequence[str] = (),
-        *,
-        types: Sequence[str] = (),
-        regex: str = "",
-        all_topics: bool = False,
-        all_services: bool = False,
-        exclude: Sequence[str] = (),
-        exclude_types: Sequence[str] = (),
-        exclude_regex: str = "",
-        names: NodeNames = PLAIN,
-    ) -> None:
-        self._recorded: dict[str, str] = {}
-        for topic in topics:
-            asked = names.resolved(topic.strip())
-            first = self._recorded.setdefault(names.renamed(asked), asked)
-            if first != asked:
-                raise OptionError(
-                    f"{first} and {asked} are the same topic after remapping: name one of them."
-                )
-        self._named = Selection([*self._recorded]) if topics else None
-        self._types = {*types}
-        self._regex = _compiled("regex", regex)
-        is_all = not (topics or types or regex or all_topics or all_services)
-        self._all_topics, self._all_services = all_topics or is_all, all_services or is_all
-        left_out = [names.resolved(topic.strip()) for topic in exclude]
-        self._exclude = Selection(left_out) if exclude else None
-        self._exclude_types = {*exclude_types}
-        self._exclude_regex = _compiled("exclude_regex", exclude_regex)
-
-    def __call__(self, topic: str, type_name: str = "") -> bool:
-        """Whether a topic is recorded."""
-        if self._exclude and self._exclude(topic):
-            return False
-        if self._exclude_regex and self._exclude_regex.search(topic):
-            return False
-        if type_name in self._exclude_types:
-            return False
-        if self._all_services if topic.endswith(SERVICE_EVENTS) else self._all_topics:
-            return True
-        is_named = self._named is not None and self._named(topic)
-        is_found = self._regex is not None and self._regex.search(topic) is not None
-        return is_named or is_found or type_name in self._types
-
-    def recorded_as(self, topic: str) -> str:
-        """The name under which a topic is recorded."""
-        return self._recorded.get(topic, topic)
-
-
-def _compiled(option: str, pattern: str) -> re.Pattern[str] | None:
-    try:
-        return re.compile(pattern) if pattern else None
-    except re.error as error:
-        raise OptionError(
-            f"`{option}` {pattern!r} is not a valid regular expression: {error}."
-        ) from None
-
-
-@dataclass
-class SourceState:
-    """State of a source, updated by its own threads.
+        node: Closed with this.
+        options: How to record.
 
     Attributes:
-        lost: Messages lost, as reported by the middleware, by topic.
+        profile: ``ros1`` or ``ros2``.
+        format: The format of ROS's own recorder.
+        address: What it is connected to, to be displayed.
         warnings: Sentences, each to be shown once.
         topics: Topics subscribed to, with their channel if it is known before the first message.
         waiting_for: The clock topic that the recording waits for; empty once the clock runs.
     """
 
-    lost: Counter[str] = field(default_factory=Counter)
-    warnings: dict[str, None] = field(default_factory=dict)
-    topics: dict[str, Channel | None] = field(default_factory=dict)
-    waiting_for: str = ""
+    def __init__(self, node: Node, options: RecordOptions) -> None:
+        self.profile = node.world or ""
+        self.format: Format = "bag" if node.world == "ros1" else "rosbag2"
+        self.address = node.address
+        self.warnings: dict[str, None] = {}
+        self.topics: dict[str, Channel | None] = {}
+        self.waiting_for = ""
+        self._node = node
+        self._options = options
+        self._recorded_as: Callable[[str], str] = str
+        self._failed: Counter[str] = Counter()
+        self._sim_time_ns: int | None = None
+        self._subscribed: set[str] = set()
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def lost(self) -> Counter[str]:
+        """Messages that the middleware reports as lost, or that could not be taken, by topic."""
+        by_node = {self._recorded_as(topic): count for topic, count in self._node.lost.items()}
+        return self._failed + Counter(by_node)
 
     def warn(self, sentence: str) -> None:
         """Add a warning."""
         self.warnings[sentence] = None
-
-
-def told(state: SourceState, topic: str, receive: Callable[..., None]) -> Callable[..., None]:
-    """A callback for middlewares, which swallow, or crash on, what a callback raises.
-
-    Args:
-        state: Where to count each message that could not be recorded.
-        topic: The topic of the messages.
-        receive: Records a message.
-    """
-
-    def call(*message: Any) -> None:
-        try:
-            receive(*message)
-        except Exception as error:
-            state.lost[topic] += 1
-            state.warn(f"{topic}: a message could not be recorded: {error!r}")
-
-    return call
-
-
-class RecorderControls(Protocol):
-    """What remote controls (services, keys) may do to a recorder."""
-
-    @property
-    def is_paused(self) -> bool:
-        """Whether it is paused."""
-        ...
-
-    def pause(self) -> None:
-        """Pause: ignore messages from now on."""
-        ...
-
-    def resume(self) -> None:
-        """Resume after a pause."""
-        ...
-
-    def split(self) -> None:
-        """Start a new dataset."""
-        ...
-
-    def stop(self) -> None:
-        """Stop, and complete the dataset."""
-        ...
-
-
-class Source(Protocol):
-    """Receives the messages of wanted topics, including topics that appear later.
-
-    Attributes:
-        format: The format of ROS's own recorder: ``bag`` or ``rosbag2``.
-        profile: ``ros1`` or ``ros2``.
-        address: What it is connected to, to be displayed.
-        state: Its state.
-    """
-
-    format: Format
-    profile: str
-    address: str
-    state: SourceState
 
     def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
         """Start receiving, in threads of its own.
@@ -193,61 +76,109 @@ class Source(Protocol):
         Raises:
             PublishError: The middleware refuses.
         """
-        ...
+        self._recorded_as = wanted.recorded_as
+        names = self._options.names
+        if self._options.use_sim_time or names.use_sim_time or self._node.wants_clock:
+            self.waiting_for = names.renamed(CLOCK)
+            self._node.follow_clock(self._tick)
+        else:
+            self._look(wanted, take)
+        self._thread = threading.Thread(
+            target=self._keep_looking, args=(wanted, take), name="topics", daemon=True
+        )
+        self._thread.start()
 
-    def serve(self, controls: RecorderControls) -> None:
-        """Offer the services of `ros2 bag record` (ROS 2)."""
-        ...
+    def serve(self, services: Sequence[Service]) -> None:
+        """Offer remote control, as `ros2 bag record` does; `rosbag record` has none."""
+        if self.profile == "ros2":
+            self._node.serve(services)
+
+    def _tick(self, time_ns: int) -> None:
+        if time_ns:  # 0 means that the clock has not started
+            self._sim_time_ns, self.waiting_for = time_ns, ""
+
+    def _keep_looking(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        is_clear = self.waiting_for == ""  # then it has looked once
+        while self.waiting_for:
+            if self._ended.wait(_CLOCK_POLL_S):
+                return
+        poll_s = max(self._options.polling_interval / 1000, self._node.poll_s)
+        end = time.monotonic() + self._node.discovery_s
+        while self._options.discover or not is_clear or time.monotonic() < end:
+            if self._ended.wait(poll_s if is_clear else 0.0):
+                return
+            try:
+                self._look(wanted, take)
+                is_clear = True
+            except Mp4dsError as error:
+                self.warn(f"new topics are not noticed: {error}")
+                self._ended.wait(poll_s)
+
+    def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+        """Subscribe to new topics."""
+        is_leaf_wanted = not self._options.ignore_leaf or self.profile != "ros2"
+        heard = None if is_leaf_wanted else self._node.subscribed_topics()
+
+        def is_new(topic: str, kind: str) -> bool:
+            is_shown = self._options.hidden or self.profile != "ros2" or not is_hidden(topic)
+            is_due = topic not in self._subscribed and (heard is None or topic in heard)
+            return is_due and is_shown and wanted(topic, kind)
+
+        for topic, kinds in self._node.topics(is_new).items():
+            self._subscribed.add(topic)
+            self._subscribe(topic, kinds, take)
+
+    def _subscribe(self, topic: str, kinds: Sequence[str], take: Callable[[Message], None]) -> None:
+        name = self._recorded_as(topic)
+
+        def receive(channel: Channel, data: bytes, sent_ns: int) -> None:
+            # middlewares swallow, or crash on, what a callback raises
+            try:
+                now = time.time_ns() if self._sim_time_ns is None else self._sim_time_ns
+                take(Message(channel, now, sent_ns if sent_ns > 0 else now, 0, data))
+            except Exception as error:
+                self._failed[name] += 1
+                self.warn(f"{name}: a message could not be recorded: {error!r}")
+
+        if len(kinds) > 1:
+            self.warn(f"{topic}: has several types: only {kinds[0]} is recorded")
+        try:
+            channel = self._node.subscribe(topic, kinds[0], name, receive)
+        except Refused as reason:
+            self.warn(f"{topic}: not recorded: {reason}")
+            return
+        if channel is not None and channel.schema and not channel.schema.data:
+            self.warn(
+                f"{topic}: recorded without the definition of {kinds[0]}, which was not found"
+            )
+        self.topics[name] = channel
 
     def close(self) -> None:
         """Stop receiving."""
-        ...
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._node.close()
 
 
-@dataclass(frozen=True, slots=True)
-class SourceOptions:
-    """How a source receives.
-
-    Attributes:
-        node: Name of the node, if `names` has none.
-        use_sim_time: Whether log times are those of /clock.
-        poll_s: Seconds between two checks for new topics; None to check only once.
-        hidden: Whether to include hidden topics (ROS 2).
-        unpublished: Whether to include topics without a publisher (rclpy).
-        ignore_leaf: Whether to leave out topics without a subscriber (ROS 2).
-        qos_overrides: YAML file of QoS profiles by topic.
-        names: Name, namespace and remappings of the node.
-    """
-
-    node: str
-    use_sim_time: bool = False
-    poll_s: float | None = 0.1
-    hidden: bool = False
-    unpublished: bool = False
-    ignore_leaf: bool = False
-    qos_overrides: Path | None = None
-    names: NodeNames = PLAIN
-
-
-_SOURCES: Mapping[str, str] = {
-    "ros1": "ros1:RospySource",
-    "ros2": "ros2:RclpySource",
-    "dds": "dds:DdsSource",
-}
-
-
-def open_source(kind: str, options: SourceOptions) -> Source:
+def open_source(kind: str, options: RecordOptions) -> Source:
     """Open a source.
 
     Args:
-        kind: ``ros1`` or ``ros2``; ROS 2 is rclpy if a ROS 2 is sourced, else Cyclone DDS.
-        options: How to receive.
+        kind: ``ros1`` or ``ros2``.
+        options: How to record.
 
     Raises:
+        OptionError: An option is not valid there.
         PublishError: The middleware is not installed, or cannot be reached.
     """
-    if kind == "ros2" and find_spec("rclpy") is None:
-        kind = "dds"
-    module, _, name = _SOURCES[kind].partition(":")
-    made: Source = getattr(import_module(f"mp4ds.plugins.recording.{module}"), name)(options)
-    return made
+    node = open_node(
+        kind,
+        NodeOptions(
+            options.node or _NODES[kind],
+            options.names,
+            overrides=load_overrides(options.qos_overrides),
+            unpublished=options.unpublished,
+        ),
+    )
+    return Source(node, options)

@@ -1,4 +1,4 @@
-"""The ROS 1 publisher, which uses rospy."""
+"""A node of ROS 1, by rospy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as TimedOut
 from contextlib import contextmanager
@@ -22,9 +22,10 @@ from typing import Any, TypeVar
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import is_ros1
+from mp4ds.bags.ros1_records import make_channel
 from mp4ds.errors import ConversionError, OptionError, PublishError
-from mp4ds.plugins.publishing.names import PLAIN, NodeNames
-from mp4ds.plugins.publishing.publisher import Controls
+from mp4ds.plugins.ros.names import NodeNames
+from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions, Receive, Service
 from mp4ds.records import Channel
 
 MAX_BYTES = 128 << 20
@@ -251,32 +252,35 @@ class AdvertisedTopic:
 
 _T = TypeVar("_T")
 
-ANSWER_S = 4.0
+_ANSWER_S = 4.0
 """Seconds to wait for an answer of the master."""
 
 _BACKLOG = 1024
 _LOGGING = "version: 1\nincremental: true\n"
 
 
-def start_node(
-    node: str,
-    names: NodeNames = PLAIN,
-) -> tuple[Any, str]:
+def _start_node(node: str, names: NodeNames) -> tuple[Any, str]:
     """Make this process a node; returns rospy, and the address of the master.
 
     Args:
         node: Its name, to which a number is appended, unless `names` has a name.
-        names: Name, namespace and remappings of the node.
+        names: Name and namespace of the node.
 
     Raises:
+        ImportError: rospy is missing.
         OptionError: The address of the master is not valid.
-        PublishError: rospy is missing, or no master answers.
+        PublishError: No master answers.
     """
-    rosgraph, rospy = _imported()
+    before = logging.getLoggerClass()
+    try:
+        import rosgraph
+        import rospy
+    finally:
+        logging.setLoggerClass(before)  # rosgraph sets its own for the whole process
     try:
         master = str(rosgraph.get_master_uri())
         # init_node() would wait for it forever
-        has_master = answer(rosgraph.is_master_online, ANSWER_S)
+        has_master = _answer(rosgraph.is_master_online, _ANSWER_S)
     except ValueError as error:
         raise OptionError(f"The address of the ROS master is not valid: {error}.") from None
     if not has_master:
@@ -286,11 +290,12 @@ def start_node(
         raise PublishError(
             master, "a process can be a ROS node only once, and this one was; start a new process"
         )
+    arguments = (("name", names.node), ("ns", names.namespace))
     try:
         with _own_logging():
             rospy.init_node(
                 node,
-                argv=[f"__{key}:={value}" for key, value in _node_arguments(names)],
+                argv=[f"__{key}:={value}" for key, value in arguments if value],
                 anonymous=True,
                 disable_signals=True,
                 disable_rostime=True,  # this process publishes the time, and must not wait for it
@@ -302,11 +307,6 @@ def start_node(
     return rospy, master
 
 
-def _node_arguments(names: NodeNames) -> list[tuple[str, str]]:
-    arguments = (("name", names.node), ("ns", names.namespace))
-    return [(key, value) for key, value in arguments if value]
-
-
 def _receive_many() -> None:
     """Let many subscribers connect at once: beyond rospy's 5, they retry only after seconds."""
     from rospy.impl.tcpros_base import init_tcpros_server
@@ -314,22 +314,6 @@ def _receive_many() -> None:
     server = init_tcpros_server().tcp_ros_server
     if server is not None:
         server.server_sock.listen(_BACKLOG)
-
-
-def _imported() -> tuple[Any, Any]:
-    before = logging.getLoggerClass()
-    try:
-        import rosgraph
-        import rospy
-    except ImportError as error:
-        problem = (
-            f"ROS 1 is not available ({error}); source its setup.bash, or install python3-rospy "
-            "and use a virtual environment made with python3 -m venv --system-site-packages"
-        )
-        raise PublishError("rospy", problem) from None
-    finally:
-        logging.setLoggerClass(before)  # rosgraph sets its own for the whole process
-    return rosgraph, rospy
 
 
 @contextmanager
@@ -348,7 +332,7 @@ def _own_logging() -> Iterator[None]:
                 del os.environ[key]
 
 
-def answer(call: Callable[[], _T], seconds: float) -> _T | None:
+def _answer(call: Callable[[], _T], seconds: float) -> _T | None:
     """The result of a call, or None after a timeout, as rospy's calls have none."""
     future: Future[_T] = Future()
 
@@ -365,14 +349,14 @@ def answer(call: Callable[[], _T], seconds: float) -> _T | None:
         return None
 
 
-def is_name(name: str) -> bool:
+def _is_name(name: str) -> bool:
     """Whether a topic name is valid."""
     import rosgraph.names
 
     return bool(name.strip("/")) and bool(rosgraph.names.is_legal_name(name))
 
 
-def raw_class(kind: RosType) -> Any:
+def _raw_class(kind: RosType) -> Any:
     """A message class whose only field is the serialized message."""
     import genpy
 
@@ -396,20 +380,20 @@ def raw_class(kind: RosType) -> Any:
     return type(kind.name.rpartition("/")[2], (genpy.Message,), members)
 
 
-def set_bool_class() -> Any:
+def _set_bool_class() -> Any:
     """A class for std_srvs/SetBool, which may not be installed."""
     request = "8b94c1b53db61fb6aed406028ad6332a", b"bool data\n"
     response = "937c9679a518e3a18d831e57125ea522", b"bool success\nstring message\n"
     members = {
         "_type": "std_srvs/SetBool",
         "_md5sum": "09fb03525b03e7ea1fd3992bafd87e16",
-        "_request_class": raw_class(RosType("std_srvs/SetBoolRequest", *request)),
-        "_response_class": raw_class(RosType("std_srvs/SetBoolResponse", *response)),
+        "_request_class": _raw_class(RosType("std_srvs/SetBoolRequest", *request)),
+        "_response_class": _raw_class(RosType("std_srvs/SetBoolResponse", *response)),
     }
     return type("SetBool", (), members)
 
 
-# ---------------------------------------------------------------- the publisher
+# ---------------------------------------------------------------- publishing and receiving
 
 _FLUSH_S = 3.0  # to send what is queued
 _FAREWELL_S = 0.5  # for subscribers to read it: rospy's drop unread data at a disconnect
@@ -419,58 +403,53 @@ _CLOCK = RosType("rosgraph_msgs/Clock", "a9c97c1d230cfc112e270351a944ee47", b"ti
 _CLOCK_QUEUE = 10  # old times are of no use, but one of the last few may belong to a message
 _RENAME = "Leave the topic out with `exclude`, or rename it with `remap`."
 _REMEDY = "Leave the topic out with `exclude`."
+_RECEIVED_BYTES = 2**18
+"""Bytes read from a socket at a time; rospy's 64 KB take a third more CPU time."""
 
 
-class RospyPublisher:
-    """Publishes to ROS 1, as a node of its own. A process can have one only once.
+class Ros1Node(Node):
+    """A node of ROS 1. A process can have one only once.
 
     It uses the rospy of the ROS 1 that is sourced, or any other that Python finds. A subscriber
     that is too slow loses the oldest messages, as with every ROS 1 publisher, and delays no others.
+    Each publisher of a topic has its own channel, whose metadata is the connection header, as
+    `rosbag record` keeps it.
 
     Args:
-        node: Name of the node if `names` has none; a number is appended.
-        names: Name, namespace and remappings of the node.
-        queue_size: Messages that may wait for each subscriber of a topic, as with
-            ``rosbag play --queue``; 0 for any number. The limit of 128 MiB applies in any case.
-        wait_s: How many seconds to wait for a subscriber that receives nothing and has a full
-            queue, before its oldest message is dropped. Above 0, publishing without pacing is as
-            fast as the subscribers, which lose nothing. After a timeout, a subscriber is not waited
-            for again until it has caught up.
+        options: How it takes part.
 
     Raises:
-        OptionError: An option is not valid.
-        PublishError: rospy is missing, or no master answers.
+        OptionError: The address of the master is not valid.
+        PublishError: No master answers.
     """
 
-    world: str | None = "ros1"
+    world = "ros1"
+    poll_s = 0.5  # the master is asked over the network
 
-    def __init__(
-        self,
-        *,
-        node: str = "mp4ds_play",
-        names: NodeNames = PLAIN,
-        queue_size: int = 100,
-        wait_s: float = 0.0,
-    ) -> None:
-        if queue_size < 0 or wait_s < 0:
-            raise OptionError("A ROS 1 queue cannot be shorter than 0. Use 100, or 0 for no limit.")
-        self._rospy, self._master = start_node(node, names)
-        self._clock_topic = names.renamed("/clock")
-        self._queue_size, self._wait_s = queue_size, wait_s
+    def __init__(self, options: NodeOptions) -> None:
+        super().__init__()
+        self._options = options
+        self._rospy, self._master = _start_node(options.node, options.names)
+        self._clock_topic = options.names.renamed(CLOCK)
         self._topics: dict[str, AdvertisedTopic] = {}
         self._channels: dict[int, tuple[Channel, AdvertisedTopic, str | None]] = {}  # by id()
         self._converter: Converter | None = None
+        self._received: dict[tuple[str, tuple[tuple[str, str], ...]], Channel] = {}
+        self._lock = threading.Lock()
+        self._subscribers: list[Any] = []
         self._is_closed = False
 
     @property
     def address(self) -> str:
-        """Its master, for display."""
+        """Its master."""
         return f"ROS 1, {self._master}"
 
+    # ------------------------------------------------------------ publishing
+
     def advertise(self, channel: Channel) -> None:
-        """Announce a channel before its first message."""
+        """Announce a channel."""
         self._check_alive()
-        topic = self._topic(channel.topic, self._kind(channel), self._queue_size)
+        topic = self._topic(channel.topic, self._kind(channel), self._options.queue_size)
         caller = None
         if is_ros1(channel):
             caller = channel.metadata.get("callerid", "")
@@ -478,10 +457,10 @@ class RospyPublisher:
         self._channels[id(channel)] = channel, topic, caller
 
     def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
-        """Publish a message of an advertised channel."""
+        """Publish a message."""
         _, topic, caller = self._channels[id(channel)]
         self._check_alive()
-        topic.publish(payload, caller=caller, wait_s=self._wait_s)
+        topic.publish(payload, caller=caller, wait_s=self._options.wait_s)
 
     def clock(self, time_ns: int) -> None:
         """Publish a recording time as /clock."""
@@ -500,72 +479,6 @@ class RospyPublisher:
     def dropped(self) -> int:
         """Messages dropped so far because subscribers were too slow."""
         return sum(topic.dropped for topic in self._topics.values())
-
-    def follow_clock(self, on_time: Callable[[int], None]) -> None:
-        """Call back with each time, in nanoseconds, that another node publishes as /clock."""
-
-        def on_message(message: Any) -> None:
-            if len(message._buff) == _TIME.size:
-                seconds, nanoseconds = _TIME.unpack(message._buff)
-                on_time(seconds * _NS + nanoseconds)
-
-        self._subscribe(self._clock_topic, on_message)
-
-    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Call back for each message on another node's topic, with its header stamp."""
-        self._subscribe(topic, lambda message: on_message(_stamp_of(message)))
-
-    def serve(self, controls: Controls) -> None:
-        """Offer ``~pause_playback``, a std_srvs/SetBool, as rosbag play does."""
-
-        def handle(request: Any) -> Any:
-            is_wanted = request.payload != b"\0"
-            is_change = is_wanted != controls.is_paused
-            if is_change:
-                (controls.pause if is_wanted else controls.resume)()
-                answer_text = f"Playback is now {'paused' if is_wanted else 'resumed'}"
-            else:
-                answer_text = f"Bag is already {'paused.' if is_wanted else 'running.'}"
-            text = answer_text.encode()
-            return service._response_class(struct.pack("<BI", is_change, len(text)) + text)
-
-        service = set_bool_class()
-        self._rospy.Service("~pause_playback", service, handle)
-
-    @property
-    def wants_clock(self) -> bool:
-        """Whether /use_sim_time is set."""
-        try:
-            found = answer(lambda: self._rospy.get_param("/use_sim_time", False), ANSWER_S)
-        except (OSError, self._rospy.ROSException) as error:
-            raise PublishError(self._master, f"lost the ROS master ({error})") from None
-        return bool(found)
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether the node has not been shut down."""
-        return not self._rospy.is_shutdown()
-
-    def close(self) -> None:
-        """Send what is still waiting, for a limited time, and shut down the node."""
-        if self._is_closed:
-            return
-        self._is_closed = True
-        deadline = time.monotonic() + _FLUSH_S
-        for topic in self._topics.values():
-            topic.flush(deadline)
-        if self.is_alive and any(topic.subscribers for topic in self._topics.values()):
-            time.sleep(_FAREWELL_S)
-        # The master may be gone.
-        answer(lambda: self._rospy.signal_shutdown("the player has ended"), ANSWER_S)
-        for topic in self._topics.values():
-            topic.end()
-
-    def __enter__(self) -> RospyPublisher:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _check_alive(self) -> None:
         if not self.is_alive:
@@ -588,7 +501,7 @@ class RospyPublisher:
 
     def _topic(self, name: str, kind: RosType, queue_size: int) -> AdvertisedTopic:
         """The topic of that name, advertised; channels of one topic share it."""
-        if not is_name(name):
+        if not _is_name(name):
             raise ConversionError(name, "its name is not valid in ROS 1", _RENAME)
         resolved = self._rospy.resolve_name(name)
         topic = self._topics.get(resolved)
@@ -606,12 +519,113 @@ class RospyPublisher:
     def _make_publisher(self, name: str, kind: RosType, listener: Any) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # rospy's advice to use its queues
-            return self._rospy.Publisher(name, raw_class(kind), subscriber_listener=listener)
+            return self._rospy.Publisher(name, _raw_class(kind), subscriber_listener=listener)
+
+    # ------------------------------------------------------------ receiving
+
+    @property
+    def wants_clock(self) -> bool:
+        """Whether /use_sim_time is set."""
+        return bool(self._of_master(lambda: self._rospy.get_param("/use_sim_time", False)))
+
+    def _of_master(self, call: Callable[[], _T]) -> _T:
+        try:
+            found = _answer(call, _ANSWER_S)
+        except (OSError, self._rospy.ROSException) as error:
+            raise PublishError(self._master, f"lost the ROS master ({error})") from None
+        if found is None:
+            raise PublishError(self._master, "the ROS master does not respond")
+        return found
+
+    def follow_clock(self, on_time: Callable[[int], None]) -> None:
+        """Subscribe to /clock."""
+
+        def on_message(message: Any) -> None:
+            if len(message._buff) == _TIME.size:
+                seconds, nanoseconds = _TIME.unpack(message._buff)
+                on_time(seconds * _NS + nanoseconds)
+
+        self._subscribe(self._clock_topic, on_message)
+
+    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
+        """Subscribe to a topic for its header stamps."""
+        if not _is_name(topic):
+            raise OptionError(f"{topic!r} is not a valid ROS 1 topic name, such as /reply.")
+        self._subscribe(topic, lambda message: on_message(_stamp_of(message)))
+
+    def topics(self, is_wanted: Callable[[str, str], bool]) -> Mapping[str, Sequence[str]]:
+        """Topics that the master knows."""
+        found = self._of_master(self._rospy.get_published_topics)
+        return {topic: [kind] for topic, kind in found if is_wanted(topic, kind)}
+
+    def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> None:
+        """Subscribe; each connection tells its own channel."""
+
+        def on_message(message: Any) -> None:
+            receive(self._channel(name, message._connection_header), message._buff, 0)
+
+        self._subscribe(topic, on_message)
 
     def _subscribe(self, topic: str, on_message: Callable[[Any], None]) -> None:
-        if not is_name(topic):
-            raise OptionError(f"{topic!r} is not a valid ROS 1 topic name, such as /reply.")
-        self._rospy.Subscriber(topic, self._rospy.AnyMsg, on_message, tcp_nodelay=True)
+        self._subscribers.append(
+            self._rospy.Subscriber(
+                topic,
+                self._rospy.AnyMsg,
+                on_message,
+                buff_size=_RECEIVED_BYTES,
+                tcp_nodelay=True,
+            )
+        )
+
+    def _channel(self, topic: str, header: Mapping[str, str]) -> Channel:
+        key = topic, tuple(sorted(header.items()))
+        with self._lock:
+            if key not in self._received:
+                raw = {name.encode(): value.encode() for name, value in header.items()}
+                self._received[key] = make_channel(len(self._received), topic.encode(), raw)
+            return self._received[key]
+
+    def serve(self, services: Sequence[Service]) -> None:
+        """Offer ``~pause_playback``, a std_srvs/SetBool, as rosbag play does."""
+        answers = {service.name: service.answer for service in services}
+
+        def handle(request: Any) -> Any:
+            is_wanted = request.payload != b"\0"
+            is_change = is_wanted != answers["is_paused"](None)["paused"]
+            if is_change:
+                answers["pause" if is_wanted else "resume"](None)
+                said = f"Playback is now {'paused' if is_wanted else 'resumed'}"
+            else:
+                said = f"Bag is already {'paused.' if is_wanted else 'running.'}"
+            text = said.encode()
+            return kind._response_class(struct.pack("<BI", is_change, len(text)) + text)
+
+        kind = _set_bool_class()
+        self._rospy.Service("~pause_playback", kind, handle)
+
+    # ------------------------------------------------------------ the end
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the node has not been shut down."""
+        return not self._rospy.is_shutdown()
+
+    def close(self) -> None:
+        """Send what is still waiting, for a limited time, and shut down the node."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        for subscriber in self._subscribers:
+            subscriber.unregister()
+        deadline = time.monotonic() + _FLUSH_S
+        for topic in self._topics.values():
+            topic.flush(deadline)
+        if self.is_alive and any(topic.subscribers for topic in self._topics.values()):
+            time.sleep(_FAREWELL_S)
+        # The master may be gone.
+        _answer(lambda: self._rospy.signal_shutdown("the node is closed"), _ANSWER_S)
+        for topic in self._topics.values():
+            topic.end()
 
 
 _HEADER = re.compile(r"(?:\s|#[^\n]*\n)*(?:std_msgs/)?Header\s")

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from mp4ds.errors import OptionError
 
 SERVICE_EVENTS = "/_service_event"
@@ -37,6 +39,8 @@ _VALUED = {
 _SIM_TIME = "use_sim_time"
 _FLAG = re.compile(r"--(?:enable|disable)-[\w-]+-logs")
 _LEVELS = ("debug", "info", "warn", "error", "fatal")
+_MAX_BYTES = 2**20
+_Loader: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
@@ -157,13 +161,39 @@ def _with(names: NodeNames, parameter: str) -> NodeNames:
 
 def _with_file(names: NodeNames, path: Path) -> NodeNames:
     """Add the parameters that a file has for this node."""
-    from mp4ds.plugins.publishing.ros2_writers import load_map  # which imports this module
-
     own = names.of_node("")
     for node, parameters in _nodes(load_map(path, "nodes to parameters"), ""):
         if node in ("**", own) and _SIM_TIME in parameters:
             names = replace(names, use_sim_time=_truth(parameters[_SIM_TIME], str(path)))
     return names
+
+
+def load_map(path: Path, of: str) -> dict[Any, Any]:
+    """Read a small YAML file of the user's.
+
+    Args:
+        path: The file; an empty one is an empty map.
+        of: What it maps, for errors.
+
+    Raises:
+        OptionError: It cannot be read, or is not a map.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read: {error.strerror}.") from None
+    if len(data) > _MAX_BYTES:
+        raise OptionError(f"{path}: is larger than {_MAX_BYTES} bytes, too large to map {of}.")
+    try:
+        document = yaml.load(data.decode(), Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise OptionError(f"{path}: is not valid YAML: {reason}.") from None
+    if document is None:
+        return {}
+    if not isinstance(document, dict):
+        raise OptionError(f"{path}: does not map {of}.")
+    return document
 
 
 def _nodes(found: Mapping[Any, Any], place: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:

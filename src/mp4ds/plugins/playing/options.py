@@ -1,0 +1,212 @@
+"""The options of a player."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mp4ds.errors import OptionError
+from mp4ds.options import WHAT, WHERE, Parsed, argument, jpeg_quality, option
+from mp4ds.plugins.ros.names import PLAIN, NodeNames
+from mp4ds.unpacking.pictures import ReductionOptions
+
+KINDS = {"raw": "raw", "compressed": "jpeg", "ffmpeg": "ffmpeg"}
+"""Transport that cameras are published as -> kind of image in `mp4ds.unpacking`."""
+
+
+def _seconds(value: str | float) -> float:
+    return _number(value, lambda number: number >= 0, "a number of seconds, 0 or more")
+
+
+def _rate(value: str | float) -> float:
+    return _number(value, lambda number: number > 0, "greater than 0")
+
+
+def _number(value: str | float, is_valid: Callable[[float], bool], what: str) -> float:
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and is_valid(number)):
+        raise OptionError(f"{value} is not {what}.")
+    return number
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayOptions(ReductionOptions):
+    """How to play datasets back."""
+
+    exclude: Sequence[str] = option(
+        "Leave out matching topics.",
+        (),
+        "--exclude",
+        "--exclude-topics",
+        "-x",
+        panel=WHAT,
+        metavar="GLOB",
+    )
+    to: str | None = argument("ros1 or ros2; default: the ROS that is sourced.")
+    rate: Parsed[float] = option(
+        "Playback rate; 2 is twice as fast.",
+        1.0,
+        "-r",
+        metavar="FACTOR",
+        parse=_rate,
+    )
+    start_offset: Parsed[float] = option(
+        "Start this many seconds into the recording.",
+        0.0,
+        "--start-offset",
+        "--start",
+        "-s",
+        panel=WHAT,
+        metavar="SECONDS",
+        parse=_seconds,
+    )
+    duration: Parsed[float | None] = option(
+        "Play only this many seconds.",
+        None,
+        "--duration",
+        "--playback-duration",
+        "-u",
+        panel=WHAT,
+        metavar="SECONDS",
+        parse=_seconds,
+    )
+    until_sec: float | None = option(
+        "Play until this time, in seconds since 1970, or for `duration`, whichever is later.",
+        None,
+        "--playback-until-sec",
+        panel=WHAT,
+    )
+    until_nsec: int | None = option(
+        "Play until this time, in nanoseconds since 1970.",
+        None,
+        "--playback-until-nsec",
+        panel=WHAT,
+    )
+    loop: bool = option("Loop playback.", False, "-l")
+    keep_alive: bool = option("Keep running at the end, for late subscribers.", False, "-k")
+    delay: Parsed[float] = option(
+        "Seconds to wait before playing; in ROS 2, before each loop.",
+        0.0,
+        "-d",
+        metavar="SECONDS",
+        parse=_seconds,
+    )
+    paused: bool = option("Start paused.", False, "--pause", "--start-paused", "-p")
+    regex: str = option(
+        "Only topics that fully match a regular expression, and those of `topics`.",
+        "",
+        "-e",
+        panel=WHAT,
+    )
+    exclude_regex: str = option(
+        "Leave out topics that fully match a regular expression.", "", panel=WHAT
+    )
+    remap: Sequence[str] = option(
+        "Rename a topic; repeatable.", (), "-m", metavar="OLD:=NEW", panel=WHERE
+    )
+    prefix: str = option(
+        "Prefix for all topics that are not remapped.",
+        "",
+        panel=WHERE,
+    )
+    clock: float | None = argument("Publish /clock at this rate in Hz; default: do not publish it.")
+    clock_topics: Sequence[str] = option(
+        "Publish /clock just before each message on these topics.", (), metavar="TOPIC"
+    )
+    clock_topics_all: bool = option("Publish /clock just before each message.", False)
+    follow_clock: bool | None = option(
+        "Play in step with another player's /clock; default: if /use_sim_time is set (ROS 1) and "
+        "`clock` is not given.",
+        None,
+        "--follow-clock/--no-follow-clock",
+    )
+    immediate: bool = option("Publish as fast as possible.", False, "-i")
+    skip_empty: Parsed[float | None] = option(
+        "Skip gaps between messages that are longer than this.",
+        metavar="SECONDS",
+        panel=WHAT,
+        parse=_seconds,
+    )
+    pause_topics: Sequence[str] = option(
+        "Pause before each message on these topics.", (), metavar="TOPIC"
+    )
+    rate_control_topic: str = option(
+        "Wait when playback gets too far ahead of the header stamps on this topic (ROS 1).",
+        "",
+        metavar="TOPIC",
+    )
+    rate_control_max_delay: Parsed[float] = option(
+        "Seconds that playback may be ahead of `rate_control_topic`.",
+        1.0,
+        metavar="SECONDS",
+        parse=_seconds,
+    )
+    wait_for_subscribers: bool = option("Wait for a subscriber on each topic first.", False)
+    wait_for_all_acked: int | None = option(
+        "At the end, wait this many milliseconds at most for subscribers to acknowledge all "
+        "messages; 0: wait forever (ROS 2).",
+        None,
+        metavar="MS",
+        least=0,
+    )
+    queue: int = option(
+        "Outgoing queue per subscriber, in messages; 0: no limit but 128 MiB (ROS 1).", 0, least=0
+    )
+    qos_overrides: Path | None = option(
+        "QoS profiles by topic (ROS 2).", None, "--qos-profile-overrides-path", metavar="YAML"
+    )
+    publish_as: str | None = option(
+        "Publish cameras as raw, compressed (JPEG) or ffmpeg (video packets); default: as recorded."
+    )
+    jpeg_quality: int = jpeg_quality()
+    read_ahead: int = option(
+        "Frames per camera to decode ahead.",
+        8,
+        "--read-ahead",
+        "--read-ahead-queue-size",
+        least=1,
+        most=10_000,
+    )
+    drop: bool = option("Drop late frames instead of playing slower.", False)
+    restamp: str | None = option("Set header stamps to the time of publishing.", metavar="now")
+    lock_step: str = option(
+        "Publish the next frame only after a message on this topic.", "", metavar="TOPIC"
+    )
+    names: NodeNames = argument("Name, namespace and remappings of the ROS node.", PLAIN)
+
+    def __post_init__(self) -> None:
+        """Refuse options that are invalid or contradict each other."""
+        super().__post_init__()
+        if self.clock is not None and not 0 < self.clock <= 10_000:
+            raise OptionError(f"`clock` {self.clock:g} is not a rate from 0 to 10000 Hz.")
+        if self.until_sec is not None and not math.isfinite(self.until_sec):
+            raise OptionError(f"`until_sec` {self.until_sec:g} is not a number of seconds.")
+        if self.publish_as not in (None, *KINDS):
+            known = ", ".join(KINDS)
+            raise OptionError(f"`publish_as` {self.publish_as!r} is not known. Use {known}.")
+        if self.restamp not in (None, "now"):
+            raise OptionError(f"`restamp` {self.restamp!r} is not known. Use now.")
+        clocks = {
+            "clock": self.clock is not None,
+            "clock_topics": bool(self.clock_topics),
+            "clock_topics_all": self.clock_topics_all,
+        }
+        given = [name for name, is_given in clocks.items() if is_given]
+        if len(given) > 1:
+            raise OptionError(f"`{given[-1]}` contradicts `{given[0]}`: choose one.")
+        others = {"rate": self.rate != 1.0, "immediate": self.immediate}
+        given += [name for name, is_given in others.items() if is_given]
+        if self.follow_clock and given:
+            raise OptionError(
+                f"`{given[0]}` contradicts `follow_clock`: another player's clock sets the pace."
+            )
+
+    @property
+    def leads(self) -> bool:
+        """Whether it publishes /clock."""
+        return self.clock is not None or bool(self.clock_topics) or self.clock_topics_all

@@ -1,0 +1,244 @@
+"""Quality of service in ROS 2: as recorded, as offered by a player, as asked for by a recorder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mp4ds.bags.latched import PLAYER_DEPTH, latched_depth
+from mp4ds.bags.rosbag2_metadata import dump_yaml, native_qos
+from mp4ds.errors import OptionError
+from mp4ds.plugins.ros.names import load_map
+from mp4ds.records import QOS_KEY, Channel
+
+_NS = 10**9
+_MAX_DEPTH = 2**31 - 1
+_INFINITE_SECONDS = 2**31 - 1  # the smallest of the values that middlewares use for infinity
+_INFINITE = {"sec": 2**63 // _NS, "nsec": 2**63 % _NS - 1}
+_NAMES = {
+    "history": ("keep_last", "keep_all"),
+    "reliability": ("reliable", "best_effort"),
+    "durability": ("volatile", "transient_local"),
+    "liveliness": ("automatic", "manual_by_node", "manual_by_topic"),
+}
+_DURATIONS = {
+    "deadline": "deadline_ns",
+    "lifespan": "lifespan_ns",
+    "liveliness_lease_duration": "lease_ns",
+}
+_BARE = "avoid_ros_namespace_conventions"
+_KNOWN = (*_NAMES, "depth", *_DURATIONS, _BARE)
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """The QoS profile that a publisher offers; the defaults are those of `ros2 bag play`.
+
+    Attributes:
+        history: ``keep_last`` or ``keep_all``.
+        depth: How many messages ``keep_last`` keeps, at least 1.
+        reliability: ``reliable`` or ``best_effort``.
+        durability: ``volatile`` or ``transient_local``.
+        deadline_ns: Maximum nanoseconds between two messages; None for no limit.
+        lifespan_ns: Nanoseconds after which a message expires; None for never.
+        liveliness: ``automatic``, ``manual_by_node`` or ``manual_by_topic``.
+        lease_ns: Nanoseconds after which a silent publisher is considered dead; None for never.
+        avoid_ros_namespace_conventions: Whether the topic's DDS name has no ``rt/`` prefix.
+    """
+
+    history: str = "keep_last"
+    depth: int = PLAYER_DEPTH
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    deadline_ns: int | None = None
+    lifespan_ns: int | None = None
+    liveliness: str = "automatic"
+    lease_ns: int | None = None
+    avoid_ros_namespace_conventions: bool = False
+
+    @property
+    def is_reliable(self) -> bool:
+        """Whether lost messages are resent."""
+        return self.reliability == "reliable"
+
+    @property
+    def is_latched(self) -> bool:
+        """Whether late subscribers get earlier messages."""
+        return self.durability == "transient_local"
+
+
+CLOCK_QOS = Qos(depth=1, reliability="best_effort")
+"""The profile of /clock, rclcpp's ClockQoS."""
+
+
+def offered_qos(channel: Channel, overrides: Mapping[str, Qos]) -> Qos:
+    """The profile that a player offers for a channel, chosen as by `ros2 bag play`.
+
+    It is that of the overrides; else the recorded one, if those of all recorded publishers are the
+    same to subscribers; else the default. For a latched topic, the depth is the number of messages
+    that all publishers kept together, since that is what late subscribers get.
+
+    Args:
+        channel: The channel, with the recorded profiles in its metadata.
+        overrides: Topic -> profile to offer instead.
+    """
+    if channel.topic in overrides:
+        return overrides[channel.topic]
+    profiles = recorded_qos(channel.metadata.get(QOS_KEY, ""))
+    if len({_as_subscribers_see(profile) for profile in profiles}) != 1:
+        return Qos()
+    depth = latched_depth(channel) if profiles[0].is_latched else PLAYER_DEPTH
+    return replace(profiles[0], history="keep_last", depth=depth)
+
+
+def _as_subscribers_see(qos: Qos) -> Qos:
+    return replace(
+        qos,
+        history="keep_last",
+        depth=PLAYER_DEPTH,
+        lifespan_ns=None,
+        avoid_ros_namespace_conventions=False,
+    )
+
+
+def asked_qos(profiles: Sequence[Qos], depth: int) -> Qos:
+    """The QoS that matches all publishers, chosen as rosbag2 does; the default if there are none.
+
+    Args:
+        profiles: What the publishers offer.
+        depth: Depth of the subscription.
+    """
+    return Qos(
+        depth=depth,
+        reliability="reliable" if all(one.is_reliable for one in profiles) else "best_effort",
+        durability="transient_local"
+        if profiles and all(one.is_latched for one in profiles)
+        else "volatile",
+        avoid_ros_namespace_conventions=any(
+            one.avoid_ros_namespace_conventions for one in profiles
+        ),
+    )
+
+
+# ---------------------------------------------------------------- as text
+
+
+def qos_text(profiles: Sequence[Qos]) -> str:
+    """QoS profiles as rosbag2 writes them from metadata version 9 on."""
+    return dump_yaml(
+        [
+            {
+                "history": profile.history,
+                "depth": profile.depth,
+                "reliability": profile.reliability,
+                "durability": profile.durability,
+                "deadline": _written(profile.deadline_ns),
+                "lifespan": _written(profile.lifespan_ns),
+                "liveliness": profile.liveliness,
+                "liveliness_lease_duration": _written(profile.lease_ns),
+                _BARE: profile.avoid_ros_namespace_conventions,
+            }
+            for profile in profiles
+        ]
+    )
+
+
+def _written(nanoseconds: int | None) -> dict[str, int]:
+    if nanoseconds is None:
+        return dict(_INFINITE)
+    return {"sec": nanoseconds // _NS, "nsec": nanoseconds % _NS}
+
+
+def recorded_qos(text: str) -> tuple[Qos, ...]:
+    """The profiles that the publishers of a topic offered when it was recorded.
+
+    Policies that are unknown or system defaults become the defaults of `Qos`; a text that is not a
+    list of profiles has none.
+
+    Args:
+        text: YAML as rosbag2 of metadata versions 2 to 9 writes it.
+    """
+    return tuple(map(_recorded, native_qos(text)))
+
+
+def _recorded(profile: Mapping[str, Any]) -> Qos:
+    found: dict[str, Any] = {}
+    has_depth = profile.get("history") == "keep_last" and profile.get("depth") != 0
+    for key in _KNOWN if has_depth else (key for key in _KNOWN if key != "depth"):
+        with suppress(ValueError, KeyError):
+            name, value = _policy(key, profile[key])
+            found[name] = value
+    return Qos(**found)
+
+
+def load_overrides(path: Path | None) -> dict[str, Qos]:
+    """Read a file for `--qos-profile-overrides-path`, in the format of `ros2 bag play`.
+
+    Args:
+        path: The file; None for no overrides.
+
+    Returns:
+        Topic -> its profile; policies that the file leaves out have the default.
+
+    Raises:
+        OptionError: It cannot be read or is not valid; names the key.
+    """
+    if path is None:
+        return {}
+    document = load_map(path, "topics to QoS profiles")
+    return {topic: _override(path, topic, value) for topic, value in document.items()}
+
+
+def _override(path: Path, topic: Any, profile: Any) -> Qos:
+    if not isinstance(topic, str):
+        raise OptionError(f"{path}: {topic!r} is not a topic name; put it in quotes.")
+    if not isinstance(profile, dict):
+        raise OptionError(f"{path}: {topic}: is not a QoS profile; list policies such as depth: 1.")
+    found: dict[str, Any] = {}
+    for key, value in profile.items():
+        try:
+            name, found_value = _policy(key, value)
+        except ValueError as reason:
+            raise OptionError(f"{path}: {topic}: {key}: {reason}.") from None
+        found[name] = found_value
+    return Qos(**found)
+
+
+def _policy(key: str, value: Any) -> tuple[str, Any]:
+    """Attribute of `Qos` and value of a policy.
+
+    Raises:
+        ValueError: It is none; says why.
+    """
+    if key in _NAMES:
+        names = _NAMES[key]
+        name = value.lower() if isinstance(value, str) else value
+        if name != "system_default" and name not in names:
+            raise ValueError(f"{value!r} is not known. Use {', '.join(names)}")
+        return key, names[0] if name == "system_default" else name
+    if key in _DURATIONS:
+        return _DURATIONS[key], _duration(value)
+    if key == "depth":
+        if type(value) is not int or not 0 <= value <= _MAX_DEPTH:
+            raise ValueError(f"{value!r} is not an integer from 0 to {_MAX_DEPTH}")
+        return key, max(1, value)
+    if key == _BARE:
+        if not isinstance(value, bool):
+            raise ValueError(f"{value!r} is neither true nor false")
+        return key, value
+    raise ValueError(f"is not a QoS policy. Use {', '.join(_KNOWN)}")
+
+
+def _duration(value: Any) -> int | None:
+    """Nanoseconds; None if it is infinite or, as 0 is in ROS, unspecified."""
+    if value is None or value == {}:
+        return None
+    if not isinstance(value, dict) or set(value) != {"sec", "nsec"}:
+        raise ValueError("is not a duration; give sec and nsec")
+    sec, nsec = value["sec"], value["nsec"]
+    if type(sec) is not int or type(nsec) is not int or sec < 0 or nsec < 0:
+        raise ValueError("sec and nsec have to be integers, 0 or more")
+    return None if sec >= _INFINITE_SECONDS else (sec * _NS + nsec or None)

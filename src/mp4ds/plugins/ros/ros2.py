@@ -1,0 +1,326 @@
+"""What nodes of ROS 2 have in common, whatever their library: writers, definitions of types."""
+
+from __future__ import annotations
+
+import re
+import struct
+import time
+import warnings
+from abc import abstractmethod
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import Any, Protocol
+
+from mp4ds.bags.types import (
+    RosVersion,
+    by_library,
+    incomprehensible,
+    make_store,
+    ros2_version,
+    types_of,
+)
+from mp4ds.errors import ConversionError, Refused
+from mp4ds.plugins.ros.names import SERVICE_EVENTS
+from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions
+from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, offered_qos, qos_text
+from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
+
+CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+RECEIVED = 100
+"""Depth of subscriptions: messages are taken out at once."""
+
+_NS = 10**9
+_LITTLE = b"\0\1\0\0"
+_PARTING_S = 3.0
+_TOPIC = re.compile(r"/?[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*", re.ASCII)
+
+
+class Writer(Protocol):
+    """Writes the messages of channels of the same topic, type and QoS."""
+
+    def write(self, payload: bytes) -> None:
+        """Send a message.
+
+        Raises:
+            ConversionError: It is not of its type.
+            PublishError: It cannot be sent.
+        """
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until reliable subscribers have all messages; returns whether they do."""
+
+    def subscribers(self) -> int:
+        """How many subscribers will get the next message."""
+
+
+class Ros2Node(Node):
+    """A node of ROS 2.
+
+    Channels with the same topic, type and QoS share a writer; latched ones have one each, so that
+    late subscribers get the last message of each, as from the recorded publishers.
+
+    Args:
+        options: How it takes part.
+    """
+
+    world = "ros2"
+
+    def __init__(self, options: NodeOptions) -> None:
+        super().__init__()
+        self._parting_s = options.parting_s
+        self._overrides = options.overrides
+        self._clock_topic = options.names.renamed(CLOCK)
+        self._clock: Writer | None = None
+        self._channels: dict[int, tuple[Channel, Writer]] = {}  # by id()
+        self._shared: dict[tuple[str, Hashable, Qos], Writer] = {}
+        self._numbers = count()  # of channels received
+
+    @abstractmethod
+    def _make_writer(self, channel: Channel, qos: Qos) -> Writer:
+        """A writer of a channel's messages.
+
+        Raises:
+            Refused: The type is not installed.
+            ConversionError: The name of the topic or the type is not valid.
+        """
+
+    def advertise(self, channel: Channel) -> None:
+        """Announce a channel."""
+        if id(channel) in self._channels:
+            return
+        if channel.message_encoding != "cdr":
+            encoding = channel.message_encoding or "unknown"
+            raise ConversionError(channel.topic, f"its message encoding is {encoding}, not cdr")
+        qos = offered_qos(channel, self._overrides)
+        key = (channel.topic, channel.schema, qos)
+        writer = None if qos.is_latched else self._shared.get(key)
+        if writer is None:
+            writer = self._shared[key] = self._make_writer(channel, qos)
+        self._channels[id(channel)] = channel, writer
+
+    def publish(self, channel: Channel, payload: bytes | memoryview, time_ns: int) -> None:
+        """Publish a message."""
+        self._channels[id(channel)][1].write(bytes(payload))
+
+    def clock(self, time_ns: int) -> None:
+        """Publish a recording time as /clock."""
+        if self._clock is None:
+            schema = Schema(CLOCK_TYPE, "", b"")
+            self._clock = self._make_writer(
+                Channel(0, self._clock_topic, "cdr", schema, {}), CLOCK_QOS
+            )
+        self._clock.write(_LITTLE + struct.pack("<iI", *divmod(time_ns, _NS)))
+
+    def subscribers(self, channel: Channel) -> int:
+        """How many subscribers a channel's topic has now."""
+        return self._channels[id(channel)][1].subscribers()
+
+    def _part(self) -> None:
+        """Wait until subscribers have what was sent, as long as they may take."""
+        end = time.monotonic() + (_PARTING_S if self._parting_s is None else self._parting_s)
+        found = {id(writer): (channel.topic, writer) for channel, writer in self._channels.values()}
+        late = sorted(
+            {topic for topic, one in found.values() if not one.wait(_left(end))},
+        )
+        if late and self._parting_s is not None:
+            warnings.warn(
+                f"{', '.join(late)}: subscribers have not acknowledged every message in time",
+                stacklevel=2,
+            )
+        self._channels.clear()
+        self._shared.clear()
+        self._clock = None
+
+    def _channel(
+        self, name: str, type_name: str, definition: str, type_hash: str, qos: Sequence[Qos]
+    ) -> Channel:
+        """A channel as rosbag2 records it.
+
+        Args:
+            name: Its topic.
+            type_name: Such as ``sensor_msgs/msg/Image``.
+            definition: Its definition, with those of its parts; empty if unknown.
+            type_hash: ``RIHS01_...``; empty if unknown.
+            qos: What its publishers offer.
+        """
+        schema = Schema(type_name, _ENCODING if definition else "", definition.encode())
+        metadata = {QOS_KEY: qos_text(qos), **({HASH_KEY: type_hash} if type_hash else {})}
+        return Channel(next(self._numbers), name, "cdr", schema, metadata)
+
+
+def _left(end: float) -> float:
+    return max(0.0, end - time.monotonic())
+
+
+def is_topic(name: str) -> bool:
+    """Whether ROS 2 can have a topic of this name."""
+    return _TOPIC.fullmatch(name) is not None and "__" not in name
+
+
+def is_hidden(topic: str) -> bool:
+    """Whether ROS 2 hides a topic: a part of its name begins with an underscore.
+
+    For recorders, service events are not hidden.
+    """
+    return not topic.endswith(SERVICE_EVENTS) and any(
+        part.startswith("_") for part in topic.split("/")
+    )
+
+
+def clock_time(payload: bytes | memoryview) -> int:
+    """The time in a message of /clock (CDR), nanoseconds."""
+    sec, nanosec = struct.unpack_from("<iI" if payload[1] & 1 else ">iI", payload, 4)
+    return int(sec) * _NS + int(nanosec)
+
+
+def finite(nanoseconds: int) -> int | None:
+    """A duration of a QoS profile; None if it is infinite or unspecified."""
+    return nanoseconds if 0 < nanoseconds < 2**63 - 1 else None
+
+
+# ---------------------------------------------------------------- definitions of types
+
+_ENCODING = "ros2msg"
+_SEPARATOR = "=" * 80
+_MAX_TEXT = 2**22
+_FIELD = re.compile(r"^\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w+")
+_PRIMITIVE = re.compile(r"bool|byte|char|u?int(?:8|16|32|64)|float(?:32|64)|w?string")
+_HASH = re.compile(r"RIHS01_[0-9a-f]{64}")
+
+
+@cache
+def standard_types() -> RosVersion:
+    """The types of a recent ROS 2, for publishers and recordings that do not define them."""
+    return ros2_version("jazzy")
+
+
+def full_name(name: str) -> str:
+    """The full name of a type: ``std_msgs/String`` is short for ``std_msgs/msg/String``."""
+    rooms = name.split("/")
+    return f"{rooms[0]}/msg/{rooms[1]}" if len(rooms) == 2 else name
+
+
+def types_in(schema: Schema | None) -> dict[str, Any]:
+    """Definitions of a type and its parts; those without fields have the one that ROS 2 adds.
+
+    Raises:
+        Refused: There is no definition, or it cannot be parsed.
+    """
+    if schema is None:
+        raise Refused("there is no definition")
+    filler = standard_types().standard["std_msgs/msg/Empty"][1][0]
+    return {
+        name: (constants, fields or [filler])
+        for name, (constants, fields) in types_of(schema, standard_types()).items()
+    }
+
+
+def hash_of(types: Mapping[str, Any], name: str) -> str:
+    """The hash of a type, RIHS01_...
+
+    Raises:
+        Refused: ROS 2 cannot have this type.
+    """
+    hashed = make_store(dict(types), standard_types()).hash_rihs01
+    return by_library(incomprehensible(name), hashed, name)
+
+
+def metadata_hash(channel: Channel) -> str:
+    """The recorded hash of a channel's type; empty if there is none."""
+    recorded = channel.metadata.get(HASH_KEY, "")
+    return recorded if _HASH.fullmatch(recorded) else ""
+
+
+def recorded_hash(channel: Channel) -> str:
+    """The hash of a channel's type, as recorded or of its definition; empty if it has none."""
+    try:
+        if recorded := metadata_hash(channel):
+            return recorded
+        return hash_of(types_in(channel.schema), full_name(channel.type_name))
+    except (Refused, KeyError):
+        return ""
+
+
+def standard_definition(type_name: str, type_hash: str) -> str:
+    """The definition of a standard type; empty if it is not one, or its hash differs.
+
+    Args:
+        type_name: Such as ``sensor_msgs/msg/Image``.
+        type_hash: As announced by the publisher; empty if it announced none.
+    """
+    if type_name not in standard_types().standard:
+        return ""
+    return _proven(Schema(type_name, _ENCODING, b""), type_hash)
+
+
+def described_definition(texts: Mapping[str, str], type_name: str, type_hash: str) -> str:
+    """The definition of a type as described by a node or a publisher.
+
+    Args:
+        texts: Definitions of the type and its parts, by type.
+        type_name: The type.
+        type_hash: As announced by the publisher, which the definition must have.
+
+    Returns:
+        The text, with the definitions of its parts; empty if it is not proven by the hash.
+    """
+    if not type_hash or type_name not in texts or sum(map(len, texts.values())) > _MAX_TEXT:
+        return ""
+    text = _with_parts({type_name: texts[type_name], **texts})
+    return text if _proven(Schema(type_name, _ENCODING, text.encode()), type_hash) else ""
+
+
+def _proven(schema: Schema, type_hash: str) -> str:
+    """A definition with those of its parts; empty if its hash is not the one announced."""
+    try:
+        if type_hash and hash_of(types_in(schema), schema.name) != type_hash:
+            return ""
+        store: Any = make_store(types_of(schema, standard_types()), standard_types())
+        text: str = by_library("", store.generate_msgdef, schema.name)[0]
+        return text
+    except Refused:
+        return ""
+
+
+def installed_definition(type_name: str, share: Sequence[Path]) -> str:
+    """The installed definition of a type, with those of its parts, as rosbag2 stores it.
+
+    Args:
+        type_name: Such as ``sensor_msgs/msg/Image``.
+        share: The ``share`` folders of all workspaces.
+
+    Returns:
+        The text; empty if a part is not installed as a ``.msg`` file.
+    """
+    found: dict[str, str] = {}
+    todo = [type_name]
+    while todo:
+        name = todo.pop(0)
+        if name in found:
+            continue
+        package, _, short = name.partition("/msg/")
+        paths = [folder / package / "msg" / f"{short}.msg" for folder in share]
+        text = next((path.read_text() for path in paths if path.is_file()), None)
+        if text is None:
+            return ""
+        found[name] = text
+        todo += _parts(text, package)
+    return _with_parts(found)
+
+
+def _with_parts(texts: Mapping[str, str]) -> str:
+    """A definition followed by those of its parts; the first text is the type's own."""
+    main, *parts = texts.items()
+    rest = (f"\n{_SEPARATOR}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in parts)
+    return "".join((main[1], *rest))
+
+
+def _parts(text: str, package: str) -> Iterator[str]:
+    """Types of a definition's fields, except for built-in ones."""
+    for line in text.splitlines():
+        match = _FIELD.match(line.partition("#")[0])
+        if match and not _PRIMITIVE.fullmatch(match[1]):
+            rooms = match[1].split("/")
+            yield f"{rooms[0] if len(rooms) > 1 else package}/msg/{rooms[-1]}"
