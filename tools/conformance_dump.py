@@ -21,10 +21,10 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from mp4ds.dataset.channels import ImageChannel
+from mp4ds.dataset.channels import ChannelGroup
 from mp4ds.dataset.checks import Problem, validate
+from mp4ds.dataset.columns import DecodedColumns
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import DecodedColumns
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Mp4dsError, SourceError
 from mp4ds.files.urls import location
@@ -83,7 +83,7 @@ def conformance_dump(path: Path | str) -> dict[str, Any]:
             found["manifest"] = _manifest(dataset.manifest)
         found["streams"] = [_stream(stream) for stream in dataset.streams]
         if dataset.manifest:
-            found["order"] = [_order(channel) for channel in dataset.image_channels()]
+            found["order"] = [_order(dataset, channel) for channel in dataset.image_channels()]
             found["messages"] = _messages(dataset)
         return found
 
@@ -192,7 +192,7 @@ def _of_pictures(stream: Stream) -> Iterator[tuple[str, str]]:
 
 
 def _of_packets(stream: Stream) -> Iterator[tuple[str, str]]:
-    for payload in stream.payloads():
+    for _, payload in stream.payloads():
         yield "", _sha256(payload)
 
 
@@ -271,9 +271,8 @@ def _camera_info(stream: Stream) -> Values | None:
         "payloads": None,
         "holds": None,
     }
-    columns = stream.camera_info_columns
-    if columns is not None:
-        messages = stream.camera_info_messages(channel)
+    if stream.infos is not None:
+        columns, messages = stream.infos.columns, stream.infos.messages(channel)
         found["columns"] = _columns(columns)
         found["payloads"] = [_sha256(message.data) for _, message in messages]
         after = np.searchsorted(columns.log_time, stream.log_times, side="right")
@@ -284,14 +283,14 @@ def _camera_info(stream: Stream) -> Values | None:
 # ---------------------------------------------------------------- the dataset
 
 
-def _order(channel: ImageChannel) -> Values:
+def _order(dataset: Dataset, channel: ChannelGroup) -> Values:
     """The file of each message of a channel, in the channel's order."""
     places = {
         ordinal: stream.path.name
         for stream in channel.streams
         for ordinal in stream.columns.ordinal.tolist()
     }
-    count = len(places) + channel.recorded
+    count = len(places) + channel.recorded(dataset.recorded_counts)
     return {
         "topic": channel.channel.topic,
         "files": [places.get(ordinal, MESSAGES_NAME) for ordinal in range(count)],

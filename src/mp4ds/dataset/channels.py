@@ -5,57 +5,37 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
-from typing import Protocol, TypeVar, cast
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything
+from mp4ds.dataset.columns import Choice
+from mp4ds.dataset.rebuild import CalibrationMessages
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import FormatError
 from mp4ds.records import Channel, Message, Record
 
+Part = Stream | CalibrationMessages
+"""Messages of a channel that are not in messages.mcap."""
+
 MessageSource = Callable[[Channel, Choice], Iterator[tuple[int, Message]]]
-"""Yields the wanted messages of a channel, each with its ordinal."""
+"""Yields the wanted messages of a part on a channel, each with its ordinal."""
+
+Read = Callable[[Part, Channel], Iterator[tuple[int, Message]]]
+"""Yields the messages of a part that are wanted, each with its ordinal."""
 
 T = TypeVar("T")
 _RecordT = TypeVar("_RecordT", bound=Record)
 
 
-@dataclass(frozen=True)
-class PartKey:
-    """Identifies some messages of a dataset.
-
-    Attributes:
-        sidecar: Path of the sidecar that has them.
-        is_calibration: Whether they are its calibrations, not its images.
-    """
-
-    sidecar: Path
-    is_calibration: bool = False
-
-
-class Ahead(Protocol):
-    """Prefetches the items of an iterator, for example in a thread."""
-
-    def __call__(self, items: Iterator[T], /) -> Iterator[T]:
-        """The same items."""
-
-
-def when_asked(items: Iterator[T], /) -> Iterator[T]:
-    """Prefetches nothing."""
-    return items
-
-
 def by_time(*records: Iterator[_RecordT]) -> Iterator[_RecordT]:
     """Merge records that are in the order of their log times; what has none comes first."""
-    return _merged(records, lambda record: getattr(record, "log_time", 0))
+    return _in_order(records, lambda record: getattr(record, "log_time", 0))
 
 
-def _merged(parts: Sequence[Iterator[T]], key: Callable[[T], int]) -> Iterator[T]:
+def _in_order(parts: Sequence[Iterator[T]], key: Callable[[T], int]) -> Iterator[T]:
     with ExitStack() as stack:
         for part in parts:
             # the files of the others are open still when one fails
@@ -63,58 +43,8 @@ def _merged(parts: Sequence[Iterator[T]], key: Callable[[T], int]) -> Iterator[T
         yield from heapq.merge(*parts, key=key)
 
 
-@dataclass(frozen=True)
-class Reading:
-    """How messages in videos are read.
-
-    Attributes:
-        sources: Replacement sources for the messages of a part.
-        choice: Which are wanted.
-        ahead: Wraps the messages of each part of a channel.
-    """
-
-    sources: Mapping[PartKey, MessageSource] = field(default_factory=dict)
-    choice: Choice = everything
-    ahead: Ahead = when_asked
-
-
-@dataclass(frozen=True)
-class ImageChannel:
-    """A channel with images in videos.
-
-    Attributes:
-        channel: As in `Dataset.channels`.
-        streams: Its streams; each holds some of its messages.
-        recorded: Number of its messages that are in messages.mcap.
-    """
-
-    channel: Channel
-    streams: list[Stream]
-    recorded: int
-
-
-@dataclass(frozen=True)
-class ChannelPart:
-    """Messages of a channel in one video.
-
-    Attributes:
-        key: Which they are.
-        source: Makes them.
-        decode_columns: Decodes their columns.
-        count: How many there are.
-        stream: Whose images they are; None for calibrations.
-    """
-
-    key: PartKey
-    source: MessageSource
-    decode_columns: Callable[[], DecodedColumns]
-    count: int
-    stream: Stream | None = None
-
-    @property
-    def columns(self) -> DecodedColumns:
-        """Their columns."""
-        return self.decode_columns()
+def _ordinal(pair: tuple[int, Message]) -> int:
+    return pair[0]
 
 
 @dataclass(frozen=True)
@@ -122,19 +52,23 @@ class ChannelGroup:
     """A channel with messages in videos, and its channels in messages.mcap if any.
 
     Attributes:
-        channel: The channel as a whole.
+        channel: The channel as a whole, as in `Dataset.channels`.
         parts: Its messages in videos.
         recorded_ids: Channels of messages.mcap with the other messages.
     """
 
     channel: Channel
-    parts: list[ChannelPart]
+    parts: list[Part]
     recorded_ids: set[int]
 
     @property
     def streams(self) -> list[Stream]:
         """The streams with its images; none for calibrations."""
-        return [part.stream for part in self.parts if part.stream is not None]
+        return [part for part in self.parts if isinstance(part, Stream)]
+
+    def recorded(self, counts: Mapping[int, int]) -> int:
+        """How many of its messages are in messages.mcap, from the counts of its channels there."""
+        return sum(counts.get(key, 0) for key in self.recorded_ids)
 
     def found_in(self, records: Iterable[Record]) -> Iterator[Message]:
         """Its messages among the records of messages.mcap, read only if there are any."""
@@ -142,21 +76,24 @@ class ChannelGroup:
             if isinstance(record, Message) and record.channel.id in self.recorded_ids:
                 yield replace(record, channel=self.channel)
 
-    def messages(self, reading: Reading) -> Iterator[Message]:
+    def messages(self, read: Read) -> Iterator[Message]:
         """Its messages in videos, in the channel's order."""
-        return (message for _, message in self._placed(reading))
+        return (message for _, message in _in_order(self._read(read), _ordinal))
 
-    def parts_of(self, reading: Reading) -> list[Iterator[Message]]:
+    def parts_of(self, read: Read) -> list[Iterator[Message]]:
         """Its messages in videos, separately for each part."""
-        return [(message for _, message in part) for part in self._read(reading)]
+        return [(message for _, message in part) for part in self._read(read)]
+
+    def _read(self, read: Read) -> list[Iterator[tuple[int, Message]]]:
+        return [read(part, self.channel) for part in self.parts]
 
     def merged(
-        self, reading: Reading, recorded: Iterator[Message], place: str | None
+        self, read: Read, recorded: Iterator[Message], place: str | None
     ) -> Iterator[Message]:
         """All its messages, in the channel's order.
 
         Args:
-            reading: How those in videos are read.
+            read: Reads those in videos.
             recorded: Those of messages.mcap, which fill the remaining ordinals.
             place: The dataset, for errors; None if some may be missing.
 
@@ -165,7 +102,7 @@ class ChannelGroup:
         """
         places = self.places
         given = 0
-        for ordinal, message in self._placed(reading):
+        for ordinal, message in _in_order(self._read(read), _ordinal):
             before = ordinal - int(np.searchsorted(places, ordinal))
             while given < before:
                 verbatim = next(recorded, None)
@@ -232,13 +169,6 @@ class ChannelGroup:
             return f"has {total} messages, and one with number {places[-1]}"
         return ""
 
-    def _placed(self, reading: Reading) -> Iterator[tuple[int, Message]]:
-        return _merged(self._read(reading), lambda pair: pair[0])
-
-    def _read(self, reading: Reading) -> list[Iterator[tuple[int, Message]]]:
-        sources = [reading.sources.get(part.key, part.source) for part in self.parts]
-        return [reading.ahead(source(self.channel, reading.choice)) for source in sources]
-
 
 def channel_groups(streams: Sequence[Stream], recorded: Sequence[Channel]) -> list[ChannelGroup]:
     """The channels that have messages in videos.
@@ -250,20 +180,12 @@ def channel_groups(streams: Sequence[Stream], recorded: Sequence[Channel]) -> li
     groups: dict[tuple[object, ...], ChannelGroup] = {}
     first_id = 1 + max((channel.id for channel in recorded), default=0)
     for stream in streams:
-        key = PartKey(stream.path)
-        columns = partial(_columns_of, stream)
-        images = ChannelPart(key, stream.messages, columns, len(stream), stream)
-        sources = [] if stream.is_lost else [(stream.sidecar.channel, images)]
-        info = stream.sidecar.camera_info
-        if info and info.messages:
-            key = PartKey(stream.path, is_calibration=True)
-            columns = partial(_info_columns_of, stream)
-            part = ChannelPart(key, stream.camera_info_messages, columns, info.messages)
-            sources.append((info.channel, part))
-        for model, part in sources:
-            identity = model.to_record(0).identity
+        parts: list[Part] = [] if stream.is_lost else [stream]
+        parts += [stream.infos] if stream.infos else []
+        for part in parts:
+            identity = part.channel.identity
             if identity not in groups:
-                channel = model.to_record(first_id + len(groups))
+                channel = replace(part.channel, id=first_id + len(groups))
                 ids = {item.id for item in recorded if item.identity == identity}
                 groups[identity] = ChannelGroup(channel, [], ids)
             groups[identity].parts.append(part)
@@ -284,11 +206,3 @@ def log_times(
         others = [found.pop(key)[0] for key in group.recorded_ids if key in found]
         found[group.channel.id] = [*others, *(part.columns.log_time for part in group.parts)]
     return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items() if arrays}
-
-
-def _columns_of(stream: Stream) -> DecodedColumns:
-    return stream.columns
-
-
-def _info_columns_of(stream: Stream) -> DecodedColumns:
-    return cast(DecodedColumns, stream.camera_info_columns)  # it has messages

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from mp4ds.bags.formats import limits_of
+from mp4ds.dataset.channels import Part
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import MessagesFile, recorded_storage
@@ -280,7 +281,7 @@ def _check_stream(stream: Stream) -> list[Problem]:
     try:
         problems += _check_video_file(stream, deep=False)
         _ = stream.rebuilder  # decodes and checks the columns
-        _ = stream.info_rebuilder
+        _ = stream.infos and stream.infos.templates
         _check_quality(stream)
         with stream.open_video(sequential=True) as decoder:
             problems += _check_count(stream, decoder.coded_frames)
@@ -459,20 +460,17 @@ def _check_limits(
 
 def _extremes(stream: Stream) -> Iterator[Message]:
     """Messages with the smallest and largest times and numbers of a sidecar."""
-    parts = [(stream.sidecar.channel, stream.columns)]
-    info, columns = stream.sidecar.camera_info, stream.camera_info_columns
-    if info and columns:
-        parts.append((info.channel, columns))
-    for model, part in parts:
-        values = part.log_time, part.publish_time, part.sequence
+    parts: list[Part] = [stream, *([stream.infos] if stream.infos else [])]
+    for part in parts:
+        columns = part.columns
+        values = columns.log_time, columns.publish_time, columns.sequence
         for end in (np.min, np.max):
             log_time, publish_time, sequence = (int(end(column)) for column in values)
-            yield Message(model.to_record(0), log_time, publish_time, sequence, b"")
+            yield Message(part.channel, log_time, publish_time, sequence, b"")
 
 
 def _modelled(stream: Stream) -> int:
-    info = stream.sidecar.camera_info
-    return len(stream) + (info.messages if info else 0)
+    return len(stream) + len(stream.infos or ())
 
 
 # ---------------------------------------------------------------- facts of the video

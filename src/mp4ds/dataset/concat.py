@@ -21,8 +21,8 @@ from mp4ds.bags.combined import bounded
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import in_span, write_record
 from mp4ds.dataset.channels import by_time
+from mp4ds.dataset.columns import DecodedColumns, within
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import DecodedColumns, within
 from mp4ds.dataset.segments import Cut, JoinedStream, copy_file
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Refused
@@ -126,10 +126,9 @@ class _Part:
         self.cuts = [self._cut(stream) for stream in dataset.streams]
 
     def _cut(self, stream: Stream) -> Cut:
-        info, columns = stream.sidecar.camera_info, stream.camera_info_columns
         infos: Integers = _NO_TIMES
-        if info and columns and self.selected(info.channel.topic):
-            infos = self._numbers(columns)
+        if stream.infos and self.selected(stream.infos.channel.topic):
+            infos = self._numbers(stream.infos.columns)
         images = self._numbers(stream.columns) if self.selected(stream.topic) else _NO_TIMES
         return Cut(self.dataset, stream, images, infos)
 
@@ -152,13 +151,8 @@ class _Part:
         if self.is_slice and not self.dataset.is_in_time:
             raise Refused("its messages are not ordered by log time")
         for cut in self.cuts:
-            info = cut.stream.sidecar.camera_info
-            if (
-                info
-                and info.messages
-                and self.selected(info.channel.topic) != self.selected(cut.stream.topic)
-            ):
-                raise Refused(f"{cut.stream.topic} and {info.channel.topic} share one stream")
+            if len(set(map(self.selected, cut.stream.topics))) > 1:
+                raise Refused(f"{' and '.join(cut.stream.topics)} share one stream")
             if np.any(np.diff(cut.images) != 1):
                 raise Refused(f"frames of {cut.stream.topic} are not ordered by time")
 
@@ -244,12 +238,11 @@ class _Part:
         return chain(self.latched, found)
 
     def _orphans(self, cut: Cut) -> Iterator[Message]:
-        info = cut.stream.sidecar.camera_info
-        if info is None or not len(cut.infos):
+        infos = cut.stream.infos
+        if infos is None or not len(cut.infos):
             return iter(())
         channels = {channel.identity: channel for channel in self.dataset.channels}
-        channel = channels[_identity_of(info.channel)]
-        found = cut.stream.camera_info_messages(channel, within(self.span))
+        found = infos.messages(channels[infos.channel.identity], within(self.span))
         return (message for _, message in found)
 
 

@@ -15,20 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.dataset.channels import (
-    Ahead,
     ChannelGroup,
-    ImageChannel,
     MessageSource,
-    PartKey,
-    Reading,
+    Part,
+    Read,
     by_time,
     channel_groups,
     log_times,
-    when_asked,
 )
+from mp4ds.dataset.columns import Choice, everything, last_of, within
 from mp4ds.dataset.images import Images, VideoImages
 from mp4ds.dataset.messages import MessagesFile, RecordedMessage, SalvagedMessages, as_recorded
-from mp4ds.dataset.rebuild import Choice, everything, last_of, within
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.verbatim import VerbatimImages, verbatim_images
@@ -53,6 +50,13 @@ from mp4ds.times import Sync, synchronize
 _VIDEOS = (".mp4", ".m4v", ".mov")
 _RECORDINGS = (".bag", ".mcap", ".db3")
 _MOST_TOPICS = 4  # named in a repr
+
+Ahead = Callable[[Iterator[Any]], Iterator[Any]]
+"""Fetches the items of an iterator in advance, for example in a thread."""
+
+
+def _read_all(part: Part, channel: Channel) -> Iterator[tuple[int, Message]]:
+    return part.messages(channel)
 
 
 class Dataset:
@@ -402,15 +406,9 @@ class Dataset:
         split = {channel_id for group in self._groups for channel_id in group.recorded_ids}
         return [channel for channel in self._file.channels if channel.id not in split]
 
-    def image_channels(self) -> list[ImageChannel]:
+    def image_channels(self) -> list[ChannelGroup]:
         """The channels with images in videos."""
-        recorded = self._file.counts
-        found = []
-        for group in self._groups:
-            if group.streams:
-                count = sum(recorded.get(key, 0) for key in group.recorded_ids)
-                found.append(ImageChannel(group.channel, group.streams, count))
-        return found
+        return [group for group in self._groups if group.streams]
 
     def messages(self, topics: Sequence[str] | None = None) -> Iterator[RecordedMessage]:
         """The messages that are not frames, by log time, decoded on request.
@@ -443,7 +441,7 @@ class Dataset:
             if wanted is not None and group.channel.topic not in wanted:
                 continue
             if not group.streams:
-                calibrations.append(self._group_messages(group, Reading()))
+                calibrations.append(self._group_messages(group, _read_all))
             elif wanted is not None:
                 ids |= group.recorded_ids
         found = self._file.in_time(Excerpt(topics=wanted))
@@ -483,13 +481,13 @@ class Dataset:
 
     def records(
         self,
-        sources: Mapping[PartKey, MessageSource] | None = None,
+        sources: Mapping[Part, MessageSource] | None = None,
         *,
         start: int | None = None,
         end: int | None = None,
         choose: Choice = everything,
         topics: Collection[str] | None = None,
-        ahead: Ahead = when_asked,
+        ahead: Ahead = iter,
     ) -> Iterator[Record]:
         """Everything recorded, merged by log time; each channel in its own order.
 
@@ -515,13 +513,17 @@ class Dataset:
         """
         is_span = start is not None or end is not None
         span = Excerpt(start, end, None if topics is None else frozenset(topics))
-        reading = Reading(sources or {}, within(span, choose) if is_span else choose, ahead)
+        choice = within(span, choose) if is_span else choose
+
+        def read(part: Part, channel: Channel) -> Iterator[tuple[int, Message]]:
+            return ahead((sources or {}).get(part, part.messages)(channel, choice))
+
         groups = [item for item in self._groups if topics is None or item.channel.topic in topics]
         if is_span:
             recorded = ahead(self.recorded_messages(span))
-            parts = [part for group in groups for part in group.parts_of(reading)]
+            parts = [part for group in groups for part in group.parts_of(read)]
             return by_time(recorded, *parts)
-        channels = (self._group_messages(group, reading) for group in groups)
+        channels = (self._group_messages(group, read, ahead) for group in groups)
         return by_time(ahead(self._verbatim_records(topics)), *channels)
 
     def before(self, time_ns: int, topics: Collection[str], frames: int) -> Iterator[Message]:
@@ -533,10 +535,14 @@ class Dataset:
             frames: How many of each video at most.
         """
         wanted = frozenset(topics)
-        reading = Reading(choice=last_of(time_ns, frames))
+        choice = last_of(time_ns, frames)
         groups = [group for group in self._groups if group.channel.topic in wanted]
         recorded = self.recorded_messages(Excerpt(end=time_ns, topics=wanted))
-        parts = [part for group in groups for part in group.parts_of(reading)]
+
+        def read(part: Part, channel: Channel) -> Iterator[tuple[int, Message]]:
+            return part.messages(channel, choice)
+
+        parts = [part for group in groups for part in group.parts_of(read)]
         return by_time(recorded, *parts)
 
     def times(self) -> dict[int, NDArray[np.int64]]:
@@ -570,7 +576,7 @@ class Dataset:
         found = dict(self._file.counts)
         for group in self._groups:
             recorded = sum(found.pop(key, 0) for key in group.recorded_ids)
-            found[group.channel.id] = recorded + sum(part.count for part in group.parts)
+            found[group.channel.id] = recorded + sum(map(len, group.parts))
         return found
 
     def recorded_times(self, topic: str) -> NDArray[np.int64]:
@@ -594,7 +600,7 @@ class Dataset:
             return
         recorded = self._file.counts
         for group in self._groups:
-            gap = group.gap(sum(recorded.get(key, 0) for key in group.recorded_ids))
+            gap = group.gap(group.recorded(recorded))
             if gap:
                 yield group.channel.topic, gap
 
@@ -612,12 +618,14 @@ class Dataset:
             owner = owners.get(message.channel.id)
             yield replace(message, channel=owner) if owner else message
 
-    def _group_messages(self, group: ChannelGroup, reading: Reading) -> Iterator[Message]:
+    def _group_messages(
+        self, group: ChannelGroup, read: Read, ahead: Ahead = iter
+    ) -> Iterator[Message]:
         """One channel's messages from all its files, in the channel's order."""
-        recorded = reading.ahead(group.found_in(self.recorded_records()))
+        recorded = ahead(group.found_in(self.recorded_records()))
         if self.manifest is None:  # a pair on its own has only its own messages
-            return chain(group.messages(reading), recorded)
-        return group.merged(reading, recorded, None if self.is_salvaged else str(self.path))
+            return chain(group.messages(read), recorded)
+        return group.merged(read, recorded, None if self.is_salvaged else str(self.path))
 
     def close(self) -> None:
         """Close all videos."""

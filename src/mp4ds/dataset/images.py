@@ -133,15 +133,21 @@ class Images(ABC):
         try:
             yield
         except FormatError as error:
-            # a damaged video may have more frames than its sidecar
-            if error.frame is None or error.name or error.frame >= len(self.stamps):
+            named = self.named(error)
+            if named is error:
                 raise
-            raise self.named(error, error.frame) from None
+            raise named from None
 
-    def named(self, error: FormatError, first: int, last: int | None = None) -> FormatError:
-        """An error of a frame, or of several in a row, with their topic and times."""
-        name = self.name_of(first, last)
-        return type(error)(error.code, error.place, error.what, frame=first, name=name)
+    def named(self, error: FormatError, last: int | None = None) -> FormatError:
+        """An error of a frame, or of several in a row up to the last, with topic and times.
+
+        It stays as it is if it names its frame already, or is of none.
+        """
+        # a damaged video may have more frames than its sidecar
+        if error.frame is None or error.name or error.frame >= len(self.stamps):
+            return error
+        name = self.name_of(error.frame, last)
+        return type(error)(error.code, error.place, error.what, frame=error.frame, name=name)
 
 
 class VideoImages(Images):

@@ -1,379 +1,35 @@
-"""Everything around the bodies of messages: collected, rebuilt, and selected."""
+"""Rebuilds messages from their bodies, and all that a sidecar says about the rest."""
 
 from __future__ import annotations
 
-import base64
-from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+import zlib
+from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+import xxhash
 
+from mp4ds.dataset.columns import Choice, DecodedColumns, decode_columns, everything
 from mp4ds.errors import FormatError, Refused
-from mp4ds.format.fields import (
-    MAX_CAMERA_INFOS,
-    MAX_VARIANTS,
-    Column,
-    Columns,
-    Digests,
-    decode_base64,
-)
-from mp4ds.format.models import Calibration, CameraInfo, ChannelModel, Roi
-from mp4ds.messages.serializations import form_of, wire_of
+from mp4ds.format.fields import decode_base64
+from mp4ds.format.models import CameraInfo, StreamSidecar
+from mp4ds.messages import depth, png
+from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, put_padding
+from mp4ds.messages.png import zlib_build, zlib_fingerprint
+from mp4ds.messages.serializations import form_of
 from mp4ds.messages.wire import (
-    CalibrationFields,
     CodedFields,
     Fields,
     Form,
-    Parts,
+    ImageFields,
     Slots,
     Template,
     WireError,
-    prove,
 )
-from mp4ds.records import Channel, Excerpt, Message
-from mp4ds.times import INT64_MAX, INT64_MIN, Int64Column, encode_column
-
-_DIGESTS_PER_LINE = 12
-
-
-class ColumnsWriter:
-    """The growing columns of one stream or of its camera_info."""
-
-    def __init__(self) -> None:
-        self._log_time = Int64Column()
-        self._publish_time = Int64Column()
-        self._sequence = Int64Column()
-        self._stamp = Int64Column()
-        self._seq = Int64Column()
-        self._pts = Int64Column()
-        self._variant = Int64Column()
-        self._ordinal = Int64Column()
-
-    def __len__(self) -> int:
-        return len(self._log_time)
-
-    @staticmethod
-    def check(message: Message, parts: Parts) -> None:
-        """Refuse times that a column cannot hold.
-
-        Raises:
-            Refused: A time does not fit into a signed 64-bit integer.
-        """
-        for value in (message.log_time, message.publish_time, parts.pts or 0):
-            if not INT64_MIN <= value <= INT64_MAX:
-                raise Refused(f"time {value} ns does not fit into 64 bits with sign")
-
-    def append(self, message: Message, parts: Parts, *, variant: int, ordinal: int) -> None:
-        """Append one message's values, already checked."""
-        self._log_time.append(message.log_time)
-        self._publish_time.append(message.publish_time)
-        self._sequence.append(message.sequence)
-        self._stamp.append(parts.stamp)
-        if parts.seq is not None:
-            self._seq.append(parts.seq)
-        if parts.pts is not None:
-            self._pts.append(parts.pts)
-        self._variant.append(variant)
-        self._ordinal.append(ordinal)
-
-    def to_model(self) -> Columns:
-        """The columns as the sidecar holds them."""
-        columns = {
-            "log_time": self._log_time,
-            "publish_time": self._publish_time,
-            "sequence": self._sequence,
-            "stamp": self._stamp,
-            **({"seq": self._seq} if len(self._seq) else {}),
-            **({"pts": self._pts} if len(self._pts) else {}),
-            "variant": self._variant,
-            "ordinal": self._ordinal,
-        }
-        return columns_model({name: column.to_numpy() for name, column in columns.items()})
-
-
-def columns_model(values: Mapping[str, NDArray[np.int64]]) -> Columns:
-    """Columns as the sidecar stores them, without those that follow from others.
-
-    Args:
-        values: All that `Columns` has by name, shape (messages,); ``seq`` and ``pts`` if the
-            messages have them.
-    """
-    log_time, publish_time, ordinal = (
-        values[name] for name in ("log_time", "publish_time", "ordinal")
-    )
-    return Columns(
-        log_time=_column(log_time),
-        publish_time=None if _same(publish_time, log_time) else _column(publish_time),
-        sequence=_unless_zero(values["sequence"]),
-        stamp=_column(values["stamp"]),
-        seq=_column(values["seq"]) if "seq" in values else None,
-        pts=_column(values["pts"]) if "pts" in values else None,
-        variant=_unless_zero(values["variant"]),
-        ordinal=None if _same(ordinal, np.arange(len(ordinal))) else _column(ordinal),
-    )
-
-
-def digests_model(digests: Iterable[int]) -> Digests:
-    """XXH64 digests of messages, as the sidecar holds them."""
-    words = [f"{value:016x}" for value in digests]
-    lines = (
-        " ".join(words[start : start + _DIGESTS_PER_LINE])
-        for start in range(0, len(words), _DIGESTS_PER_LINE)
-    )
-    return Digests(algorithm="xxh64", values="\n".join(lines) + "\n")
-
-
-def _same(a: NDArray[np.int64], b: NDArray[np.int64]) -> bool:
-    return bool(np.array_equal(a, b))
-
-
-def _unless_zero(values: NDArray[np.int64]) -> Column | None:
-    return _column(values) if values.any() else None
-
-
-def _column(values: NDArray[np.int64]) -> Column:
-    return Column.model_validate(encode_column(values))
-
-
-# ---------------------------------------------------------------- headers
-
-_ModelT = TypeVar("_ModelT")
-
-
-class MessageSplitter:
-    """Splits the messages of one channel; its serialization may change between messages."""
-
-    def __init__(self, channel: Channel) -> None:
-        self._channel = channel
-        self._forms: dict[str, Form] = {}
-
-    def split(self, message: Message) -> tuple[Form, Parts]:
-        """The form of a message and its parts.
-
-        Raises:
-            Refused: It does not parse, or is not modelled.
-        """
-        data = memoryview(message.data)
-        schema = self._channel.schema
-        try:
-            wire = wire_of(self._channel.message_encoding, data)
-            if wire not in self._forms:
-                definition = schema.data if schema else b""
-                self._forms[wire] = form_of(wire, self._channel.type_name, definition)
-            form = self._forms[wire]
-            return form, form.split(data)
-        except WireError as error:
-            raise Refused(f"it does not parse: {error}") from None
-
-
-class HeaderTable(Generic[_ModelT]):
-    """Numbers the distinct blanks of a stream's messages.
-
-    Args:
-        form: Of all messages.
-    """
-
-    def __init__(self, form: Form) -> None:
-        self.form = form
-        self.items: list[_ModelT] = []
-        self._templates: dict[bytes, Template] = {}
-        self._numbers: dict[tuple[bytes, object], int] = {}
-
-    def number(
-        self,
-        parts: Parts,
-        data: memoryview,
-        *,
-        describe: Callable[[str | None], _ModelT],
-        extra: object = None,
-    ) -> int:
-        """The number of a message's header, after rebuilding and comparing the message.
-
-        Args:
-            parts: Of the message.
-            data: The message.
-            describe: Makes the model of a new header, from its template or None for a plain one.
-            extra: What else distinguishes headers.
-
-        Raises:
-            Refused: It does not rebuild, or there are too many.
-        """
-        blank = parts.blank
-        try:
-            template = self._templates.get(blank) or self.form.template(blank)
-            exact = prove(template, parts, data)
-        except WireError as error:
-            raise Refused(f"its header does not rebuild: {error}") from None
-        if not exact:
-            raise Refused("its header does not rebuild")
-        known = self._numbers.get((blank, extra))
-        if known is not None:
-            return known
-        if len(self.items) == MAX_VARIANTS:
-            raise Refused(f"more than {MAX_VARIANTS} different message headers")
-        plain = self.form.plain(parts.frame_id, parts.fields)
-        self.items.append(describe(None if plain == blank else base64.b64encode(blank).decode()))
-        self._templates[blank] = template
-        self._numbers[blank, extra] = len(self.items) - 1
-        return len(self.items) - 1
-
-
-# ---------------------------------------------------------------- CameraInfo
-
-
-class CameraInfoWriter:
-    """The calibration messages of one channel."""
-
-    def __init__(self, channel: Channel) -> None:
-        self.channel = channel
-        self._forms = MessageSplitter(channel)
-        self._columns = ColumnsWriter()
-        self._heads: HeaderTable[Calibration] | None = None
-
-    def accept(self, message: Message, ordinal: int) -> None:
-        """Accept a message.
-
-        Args:
-            message: The message.
-            ordinal: Its position among the channel's messages.
-
-        Raises:
-            Refused: It cannot be modelled exactly; nothing was changed.
-        """
-        form, parts = self._forms.split(message)
-        self._columns.check(message, parts)
-        if len(self._columns) == MAX_CAMERA_INFOS:
-            raise Refused(f"more than {MAX_CAMERA_INFOS} messages")
-        fields = parts.fields
-        if not isinstance(fields, CalibrationFields):
-            raise Refused("it is not a calibration")
-        heads = self._heads or HeaderTable[Calibration](form)
-        if heads.form.wire != form.wire:
-            raise Refused("its byte order differs from the first one's")
-        variant = heads.number(
-            parts,
-            memoryview(message.data),
-            describe=lambda template: _calibration(parts.frame_id, fields, template),
-        )
-        self._heads = heads
-        self._columns.append(message, parts, variant=variant, ordinal=ordinal)
-
-    def to_model(self) -> CameraInfo | None:
-        """The model, or None if no message was accepted."""
-        if self._heads is None:
-            return None
-        return CameraInfo(
-            channel=ChannelModel.from_record(self.channel),
-            wire=self._heads.form.wire,
-            messages=len(self._columns),
-            calibrations=self._heads.items,
-            columns=self._columns.to_model(),
-        )
-
-
-def _calibration(frame_id: str, fields: CalibrationFields, template: str | None) -> Calibration:
-    x_offset, y_offset, height, width = fields.roi
-    roi = Roi(
-        x_offset=x_offset,
-        y_offset=y_offset,
-        height=height,
-        width=width,
-        do_rectify=fields.roi_do_rectify,
-    )
-    return Calibration(
-        frame_id=frame_id,
-        height=fields.height,
-        width=fields.width,
-        distortion_model=fields.distortion_model,
-        d=list(fields.d),
-        k=list(fields.k),
-        r=list(fields.r),
-        p=list(fields.p),
-        binning_x=fields.binning_x,
-        binning_y=fields.binning_y,
-        roi=roi if any((*fields.roi, fields.roi_do_rectify)) else None,
-        template=template,
-    )
-
-
-def fields_of(calibration: Calibration) -> CalibrationFields:
-    """The fields of a calibration, for serialization."""
-    roi = calibration.roi
-    return CalibrationFields(
-        height=calibration.height,
-        width=calibration.width,
-        distortion_model=calibration.distortion_model,
-        d=tuple(calibration.d),
-        k=tuple(calibration.k),
-        r=tuple(calibration.r),
-        p=tuple(calibration.p),
-        binning_x=calibration.binning_x,
-        binning_y=calibration.binning_y,
-        roi=(roi.x_offset, roi.y_offset, roi.height, roi.width) if roi else (0, 0, 0, 0),
-        roi_do_rectify=roi.do_rectify if roi else 0,
-    )
-
-
-# ---------------------------------------------------------------- rebuild
-
-
-@dataclass(frozen=True)
-class DecodedColumns:
-    """The columns of a stream as int64 arrays of shape (messages,); times in nanoseconds."""
-
-    log_time: NDArray[np.int64]
-    publish_time: NDArray[np.int64]
-    sequence: NDArray[np.int64]
-    stamp: NDArray[np.int64]
-    seq: NDArray[np.int64] | None
-    pts: NDArray[np.int64] | None
-    variant: NDArray[np.int64]
-    ordinal: NDArray[np.int64]
-
-    def slots(self, index: int) -> Slots:
-        """The values that fill a message's blank."""
-        return Slots(
-            stamp=int(self.stamp[index]),
-            seq=None if self.seq is None else int(self.seq[index]),
-            pts=None if self.pts is None else int(self.pts[index]),
-        )
-
-
-def decode_columns(columns: Columns, count: int, variants: int, place: str) -> DecodedColumns:
-    """Decode all columns and check what they refer to.
-
-    Raises:
-        FormatError: ``column-invalid``, naming the column.
-    """
-    arrays: dict[str, NDArray[np.int64]] = {}
-    for name in columns.names():
-        try:
-            arrays[name] = getattr(columns, name).decode(count)
-        except ValueError as error:
-            raise FormatError("column-invalid", f"{place} at columns.{name}", str(error)) from None
-    zeros = np.broadcast_to(np.int64(0), (count,))
-    decoded = DecodedColumns(
-        log_time=arrays["log_time"],
-        publish_time=arrays.get("publish_time", arrays["log_time"]),
-        sequence=arrays.get("sequence", zeros),
-        stamp=arrays["stamp"],
-        seq=arrays.get("seq"),
-        pts=arrays.get("pts"),
-        variant=arrays.get("variant", zeros),
-        ordinal=arrays.get("ordinal", np.arange(count, dtype=np.int64)),
-    )
-    if decoded.variant.min() < 0 or decoded.variant.max() >= variants:
-        raise FormatError(
-            "column-invalid",
-            f"{place} at columns.variant",
-            f"refers to number {int(decoded.variant.max())} of {variants}",
-        )
-    if decoded.ordinal[0] < 0 or (decoded.ordinal[1:] <= decoded.ordinal[:-1]).any():
-        raise FormatError("column-invalid", f"{place} at columns.ordinal", "does not increase")
-    return decoded
+from mp4ds.records import Channel, Message
+from mp4ds.video.coded_messages import body_of
+from mp4ds.video.images import ImageFile
 
 
 def check_slots(columns: DecodedColumns, templates: list[Template], place: str) -> None:
@@ -439,61 +95,6 @@ def template_of(
         raise FormatError("header-mismatch", place, str(error)) from None
 
 
-def camera_info_columns(camera_info: CameraInfo, place: str) -> DecodedColumns:
-    """The columns of a stream's CameraInfo messages, of which there is at least one.
-
-    Raises:
-        FormatError: ``column-invalid``.
-    """
-    place = f"{place} at camera_info"
-    if camera_info.columns is None:
-        raise FormatError("column-invalid", place, "has no columns")
-    calibrations = len(camera_info.calibrations)
-    return decode_columns(camera_info.columns, camera_info.messages, calibrations, place)
-
-
-class CameraInfoRebuilder:
-    """Makes the CameraInfo messages of a stream.
-
-    Args:
-        camera_info: The stream's; must have messages.
-        columns: Theirs.
-        place: Name of the sidecar, for errors.
-
-    Raises:
-        FormatError: The sidecar contradicts itself.
-    """
-
-    def __init__(self, camera_info: CameraInfo, columns: DecodedColumns, place: str) -> None:
-        place = f"{place} at camera_info"
-        self.columns = columns
-        form = form_for(camera_info.channel.to_record(0), camera_info.wire, place)
-        self._templates = [
-            template_of(
-                form,
-                calibration.template,
-                calibration.frame_id,
-                fields_of(calibration),
-                f"{place}.calibrations.{number}",
-            )
-            for number, calibration in enumerate(camera_info.calibrations)
-        ]
-        check_slots(self.columns, self._templates, place)
-
-    def messages(self, channel: Channel, indices: Iterable[int]) -> Iterator[tuple[int, Message]]:
-        """Ordinal and message of each wanted one.
-
-        Args:
-            channel: The channel to make them on.
-            indices: Their numbers.
-        """
-        columns = self.columns
-        for index in indices:
-            template = self._templates[int(columns.variant[index])]
-            payload = b"".join(template.around(columns.slots(index), 0))
-            yield int(columns.ordinal[index]), message_at(columns, index, channel, payload)
-
-
 def message_at(
     columns: DecodedColumns, index: int, channel: Channel, payload: bytes | bytearray
 ) -> Message:
@@ -507,69 +108,295 @@ def message_at(
     )
 
 
-# ---------------------------------------------------------------- choices
-
-Choice = Callable[[DecodedColumns], Iterator[int]]
-"""Yields the numbers of the wanted messages, increasing.
-
-The next number is requested only when the previous message has been made, so that it can skip those
-for which it is too late by then.
-"""
+# ---------------------------------------------------------------- images
 
 
-def everything(columns: DecodedColumns) -> Iterator[int]:
-    """All messages."""
-    return iter(range(len(columns.log_time)))
-
-
-def within(excerpt: Excerpt, choice: Choice = everything) -> Choice:
-    """Restrict the wanted messages to a span of log time."""
-
-    def choose(columns: DecodedColumns) -> Iterator[int]:
-        times = columns.log_time
-        return (index for index in choice(columns) if excerpt.has_time(int(times[index])))
-
-    return choose
-
-
-def last_of(end: int, count: int) -> Choice:
-    """The last messages before a log time, nanoseconds, as many as there are."""
-
-    def choose(columns: DecodedColumns) -> Iterator[int]:
-        return iter(np.flatnonzero(columns.log_time < end)[-count:].tolist())
-
-    return choose
-
-
-def marked(is_wanted: NDArray[np.bool_], choice: Choice = everything) -> Choice:
-    """Restrict the wanted messages to marked ones.
+class MessageRebuilder:
+    """Rebuilds the camera messages of a stream.
 
     Args:
-        is_wanted: For each message, shape (messages,).
-        choice: Says which are wanted.
+        sidecar: The stream's.
+        columns: The stream's.
+        place: Name of the sidecar, for errors.
+        jpeg_quality: Quality of the JPEG files in transcoded messages, 1 to 100.
+
+    Raises:
+        FormatError: The sidecar contradicts itself.
     """
 
-    def choose(columns: DecodedColumns) -> Iterator[int]:
-        return (index for index in choice(columns) if is_wanted[index])
+    def __init__(
+        self, sidecar: StreamSidecar, columns: DecodedColumns, place: str, *, jpeg_quality: int = 95
+    ) -> None:
+        self._sidecar = sidecar
+        self._place = place
+        self._encoding = ENCODINGS[sidecar.image.encoding]
+        self._layout = sidecar.layout
+        self.columns = columns
+        self._digests = self._decode_digests()
+        self._templates = self._make_templates()
+        self._recipes = [
+            png.PngRecipe(**header.png.model_dump(exclude={"deflate"})) if header.png else None
+            for header in sidecar.headers
+        ]
+        image = sidecar.image
+        self._row_bytes = image.width * self._encoding.pixel_bytes
+        rows = self._encoding.shape(image.width, image.height)[0]
+        self._padding_size = rows * (image.step - self._row_bytes)
+        self._paddings: dict[int, bytes | None] = {}
+        for variant in range(len(sidecar.headers)):  # so that a wrong one is reported at once
+            self._padding(variant)
+        self._jpeg = (
+            ImageFile(self._encoding.name, "jpeg", quality=jpeg_quality)
+            if sidecar.body == "jpeg"
+            else None
+        )
+        check_slots(self.columns, self._templates, place)
 
-    return choose
+    @property
+    def picture_format(self) -> str:
+        """Pixel format of the pictures for `pixels`."""
+        return self._layout.pixel_format
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """Width and height of the pictures for `pixels`."""
+        return self._layout.picture_size(self._sidecar.image.width, self._sidecar.image.height)
+
+    def pixels(self, picture: Picture) -> Pixels:
+        """A new array of the image's pixels, shape `Encoding.shape`, native byte order."""
+        image = self._sidecar.image
+        shape = self._encoding.shape(image.width, image.height)
+        out: Pixels = np.empty(shape, self._encoding.dtype)
+        self.write_pixels(picture, out)
+        return out
+
+    def write_pixels(self, picture: Picture, out: Pixels) -> None:
+        """Write the image's pixels into an array with the shape and type returned by `pixels`."""
+        self._layout.to_pixels(picture, out)
+
+    def payload(self, index: int, picture: Picture) -> bytes | bytearray:
+        """The message of a frame, verified against its digest if there is one.
+
+        Args:
+            index: Of the frame.
+            picture: Of the frame, decoded.
+
+        Raises:
+            FormatError: ``digest-mismatch``, with the frame's number.
+        """
+        if self._sidecar.body == "pixels":
+            return self._verified(index, self._with_pixels(index, picture))
+        variant = int(self.columns.variant[index])
+        pixels, recipe = self.pixels(picture), self._recipes[variant]
+        prefix = bytes.fromhex(self._sidecar.headers[variant].prefix)
+        try:
+            if self._jpeg is not None:
+                body = self._jpeg.encode(pixels)
+            elif recipe is not None:
+                body = prefix + png.rebuild(pixels, recipe)
+            else:
+                body = prefix + depth.encode_rvl(pixels)
+        except Refused as error:
+            raise self._failure("header-mismatch", index, f"cannot be rebuilt: {error}") from None
+        if self._digests is None:  # its length may differ from the recorded one
+            body += bytes(self._templates[variant].padding(len(body)))
+        return self._verified(index, self._around(index, body))
+
+    def packet_payload(self, index: int, packet: bytes) -> bytes | bytearray:
+        """The message of a packet, verified against its digest.
+
+        Args:
+            index: Of the frame.
+            packet: As stored in the video.
+
+        Raises:
+            FormatError: ``digest-mismatch`` or ``decode-failed``, with the frame's number.
+        """
+        framing = self._sidecar.headers[int(self.columns.variant[index])].framing
+        try:
+            body = body_of(self._sidecar.video.codec, packet, framing)
+        except Refused as error:
+            raise self._failure("decode-failed", index, f"cannot be rebuilt: {error}") from None
+        return self._verified(index, self._around(index, body))
+
+    def _with_pixels(self, index: int, picture: Picture) -> bytes | bytearray:
+        image = self._sidecar.image
+        template = self._templates[int(self.columns.variant[index])]
+        padding = self._padding(int(self.columns.variant[index]))
+        size = self._encoding.size(image.step, image.height)
+        if padding is not None:
+            size += len(padding) - self._padding_size
+        head, tail = template.around(self.columns.slots(index), size)
+        payload = bytearray(len(head) + size + len(tail))
+        payload[: len(head)] = head
+        out = pixel_view(
+            memoryview(payload)[len(head) :],
+            self._encoding,
+            width=image.width,
+            height=image.height,
+            step=image.step,
+            is_bigendian=bool(image.is_bigendian),
+        )
+        self._layout.to_pixels(picture, out)
+        if padding is not None:
+            body = memoryview(payload)[len(head) : len(head) + size]
+            put_padding(body, padding, row_bytes=self._row_bytes, step=image.step)
+        if tail:
+            payload[len(payload) - len(tail) :] = tail
+        return payload
+
+    def _around(self, index: int, body: bytes | bytearray) -> bytes:
+        template = self._templates[int(self.columns.variant[index])]
+        head, tail = template.around(self.columns.slots(index), len(body))
+        return b"".join((head, body, tail))
+
+    def _verified(self, index: int, payload: bytes | bytearray) -> bytes | bytearray:
+        if self._digests is None or xxhash.xxh64_intdigest(payload) == self._digests[index]:
+            return payload
+        header = self._sidecar.headers[int(self.columns.variant[index])]
+        remark = ""
+        if header.png and header.png.deflate != zlib_fingerprint():
+            remark = (
+                f": its PNG file is rebuilt with zlib, and this Python has {zlib_build()}, which "
+                "compresses to different bytes. Use a Python linked with plain zlib, or unpack "
+                "with `images` raw"
+            )
+        raise self._failure("digest-mismatch", index, f"differs from what was recorded{remark}")
+
+    def _failure(self, code: str, index: int, problem: str) -> FormatError:
+        return FormatError(code, self._place, problem, frame=index)
+
+    def _decode_digests(self) -> list[int] | None:
+        if self._sidecar.digests is None:
+            return None
+        try:
+            return self._sidecar.digests.decode(self._sidecar.frames).tolist()  # type: ignore[no-any-return]
+        except ValueError as error:
+            raise FormatError("column-invalid", f"{self._place} at digests", str(error)) from None
+
+    def _padding(self, variant: int) -> bytes | None:
+        """The row padding in messages of a header; None: zeros.
+
+        Raises:
+            FormatError: ``header-mismatch``: it does not have as many bytes as the rows leave.
+        """
+        if variant not in self._paddings:
+            text = self._sidecar.headers[variant].padding
+            place = f"{self._place} at headers.{variant}.padding"
+            try:
+                padding = None if text is None else _inflated(text, self._padding_size)
+            except ValueError as error:
+                raise FormatError("header-mismatch", place, str(error)) from None
+            per_row = self._sidecar.image.step - self._row_bytes
+            dues = (self._padding_size, self._padding_size - per_row)
+            if padding is not None and (not per_row or len(padding) not in dues):
+                raise FormatError(
+                    "header-mismatch", place, f"does not have the {dues[0]} bytes that rows leave"
+                )
+            self._paddings = {variant: padding}  # only one of them: they may be large
+        return self._paddings[variant]
+
+    def _make_templates(self) -> list[Template]:
+        sidecar, image = self._sidecar, self._sidecar.image
+        form = form_for(sidecar.channel.to_record(0), sidecar.wire, self._place)
+        raw = ImageFields(
+            encoding=image.encoding,
+            width=image.width,
+            height=image.height,
+            step=image.step,
+            is_bigendian=image.is_bigendian,
+        )
+        templates = []
+        for number, header in enumerate(sidecar.headers):
+            fields: Fields = raw if sidecar.body == "pixels" else CodedFields(header.format or "")
+            place = f"{self._place} at headers.{number}.template"
+            templates.append(template_of(form, header.template, header.frame_id, fields, place))
+        return templates
 
 
-def unbroken(
-    indices: Iterable[int], keys: Sequence[int], *, from_key: bool = False
-) -> Iterator[int]:
-    """Packets of a video, including those between that must be decoded first.
+def _inflated(text: str, most: int) -> bytes:
+    """The contents of a base64 zlib stream, up to one byte more than allowed.
+
+    Raises:
+        ValueError: It is not valid.
+    """
+    inflater = zlib.decompressobj()
+    try:
+        data = inflater.decompress(decode_base64(text), most + 1)
+    except zlib.error as error:
+        raise ValueError(f"cannot be inflated: {error}") from None
+    if len(data) <= most and (not inflater.eof or inflater.unused_data):
+        raise ValueError("is not a single complete zlib stream")
+    return data
+
+
+# ---------------------------------------------------------------- calibrations
+
+
+class CalibrationMessages:
+    """The CameraInfo messages of a stream, of which there is at least one.
 
     Args:
-        indices: Numbers of the wanted packets, increasing.
-        keys: Numbers of the key frames, increasing.
-        from_key: Start with the key frame before the first one.
+        info: From its sidecar.
+        place: Name of the sidecar, for errors.
+
+    Attributes:
+        info: As given.
+        channel: Their channel; its id has no meaning.
     """
-    due: int | None = None
-    for index in indices:
-        at = bisect_right(keys, index)
-        key = keys[at - 1] if at else 0
-        if due is None:
-            due = key if from_key else index
-        yield from range(max(due, key), index + 1)
-        due = index + 1
+
+    def __init__(self, info: CameraInfo, place: str) -> None:
+        self.info = info
+        self.channel = info.channel.to_record(0)
+        self._place = f"{place} at camera_info"
+
+    def __len__(self) -> int:
+        return self.info.messages
+
+    @cached_property
+    def columns(self) -> DecodedColumns:
+        """One value per message, with the number of its calibration.
+
+        Raises:
+            FormatError: ``column-invalid``.
+        """
+        if self.info.columns is None:
+            raise FormatError("column-invalid", self._place, "has no columns")
+        calibrations = len(self.info.calibrations)
+        return decode_columns(self.info.columns, len(self), calibrations, self._place)
+
+    @cached_property
+    def templates(self) -> list[Template]:
+        """What makes a message of each calibration.
+
+        Raises:
+            FormatError: The sidecar contradicts itself.
+        """
+        form = form_for(self.channel, self.info.wire, self._place)
+        templates = [
+            template_of(
+                form,
+                calibration.template,
+                calibration.frame_id,
+                calibration.fields,
+                f"{self._place}.calibrations.{number}",
+            )
+            for number, calibration in enumerate(self.info.calibrations)
+        ]
+        check_slots(self.columns, templates, self._place)
+        return templates
+
+    def messages(
+        self, channel: Channel, choice: Choice = everything
+    ) -> Iterator[tuple[int, Message]]:
+        """Ordinal and message of each wanted one.
+
+        Args:
+            channel: The channel to make them on.
+            choice: Which are wanted.
+        """
+        columns = self.columns
+        for index in choice(columns):
+            template = self.templates[int(columns.variant[index])]
+            payload = b"".join(template.around(columns.slots(index), 0))
+            yield int(columns.ordinal[index]), message_at(columns, index, channel, payload)

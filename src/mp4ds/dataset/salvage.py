@@ -49,9 +49,7 @@ class Damage:
     @property
     def error(self) -> FormatError:
         """The error that names them all, by number, topic and times."""
-        if self._error.frame is None:
-            return self._error
-        return self._stream.named(self._error, self._error.frame, self.last)
+        return self._stream.named(self._error, self.last)
 
     @property
     def frames(self) -> tuple[int, int]:

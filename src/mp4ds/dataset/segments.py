@@ -12,8 +12,8 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.dataset.columns import DecodedColumns, columns_model, digests_model
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import DecodedColumns, columns_model, digests_model
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import VideoError
 from mp4ds.format.fields import (
@@ -73,11 +73,11 @@ class Cut:
     @cached_property
     def calibrations(self) -> list[Calibration]:
         """Those of its camera."""
-        info, columns = self.stream.sidecar.camera_info, self.stream.camera_info_columns
-        if info is None or columns is None or not len(self.infos):
+        infos = self.stream.infos
+        if infos is None:
             return []
-        kinds = np.unique(columns.variant[self.infos])
-        return [info.calibrations[kind] for kind in kinds.tolist()]
+        kinds = np.unique(infos.columns.variant[self.infos])
+        return [infos.info.calibrations[kind] for kind in kinds.tolist()]
 
 
 class _Distinct(Generic[_ModelT]):
@@ -207,11 +207,11 @@ class JoinedStream:
         stream, sidecar = cut.stream, cut.stream.sidecar
         kinds = self._headers.add(cut.headers, sidecar.headers)
         self._columns.add(stream.columns, cut.images, kinds, offset(sidecar.channel))
-        info, columns = sidecar.camera_info, stream.camera_info_columns
-        if info is not None and columns is not None and len(cut.infos):
-            self._info = self._info or info
-            kinds = self._calibrations.add(cut.calibrations, info.calibrations)
-            self._infos.add(columns, cut.infos, kinds, offset(info.channel))
+        infos = stream.infos
+        if infos is not None and len(cut.infos):
+            self._info = self._info or infos.info
+            kinds = self._calibrations.add(cut.calibrations, infos.info.calibrations)
+            self._infos.add(infos.columns, cut.infos, kinds, offset(infos.info.channel))
 
     def write(self, stem: str, folder: Path) -> StreamSidecar:
         """Write the video; the sidecar is returned.

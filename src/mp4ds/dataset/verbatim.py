@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from mp4ds.dataset.images import Images, Integers
-from mp4ds.dataset.rebuild import MessageSplitter
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Refused, VideoError
 from mp4ds.format.models import Calibration
@@ -20,6 +19,7 @@ from mp4ds.messages import depth, png
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view
 from mp4ds.messages.layouts import why_not
+from mp4ds.messages.serializations import MessageSplitter
 from mp4ds.messages.wire import CodedFields, ImageFields, Parts
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.video.images import coded_pixels
@@ -196,8 +196,8 @@ class VerbatimImages(Images):
         span = Excerpt(entry.log_time, entry.log_time + 1, frozenset([self.topic]), others=False)
         message = next(islice(self._recorded(span), entry.tie, None), None)
         if message is None:
-            error = VideoError("decode-failed", self.path, "was not found")
-            raise self.named(error, index)
+            error = VideoError("decode-failed", self.path, "was not found", frame=index)
+            raise self.named(error)
         return self._shown(index, MessageSplitter(self.channel), message)
 
     def all_shown(self) -> Iterator[tuple[int, Shown]]:

@@ -8,7 +8,6 @@ from operator import index as as_integer
 
 import numpy as np
 
-from mp4ds.dataset.rebuild import fields_of
 from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration, Roi
 from mp4ds.messages.depth import DEPTHS
@@ -96,7 +95,7 @@ class Placement:
             image: The calibration of the image, as recorded.
         """
         x, y, width, height = self.crop
-        k, p = (np.array(matrix) for matrix in effective(fields_of(image)))
+        k, p = (np.array(matrix) for matrix in effective(image.fields))
         for row, offset, scale in (
             (0, x, self.size[0] / width),
             (1, y, self.size[1] / height),

@@ -37,6 +37,7 @@ from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, MAX_TABLE, Parameters
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, why_not
 from mp4ds.messages.png import PNG_ENCODINGS
 from mp4ds.messages.serializations import WIRES
+from mp4ds.messages.wire import CalibrationFields
 from mp4ds.plan import TOLERANCES, QualityTarget
 from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
@@ -516,6 +517,50 @@ class Calibration(Model):
         None,
         description="The blank message, where it is not that of a plain serialization.",
     )
+
+    @classmethod
+    def of(cls, frame_id: str, fields: CalibrationFields, template: str | None) -> Calibration:
+        """The calibration of a message."""
+        x_offset, y_offset, height, width = fields.roi
+        roi = Roi(
+            x_offset=x_offset,
+            y_offset=y_offset,
+            height=height,
+            width=width,
+            do_rectify=fields.roi_do_rectify,
+        )
+        return cls(
+            frame_id=frame_id,
+            height=fields.height,
+            width=fields.width,
+            distortion_model=fields.distortion_model,
+            d=list(fields.d),
+            k=list(fields.k),
+            r=list(fields.r),
+            p=list(fields.p),
+            binning_x=fields.binning_x,
+            binning_y=fields.binning_y,
+            roi=roi if any((*fields.roi, fields.roi_do_rectify)) else None,
+            template=template,
+        )
+
+    @property
+    def fields(self) -> CalibrationFields:
+        """The fields of its message."""
+        roi = self.roi
+        return CalibrationFields(
+            height=self.height,
+            width=self.width,
+            distortion_model=self.distortion_model,
+            d=tuple(self.d),
+            k=tuple(self.k),
+            r=tuple(self.r),
+            p=tuple(self.p),
+            binning_x=self.binning_x,
+            binning_y=self.binning_y,
+            roi=(roi.x_offset, roi.y_offset, roi.height, roi.width) if roi else (0, 0, 0, 0),
+            roi_do_rectify=roi.do_rectify if roi else 0,
+        )
 
 
 class CameraInfo(Model):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from mp4ds.errors import Refused
 from mp4ds.messages.ros import LAYOUTS, RosForm, RosWire
 from mp4ds.messages.wire import (
     CalibrationFields,
@@ -11,10 +12,11 @@ from mp4ds.messages.wire import (
     Fields,
     Form,
     ImageFields,
+    Parts,
     Slots,
     WireError,
 )
-from mp4ds.records import Channel
+from mp4ds.records import Channel, Message
 
 _ROS = {
     wire.name: wire
@@ -139,3 +141,29 @@ def plain_message(
 
 def _ros_type(name: str) -> str:
     return name.replace("/msg/", "/")
+
+
+class MessageSplitter:
+    """Splits the messages of one channel; its serialization may change between messages."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self._forms: dict[str, Form] = {}
+
+    def split(self, message: Message) -> tuple[Form, Parts]:
+        """The form of a message and its parts.
+
+        Raises:
+            Refused: It does not parse, or is not modelled.
+        """
+        data = memoryview(message.data)
+        schema = self._channel.schema
+        try:
+            wire = wire_of(self._channel.message_encoding, data)
+            if wire not in self._forms:
+                definition = schema.data if schema else b""
+                self._forms[wire] = form_of(wire, self._channel.type_name, definition)
+            form = self._forms[wire]
+            return form, form.split(data)
+        except WireError as error:
+            raise Refused(f"it does not parse: {error}") from None

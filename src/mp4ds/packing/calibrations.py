@@ -7,13 +7,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-from mp4ds.dataset.rebuild import CameraInfoWriter, MessageSplitter
 from mp4ds.errors import OptionError, Refused
-from mp4ds.format.models import CameraInfo
-from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
+from mp4ds.format.fields import MAX_CAMERA_INFOS
+from mp4ds.format.models import Calibration, CameraInfo, ChannelModel
+from mp4ds.messages.serializations import (
+    MessageSplitter,
+    is_calibration,
+    is_camera,
+    kind_of,
+)
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
 from mp4ds.packing.inspection import CameraMessage
 from mp4ds.packing.options import TopicSummary
+from mp4ds.packing.writer import ColumnsWriter, HeaderTable
 from mp4ds.plan import INFO_NAMES, TRANSPORTS
 from mp4ds.records import Channel, Message
 
@@ -370,6 +376,56 @@ class CalibratedStream(Protocol):
 
     channel: Channel
     camera_info: CameraInfo | None
+
+
+class CameraInfoWriter:
+    """The calibration messages of one channel."""
+
+    def __init__(self, channel: Channel) -> None:
+        self.channel = channel
+        self._forms = MessageSplitter(channel)
+        self._columns = ColumnsWriter()
+        self._heads: HeaderTable[Calibration] | None = None
+
+    def accept(self, message: Message, ordinal: int) -> None:
+        """Accept a message.
+
+        Args:
+            message: The message.
+            ordinal: Its position among the channel's messages.
+
+        Raises:
+            Refused: It cannot be modelled exactly; nothing was changed.
+        """
+        form, parts = self._forms.split(message)
+        self._columns.check(message, parts)
+        if len(self._columns) == MAX_CAMERA_INFOS:
+            raise Refused(f"more than {MAX_CAMERA_INFOS} messages")
+        fields = parts.fields
+        if not isinstance(fields, CalibrationFields):
+            raise Refused("it is not a calibration")
+        heads = self._heads or HeaderTable[Calibration](form)
+        if heads.form.wire != form.wire:
+            raise Refused("its byte order differs from the first one's")
+        variant = heads.number(
+            parts,
+            memoryview(message.data),
+            describe=lambda template: Calibration.of(parts.frame_id, fields, template),
+        )
+        self._heads = heads
+        self._columns.append(message, parts, variant=variant, ordinal=ordinal)
+
+    def to_model(self) -> CameraInfo | None:
+        """The model, or None if no message was accepted."""
+        if self._heads is None:
+            return None
+        return CameraInfo(
+            channel=ChannelModel.from_record(self.channel),
+            wire=self._heads.form.wire,
+            messages=len(self._columns),
+            calibrations=self._heads.items,
+            columns=self._columns.to_model(),
+        )
 
 
 @dataclass

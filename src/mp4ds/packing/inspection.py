@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from mp4ds.dataset.rebuild import MessageSplitter
 from mp4ds.errors import Refused
 from mp4ds.format.fields import Body
 from mp4ds.messages import depth, jpeg, png
 from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, row_padding
 from mp4ds.messages.layouts import why_not
 from mp4ds.messages.png import PNG_ENCODINGS
+from mp4ds.messages.serializations import MessageSplitter
 from mp4ds.messages.wire import CodedFields, Form, ImageFields, Parts
 from mp4ds.records import Channel, Message
 from mp4ds.video.coded_messages import PictureParser, packet_codec

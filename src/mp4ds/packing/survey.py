@@ -8,9 +8,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from mp4ds.bags.protocols import BagReader
-from mp4ds.dataset.rebuild import MessageSplitter
 from mp4ds.errors import Refused
-from mp4ds.messages.serializations import is_calibration
+from mp4ds.messages.serializations import MessageSplitter, is_calibration
 from mp4ds.packing.calibrations import StampPairing
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
 from mp4ds.packing.tracks import (

@@ -7,12 +7,13 @@ from array import array
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import xxhash
 
-from mp4ds.dataset.rebuild import ColumnsWriter, HeaderTable, digests_model
+from mp4ds.dataset.columns import columns_model, digests_model
 from mp4ds.errors import OutOfReachError, Refused
-from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, exceeds_padding
+from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, MAX_VARIANTS, Columns, exceeds_padding
 from mp4ds.format.models import (
     CameraInfo,
     ChannelModel,
@@ -25,11 +26,108 @@ from mp4ds.format.models import (
 )
 from mp4ds.format.sidecars import dump_document
 from mp4ds.messages.png import PngRecipe, zlib_fingerprint
-from mp4ds.messages.wire import CodedFields
+from mp4ds.messages.wire import CodedFields, Form, Parts, Template, WireError, prove
 from mp4ds.packing.inspection import CameraMessage
 from mp4ds.packing.tracks import StreamSettings, TrackPlan
 from mp4ds.records import Channel, Message
-from mp4ds.times import PresentationClock
+from mp4ds.times import INT64_MAX, INT64_MIN, Int64Column, PresentationClock
+
+_ModelT = TypeVar("_ModelT")
+
+
+class ColumnsWriter:
+    """The growing columns of one stream or of its camera_info."""
+
+    def __init__(self) -> None:
+        self._columns = {name: Int64Column() for name in Columns.model_fields}
+
+    def __len__(self) -> int:
+        return len(self._columns["log_time"])
+
+    @staticmethod
+    def check(message: Message, parts: Parts) -> None:
+        """Refuse times that a column cannot hold.
+
+        Raises:
+            Refused: A time does not fit into a signed 64-bit integer.
+        """
+        for value in (message.log_time, message.publish_time, parts.pts or 0):
+            if not INT64_MIN <= value <= INT64_MAX:
+                raise Refused(f"time {value} ns does not fit into 64 bits with sign")
+
+    def append(self, message: Message, parts: Parts, *, variant: int, ordinal: int) -> None:
+        """Append one message's values, already checked."""
+        values = {
+            "log_time": message.log_time,
+            "publish_time": message.publish_time,
+            "sequence": message.sequence,
+            "stamp": parts.stamp,
+            "seq": parts.seq,
+            "pts": parts.pts,
+            "variant": variant,
+            "ordinal": ordinal,
+        }
+        for name, value in values.items():
+            if value is not None:
+                self._columns[name].append(value)
+
+    def to_model(self) -> Columns:
+        """The columns as the sidecar holds them."""
+        found = {name: column.to_numpy() for name, column in self._columns.items() if len(column)}
+        return columns_model(found)
+
+
+class HeaderTable(Generic[_ModelT]):
+    """Numbers the distinct blanks of a stream's messages.
+
+    Args:
+        form: Of all messages.
+    """
+
+    def __init__(self, form: Form) -> None:
+        self.form = form
+        self.items: list[_ModelT] = []
+        self._templates: dict[bytes, Template] = {}
+        self._numbers: dict[tuple[bytes, object], int] = {}
+
+    def number(
+        self,
+        parts: Parts,
+        data: memoryview,
+        *,
+        describe: Callable[[str | None], _ModelT],
+        extra: object = None,
+    ) -> int:
+        """The number of a message's header, after rebuilding and comparing the message.
+
+        Args:
+            parts: Of the message.
+            data: The message.
+            describe: Makes the model of a new header, from its template or None for a plain one.
+            extra: What else distinguishes headers.
+
+        Raises:
+            Refused: It does not rebuild, or there are too many.
+        """
+        blank = parts.blank
+        try:
+            template = self._templates.get(blank) or self.form.template(blank)
+            exact = prove(template, parts, data)
+        except WireError as error:
+            raise Refused(f"its header does not rebuild: {error}") from None
+        if not exact:
+            raise Refused("its header does not rebuild")
+        known = self._numbers.get((blank, extra))
+        if known is not None:
+            return known
+        if len(self.items) == MAX_VARIANTS:
+            raise Refused(f"more than {MAX_VARIANTS} different message headers")
+        plain = self.form.plain(parts.frame_id, parts.fields)
+        self.items.append(describe(None if plain == blank else base64.b64encode(blank).decode()))
+        self._templates[blank] = template
+        self._numbers[blank, extra] = len(self.items) - 1
+        return len(self.items) - 1
+
 
 # ---------------------------------------------------------------- writer
 

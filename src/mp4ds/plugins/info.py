@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import MessageSplitter, fields_of
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import Matrix, effective
 from mp4ds.errors import Refused, counted
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import names_dataset
-from mp4ds.messages.serializations import is_calibration, is_camera, kind_of
+from mp4ds.messages.serializations import MessageSplitter, is_calibration, is_camera, kind_of
 from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.messages.wire import CalibrationFields, CodedFields, ImageFields
 from mp4ds.options import WHOLE, Slice
@@ -598,17 +597,17 @@ def _add_intrinsics(camera: CameraCalibrations, stream: Stream) -> None:
     if info is None:
         return
     camera.info_topic = info.channel.topic
-    columns = stream.camera_info_columns
+    columns = stream.infos.columns if stream.infos else None
     if columns is None:
         camera.calibrations += [
-            _listed(fields_of(item), item.frame_id, None, None) for item in info.calibrations
+            _listed(item.fields, item.frame_id, None, None) for item in info.calibrations
         ]
         return
     changes = np.flatnonzero(np.diff(columns.variant, prepend=-1))
     for place in changes[:MAX_LISTED].tolist():
         item = info.calibrations[int(columns.variant[place])]
         number, log_time = int(columns.ordinal[place]), int(columns.log_time[place])
-        camera.calibrations.append(_listed(fields_of(item), item.frame_id, number, log_time))
+        camera.calibrations.append(_listed(item.fields, item.frame_id, number, log_time))
     camera.more += max(0, len(changes) - MAX_LISTED)
 
 

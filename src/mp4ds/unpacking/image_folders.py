@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.dataset.columns import marked
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import marked
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.verbatim import VerbatimImages

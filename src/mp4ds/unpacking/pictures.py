@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.dataset.columns import Choice, DecodedColumns, everything, unbroken
 from mp4ds.dataset.images import Images
-from mp4ds.dataset.rebuild import Choice, DecodedColumns, everything, form_for, unbroken
+from mp4ds.dataset.rebuild import form_for
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import size_after, view_of
 from mp4ds.errors import OptionError, Refused
@@ -533,8 +534,8 @@ def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int,
     form = form_for(sidecar.channel.to_record(0), sidecar.wire, str(stream.path))
     if sidecar.digests is None and verify:
         stream.verify_video()
-    for index, make in stream.numbered_makers(choice):
-        yield index, form.split(memoryview(make())).body
+    for index, payload in stream.payloads(choice):
+        yield index, form.split(memoryview(payload)).body
 
 
 def _from_pictures(
@@ -577,5 +578,5 @@ def _verify(stream: Stream) -> None:
     """Check the video against its SHA-256 or, without one, all messages against their digests."""
     stream.verify_video()
     if stream.sidecar.video.sha256 is None and stream.sidecar.digests is not None:
-        for make in stream.makers():
-            make()
+        for _ in stream.payloads():
+            pass

@@ -10,9 +10,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.channels import ImageChannel, MessageSource, PartKey
+from mp4ds.dataset.channels import ChannelGroup, MessageSource, Part
+from mp4ds.dataset.columns import Choice, everything, marked
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import CameraInfoRebuilder, Choice, everything, marked, message_at
+from mp4ds.dataset.rebuild import CalibrationMessages, message_at
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import Placement
 from mp4ds.errors import ConversionError, FormatError, OptionError, Refused
@@ -100,67 +101,24 @@ class FreeTopics:
 # ---------------------------------------------------------------- calibrations
 
 
-@dataclass(frozen=True)
-class CalibrationSource:
-    """Yields the calibration messages of a stream.
-
-    Attributes:
-        rebuilder: Makes them.
-        is_kept: Which are kept, shape (messages,).
-    """
-
-    rebuilder: CameraInfoRebuilder
-    is_kept: NDArray[np.bool_]
-
-    @property
-    def left_out(self) -> int:
-        """How many are left out."""
-        return int((~self.is_kept).sum())
-
-    def messages(self, channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
-        """The wanted ones, each with its ordinal."""
-        chosen = choice if self.is_kept.all() else marked(self.is_kept, choice)
-        return self.rebuilder.messages(channel, chosen(self.rebuilder.columns))
-
-
-def calibration_source(
-    stream: Stream, size: tuple[int, int] | None, is_kept: NDArray[np.bool_] | None
-) -> CalibrationSource | None:
-    """The calibration messages of a stream whose images are reduced.
-
-    If images are left out, so are the calibrations that only have their stamps. Those whose stamps
-    no image has are kept.
-
-    Args:
-        stream: The stream, which must have such messages.
-        size: New width and height of its images; None for as recorded.
-        is_kept: Which of its images are kept; None for all.
-
-    Returns:
-        None if they stay as recorded.
+def resized(
+    infos: CalibrationMessages, stream: Stream, size: tuple[int, int]
+) -> CalibrationMessages:
+    """The calibration messages of a stream for another width and height of its images.
 
     Raises:
-        Refused: They cannot be adapted to another size; says why.
+        Refused: They cannot be adapted; says why.
     """
-    info, columns = stream.sidecar.camera_info, stream.camera_info_columns
-    if info is None or columns is None or (size is None and is_kept is None):
-        return None
-    if size is not None:
-        placement = Placement((0, 0, *stream.image_size), size)
-        made = [placement.calibration(calibration) for calibration in info.calibrations]
-        info = info.model_copy(update={"calibrations": made})
+    placement = Placement((0, 0, *stream.image_size), size)
+    made = [placement.calibration(calibration) for calibration in infos.info.calibrations]
+    found = CalibrationMessages(
+        infos.info.model_copy(update={"calibrations": made}), str(stream.path)
+    )
     try:
-        rebuilder = CameraInfoRebuilder(info, columns, str(stream.path))
+        _ = found.templates
     except FormatError:
-        if size is None:
-            raise
         raise Refused("calibrations of this type cannot be adapted to another size") from None
-    stamps = columns.stamp
-    is_wanted: NDArray[np.bool_] = np.ones(len(stamps), np.bool_)
-    if is_kept is not None:
-        frames = stream.stamps
-        is_wanted = ~np.isin(stamps, frames) | np.isin(stamps, frames[is_kept])
-    return CalibrationSource(rebuilder, is_wanted)
+    return found
 
 
 # ---------------------------------------------------------------- republisher
@@ -261,7 +219,7 @@ class Republisher:
         self._omitted: Counter[str] = Counter()
         self._made: set[int] = set()
         self.channels: list[Channel] = []
-        self.sources: dict[PartKey, MessageSource] = {}
+        self.sources: dict[Part, MessageSource] = {}
         self.republished: dict[str, Republished] = {}
         self.as_recorded: dict[str, dict[str, int]] = {}
         self.thinned: dict[str, int] = {}
@@ -269,7 +227,8 @@ class Republisher:
         chosen = [item for item in dataset.image_channels() if selected(item.channel.topic)]
         planned = [(item, self._plan(item)) for item in chosen]
         for item, plans in planned:
-            if not item.recorded and sum(plan.is_moved for plan in plans) == len(item.streams):
+            all_move = sum(plan.is_moved for plan in plans) == len(item.streams)
+            if all_move and not item.recorded(dataset.recorded_counts):
                 self._emptied.add(item.channel.id)
         self._declare(dataset, planned)
         for _, plans in planned:
@@ -292,7 +251,7 @@ class Republisher:
 
     # ------------------------------------------------------------ what is given how
 
-    def _plan(self, item: ImageChannel) -> list[_Plan]:
+    def _plan(self, item: ChannelGroup) -> list[_Plan]:
         """The streams of a channel that are converted or thinned, and how."""
         plans = [self._plan_stream(stream, item.channel.topic) for stream in item.streams]
         return [plan for plan in plans if plan.frames or plan.is_kept is not None]
@@ -355,7 +314,7 @@ class Republisher:
     def _types_of(self, encoding: str, kind: str) -> Types:
         return self._types.setdefault((encoding, kind), Types(encoding, kind))
 
-    def _declare(self, dataset: Dataset, planned: list[tuple[ImageChannel, list[_Plan]]]) -> None:
+    def _declare(self, dataset: Dataset, planned: list[tuple[ChannelGroup, list[_Plan]]]) -> None:
         staying = [channel for channel in dataset.channels if channel.id not in self._emptied]
         free = FreeTopics(channel.topic for channel in staying)
         next_id = 1 + max((channel.id for channel in dataset.channels), default=0)
@@ -376,7 +335,7 @@ class Republisher:
                 self.republished.setdefault(recorded.topic, known)
             for plan in plans:
                 channel = made[plan.kind] if plan.is_moved else None
-                self.sources[PartKey(plan.stream.path)] = self._source(plan, channel)
+                self.sources[plan.stream] = self._source(plan, channel)
         self._made = {channel.id for channel in self.channels}
 
     def _source(self, plan: _Plan, made: Channel | None) -> MessageSource:
@@ -389,19 +348,30 @@ class Republisher:
         return partial(self._messages, plan, plan.frames, types, made)
 
     def _give_calibrations(self, plan: _Plan, selected: Callable[[str], bool]) -> None:
-        info = plan.stream.sidecar.camera_info
-        if info is None or not info.messages or not selected(info.channel.topic):
+        """Adapt the calibrations of a stream whose images are reduced.
+
+        If images are left out, so are the calibrations that only have their stamps. Those whose
+        stamps no image has are kept.
+        """
+        stream, infos = plan.stream, plan.stream.infos
+        is_reduced = plan.size is not None or plan.is_kept is not None
+        if infos is None or not is_reduced or not selected(infos.channel.topic):
             return
-        try:
-            source: CalibrationSource | None = calibration_source(
-                plan.stream, plan.size, plan.is_kept
-            )
-        except Refused as reason:
-            self._keep(info.channel.topic, str(reason), info.messages)
-            source = calibration_source(plan.stream, None, plan.is_kept)
-        if source is not None:
-            self._leave_out(info.channel.topic, source.left_out)
-            self.sources[PartKey(plan.stream.path, is_calibration=True)] = source.messages
+        given, is_wanted = infos, np.ones(len(infos), np.bool_)
+        if plan.size is not None:
+            try:
+                given = resized(infos, stream, plan.size)
+            except Refused as reason:
+                self._keep(infos.channel.topic, str(reason), len(infos))
+        if plan.is_kept is not None:
+            stamps, frames = infos.columns.stamp, stream.stamps
+            is_wanted = ~np.isin(stamps, frames) | np.isin(stamps, frames[plan.is_kept])
+            self._leave_out(infos.channel.topic, int((~is_wanted).sum()))
+
+        def messages(channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
+            return given.messages(channel, marked(is_wanted, choice))
+
+        self.sources[infos] = messages
 
     def _count_verbatim(self, dataset: Dataset, selected: Callable[[str], bool]) -> None:
         cameras = {channel.topic for channel in dataset.channels if is_camera(channel)}

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.dataset.columns import marked
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import marked
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import Placement, View, view_of
 from mp4ds.errors import OptionError
@@ -356,8 +356,8 @@ class ExportSource:
         if info is None or camera.calibration is None:
             return None
         topic = info.channel.topic
-        columns = camera.stream.camera_info_columns
-        if columns is not None:
+        if camera.stream.infos is not None:
+            columns = camera.stream.infos.columns
             used = camera.stream.calibration_at(int(camera.stream.log_times[camera.numbers[0]]))
             same = [number for number, item in enumerate(info.calibrations) if item is used]
             is_same = np.isin(columns.variant, same)

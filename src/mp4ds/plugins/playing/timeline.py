@@ -17,9 +17,8 @@ import numpy as np
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import LatchedMessages, has_late, latched_depth
-from mp4ds.dataset.channels import Ahead
-from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.rebuild import DecodedColumns, everything
+from mp4ds.dataset.columns import DecodedColumns, everything
+from mp4ds.dataset.dataset import Ahead, Dataset
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.plan import Selection
 from mp4ds.plugins.playing.stamps import HeaderStamps

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.rebuild import fields_of
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import effective, lens_of
 from mp4ds.errors import OptionError
@@ -320,7 +319,7 @@ def overlay_of(calibration: Calibration, image_size: tuple[int, int], topic: str
         image_size: Width and height of the images, pixels.
         topic: Of the images: on image_proc's rectified topics P applies, without distortion.
     """
-    k, p = (np.array(matrix) for matrix in effective(fields_of(calibration)))
+    k, p = (np.array(matrix) for matrix in effective(calibration.fields))
     is_rectified = any(part.startswith("image_rect") for part in topic.split("/"))
     matrix = p[:, :3] if is_rectified else k
     model, d = ("none", []) if is_rectified else lens_of(calibration)
@@ -485,7 +484,7 @@ class ReportedCamera:
             FormatError: They break a rule of the format, or there is no video.
         """
         _ = self.stream.columns
-        _ = self.stream.camera_info_columns
+        _ = self.stream.infos and self.stream.infos.columns
 
     def timing(self) -> Timing:
         """Its timing statistics."""
@@ -550,7 +549,7 @@ class ReportedCamera:
         info = self.stream.sidecar.camera_info
         if info is None:
             return {"calibrations": [], "calibration_topic": "", "calibrations_more": 0}
-        columns = self.stream.camera_info_columns
+        columns = self.stream.infos.columns if self.stream.infos else None
         changes: NDArray[np.integer[Any]]
         frames: NDArray[np.integer[Any]]
         variants: NDArray[np.integer[Any]]
