@@ -245,7 +245,7 @@ class Core:
             output, errors = player.communicate(timeout=SECONDS)
         finally:
             player.kill()
-            player.wait()
+            player.communicate()  # and close its pipes
         assert player.returncode == 0, errors
         wait_until(lambda: not any(map(self.connections, before)))
         return output, errors

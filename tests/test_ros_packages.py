@@ -134,7 +134,8 @@ def test_ros2_finds_it(tmp_path: Path) -> None:
     for name in ("play", "record"):
         assert (share / "launch" / f"{name}.launch.xml").exists()
         assert os.access(prefix / "lib" / "mp4ds" / name, os.X_OK)
-    (metadata,) = prefix.rglob("METADATA")
+    # of an egg where setuptools is old and has no wheel beside it, as on Python 3.10
+    (metadata,) = (path for name in ("METADATA", "PKG-INFO") for path in prefix.rglob(name))
     text = metadata.read_text()
     # mp4ds itself stays what Python finds by its name
     assert f"Name: mp4ds-ros\nVersion: {mp4ds.__version__}\n" in text
