@@ -25,14 +25,13 @@ from coded_tools import scene as packet_scene
 from mp4ds.errors import Mp4dsError, SegmentsDifferError, VideoError
 from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video.codecs import Recipe, recipe_for
-from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.mp4 import read_sample_entry
 from mp4ds.video.packets import PacketReader, PacketWriter, join_segments
 from test_packets import write as write_packets
 from test_players import blocks as means_of_blocks
 from test_players import ffprobe
-from test_video import LOSSLESS, LOSSY, decode, encode, noise, same, scene_pictures
+from test_video import LOSSLESS, LOSSY, decode, encode, noise, same, scene_pictures, video_decoder
 
 GOP = 4
 WIDTH, HEIGHT = 66, 50  # x265 takes no fewer than 64 columns
@@ -187,7 +186,7 @@ def test_pictures_are_those_of_the_segments(kind: Kind, joined: Joined) -> None:
     found = decode(target, all_told)
     assert len(found) == TOTAL
     assert all(map(same, found, expected))
-    with VideoDecoder(target, **all_told, sequential=False) as decoder:
+    with video_decoder(target, **all_told, sequential=False) as decoder:
         for number in (*range(TOTAL), *reversed(range(TOTAL))):
             planes = tuple(plane.copy() for plane in decoder.picture(number))
             assert same(planes if len(planes) > 1 else planes[0], expected[number]), number

@@ -30,10 +30,11 @@ from coded_tools import (
 )
 from conftest import real
 from mp4ds.errors import Refused, VideoError
+from mp4ds.messages.coded import CodedPicture
 from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video import av1, h264, h265, nal
 from mp4ds.video.codecs import recipe_for
-from mp4ds.video.coded_messages import CodedPicture, PictureParser, body_of
+from mp4ds.video.coded_messages import PictureParser, body_of
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketReader, PacketWriter, StandAlonePackets
 from test_coded_pictures import packets_of

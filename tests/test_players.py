@@ -23,10 +23,10 @@ from chromium import Tab, played, video_player
 from coded_scenes import CODED
 from definitions import PICTURES
 from mp4ds.packing.options import PackOptions
-from mp4ds.video.decoder import VideoDecoder
 from pictures import CAREFUL
 from scenes import Record, Scene
 from sources import SOURCES, scene
+from test_video import video_decoder
 
 WIDTH, HEIGHT, FRAMES = 96, 66, 12
 
@@ -175,7 +175,7 @@ def shown_pictures(dataset: Path, *, centred: bool = False) -> list[NDArray[np.u
         frames, video = len(opened.streams[0]), opened.streams[0].sidecar.video
     grey = video.layout in ("gray8", "mosaic8")
     size = (video.width, video.height)
-    with VideoDecoder(
+    with video_decoder(
         dataset / video.file,
         codec=video.codec,
         coded_size=size,

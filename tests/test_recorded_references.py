@@ -21,15 +21,16 @@ from mp4ds.errors import FormatError, VideoError
 from mp4ds.format.models import References, video_facts
 from mp4ds.format.sidecars import load_stream
 from mp4ds.messages.coded import CodedFrame, UnknownStructure
-from mp4ds.video import access
 from mp4ds.video import references as structure
-from mp4ds.video.access import Chains, digest_video, packets_of_groups
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.references import (
+    Chains,
     StructureRecorder,
     Structures,
+    digest_video,
     frame_bytes,
+    packets_of_groups,
     read_structure,
     write_packet,
 )
@@ -101,7 +102,7 @@ def test_groups_that_were_not_asked_for_long_are_forgotten(
     path = written(tmp_path, recipe)
     table, data = index(path), path.read_bytes()
     most = max(np.diff(np.append(np.flatnonzero(table.sync), len(table.sizes))))
-    monkeypatch.setattr(access, "_KEPT_FRAMES", 2 * most)
+    monkeypatch.setattr(structure, "_KEPT_FRAMES", 2 * most)
 
     def read(sample: int) -> bytes:
         return data[table.places[sample] :][: table.sizes[sample]]

@@ -386,7 +386,7 @@ def test_a_picture_of_several_slices() -> None:
         ("x264-slices", with_length(b"\x22\x80\x80"), "partitions"),
         ("x264-slices", with_length(b"\x21\x80") + with_length(b"\x25\x00"), "one picture"),
         ("x264-slices", with_length(b"\x21\x00"), "one picture"),
-        ("x264-slices", with_length(b"\x21"), "length"),
+        ("x264-slices", with_length(b"\x21"), "one picture"),
         ("x264-slices", with_length(b"\x21\x80")[:-1], "length"),
         ("x264-slices", with_length(b"\x06\x05") * 600, "more than"),
         ("x265-b4", with_length(b"\x02\x01"), "one picture"),

@@ -29,6 +29,7 @@ from mp4ds.video.codecs import Recipe, check_codec, lossless_codecs, recipe_for
 from mp4ds.video.decoder import VideoDecoder, jpeg_pixels
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import ImageFile
+from mp4ds.video.pixels import PictureMaker
 from mp4ds.video.planes import PlaneMaker
 from pictures import BAYER, picture
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, rounded, suited, values
@@ -134,9 +135,17 @@ def copied(planes: tuple[Pixels, ...]) -> Any:
     return copies if len(copies) > 1 else copies[0]
 
 
+def video_decoder(
+    path: Path, *, codec: str, frames: int, sequential: bool = True, **promised: Any
+) -> VideoDecoder:
+    """A decoder of a video whose size and pictures are promised as `PictureMaker` has them."""
+    maker = PictureMaker(path, **promised)
+    return VideoDecoder(path, codec=codec, frames=frames, maker=maker, sequential=sequential)
+
+
 def decode(path: Path, told: dict[str, Any]) -> list[Any]:
     """Pictures: arrays, or tuples of planes."""
-    with VideoDecoder(path, **told) as decoder:
+    with video_decoder(path, **told) as decoder:
         assert decoder.coded_frames == told["frames"]
         return [copied(planes) for planes in decoder.pictures()]
 
@@ -171,7 +180,7 @@ def test_lossless_is_exact(codec: str, picture_format: str, tmp_path: Path) -> N
         assert all(map(same, decoded, pictures))
         first = decoded[0][0] if isinstance(decoded[0], tuple) else decoded[0]
         assert first.dtype.itemsize == (2 if picture_format.endswith("le") else 1)
-        with VideoDecoder(path, **told, sequential=False) as decoder:
+        with video_decoder(path, **told, sequential=False) as decoder:
             assert same(copied(decoder.picture(5)), pictures[5])
     # the smallest pictures are refused by some, and then another codec has them
     if codec == "h265":
@@ -277,7 +286,7 @@ def test_every_layout_returns_through_every_codec(
             except EncoderRefusedError:
                 continue
             taken.add(codec)
-            with VideoDecoder(path, **told) as decoder:
+            with video_decoder(path, **told) as decoder:
                 for planes, pixels in zip(decoder.pictures(), images, strict=True):
                     out = np.empty(pixels.shape, encoding.dtype)
                     layout.to_pixels(planes, out)
@@ -449,7 +458,7 @@ def test_any_frame_is_found(codec: str, gop: int, tmp_path: Path) -> None:
     decoded = decode(tmp_path / "v.mp4", told)
     numbers = [*range(len(ticks)), *reversed(range(len(ticks)))]
     numbers += rng.choices(range(len(ticks)), k=30)
-    with VideoDecoder(tmp_path / "v.mp4", **told, sequential=False) as decoder:
+    with video_decoder(tmp_path / "v.mp4", **told, sequential=False) as decoder:
         for number in numbers:
             assert same(decoder.picture(number), decoded[number]), number
         mixed = [copied(planes) for planes in decoder.pictures()]
@@ -553,10 +562,10 @@ def test_a_video_that_is_not_what_its_sidecar_says(
     change: dict[str, Any], code: str, plain: tuple[Path, dict[str, Any], list[Pixels]]
 ) -> None:
     path, told, _ = plain
-    with pytest.raises(VideoError) as caught, VideoDecoder(path, **{**told, **change}) as decoder:
+    with pytest.raises(VideoError) as caught, video_decoder(path, **{**told, **change}) as decoder:
         list(decoder.pictures())
     assert caught.value.code == code
-    with pytest.raises(VideoError), VideoDecoder(path, **{**told, **change}) as decoder:
+    with pytest.raises(VideoError), video_decoder(path, **{**told, **change}) as decoder:
         decoder.picture(0)
     assert caught.value.place.startswith(str(path))
 
@@ -564,13 +573,13 @@ def test_a_video_that_is_not_what_its_sidecar_says(
 def test_files_that_are_no_videos(tmp_path: Path, plain: Any) -> None:
     path, told, _ = plain
     with pytest.raises(VideoError) as caught:
-        VideoDecoder(tmp_path / "none.mp4", **told)
+        video_decoder(tmp_path / "none.mp4", **told)
     assert caught.value.code == "file-missing"
     junk = tmp_path / "junk.mp4"
     for data in (b"", b"junk" * 100, path.read_bytes()[:40]):
         junk.write_bytes(data)
         with pytest.raises(VideoError) as caught:
-            VideoDecoder(junk, **told)
+            video_decoder(junk, **told)
         assert caught.value.code == "video-unreadable"
 
 
@@ -583,12 +592,12 @@ def test_two_video_tracks_are_one_too_many(tmp_path: Path, plain: Any) -> None:
             frame = av.VideoFrame.from_ndarray(np.zeros((24, 32), np.uint8), format="gray")
             container.mux([*stream.encode(frame), *stream.encode(None)])
     with pytest.raises(VideoError, match="2 video tracks"):
-        VideoDecoder(tmp_path / "two.mp4", **plain[1])
+        video_decoder(tmp_path / "two.mp4", **plain[1])
 
 
 def read_all(path: Path, told: dict[str, Any]) -> list[Pixels] | VideoError:
     try:
-        with VideoDecoder(path, **told) as decoder:
+        with video_decoder(path, **told) as decoder:
             pictures = [copied(planes) for planes in decoder.pictures()]
             for number in range(told["frames"]):
                 decoder.picture(number)

@@ -39,8 +39,7 @@ from mp4ds.format.sidecars import (
     verify_file,
 )
 from mp4ds.records import Message, Record
-from mp4ds.video.access import digest_video, packets_in_groups
-from mp4ds.video.references import Structures
+from mp4ds.video.references import Structures, digest_video, packets_in_groups
 
 _Report = Callable[[str, float | None], None]
 _TELL_EVERY = 16  # frames

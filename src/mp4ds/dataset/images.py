@@ -16,8 +16,9 @@ from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.encodings import Pixels
 from mp4ds.options import seconds_text
 from mp4ds.records import Channel
+from mp4ds.video.access import FrameReader, open_file_frames
+from mp4ds.video.decoder import VideoFile
 from mp4ds.video.pixels import Scale
-from mp4ds.video.reader import FrameReader, VideoFile, open_file_frames
 
 Integers = NDArray[np.int64]
 

@@ -21,10 +21,10 @@ from mp4ds.messages import depth
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.encodings import Pixels
 from mp4ds.records import Channel, Message
+from mp4ds.video.access import FrameAccess, FrameReader
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.packets import PacketReader
-from mp4ds.video.pixels import Scale
-from mp4ds.video.reader import FrameReader, open_frames
+from mp4ds.video.pixels import PictureMaker, Scale
 
 
 class Stream(Images):
@@ -164,28 +164,27 @@ class Stream(Images):
             VideoError: The video cannot be read, or does not match the sidecar.
         """
         is_sound = self.sound is None
-        return VideoDecoder(self.video_path, **self._promises, sequential=sequential and is_sound)
+        return VideoDecoder(self.video_path, **self._told(), sequential=sequential and is_sound)
 
-    @property
-    def _promises(self) -> dict[str, Any]:
-        """The sidecar's description of the video, as arguments for decoders."""
+    def _told(self) -> dict[str, Any]:
+        """What the sidecar tells a decoder about the video; a maker serves one decoder."""
         video = self.sidecar.video
-        return {
-            "codec": video.codec,
-            "coded_size": (video.width, video.height),
-            "frames": self.sidecar.frames,
-            "picture_format": self.rebuilder.picture_format,
-            "picture_size": self.rebuilder.picture_size,
-            "matrix": video.matrix,
-            "full_range": video.full_range,
-        }
+        maker = PictureMaker(
+            self.video_path,
+            coded_size=(video.width, video.height),
+            picture_format=self.rebuilder.picture_format,
+            picture_size=self.rebuilder.picture_size,
+            matrix=video.matrix,
+            full_range=video.full_range,
+        )
+        return {"codec": video.codec, "frames": self.sidecar.frames, "maker": maker}
 
     def open_reader(self) -> FrameReader:
         """A separate decoder for frames by number."""
-        return open_frames(
-            self.video_path,
-            **self._promises,
-            references=self.sidecar.video.references,
+        references = self.sidecar.video.references
+        return FrameReader(
+            lambda: FrameAccess(self.video_path, **self._told(), references=references),
+            lambda: self.open_video(sequential=False),
         )
 
     def pictures(self, scale: Scale | None) -> Iterator[Picture]:

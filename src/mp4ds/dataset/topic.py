@@ -24,7 +24,7 @@ from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.depth import metres_of
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.times import StampIndex
-from mp4ds.video.reader import FrameReader
+from mp4ds.video.access import FrameReader
 
 Indices = Sequence[int] | NDArray[np.int64]
 

@@ -22,9 +22,9 @@ from mp4ds.messages.layouts import why_not
 from mp4ds.messages.serializations import MessageSplitter
 from mp4ds.messages.wire import CodedFields, ImageFields, Parts
 from mp4ds.records import Channel, Excerpt, Message
+from mp4ds.video.access import FrameReader
 from mp4ds.video.images import coded_pixels
 from mp4ds.video.pixels import Scale
-from mp4ds.video.reader import FrameReader
 
 Recorded = Callable[[Excerpt], Iterator[Message]]
 """Yields the messages of a channel within an excerpt, by log time."""

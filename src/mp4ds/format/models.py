@@ -41,7 +41,6 @@ from mp4ds.messages.wire import CalibrationFields
 from mp4ds.plan import TOLERANCES, QualityTarget
 from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
-from mp4ds.video.access import digest_video
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded_messages import PACKET_CODECS
 from mp4ds.video.pixels import shows_colours
@@ -51,6 +50,7 @@ from mp4ds.video.references import (
     MAX_STRUCTURES,
     STRUCTURE_PATTERN,
     Structures,
+    digest_video,
 )
 
 SCORE_STEPS = {"vmaf": 100, "psnr": 100, "ssim": 10_000}

@@ -76,18 +76,20 @@ class NoPicture(Refused):
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """One coded picture.
+class CodedPicture:
+    """One coded picture, and the packet that holds it.
 
     Attributes:
         width: Columns shown.
         height: Rows shown.
         keyframe: Whether decoding can begin here, given the parameters of the stream.
+        framing: What an mp4 does not keep of the packet.
     """
 
     width: int
     height: int
     keyframe: bool
+    framing: str = ""
 
 
 # ---------------------------------------------------------------- coded frames

@@ -2,298 +2,35 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import av
 import numpy as np
 from av.error import FFmpegError
-from numpy.typing import NDArray
 
 from mp4ds.errors import FormatError, Refused, VideoError, reason_of
-from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import expect
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.coded import UnknownStructure
 from mp4ds.messages.encodings import Pixels
 from mp4ds.video.codecs import CODECS
-from mp4ds.video.decoder import JpegDecoder
+from mp4ds.video.decoder import JpegDecoder, VideoFile, maker_of
 from mp4ds.video.media import raise_if_scarce
 from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.pixels import PictureMaker, Scale
 from mp4ds.video.references import (
+    Chains,
+    Group,
+    Piece,
     RecordedReferences,
-    ReferenceParser,
     StructureError,
-    StructureRecorder,
     Structures,
-    frame_bytes,
-    read_structure,
+    packets_of_groups,
 )
-
-_BLOCK = 2**20
-
-
-@dataclass(frozen=True, eq=False)
-class VideoDigest:
-    """Of a whole file.
-
-    Attributes:
-        size: Bytes.
-        sha256: Hexadecimal.
-        structures: What its frames refer to, if known.
-    """
-
-    size: int
-    sha256: str
-    structures: Structures | None
-
-
-def digest_video(path: Path, codec: str) -> VideoDigest:
-    """Hash a video, and find what its frames refer to in the same bytes.
-
-    Memory is one packet, and the video's index.
-
-    Args:
-        path: An mp4.
-        codec: Name in the registry.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    table = _table(path) if codec in CODECS and CODECS[codec].is_free else None
-    if table is None:
-        return VideoDigest(*digest_file(path), None)
-    recorder = StructureRecorder(codec, table.configuration)
-    digest = hashlib.sha256()
-    size = 0
-    with path.open("rb") as file:
-        number = 0
-        for is_packet, data in _parts(file, table):
-            digest.update(data)
-            size += len(data)
-            if is_packet:
-                recorder.add(data, key=bool(table.sync[number]))
-                number += 1
-    return VideoDigest(size, digest.hexdigest(), recorder.finish())
-
-
-def packets_in_groups(path: Path) -> NDArray[np.int64]:
-    """How many packets each group of pictures of a video has, shape (groups,).
-
-    Raises:
-        VideoError: Its index is damaged.
-        Refused: Its index is not read.
-        OSError: It cannot be read.
-    """
-    with path.open("rb") as file:
-        return packets_of_groups(read_sample_table(file, path.stat().st_size, str(path)))
-
-
-def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:
-    """How many packets each group of pictures has, shape (groups,)."""
-    return np.diff(np.append(np.flatnonzero(table.sync), len(table.sync)))
-
-
-def _table(path: Path) -> SampleTable | None:
-    """The index of a video whose packets are contiguous; None if that is unknown."""
-    try:
-        with path.open("rb") as file:
-            table = read_sample_table(file, path.stat().st_size, str(path))
-    except (VideoError, Refused):
-        return None
-    ends = table.places + table.sizes
-    return table if np.all(table.places[1:] >= ends[:-1]) else None
-
-
-def _parts(file: BinaryIO, table: SampleTable) -> Iterator[tuple[bool, bytes]]:
-    """All bytes of a file: its packets, and blocks of what is between them."""
-    place = 0
-    for start, size in zip(table.places.tolist(), table.sizes.tolist(), strict=True):
-        while place < start:
-            data = file.read(min(_BLOCK, start - place))
-            if not data:
-                return  # it became shorter meanwhile
-            place += len(data)
-            yield False, data
-        yield True, file.read(size)
-        place += size
-    while data := file.read(_BLOCK):
-        yield False, data
-
-
-# ---------------------------------------------------------------- chains
-
-_KEPT_FRAMES = 50_000  # coded frames whose references are kept in memory
-
-
-@dataclass(frozen=True, slots=True)
-class Piece:
-    """A coded frame: the part of a packet to pass to a decoder.
-
-    Attributes:
-        sample: Number of the packet.
-        part: Number of the coded frame in it.
-        needs: Numbers, within its group, of the pieces that it refers to.
-        span: Its first byte in the packet and the one after its last; None until it is read.
-    """
-
-    sample: int
-    part: int
-    needs: tuple[int, ...]
-    span: tuple[int, int] | None
-
-
-@dataclass(slots=True)
-class Group:
-    """The coded frames from one key frame to the next, as far as known.
-
-    Attributes:
-        first: Number of the key frame's packet.
-        end: Number of the next group's.
-        parser: Of its packets; None if nothing needs to be parsed.
-        pieces: In the order coded.
-        shows: For each known packet, the number of the piece that outputs its picture.
-    """
-
-    first: int
-    end: int
-    parser: ReferenceParser | None
-    pieces: list[Piece] = field(default_factory=list)
-    shows: list[int] = field(default_factory=list)
-
-    def chain(self, samples: Iterable[int]) -> list[int]:
-        """Numbers of the pieces that output the pictures of packets, and of what they depend on."""
-        pending = [self.shows[sample - self.first] for sample in samples]
-        found = set(pending)
-        while pending:
-            for number in self.pieces[pending.pop()].needs:
-                if number not in found:
-                    found.add(number)
-                    pending.append(number)
-        return sorted(found)
-
-
-class Chains:
-    """The groups of a video; each is analysed when it is first needed.
-
-    Args:
-        table: The video's index.
-        codec: Name in the registry.
-        read: Gives a packet by its number.
-        recorded: What the frames refer to, if that was recorded; it matches the index.
-
-    Raises:
-        UnknownStructure: The codec's references are not known.
-    """
-
-    def __init__(
-        self,
-        table: SampleTable,
-        codec: str,
-        read: Callable[[int], bytes],
-        recorded: Structures | None = None,
-    ) -> None:
-        self._table = table
-        self._codec = codec
-        self._read = read
-        self._recorded = recorded
-        self._keys = np.flatnonzero(table.sync)
-        self._groups: OrderedDict[int, Group] = OrderedDict()
-        self._kept = 0  # coded frames of these
-        ReferenceParser(codec, table.configuration)
-
-    def group(self, sample: int, last: int) -> Group:
-        """The group that a packet is in, known up to another one of it.
-
-        Raises:
-            UnknownStructure: What its frames refer to is not known.
-            StructureError: The recorded structure contradicts itself.
-        """
-        place = self._place(sample)
-        group = self._groups.pop(place, None)
-        if group is None:
-            group = self._begin(place)
-        else:
-            self._kept -= len(group.pieces)
-        if group.parser is not None:
-            self._parse(group, group.parser, last)
-        while self._groups and self._kept + len(group.pieces) > _KEPT_FRAMES:
-            _, forgotten = self._groups.popitem(last=False)
-            self._kept -= len(forgotten.pieces)
-        self._groups[place] = group
-        self._kept += len(group.pieces)
-        return group
-
-    def cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
-        """Extract the bytes of a piece from its packet.
-
-        Raises:
-            Refused: It does not hold the coded frames recorded for it.
-        """
-        if piece.span is not None:
-            start, end = piece.span
-            return packet if (start, end) == (0, len(packet)) else packet[start:end]
-        last = group.pieces[group.shows[piece.sample - group.first]]
-        return frame_bytes(
-            self._codec, packet, part=piece.part, parts=last.part + 1, key=not piece.needs
-        )
-
-    def unknown(self, sample: int, last: int) -> range:
-        """Numbers of the packets that `group` would have to read."""
-        if self._recorded is not None:
-            return range(0)
-        place = self._place(sample)
-        group = self._groups.get(place)
-        first = self._first(place) if group is None else group.first + len(group.shows)
-        return range(first, last + 1)
-
-    def _place(self, sample: int) -> int:
-        return int(np.searchsorted(self._keys, sample, side="right")) - 1
-
-    def _first(self, place: int) -> int:
-        return int(self._keys[place]) if place >= 0 else 0
-
-    def split(self, samples: list[int]) -> Iterator[list[int]]:
-        """Packets by group; those of a group must be consecutive."""
-        places = np.searchsorted(self._keys, np.array(samples, np.int64), side="right")
-        bounds = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), len(samples)]
-        for start, end in pairwise(bounds):
-            yield samples[start:end]
-
-    def _begin(self, place: int) -> Group:
-        count = len(self._table.sizes)
-        following = self._keys[place + 1] if place + 1 < len(self._keys) else count
-        group = Group(self._first(place), int(following), None)
-        if self._recorded is None:
-            group.parser = ReferenceParser(self._codec, self._table.configuration)
-            return group
-        text = self._recorded.texts[int(self._recorded.groups[place])]
-        for sample, frames in enumerate(read_structure(text), group.first):
-            for part, needs in enumerate(frames):
-                group.pieces.append(Piece(sample, part, needs, None))
-            group.shows.append(len(group.pieces) - 1)
-        return group
-
-    def _parse(self, group: Group, parser: ReferenceParser, last: int) -> None:
-        for sample in range(group.first + len(group.shows), last + 1):
-            frames = parser.packet(self._read(sample), key=sample == group.first)
-            shown = -1
-            for part, frame in enumerate(frames):
-                number = len(group.pieces)
-                needs = tuple(number - distance for distance in frame.references)
-                group.pieces.append(Piece(sample, part, needs, (frame.start, frame.end)))
-                if frame.shown:
-                    shown = number
-            group.shows.append(shown)
-
-
-# ---------------------------------------------------------------- access
 
 
 class FrameAccess:
@@ -547,3 +284,112 @@ class _Session:
         if group is not self.group or not self.fed.isdisjoint(shown):
             return False
         return all(number > self.last for number in chain if number not in self.fed)
+
+
+# ---------------------------------------------------------------- reader
+
+
+class Seeking(Protocol):
+    """A decoder that reaches a frame by decoding from the key frame before it."""
+
+    def picture(self, index: int, scale: Scale | None = None) -> Picture:
+        """The picture of a frame; see `PictureMaker.make`."""
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+class FrameReader:
+    """Gives frames by number; others are decoded only if necessary.
+
+    A context manager. One thread at a time may use it, in the process that opened it.
+
+    Args:
+        open_access: Opens the decoder of single frames and their references; None if there is none.
+        open_decoder: Opens the decoder from key frames, used where that is impossible.
+
+    Raises:
+        VideoError: Neither can be opened; the error of the latter.
+    """
+
+    def __init__(
+        self, open_access: Callable[[], FrameAccess] | None, open_decoder: Callable[[], Seeking]
+    ) -> None:
+        self._open_decoder = open_decoder
+        self._access: FrameAccess | None = None
+        self._decoder: Seeking | None = None
+        if open_access is not None:
+            # ffmpeg reads more, and tells what it does not
+            with suppress(UnknownStructure, VideoError, OSError):
+                self._access = open_access()
+        if self._access is None:
+            self._decoder = open_decoder()
+
+    def pictures_of(
+        self,
+        numbers: Sequence[int],
+        scale: Scale | None = None,
+        outs: Mapping[int, Pixels] | None = None,
+    ) -> Iterator[tuple[int, Picture]]:
+        """Pictures of some frames, each with its number.
+
+        Args:
+            numbers: 0 <= number < frames, increasing.
+            scale: See `PictureMaker.make`.
+            outs: Its `out`, by frame; it may stay unused.
+
+        Yields:
+            Views that are valid until the next one is requested.
+
+        Raises:
+            VideoError: One cannot be decoded.
+        """
+        done = 0
+        if self._access is not None:
+            try:
+                for pair in self._access.pictures_of(numbers, scale, outs):
+                    done += 1
+                    yield pair
+                return
+            except UnknownStructure:
+                self._access.close()
+                self._access = None
+        if self._decoder is None:
+            self._decoder = self._open_decoder()
+        for number in numbers[done:]:
+            yield number, self._decoder.picture(number, scale)
+
+    def close(self) -> None:
+        """Close the file."""
+        for part in (self._access, self._decoder):
+            if part is not None:
+                part.close()
+
+    def __enter__(self) -> FrameReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_file_frames(
+    path: Path, *, codec: str, size: tuple[int, int], frames: int, track: int | None
+) -> FrameReader:
+    """The frames of a third-party video by number, as 8-bit RGB.
+
+    Args:
+        path: The video.
+        codec: As in `VideoFile`.
+        size: As in `VideoFile`.
+        frames: How many there are.
+        track: As in `VideoFile`.
+
+    Raises:
+        VideoError: It cannot be read.
+    """
+    return FrameReader(
+        lambda: FrameAccess(
+            path, codec=codec, frames=frames, maker=maker_of(path, size), track=track
+        ),
+        lambda: VideoFile(path, track),
+    )

@@ -10,8 +10,8 @@ from mp4ds.errors import Refused
 from mp4ds.messages.coded import (
     BitReader,
     CodedFrame,
+    CodedPicture,
     NoPicture,
-    Picture,
     UnknownStructure,
     check_size,
 )
@@ -130,14 +130,15 @@ class Av1Pictures:
         """The sequence header OBU seen last."""
         return self._parameters
 
-    def picture(self, data: memoryview) -> Picture:
-        """The picture in a temporal unit without its delimiter.
+    def parse(self, body: memoryview) -> CodedPicture:
+        """The picture in a temporal unit.
 
         Raises:
             NoPicture: There is none.
             Refused: There are several, an mp4 would lose a part of it, or it needs a sequence
                 header that was not sent.
         """
+        data, framing = strip(body)
         shown = frames = 0
         keyframe = has_header = False
         for obu in obus(data):
@@ -162,7 +163,7 @@ class Av1Pictures:
             raise NoPicture("it holds no picture, only parameters or remarks")
         if shown != 1:
             raise Refused("it shows no picture" if not shown else "it holds more than one picture")
-        return Picture(*self._size, keyframe)
+        return CodedPicture(*self._size, keyframe, framing)
 
     def _frame(self, payload: bytes) -> tuple[bool, bool]:
         """Whether a frame is shown, and a key frame (5.9.2)."""

@@ -47,12 +47,12 @@ class Codec:
 
 CODECS: Mapping[str, Codec] = {
     "h264": Codec(
-        "h264", "references:H264References", "h264",
+        "h264", "h264:H264References", "h264",
         ("h264", "avc", "libx264", "libopenh264"), ("avc1", "avc3"),
         "h264:H264Pictures", "units", is_free=True,
     ),
     "h265": Codec(
-        "hevc", "references:H265References", "hevc",
+        "hevc", "h265:H265References", "hevc",
         ("h265", "hevc", "libx265"), ("hvc1", "hev1"),
         "h265:H265Pictures", "units", is_free=True,
     ),
@@ -62,7 +62,7 @@ CODECS: Mapping[str, Codec] = {
         "av1:Av1Pictures", "obus", is_free=True, is_split=True,
     ),
     "vp9": Codec(
-        "vp9", "references:Vp9References", "vp9", ("vp9", "libvpx-vp9"), ("vp09",),
+        "vp9", "vp9:Vp9References", "vp9", ("vp9", "libvpx-vp9"), ("vp09",),
         "vp9:Vp9Pictures",
     ),
     "ffv1": Codec("ffv1", "references:Ffv1References", "ffv1", entries=("FFV1",)),

@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from mp4ds.errors import Refused
 from mp4ds.messages import jpeg, png
-from mp4ds.messages.coded import NoPicture, Picture
+from mp4ds.messages.coded import CodedPicture, NoPicture
 from mp4ds.video import av1, nal
 from mp4ds.video.codecs import CODECS, part_of
-
-if TYPE_CHECKING:
-    from mp4ds.video.av1 import Av1Pictures
-    from mp4ds.video.h264 import H264Pictures
-    from mp4ds.video.h265 import H265Pictures
-    from mp4ds.video.vp9 import Vp9Pictures
 
 
 def packet_codec(message_format: str) -> str:
@@ -45,23 +38,6 @@ PACKET_CODECS = tuple(name for name, codec in CODECS.items() if codec.pictures)
 _MAX_BODY = 2**30  # what an mp4 and its readers take for one packet
 
 
-@dataclass(frozen=True, slots=True)
-class CodedPicture:
-    """A body that a video track carries.
-
-    Attributes:
-        width: Columns.
-        height: Rows.
-        keyframe: Whether decoding can begin here.
-        framing: What an mp4 does not keep of the body; see `body_of`.
-    """
-
-    width: int
-    height: int
-    keyframe: bool
-    framing: str = ""
-
-
 class PictureParser:
     """Inspects the bodies of one topic in the order they go into a video.
 
@@ -79,7 +55,7 @@ class PictureParser:
     def __init__(self, codec: str) -> None:
         if codec not in PACKET_CODECS:
             raise ValueError(f"codec {codec!r} is not one of {', '.join(PACKET_CODECS)}")
-        self._pictures: _Pictures = _pictures_of(codec)
+        self._pictures: _Pictures = part_of(CODECS[codec].pictures)()
         self._whole = False
 
     @property
@@ -126,7 +102,7 @@ class Jpegs:
     parameters = b""
 
     def parse(self, body: memoryview) -> CodedPicture:
-        """See `PictureParser.parse`."""
+        """The picture in a file."""
         info = jpeg.parse(body)
         return CodedPicture(info.width, info.height, keyframe=True)
 
@@ -137,58 +113,10 @@ class Pngs:
     parameters = b""
 
     def parse(self, body: memoryview) -> CodedPicture:
-        """See `PictureParser.parse`."""
+        """The picture in a file."""
         info = png.parse(body)
         png.check_whole(body)
         return CodedPicture(info.width, info.height, keyframe=True)
-
-
-class _Units:
-    """H.264 or H.265."""
-
-    def __init__(self, pictures: H264Pictures | H265Pictures) -> None:
-        self._pictures = pictures
-
-    @property
-    def parameters(self) -> bytes:
-        return self._pictures.parameters
-
-    def parse(self, body: memoryview) -> CodedPicture:
-        units, framing = nal.split(body)
-        picture = self._pictures.picture(units)
-        if not self.parameters:
-            raise Refused("its parameter sets were not sent before it")
-        return _coded(picture, framing)
-
-
-class _Whole:
-    """AV1 or VP9."""
-
-    def __init__(self, pictures: Av1Pictures | Vp9Pictures, *, delimited: bool) -> None:
-        self._pictures = pictures
-        self._delimited = delimited
-
-    @property
-    def parameters(self) -> bytes:
-        return self._pictures.parameters
-
-    def parse(self, body: memoryview) -> CodedPicture:
-        packet, framing = av1.strip(body) if self._delimited else (body, "")
-        return _coded(self._pictures.picture(packet), framing)
-
-
-def _coded(picture: Picture, framing: str) -> CodedPicture:
-    return CodedPicture(picture.width, picture.height, picture.keyframe, framing)
-
-
-def _pictures_of(codec: str) -> _Pictures:
-    known = CODECS[codec]
-    pictures = part_of(known.pictures)()
-    if known.framing == "units":
-        return _Units(pictures)
-    if codec in ("mjpeg", "png"):
-        return pictures  # type: ignore[no-any-return]
-    return _Whole(pictures, delimited=known.framing == "obus")
 
 
 def plain_body(codec: str, body: bytes | memoryview) -> bytes:

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mp4ds.errors import Refused
-from mp4ds.messages.coded import REORDERED, BitReader, NoPicture, Picture, check_size
-from mp4ds.video.nal import PictureOrder, join_plain, unescape
+from mp4ds.messages.coded import REORDERED, BitReader, CodedFrame, UnknownStructure, check_size
+from mp4ds.video.nal import UnitPictures, split_length_prefixed, unescape
+from mp4ds.video.references import UnitChain
 
 SLICE, PARTITION_A, IDR, SPS, PPS, AUD = 1, 2, 5, 7, 8, 9
 _HEADER_BYTES = 1024
@@ -20,12 +21,12 @@ _B_SLICE = 1
 _HIGH_PROFILES = frozenset((44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244))
 
 
-def unit_type(unit: bytes) -> int:
+def unit_type(unit: bytes | memoryview) -> int:
     """Type of a NAL unit (7.4.1)."""
     return unit[0] & 0x1F
 
 
-def has_parameters(units: Sequence[bytes]) -> bool:
+def has_parameters(units: Sequence[bytes | memoryview]) -> bool:
     """Whether NAL units include both kinds of parameter sets."""
     return {SPS, PPS} <= set(map(unit_type, units))
 
@@ -179,30 +180,17 @@ def _skip_buffering(reader: BitReader) -> None:
     reader.bits(20)
 
 
-class H264Pictures:
+class H264Pictures(UnitPictures):
     """The pictures of one stream, access unit by access unit."""
 
+    _kinds = frozenset((SPS, PPS))
+
     def __init__(self) -> None:
-        self._sets: dict[tuple[int, int], bytes] = {}
+        super().__init__()
         self._sps: dict[int, Sps] = {}
         self._sps_of_pps: dict[int, int] = {}
-        self._order = PictureOrder()
 
-    @property
-    def parameters(self) -> bytes:
-        """The parameter sets seen so far, as Annex B; empty unless there are both kinds."""
-        if not self._sps or not self._sps_of_pps:
-            return b""
-        return join_plain([self._sets[key] for key in sorted(self._sets)])
-
-    def picture(self, units: Sequence[bytes]) -> Picture:
-        """The picture in an access unit.
-
-        Raises:
-            NoPicture: There is none.
-            Refused: There are several, it needs parameters that were not sent, or it is sent
-                out of the order shown.
-        """
+    def _picture(self, units: Sequence[bytes]) -> tuple[tuple[int, int], bool]:
         slices: list[bytes] = []
         for unit in units:
             kind = unit_type(unit)
@@ -212,14 +200,8 @@ class H264Pictures:
                 self._take_pps(unit)
             elif kind in (SLICE, PARTITION_A, IDR):
                 slices.append(unit)
-        if not slices:
-            raise NoPicture("it holds no picture, only parameters or remarks")
-        first = [unit for unit in slices if len(unit) > 1 and unit[1] & 0x80]
-        if len(first) != 1:
-            raise Refused("it holds more than one picture, or a part of one")
-        keyframe = all(unit_type(unit) == IDR for unit in slices)
-        sps = self._check_order(first[0], slices)
-        return Picture(sps.width, sps.height, keyframe)
+        sps = self._check_order(self._first(slices, header=1), slices)
+        return (sps.width, sps.height), all(unit_type(unit) == IDR for unit in slices)
 
     def _take_sps(self, unit: bytes) -> None:
         sps = parse_sps(unit)
@@ -266,3 +248,37 @@ def _is_b_slice(unit: bytes) -> bool:
     reader = BitReader(unescape(unit[1:_SLICE_HEADER_BYTES]))
     reader.ue()
     return reader.ue() % 5 == _B_SLICE
+
+
+# ---------------------------------------------------------------- references
+
+
+class H264References(UnitChain):
+    """What the coded frames of a stream refer to."""
+
+    def __init__(self, configuration: bytes) -> None:
+        super().__init__("h264", configuration)
+
+    def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        """The frame of a packet."""
+        pictures = 0
+        kinds: set[int] = set()
+        kept = False
+        for unit in split_length_prefixed(data):
+            kind = unit[0] & 0x1F
+            if kind in (SLICE, IDR):
+                kinds.add(kind)
+                pictures += len(unit) > 1 and unit[1] >> 7  # its first macroblock is 0
+                kept |= bool(unit[0] & 0x60)  # nal_ref_idc (7.4.1)
+            elif kind in (SPS, PPS):
+                self.take_parameters(bytes(unit))
+                kept = True
+            elif kind in range(PARTITION_A, IDR):
+                raise UnknownStructure("its slices are in partitions")
+        begins = self.only(pictures, kinds) == IDR
+        return self.link(len(data), begins=begins, kept=kept, key=key)
+
+    def check_parameters(self, unit: bytes) -> None:
+        """Refuse interlaced pictures."""
+        if unit_type(unit) == SPS and not parse_sps(unit).frames_only:
+            self.unfit = "it may hold fields, halves of an interlaced picture"

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mp4ds.errors import Refused
-from mp4ds.messages.coded import REORDERED, BitReader, NoPicture, Picture, check_size
-from mp4ds.video.nal import PictureOrder, join_plain, unescape
+from mp4ds.messages.coded import REORDERED, BitReader, CodedFrame, UnknownStructure, check_size
+from mp4ds.video.nal import UnitPictures, split_length_prefixed, unescape
+from mp4ds.video.references import UnitChain
 
 VPS, SPS, PPS, AUD = 32, 33, 34, 35
 _SLICES = range(32)
@@ -22,12 +23,23 @@ _HEADER_BYTES = 1024
 _SLICE_HEADER_BYTES = 64
 
 
-def unit_type(unit: bytes) -> int:
+def unit_type(unit: bytes | memoryview) -> int:
     """Type of a NAL unit (7.4.2.2)."""
     return (unit[0] >> 1) & 0x3F
 
 
-def has_parameters(units: Sequence[bytes]) -> bool:
+def _is_of_another_layer(unit: bytes | memoryview) -> bool:
+    """Whether it is of another view, or more detail, which decoders leave out.
+
+    Raises:
+        Refused: It is too short to tell.
+    """
+    if len(unit) < 2:
+        raise Refused("it holds a NAL unit without a header")
+    return bool((unit[0] & 1) << 5 | unit[1] >> 3)
+
+
+def has_parameters(units: Sequence[bytes | memoryview]) -> bool:
     """Whether NAL units include all kinds of parameter sets."""
     return {VPS, SPS, PPS} <= set(map(unit_type, units))
 
@@ -104,36 +116,21 @@ def _skip_profile(reader: BitReader, sub_layers: int) -> None:
         reader.bits(88 * profile + 8 * level)
 
 
-class H265Pictures:
+class H265Pictures(UnitPictures):
     """The pictures of one stream, access unit by access unit."""
 
+    _kinds = frozenset((VPS, SPS, PPS))
+
     def __init__(self) -> None:
-        self._sets: dict[tuple[int, int], bytes] = {}
+        super().__init__()
         self._sps: dict[int, Sps] = {}
         self._pps: dict[int, _Pps] = {}
-        self._order = PictureOrder()
 
-    @property
-    def parameters(self) -> bytes:
-        """The parameter sets seen so far, as Annex B; empty unless there are all kinds."""
-        if {kind for kind, _ in self._sets} != {VPS, SPS, PPS}:
-            return b""
-        return join_plain([self._sets[key] for key in sorted(self._sets)])
-
-    def picture(self, units: Sequence[bytes]) -> Picture:
-        """The picture in an access unit.
-
-        Raises:
-            NoPicture: There is none.
-            Refused: There are several, it needs parameters that were not sent, or it is sent
-                out of the order shown.
-        """
+    def _picture(self, units: Sequence[bytes]) -> tuple[tuple[int, int], bool]:
         slices: list[bytes] = []
         for unit in units:
-            if len(unit) < 2:
-                raise Refused("it holds a NAL unit without a header")
-            if (unit[0] & 1) << 5 | unit[1] >> 3:
-                continue  # another layer: another view, or more detail
+            if _is_of_another_layer(unit):
+                continue
             kind = unit_type(unit)
             if kind == VPS:
                 self._sets[VPS, unit[2] >> 4 if len(unit) > 2 else 0] = unit
@@ -145,13 +142,9 @@ class H265Pictures:
                 self._take_pps(unit)
             elif kind in _SLICES:
                 slices.append(unit)
-        if not slices:
-            raise NoPicture("it holds no picture, only parameters or remarks")
-        first = [unit for unit in slices if len(unit) > 2 and unit[2] & 0x80]
-        if len(first) != 1:
-            raise Refused("it holds more than one picture, or a part of one")
-        sps = self._check_order(first[0])
-        return Picture(sps.width, sps.height, unit_type(first[0]) in _IRAP)
+        first = self._first(slices, header=2)
+        sps = self._check_order(first)
+        return (sps.width, sps.height), unit_type(first) in _IRAP
 
     def _take_pps(self, unit: bytes) -> None:
         reader = BitReader(unescape(unit[2:_SLICE_HEADER_BYTES]))
@@ -189,3 +182,56 @@ class H265Pictures:
         if self._order.is_broken:
             raise Refused(REORDERED)
         return sps
+
+
+# ---------------------------------------------------------------- references
+
+
+class H265References(UnitChain):
+    """What the coded frames of a stream refer to."""
+
+    _AFTER = range(8)  # refer to nothing before the last IDR picture: trailing ones and RADL
+    _UNREFERRED = (0, 2, 4, 6)  # TRAIL_N, TSA_N, STSA_N, RADL_N
+
+    def __init__(self, configuration: bytes) -> None:
+        self._highest = 0  # TemporalId that there may be
+        super().__init__("h265", configuration)
+
+    def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        """The frame of a packet."""
+        pictures = 0
+        kinds: set[int] = set()
+        kept = False
+        for unit in split_length_prefixed(data):
+            if _is_of_another_layer(unit):
+                continue
+            kind = unit[0] >> 1
+            if kind < VPS:
+                kinds.add(kind)
+                pictures += len(unit) > 2 and unit[2] >> 7  # its first slice
+                # of a lower TemporalId, pictures of a higher one may refer to it (7.4.2.2)
+                kept |= kind not in self._UNREFERRED or (unit[1] & 7) - 1 != self._highest
+            elif kind <= PPS:
+                self.take_parameters(bytes(unit))
+                kept = True
+        kind = self.only(pictures, kinds)
+        if kind not in _IDR and kind not in self._AFTER:
+            raise UnknownStructure(
+                "its key frames may be followed by pictures that refer to what is before"
+            )
+        return self.link(len(data), begins=kind in _IDR, kept=kept, key=key)
+
+    def check_parameters(self, unit: bytes) -> None:
+        """Refuse pictures that are not shown."""
+        if len(unit) < 3:
+            raise UnknownStructure("its H.265 parameters are malformed")
+        kind = unit_type(unit)
+        if kind == SPS:
+            self._highest = max(self._highest, unit[2] >> 1 & 7)
+        elif kind == PPS:
+            reader = BitReader(unescape(unit[2:_SLICE_HEADER_BYTES]))
+            reader.ue()
+            reader.ue()
+            reader.flag()
+            if reader.flag():
+                self.unfit = "it may hold pictures that are not shown"

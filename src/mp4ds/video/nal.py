@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 from mp4ds.errors import Refused
+from mp4ds.messages.coded import CodedPicture, NoPicture
 
 MAX_UNITS = 512
 """Maximum number of NAL units in one packet."""
@@ -56,7 +58,7 @@ def split(data: bytes | memoryview) -> tuple[list[bytes], str]:
             return units, " ".join(map(str, lengths)) + (f" +{zeros}" if zeros else "")
 
 
-def join(units: Sequence[bytes], framing: str) -> bytes:
+def join(units: Sequence[bytes | memoryview], framing: str) -> bytes:
     """Put start codes before NAL units according to a framing.
 
     Raises:
@@ -65,25 +67,25 @@ def join(units: Sequence[bytes], framing: str) -> bytes:
     lengths, trailing = _lengths(framing)
     if len(lengths) != len(units):
         raise Refused(f"it has {len(units)} NAL units where its framing has {len(lengths)}")
-    parts: list[bytes] = []
+    parts: list[bytes | memoryview] = []
     for unit, length in zip(units, lengths, strict=True):
         parts += (bytes(length - 1), b"\1", unit)
     return b"".join((*parts, bytes(trailing)))
 
 
-def join_plain(units: Sequence[bytes]) -> bytes:
+def join_plain(units: Sequence[bytes | memoryview]) -> bytes:
     """NAL units, each after a start code of four bytes."""
     return b"".join(part for unit in units for part in (START_CODE, unit))
 
 
-def split_length_prefixed(packet: bytes | memoryview) -> list[bytes]:
-    """The NAL units of an mp4's packet, each preceded by a length of four bytes.
+def split_length_prefixed(packet: bytes | memoryview) -> list[memoryview]:
+    """The NAL units of an mp4's packet, each preceded by a length of four bytes, as views.
 
     Raises:
         Refused: The lengths do not add up, or there are too many.
     """
     packet = memoryview(packet)
-    units: list[bytes] = []
+    units: list[memoryview] = []
     offset = 0
     while offset < len(packet):
         length = int.from_bytes(packet[offset : offset + 4], "big")
@@ -92,7 +94,7 @@ def split_length_prefixed(packet: bytes | memoryview) -> list[bytes]:
             raise Refused("a NAL unit's length in the video is wrong")
         if len(units) == MAX_UNITS:
             raise Refused(f"it holds more than {MAX_UNITS} NAL units")
-        units.append(bytes(packet[offset + 4 : end]))
+        units.append(packet[offset + 4 : end])
         offset = end
     return units
 
@@ -232,3 +234,51 @@ class PictureOrder:
         if self._last is not None and order <= self._last:
             self.is_broken = True
         self._last = order
+
+
+# ---------------------------------------------------------------- pictures
+
+
+class UnitPictures(ABC):
+    """The pictures of one stream of H.264 or H.265, access unit by access unit."""
+
+    _kinds: frozenset[int]  # of parameter sets
+
+    def __init__(self) -> None:
+        self._sets: dict[tuple[int, int], bytes] = {}
+        self._order = PictureOrder()
+
+    @property
+    def parameters(self) -> bytes:
+        """The parameter sets seen so far, as Annex B; empty unless there are all kinds."""
+        if {kind for kind, _ in self._sets} != self._kinds:
+            return b""
+        return join_plain([self._sets[key] for key in sorted(self._sets)])
+
+    def parse(self, body: memoryview) -> CodedPicture:
+        """The picture in an access unit.
+
+        Raises:
+            NoPicture: There is none.
+            Refused: There are several, it needs parameters that were not sent, or it is sent
+                out of the order shown.
+        """
+        units, framing = split(body)
+        size, keyframe = self._picture(units)
+        if not self.parameters:
+            raise Refused("its parameter sets were not sent before it")
+        return CodedPicture(*size, keyframe, framing)
+
+    @abstractmethod
+    def _picture(self, units: Sequence[bytes]) -> tuple[tuple[int, int], bool]:
+        """Width and height of the picture in NAL units, and whether it is a key frame."""
+
+    @staticmethod
+    def _first(slices: Sequence[bytes], *, header: int) -> bytes:
+        """The slice that begins the only picture, behind a header of so many bytes."""
+        if not slices:
+            raise NoPicture("it holds no picture, only parameters or remarks")
+        first = [unit for unit in slices if len(unit) > header and unit[header] & 0x80]
+        if len(first) != 1:
+            raise Refused("it holds more than one picture, or a part of one")
+        return first[0]

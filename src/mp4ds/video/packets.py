@@ -605,7 +605,7 @@ class StandAlonePackets(PacketReader):
 
 def _stand_alone(codec: str, packet: bytes, parameters: list[bytes]) -> bytes:
     module = _UNITS[codec]
-    units = nal.split_length_prefixed(packet)
+    units: list[bytes | memoryview] = [*nal.split_length_prefixed(packet)]
     if parameters and not module.has_parameters(units):
         at = 1 if units and module.unit_type(units[0]) == module.AUD else 0
         units[at:at] = parameters

@@ -430,8 +430,8 @@ class PictureMaker:
         coded_size: tuple[int, int],
         picture_format: str,
         picture_size: tuple[int, int],
-        matrix: str | None,
-        full_range: bool,
+        matrix: str | None = "bt709",
+        full_range: bool = True,
     ) -> None:
         self._path = path
         self.coded_size = coded_size

@@ -2,63 +2,51 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Protocol
+from pathlib import Path
+from typing import BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.errors import Refused
-from mp4ds.messages.coded import BitReader, CodedFrame, UnknownStructure
-from mp4ds.video import h264, h265
+from mp4ds.errors import Refused, VideoError
+from mp4ds.files.outputs import digest_file
+from mp4ds.messages.coded import CodedFrame, UnknownStructure
 from mp4ds.video.codecs import CODECS, part_of
-from mp4ds.video.nal import MAX_UNITS, parameter_units, unescape
+from mp4ds.video.mp4 import SampleTable, read_sample_table
+from mp4ds.video.nal import parameter_units
 
 _MAX_SETS = 64
-_PPS_BYTES = 64
 
 
-def _units(data: memoryview) -> Iterator[memoryview]:
-    """The NAL units of a packet, each preceded by a length of four bytes."""
-    at = 0
-    for _ in range(MAX_UNITS):
-        if at == len(data):
-            return
-        begin = at + 4
-        at = begin + int.from_bytes(data[at:begin], "big")
-        if at - begin < 2 or at > len(data):
-            raise UnknownStructure("a NAL unit's length in the video is wrong")
-        yield data[begin:at]
-    raise UnknownStructure(f"it holds more than {MAX_UNITS} NAL units")
-
-
-class _Chain(ABC):
-    """Each picture refers to the last reference picture before it."""
+class Chain:
+    """Codecs each of whose frames refers to the last one that may be referred to."""
 
     def __init__(self) -> None:
-        self._back = 0  # from the next picture; 0: decoding has not begun
-        self._checked: set[bytes] = set()
-        self._unfit = ""  # why no picture that these parameters describe is taken
+        self._back = 0  # from the next frame; 0: decoding has not begun
 
     def forget(self) -> None:
         """Wait for a key frame."""
         self._back = 0
 
-    def _link(self, size: int, *, begins: bool, kept: bool, key: bool) -> list[CodedFrame]:
-        """The picture of a packet.
+    def link(self, size: int, *, begins: bool, kept: bool = True, key: bool) -> list[CodedFrame]:
+        """The frame of a packet.
 
         Args:
             size: Of the packet.
             begins: Whether nothing from here on refers to anything earlier.
-            kept: Whether later pictures may need something of the packet.
+            kept: Whether later frames may need something of the packet.
             key: Whether the file says that decoding can begin here.
+
+        Raises:
+            UnknownStructure: Decoding cannot begin at it, and would have to.
         """
-        if self._unfit:
-            raise UnknownStructure(self._unfit)
         if key and not begins:
             raise UnknownStructure(
                 "it is marked as a key frame, and later pictures refer to earlier ones"
@@ -69,103 +57,50 @@ class _Chain(ABC):
         self._back = 1 if kept or begins else self._back + 1
         return [CodedFrame(0, size, references, shown=True, existing=False)]
 
-    def _take_parameters(self, unit: bytes) -> None:
+
+class UnitChain(Chain, ABC):
+    """H.264 and H.265.
+
+    Args:
+        codec: Name in the registry.
+        configuration: Of the track.
+    """
+
+    def __init__(self, codec: str, configuration: bytes) -> None:
+        super().__init__()
+        self._checked: set[bytes] = set()
+        self.unfit = ""  # why no picture that these parameters describe is taken
+        for unit in parameter_units(codec, configuration):
+            self.take_parameters(unit)
+
+    def take_parameters(self, unit: bytes) -> None:
+        """Look at a parameter set, unless it is known."""
         if unit in self._checked:
             return
-        self._check_parameters(unit)
+        self.check_parameters(unit)
         if len(self._checked) >= _MAX_SETS:
             self._checked.clear()
         self._checked.add(unit)
 
     @abstractmethod
-    def _check_parameters(self, unit: bytes) -> None: ...
+    def check_parameters(self, unit: bytes) -> None:
+        """Set `unfit` if pictures with these parameters are not understood."""
 
+    def only(self, pictures: int, kinds: set[int]) -> int:
+        """The kind of slices of the only picture of a packet.
 
-class H264References(_Chain):
-    """The references of an H.264 stream; see `mp4ds.video.references.ReferenceParser`."""
+        Args:
+            pictures: Number of slices that begin a picture.
+            kinds: Of all slices.
 
-    def __init__(self, configuration: bytes) -> None:
-        super().__init__()
-        for unit in parameter_units("h264", configuration):
-            self._take_parameters(unit)
-
-    def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        """The picture of a packet."""
-        pictures = 0
-        kinds: set[int] = set()
-        kept = False
-        for unit in _units(data):
-            kind = unit[0] & 0x1F
-            if kind in (h264.SLICE, h264.IDR):
-                kinds.add(kind)
-                pictures += unit[1] >> 7  # its first macroblock is 0
-                kept |= bool(unit[0] & 0x60)  # nal_ref_idc (7.4.1)
-            elif kind in (h264.SPS, h264.PPS):
-                self._take_parameters(bytes(unit))
-                kept = True
-            elif kind in range(h264.PARTITION_A, h264.IDR):
-                raise UnknownStructure("its slices are in partitions")
+        Raises:
+            UnknownStructure: There is another number of pictures, or its parameters are `unfit`.
+        """
         if len(kinds) != 1 or pictures != 1:
             raise UnknownStructure("it does not hold one picture")
-        return self._link(len(data), begins=h264.IDR in kinds, kept=kept, key=key)
-
-    def _check_parameters(self, unit: bytes) -> None:
-        if h264.unit_type(unit) == h264.SPS and not h264.parse_sps(unit).frames_only:
-            self._unfit = "it may hold fields, halves of an interlaced picture"
-
-
-class H265References(_Chain):
-    """The references of an H.265 stream; see `mp4ds.video.references.ReferenceParser`."""
-
-    _IDR = (19, 20)
-    _AFTER = range(8)  # refer to nothing before the last IDR picture: trailing ones and RADL
-    _UNREFERRED = (0, 2, 4, 6)  # TRAIL_N, TSA_N, STSA_N, RADL_N
-
-    def __init__(self, configuration: bytes) -> None:
-        super().__init__()
-        self._highest = 0  # TemporalId that there may be
-        for unit in parameter_units("h265", configuration):
-            self._take_parameters(unit)
-
-    def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        """The picture of a packet."""
-        pictures = 0
-        kinds: set[int] = set()
-        kept = False
-        for unit in _units(data):
-            if (unit[0] & 1) << 5 | unit[1] >> 3:
-                continue  # another layer, which decoders leave out
-            kind = unit[0] >> 1
-            if kind < h265.VPS:
-                kinds.add(kind)
-                pictures += len(unit) > 2 and unit[2] >> 7  # its first slice
-                # of a lower TemporalId, pictures of a higher one may refer to it (7.4.2.2)
-                kept |= kind not in self._UNREFERRED or (unit[1] & 7) - 1 != self._highest
-            elif kind <= h265.PPS:
-                self._take_parameters(bytes(unit))
-                kept = True
-        if len(kinds) != 1 or pictures != 1:
-            raise UnknownStructure("it does not hold one picture")
-        kind = kinds.pop()
-        if kind not in self._IDR and kind not in self._AFTER:
-            raise UnknownStructure(
-                "its key frames may be followed by pictures that refer to what is before"
-            )
-        return self._link(len(data), begins=kind in self._IDR, kept=kept, key=key)
-
-    def _check_parameters(self, unit: bytes) -> None:
-        if len(unit) < 3:
-            raise UnknownStructure("its H.265 parameters are malformed")
-        kind = h265.unit_type(unit)
-        if kind == h265.SPS:
-            self._highest = max(self._highest, unit[2] >> 1 & 7)
-        elif kind == h265.PPS:
-            reader = BitReader(unescape(unit[2:_PPS_BYTES]))
-            reader.ue()
-            reader.ue()
-            reader.flag()
-            if reader.flag():
-                self._unfit = "it may hold pictures that are not shown"
+        if self.unfit:
+            raise UnknownStructure(self.unfit)
+        return kinds.pop()
 
 
 # ---------------------------------------------------------------- references
@@ -231,82 +166,36 @@ class ReferenceParser:
             raise UnknownStructure(str(error)) from None
 
 
-class Intra:
+class Intra(Chain):
     """Codecs all of whose frames are key frames."""
 
     def __init__(self, configuration: bytes) -> None:
+        super().__init__()
         del configuration
 
     def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        """See `ReferenceParser.packet`."""
-        return [CodedFrame(0, len(data), (), shown=True, existing=False)]
-
-    def forget(self) -> None:
-        """There is nothing to forget."""
+        """The frame of a packet."""
+        return self.link(len(data), begins=True, key=key)
 
 
-class _Chained(ABC):
-    """Codecs whose frames depend on the state that the last one left in the decoder."""
+class Ffv1References(Chain):
+    """FFV1 keeps its context states from frame to frame."""
 
     def __init__(self, configuration: bytes) -> None:
+        super().__init__()
         del configuration
-        self._begun = False
-
-    @abstractmethod
-    def is_key(self, data: memoryview) -> bool:
-        """Whether a packet begins with a key frame."""
 
     def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        """See `ReferenceParser.packet`."""
-        is_key = self.is_key(data)
-        if key and not is_key:
-            raise UnknownStructure("it is marked as a key frame but is not one")
-        if not is_key and not self._begun:
-            raise UnknownStructure("it comes before the first key frame")
-        self._begun = True
-        return [CodedFrame(0, len(data), () if is_key else (1,), shown=True, existing=False)]
+        """The frame of a packet.
 
-    def forget(self) -> None:
-        """See `ReferenceParser.forget`."""
-        self._begun = False
-
-
-class Vp9References(_Chained):
-    """VP9 keeps motion vectors, probabilities and segments from frame to frame."""
-
-    def is_key(self, data: memoryview) -> bool:
-        """By the headers of all frames of a packet (VP9, 6.2)."""
-        from mp4ds.video.vp9 import split_superframe
-
-        shown = 0
-        keys = []
-        for frame in split_superframe(data):
-            head = int.from_bytes(frame[:2].tobytes().ljust(2, b"\0"), "big")
-            if head >> 14 != 2:
-                raise UnknownStructure("it is not VP9: a frame does not begin with its marker")
-            bits = head << 1 if head >> 12 & 3 == 3 else head  # profile 3 has a reserved bit more
-            existing = bool(bits & 0x800)
-            keys.append(not existing and not bits & 0x400)
-            shown += existing or bool(bits & 0x200)
-        if shown != 1:
-            raise UnknownStructure(
-                "it shows no picture" if not shown else "it holds more than one picture"
-            )
-        return keys[0]
-
-
-class Ffv1References(_Chained):
-    """FFV1 keeps its context states."""
-
-    def is_key(self, data: memoryview) -> bool:
-        """By the first value that a frame codes, its `keyframe` (RFC 9043, 4.3).
-
+        Key frames are known by the first value that a frame codes, its `keyframe` (RFC 9043, 4.3).
         A range coder of even odds (3.8.1.1) gives 1 where the first 16 bits are in the upper half
         of its range, 0xFF00.
         """
         if len(data) < 2:
             raise UnknownStructure("it is not FFV1: it is too short")
-        return int.from_bytes(data[:2], "big") >= _FFV1_KEY
+        is_key = int.from_bytes(data[:2], "big") >= _FFV1_KEY
+        return self.link(len(data), begins=is_key, key=key)
 
 
 # ---------------------------------------------------------------- structure
@@ -528,3 +417,262 @@ def frame_bytes(codec: str, packet: bytes, *, part: int, parts: int, key: bool) 
         raise UnknownStructure(f"it holds {len(found)} coded frames, {parts} are due")
     header, start, end = found[part]
     return packet[header if key else start : end]
+
+
+# ---------------------------------------------------------------- chains
+
+_KEPT_FRAMES = 50_000  # coded frames whose references are kept in memory
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A coded frame: the part of a packet to pass to a decoder.
+
+    Attributes:
+        sample: Number of the packet.
+        part: Number of the coded frame in it.
+        needs: Numbers, within its group, of the pieces that it refers to.
+        span: Its first byte in the packet and the one after its last; None until it is read.
+    """
+
+    sample: int
+    part: int
+    needs: tuple[int, ...]
+    span: tuple[int, int] | None
+
+
+@dataclass(slots=True)
+class Group:
+    """The coded frames from one key frame to the next, as far as known.
+
+    Attributes:
+        first: Number of the key frame's packet.
+        end: Number of the next group's.
+        parser: Of its packets; None if nothing needs to be parsed.
+        pieces: In the order coded.
+        shows: For each known packet, the number of the piece that outputs its picture.
+    """
+
+    first: int
+    end: int
+    parser: ReferenceParser | None
+    pieces: list[Piece] = field(default_factory=list)
+    shows: list[int] = field(default_factory=list)
+
+    def chain(self, samples: Iterable[int]) -> list[int]:
+        """Numbers of the pieces that output the pictures of packets, and of what they depend on."""
+        pending = [self.shows[sample - self.first] for sample in samples]
+        found = set(pending)
+        while pending:
+            for number in self.pieces[pending.pop()].needs:
+                if number not in found:
+                    found.add(number)
+                    pending.append(number)
+        return sorted(found)
+
+
+class Chains:
+    """The groups of a video; each is analysed when it is first needed.
+
+    Args:
+        table: The video's index.
+        codec: Name in the registry.
+        read: Gives a packet by its number.
+        recorded: What the frames refer to, if that was recorded; it matches the index.
+
+    Raises:
+        UnknownStructure: The codec's references are not known.
+    """
+
+    def __init__(
+        self,
+        table: SampleTable,
+        codec: str,
+        read: Callable[[int], bytes],
+        recorded: Structures | None = None,
+    ) -> None:
+        self._table = table
+        self._codec = codec
+        self._read = read
+        self._recorded = recorded
+        self._keys = np.flatnonzero(table.sync)
+        self._groups: OrderedDict[int, Group] = OrderedDict()
+        self._kept = 0  # coded frames of these
+        ReferenceParser(codec, table.configuration)
+
+    def group(self, sample: int, last: int) -> Group:
+        """The group that a packet is in, known up to another one of it.
+
+        Raises:
+            UnknownStructure: What its frames refer to is not known.
+            StructureError: The recorded structure contradicts itself.
+        """
+        place = self._place(sample)
+        group = self._groups.pop(place, None)
+        if group is None:
+            group = self._begin(place)
+        else:
+            self._kept -= len(group.pieces)
+        if group.parser is not None:
+            self._parse(group, group.parser, last)
+        while self._groups and self._kept + len(group.pieces) > _KEPT_FRAMES:
+            _, forgotten = self._groups.popitem(last=False)
+            self._kept -= len(forgotten.pieces)
+        self._groups[place] = group
+        self._kept += len(group.pieces)
+        return group
+
+    def cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
+        """Extract the bytes of a piece from its packet.
+
+        Raises:
+            Refused: It does not hold the coded frames recorded for it.
+        """
+        if piece.span is not None:
+            start, end = piece.span
+            return packet if (start, end) == (0, len(packet)) else packet[start:end]
+        last = group.pieces[group.shows[piece.sample - group.first]]
+        return frame_bytes(
+            self._codec, packet, part=piece.part, parts=last.part + 1, key=not piece.needs
+        )
+
+    def unknown(self, sample: int, last: int) -> range:
+        """Numbers of the packets that `group` would have to read."""
+        if self._recorded is not None:
+            return range(0)
+        place = self._place(sample)
+        group = self._groups.get(place)
+        first = self._first(place) if group is None else group.first + len(group.shows)
+        return range(first, last + 1)
+
+    def _place(self, sample: int) -> int:
+        return int(np.searchsorted(self._keys, sample, side="right")) - 1
+
+    def _first(self, place: int) -> int:
+        return int(self._keys[place]) if place >= 0 else 0
+
+    def split(self, samples: list[int]) -> Iterator[list[int]]:
+        """Packets by group; those of a group must be consecutive."""
+        places = np.searchsorted(self._keys, np.array(samples, np.int64), side="right")
+        bounds = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), len(samples)]
+        for start, end in pairwise(bounds):
+            yield samples[start:end]
+
+    def _begin(self, place: int) -> Group:
+        count = len(self._table.sizes)
+        following = self._keys[place + 1] if place + 1 < len(self._keys) else count
+        group = Group(self._first(place), int(following), None)
+        if self._recorded is None:
+            group.parser = ReferenceParser(self._codec, self._table.configuration)
+            return group
+        text = self._recorded.texts[int(self._recorded.groups[place])]
+        for sample, frames in enumerate(read_structure(text), group.first):
+            for part, needs in enumerate(frames):
+                group.pieces.append(Piece(sample, part, needs, None))
+            group.shows.append(len(group.pieces) - 1)
+        return group
+
+    def _parse(self, group: Group, parser: ReferenceParser, last: int) -> None:
+        for sample in range(group.first + len(group.shows), last + 1):
+            frames = parser.packet(self._read(sample), key=sample == group.first)
+            shown = -1
+            for part, frame in enumerate(frames):
+                number = len(group.pieces)
+                needs = tuple(number - distance for distance in frame.references)
+                group.pieces.append(Piece(sample, part, needs, (frame.start, frame.end)))
+                if frame.shown:
+                    shown = number
+            group.shows.append(shown)
+
+
+# ---------------------------------------------------------------- digest
+
+_BLOCK = 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class VideoDigest:
+    """Of a whole file.
+
+    Attributes:
+        size: Bytes.
+        sha256: Hexadecimal.
+        structures: What its frames refer to, if known.
+    """
+
+    size: int
+    sha256: str
+    structures: Structures | None
+
+
+def digest_video(path: Path, codec: str) -> VideoDigest:
+    """Hash a video, and find what its frames refer to in the same bytes.
+
+    Memory is one packet, and the video's index.
+
+    Args:
+        path: An mp4.
+        codec: Name in the registry.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    table = _table(path) if codec in CODECS and CODECS[codec].is_free else None
+    if table is None:
+        return VideoDigest(*digest_file(path), None)
+    recorder = StructureRecorder(codec, table.configuration)
+    digest = hashlib.sha256()
+    size = 0
+    with path.open("rb") as file:
+        number = 0
+        for is_packet, data in _parts(file, table):
+            digest.update(data)
+            size += len(data)
+            if is_packet:
+                recorder.add(data, key=bool(table.sync[number]))
+                number += 1
+    return VideoDigest(size, digest.hexdigest(), recorder.finish())
+
+
+def packets_in_groups(path: Path) -> NDArray[np.int64]:
+    """How many packets each group of pictures of a video has, shape (groups,).
+
+    Raises:
+        VideoError: Its index is damaged.
+        Refused: Its index is not read.
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as file:
+        return packets_of_groups(read_sample_table(file, path.stat().st_size, str(path)))
+
+
+def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:
+    """How many packets each group of pictures has, shape (groups,)."""
+    return np.diff(np.append(np.flatnonzero(table.sync), len(table.sync)))
+
+
+def _table(path: Path) -> SampleTable | None:
+    """The index of a video whose packets are contiguous; None if that is unknown."""
+    try:
+        with path.open("rb") as file:
+            table = read_sample_table(file, path.stat().st_size, str(path))
+    except (VideoError, Refused):
+        return None
+    ends = table.places + table.sizes
+    return table if np.all(table.places[1:] >= ends[:-1]) else None
+
+
+def _parts(file: BinaryIO, table: SampleTable) -> Iterator[tuple[bool, bytes]]:
+    """All bytes of a file: its packets, and blocks of what is between them."""
+    place = 0
+    for start, size in zip(table.places.tolist(), table.sizes.tolist(), strict=True):
+        while place < start:
+            data = file.read(min(_BLOCK, start - place))
+            if not data:
+                return  # it became shorter meanwhile
+            place += len(data)
+            yield False, data
+        yield True, file.read(size)
+        place += size
+    while data := file.read(_BLOCK):
+        yield False, data

@@ -7,7 +7,8 @@ annex B.
 from __future__ import annotations
 
 from mp4ds.errors import Refused
-from mp4ds.messages.coded import BitReader, NoPicture, Picture, check_size
+from mp4ds.messages.coded import BitReader, CodedFrame, CodedPicture, NoPicture, check_size
+from mp4ds.video.references import Chain
 
 _SYNC_CODE = 0x498342
 _RGB = 7
@@ -49,16 +50,16 @@ class Vp9Pictures:
     def __init__(self) -> None:
         self._size = (0, 0)
 
-    def picture(self, data: memoryview) -> Picture:
+    def parse(self, body: memoryview) -> CodedPicture:
         """The picture in a packet.
 
         Raises:
             NoPicture: It shows nothing; a muxer would join it with the next packet.
             Refused: It shows several, or is not VP9.
         """
-        shown = 0
         keyframe = False
-        for number, frame in enumerate(split_superframe(data)):
+        shown = 0
+        for number, frame in enumerate(split_superframe(body)):
             is_shown, is_key = self._frame(bytes(frame[:_HEADER_BYTES]))
             keyframe |= is_key and not number
             shown += is_shown
@@ -68,7 +69,7 @@ class Vp9Pictures:
             raise Refused("it holds more than one picture")
         if self._size == (0, 0):
             raise Refused("it comes before the first key frame")
-        return Picture(*self._size, keyframe)
+        return CodedPicture(*self._size, keyframe)
 
     def _frame(self, header: bytes) -> tuple[bool, bool]:
         """Whether a frame is shown, and a key frame."""
@@ -104,3 +105,17 @@ def _key_frame_size(reader: BitReader, profile: int) -> tuple[int, int]:
     width, height = reader.bits(16) + 1, reader.bits(16) + 1
     check_size(width, height)
     return width, height
+
+
+class Vp9References(Chain):
+    """VP9 keeps motion vectors, probabilities and segments from frame to frame."""
+
+    def __init__(self, configuration: bytes) -> None:
+        super().__init__()
+        del configuration
+        self._pictures = Vp9Pictures()
+
+    def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        """The frame of a packet."""
+        is_key = self._pictures.parse(data).keyframe
+        return self.link(len(data), begins=is_key, key=key)
