@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import queue
-import re
 import shutil
 import signal
 import socket
@@ -174,7 +173,9 @@ class Core:
             )
         if own_net:
             self._prefix = ["nsenter", "-t", str(self._master.pid), "-n"]
-        wait_until(lambda: self._master.poll() is not None or self.run("rosnode", "list")[0] == 0)
+        asking = [*self._prefix, sys.executable, str(HERE / "ros1_state.py"), self.uri]
+        self._state = Process(asking, self.environment)
+        wait_until(lambda: self._master.poll() is not None or self._state.ask("nodes") is not None)
 
     def run(self, *command: str, **environment: str) -> tuple[int, str, str]:
         """Run a program beside the master; returns exit code, output and errors."""
@@ -215,11 +216,11 @@ class Core:
 
     def nodes(self) -> list[str]:
         """The names of all nodes."""
-        return self.run("rosnode", "list")[1].split()
+        return list(self._state.ask("nodes"))
 
     def connections(self, node: str) -> Counter[str]:
         """How many connections a node has, by topic."""
-        return Counter(re.findall(r"\* topic: (\S+)", self.run("rosnode", "info", node)[1]))
+        return Counter(self._state.ask("connections", node))
 
     def play(self, command: list[str], topics: Iterable[str], subscribers: int) -> tuple[str, str]:
         """Run a player to its end, once each topic has its subscribers.
@@ -265,6 +266,7 @@ class Core:
         trace: TracebackType | None,
     ) -> None:
         self.end_processes()
+        self._state.end()
         self._master.terminate()
         self._master.wait(SECONDS)
 

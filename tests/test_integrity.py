@@ -413,15 +413,6 @@ def test_a_recipe_that_was_changed(
 # ---------------------------------------------------------------- whole files
 
 
-@pytest.mark.parametrize("name", [FILES[0], FILES[1], FILES[3]])
-def test_a_file_that_is_missing(name: str, dataset: Path) -> None:
-    (dataset / name).unlink()
-    assert "file-missing" in codes(dataset)
-    assert "file-missing" in codes(dataset, deep=False)
-    assert name in places(dataset, "file-missing")
-    assert name in refused(dataset)
-
-
 def test_a_manifest_that_is_missing(dataset: Path) -> None:
     (dataset / "dataset.yaml").unlink()
     with pytest.raises(SourceError, match="dataset"):
@@ -429,33 +420,11 @@ def test_a_manifest_that_is_missing(dataset: Path) -> None:
     assert "dataset" in refused(dataset)
 
 
-@pytest.mark.parametrize("name", ["extra.mp4", "extra.yaml", "extra.mcap"])
-def test_a_file_that_is_not_listed(name: str, dataset: Path) -> None:
-    shutil.copy(dataset / f"{STEM}{Path(name).suffix}" if "mcap" not in name else
-                dataset / "messages.mcap", dataset / name)  # fmt: skip
-    assert codes(dataset) == ["file-unlisted"]
-    assert name in places(dataset, "file-unlisted")
-
-
-def test_other_files_are_nobodys_business(dataset: Path) -> None:
-    (dataset / "notes.txt").write_text("windy")
-    (dataset / ".DS_Store").write_bytes(b"\0")
-    (dataset / "thumbnails").mkdir()
-    assert codes(dataset) == []
-
-
 def swap(folder: Path, suffix: str) -> None:
     left, right = (folder / f"{side}_cam_image_raw{suffix}" for side in ("left", "right"))
     first, second = left.read_bytes(), right.read_bytes()
     left.write_bytes(second)
     right.write_bytes(first)
-
-
-def test_a_manifest_that_lists_no_streams(dataset: Path) -> None:
-    changed(dataset / "dataset.yaml", lambda manifest: manifest.update(streams=[]))
-    for deep in (False, True):
-        assert codes(dataset, deep=deep) == ["manifest-inconsistent"]  # its files are of none
-    assert "message-count" in refused(dataset)
 
 
 def test_two_sidecars_that_were_swapped(two_cameras: Path) -> None:
@@ -518,17 +487,6 @@ def test_messages_of_another_dataset(
 # ---------------------------------------------------------------- contradictions
 
 
-def test_messages_that_lost_their_index(dataset: Path) -> None:
-    path = dataset / "messages.mcap"
-    data = path.read_bytes()
-    (summary,) = struct.unpack_from("<Q", data, len(data) - 28)
-    path.write_bytes(data[:summary] + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + data[:8])
-    agreed(dataset)
-    for deep in (False, True):
-        assert codes(dataset, deep=deep) == ["messages-unreadable"]
-    assert "has no complete index" in refused(dataset, "bag")
-
-
 @pytest.mark.parametrize(
     ("source", "column", "value"),
     [
@@ -575,18 +533,6 @@ def test_an_index_that_tells_of_other_messages(dataset: Path) -> None:
     path.write_bytes(data)
     agreed(dataset)
     assert codes(dataset) == ["messages-unreadable"]
-
-
-@pytest.mark.parametrize("frames", [7, 9])
-def test_a_number_of_frames_that_was_edited(frames: int, dataset: Path) -> None:
-    path = dataset / f"{STEM}.yaml"
-    changed(path, lambda document: document.update(frames=frames))
-    found = codes(dataset)
-    assert {"column-invalid", "manifest-inconsistent"} <= set(found)
-    assert CHANGED_FILE & set(found)
-    assert "checksum-mismatch" not in found
-    assert codes(path) == ["column-invalid"]
-    refused(dataset)
 
 
 def shortened(document: Document) -> None:
@@ -659,33 +605,6 @@ def test_a_video_of_the_same_size_and_length(dataset: Path, tmp_path: Path) -> N
     agreed(dataset)
     assert codes(dataset) == ["digest-mismatch"]
     assert "digest-mismatch" in refused(dataset)
-
-
-def test_a_stream_that_was_taken_out_of_the_manifest(two_cameras: Path) -> None:
-    gone: list[str] = []
-
-    def change(manifest: Document) -> None:
-        entry = manifest["streams"].pop()
-        gone.extend((entry["sidecar"], entry["video"]))
-        manifest["files"] = [e for e in manifest["files"] if e["name"] not in gone]
-
-    changed(two_cameras / "dataset.yaml", change)
-    assert "file-unlisted" in codes(two_cameras)
-    for name in gone:
-        (two_cameras / name).unlink()
-    assert codes(two_cameras) == ["message-count"]
-    refused(two_cameras)
-
-
-def test_a_number_of_messages_that_was_changed(dataset: Path) -> None:
-    changed(dataset / "dataset.yaml", lambda manifest: manifest.update(messages=63))
-    assert codes(dataset) == ["message-count"]
-    refused(dataset)
-
-
-def test_a_file_that_the_manifest_does_not_list(dataset: Path) -> None:
-    changed(dataset / "dataset.yaml", lambda manifest: manifest["files"].pop())
-    assert {"manifest-inconsistent", "file-unlisted"} & set(codes(dataset))
 
 
 # ---------------------------------------------------------------- several faults

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import shutil
 import sys
 from collections.abc import Callable
@@ -23,10 +22,9 @@ from coded_scenes import CODED
 from definitions import PICTURES
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.options import UnpackOptions
-from pictures import CAREFUL, pixels
+from pictures import CAREFUL
 from sources import (
     COMMON,
-    ENCODINGS,
     IMAGE,
     INFO,
     PERIOD,
@@ -129,26 +127,6 @@ def test_frames_of_a_lossy_dataset_are_near(encoding: str, tmp_path: Path) -> No
             assert error < (12 if "bayer" in encoding else 6)  # hard edges, smeared colours
 
 
-SHAPES: list[dict[str, Any]] = [{"width": 63, "height": 47}, {"pad": 3}, {"big_endian": True}]
-
-
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("encoding", [name for name in ENCODINGS if name not in COMMON])
-def test_frames_of_every_other_encoding(encoding: str, tmp_path: Path) -> None:
-    shape = SHAPES[ENCODINGS.index(encoding) % 3]
-    source = scene(encoding, **shape)
-    with mp4ds.open(packed(tmp_path, source, "mcap-ros2-none", gop=60)) as dataset:
-        stream = dataset[TOPIC]
-        for number, (frame, message) in enumerate(zip(stream, images(source), strict=True)):
-            expected = pixels(message.values)
-            assert frame.encoding == encoding
-            assert frame.data.dtype == expected.dtype
-            assert frame.data.dtype.isnative
-            assert frame.data.shape == expected.shape
-            assert frame.data.tobytes() == expected.tobytes()  # NaN and all
-            assert stream[number].data.tobytes() == expected.tobytes()
-
-
 # ---------------------------------------------------------------- frames of coded messages
 
 
@@ -188,17 +166,6 @@ def test_frames_of_png_files_are_their_pixels(name: str, tmp_path: Path) -> None
             assert frame.stamp_ns == message.values["header"]["stamp"]
             assert frame.log_time_ns == message.log_time
             assert frame.intrinsics is not None
-
-
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_frames_of_rvl_are_those_of_png(encoding: str, tmp_path: Path) -> None:
-    found = []
-    for codec in ("png", "rvl"):
-        dataset = packed(tmp_path / codec, CODED[f"depth-{encoding}-{codec}"](frames=6))
-        with mp4ds.open(dataset) as opened:
-            found.append([frame.data for frame in next(iter(opened))])
-    assert len(found[0]) == 6
-    assert np.array_equal(*found)
 
 
 JPEGS = ["jpeg-rgb", "jpeg-gray", "jpeg-444", "jpeg-422", "jpeg-progressive", "jpeg-restart"]
@@ -273,40 +240,6 @@ def test_numbers_and_slices(colour: tuple[Path, Scene]) -> None:
                      slice(5, 5), slice(0, 100), slice(None, None, -1)):  # fmt: skip
             assert [frame.index for frame in stream[part]] == list(range(12))[part]
         assert stream[np.int64(3)].index == 3  # type: ignore[call-overload]
-
-
-@pytest.mark.parametrize("number", [12, -13, 10**9, -(10**9), 2**70])
-def test_numbers_out_of_range(number: int, colour: tuple[Path, Scene]) -> None:
-    with mp4ds.open(colour[0]) as dataset:
-        with pytest.raises(IndexError, match=f"no frame {number}: its 12 frames"):
-            dataset[TOPIC][number]
-        assert dataset[TOPIC][11].index == 11
-
-
-def test_what_is_no_number(colour: tuple[Path, Scene]) -> None:
-    with mp4ds.open(colour[0]) as dataset, pytest.raises(TypeError):
-        dataset[TOPIC]["3"]  # type: ignore[call-overload]
-
-
-def test_frames_do_not_change_when_others_are_read(colour: tuple[Path, Scene]) -> None:
-    """Their pixels are their own, whatever is read besides."""
-    with mp4ds.open(colour[0]) as dataset:
-        stream = dataset[TOPIC]
-        expected = [expected_pixels(message.values) for message in images(colour[1])]
-        rng = random.Random(0)
-        kept = []
-        for frame in stream:
-            kept += [frame, stream[rng.randrange(12)]]
-            next(iter(stream)).data[...] += 1  # one's own copy
-        for frame in kept:
-            assert np.array_equal(frame.data, expected[frame.index])
-
-
-def test_two_readers_at_once(colour: tuple[Path, Scene]) -> None:
-    with mp4ds.open(colour[0]) as one, mp4ds.open(colour[0]) as two:
-        for a, b in zip(one[TOPIC], reversed(two[TOPIC][:]), strict=True):
-            assert np.array_equal(a.data, one[TOPIC][a.index].data)
-            assert np.array_equal(b.data, one[TOPIC][b.index].data)
 
 
 def test_columns(colour: tuple[Path, Scene]) -> None:
@@ -389,16 +322,6 @@ def test_what_cannot_be_opened(tmp_path: Path, colour: tuple[Path, Scene]) -> No
     (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(range(256)))
     with pytest.raises(mp4ds.Mp4dsError):
         mp4ds.open(tmp_path / "drive.bag")
-
-
-@pytest.mark.parametrize("name", ["cam_image_raw.mp4", "cam_image_raw.yaml", "messages.mcap"])
-def test_a_file_that_is_gone(name: str, tmp_path: Path, colour: tuple[Path, Scene]) -> None:
-    shutil.copytree(colour[0], tmp_path / "dataset")
-    (tmp_path / "dataset" / name).unlink()
-    with pytest.raises(mp4ds.FormatError) as caught, mp4ds.open(tmp_path / "dataset") as dataset:
-        assert list(dataset.records())
-    assert caught.value.code == "file-missing"
-    assert name in str(caught.value)
 
 
 # ---------------------------------------------------------------- closing
@@ -577,16 +500,6 @@ def test_frame_ids_that_change(tmp_path: Path) -> None:
         assert dataset["/odd/image"][3].frame_id == ""
 
 
-@pytest.mark.parametrize("trait", ["stamp-zero", "stamp-repeated", "stamp-backward", "log-equal"])
-def test_frames_are_found_by_number_whatever_the_times(trait: str, tmp_path: Path) -> None:
-    with mp4ds.open(packed(tmp_path, odd_scene(trait))) as dataset:
-        stream = dataset["/odd/image"]
-        every = list(stream)
-        for number in (5, 0, 7, 3):
-            assert np.array_equal(stream[number].data, every[number].data)
-        assert len({frame.data.tobytes() for frame in every}) == 8
-
-
 # ---------------------------------------------------------------- pairs on their own
 
 
@@ -700,11 +613,3 @@ def test_strings_and_paths_for_everything(kind: Callable[[Path], Any], tmp_path:
     write_mcap(tmp_path / "one.mcap", scene("mono8"))
     mp4ds.pack([kind(tmp_path / "one.mcap")], kind(tmp_path / "other"))
     assert mp4ds.validate(kind(tmp_path)) == []
-
-
-def test_relative_outputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_bag(Path("drive.bag"), scene("mono8", frames=2))
-    assert mp4ds.pack("drive.bag", "set").dataset == tmp_path / "set"
-    assert mp4ds.unpack("set", "bag").output == tmp_path / "set_unpacked.bag"
-    assert mp4ds.unpack("set/cam_image_raw.mp4", "mcap", "one.mcap").output == tmp_path / "one.mcap"

@@ -79,7 +79,7 @@ def published(core: Core, command: list[str], topics: Iterable[str], count: int)
         ("roboto_tiny_dvs", "--immediate"),
         pytest.param("librealsense_depth_color", "--immediate", marks=pytest.mark.slow),
         pytest.param("ecto_ros_camera_info", "--immediate", marks=pytest.mark.slow),
-        ("youliangtan_object_pose", "--rate=6"),
+        pytest.param("youliangtan_object_pose", "--rate=6", marks=pytest.mark.slow),
     ],
 )
 def test_as_rosbag_play(roscore: Core, tmp_path: Path, name: str, pace: str) -> None:

@@ -30,7 +30,7 @@ from mp4ds.unpacking.options import UnpackOptions
 from mp4ds.video.images import Renderer
 from pictures import YUV, picture, pixels
 from republished import psnr
-from sources import ENCODINGS, PERIOD, SOURCES, START, Scene, odd_scene, scene
+from sources import ENCODINGS, SOURCES, Scene, odd_scene, scene
 
 TOPIC = "/cam/image_raw"
 FRAMES = 9
@@ -473,16 +473,6 @@ def test_what_to_write_instead(code: str, colour: mp4ds.Topic) -> None:
         eval(code, {"stream": colour, "dataset": dataset, "np": np})
 
 
-def test_an_error_in_a_property_is_its_own(colour: mp4ds.Topic) -> None:
-    class Other(mp4ds.Topic):
-        @property
-        def shape(self) -> tuple[int, ...]:
-            return self.encoding.shape  # type: ignore[attr-defined,no-any-return]
-
-    with pytest.raises(AttributeError, match="'str' object has no attribute 'shape'"):
-        _ = Other(colour.parts).shape
-
-
 def test_what_it_is_in_a_line(tmp_path: Path) -> None:
     dataset = packed(tmp_path, scene("rgb8", frames=FRAMES))
     with mp4ds.open(dataset) as found:
@@ -557,13 +547,6 @@ def test_a_point_is_seen_at_the_pixel_that_shows_it(
     assert (made.binning_x, made.binning_y, made.roi, made.template) == (0, 0, None, None)
     assert (made.d, made.distortion_model, made.frame_id) == ([0.1, 0, 0, 0, 0], "plumb_bob", "cam")
     Calibration.model_validate(made.model_dump())
-
-
-def test_cameras_without_calibration_stay_without() -> None:
-    zeros = calibration(k=[0.0] * 9, p=[0.0] * 12)
-    made = Placement((3, 4, 20, 10), (10, 10)).calibration(zeros)
-    assert made.k == zeros.k
-    assert made.p == zeros.p
 
 
 def test_the_intrinsics_of_frames(colour: mp4ds.Topic) -> None:
@@ -688,13 +671,6 @@ def test_stamps_that_are_not_in_order(trait: str, tmp_path: Path) -> None:
         assert all(np.array_equal(frame.data, stream[frame.index].data) for frame in found)
         for stamp in stamps:
             assert stream.at(stamp, mode="exact").index == stamps.index(stamp)
-
-
-def test_times_of_frames_are_those_of_the_scene(tmp_path: Path) -> None:
-    with mp4ds.open(packed(tmp_path, odd_scene("plain"))) as dataset:
-        stream = dataset["/odd/image"]
-        assert stream.at(START + 3 * PERIOD + 10**6).index == 3
-        assert stream.at(START + 3 * PERIOD).log_time_ns == START + 3 * PERIOD + 5_000_000
 
 
 # ---------------------------------------------------------------- documentation

@@ -253,9 +253,7 @@ def test_rosrun_renames_topics(
     play = workspace.command(tmp_path, "rosrun", "mp4ds", "play", "-q", "--pause", "--topics")
     try:
         started.append(roscore.start(*play, IMAGES, str(drive), "__name:=player"))
-        wait_until(
-            lambda: roscore.run("rosnode", "info", "/player")[1].count("* to: /camera/") == 2
-        )
+        wait_until(lambda: roscore.connections("/player")[IMAGES] == 2)
         pause = ("rosservice", "call", "/player/pause_playback")
         assert roscore.run(*pause, "false")[0] == 0
         started[-1].wait(WATCHDOG_S)

@@ -23,7 +23,6 @@ from mp4ds.errors import Refused, VideoError
 from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video.codecs import recipe_for
 from mp4ds.video.mp4 import SampleTable, read_sample_table
-from mp4ds.video.packets import join_segments
 from test_packets import write as write_packets
 from test_video import LOSSLESS, LOSSY, encode, noise
 from waiting import lines_run
@@ -120,17 +119,6 @@ def test_frames_of_one_size(frames: int, tmp_path: Path) -> None:
     (packet,) = encode_packets(ENCODINGS["mjpeg"], frames=1)
     write_packets(tmp_path / "a.mp4", "mjpeg", [packet.data] * frames)
     assert check(tmp_path / "a.mp4").sizes.tolist() == [len(packet.data)] * frames
-
-
-@pytest.mark.parametrize(("codec", "picture_format"), [("h264", "gray"), ("ffv1", "gray16le")])
-def test_joined_files(codec: str, picture_format: str, tmp_path: Path) -> None:
-    paths = [
-        written(tmp_path / f"{n}.mp4", codec, picture_format, lossless=True, frames=n)
-        for n in (5, 1, 6)
-    ]
-    join_segments(paths, range(0, 12 * STEP, STEP), tmp_path / "joined.mp4")
-    table = check(tmp_path / "joined.mp4")
-    assert np.flatnonzero(table.sync).tolist() == [0, 4, 5, 6, 10]
 
 
 B_FRAMES = {
