@@ -474,7 +474,27 @@ def killed(tmp_path: Path) -> tuple[list[Path], Path]:
     until(is_half_packed, process)
     process.send_signal(signal.SIGKILL)
     process.wait()
+
+    def is_left() -> bool:  # by the process that packs, too
+        try:
+            SpoolFolder(folder).locked().close()
+        except SourceError:
+            return False
+        return True
+
+    until(is_left)
     return paths, folder
+
+
+def test_no_recovery_while_it_is_packed(killed: tuple[list[Path], Path], tmp_path: Path) -> None:
+    """The process that packs may live a little longer than its recorder."""
+    _, folder = killed
+    spool = SpoolFolder(folder)
+    with spool.locked(shared=True), spool.locked(shared=True):
+        with pytest.raises(SourceError, match="is being recorded"):
+            mp4ds.pack(folder, tmp_path / "salvaged", SALVAGE)
+    with spool.locked(), pytest.raises(SourceError, match="is being recovered"):
+        spool.locked(shared=True)
 
 
 def assert_prefix(paths: list[Path], dataset: Path, folder: Path) -> dict[str, int]:

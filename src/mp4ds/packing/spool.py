@@ -80,7 +80,8 @@ class SpoolFolder:
         """Make the folder, which must not exist.
 
         Returns:
-            What locks it: nobody takes it for one that was left while this is open.
+            What locks it: nobody takes it for one that was left while this is open. The lock is
+            shared with the process that packs, which may outlive a recorder that is killed.
 
         Raises:
             FileExistsError: It exists.
@@ -88,25 +89,29 @@ class SpoolFolder:
         """
         self.path.mkdir()
         file = self._settings_path.open("xb")
-        lock(file)
+        lock(file, shared=True)
         file.write(settings.model_dump_json(indent=1).encode() + b"\n")
         file.flush()
         return file
 
-    def locked(self) -> IO[bytes]:
+    def locked(self, *, shared: bool = False) -> IO[bytes]:
         """Lock it while what is returned is open.
 
+        Args:
+            shared: For a part of its recorder; else only where no recorder is at work.
+
         Raises:
-            SourceError: It is being recorded.
+            SourceError: It is being recorded; shared: it is being recovered.
         """
         file = self._settings_path.open("r+b")
         try:
-            lock(file)
+            lock(file, shared=shared)
         except BlockingIOError:
             file.close()
-            raise SourceError(
-                self.path, "is being recorded", "Wait, or stop the recorder."
-            ) from None
+            if shared:
+                raise SourceError(self.path, "is being recovered", "Wait for its end.") from None
+            remedy = "Wait, or stop the recorder."
+            raise SourceError(self.path, "is being recorded", remedy) from None
         return file
 
     def settings(self) -> SpoolSettings:

@@ -126,12 +126,13 @@ def _carry_out(kind: str, folder: str, number: int, *rest: Any) -> str:
     """Carry out an order; returns the sentence of its error, empty if there is none."""
     spool = SpoolFolder(Path(folder))
     try:
-        if kind == "pack":
-            spool.pack(number, pack)
-        else:
-            target, force, about = rest
-            told = load_about(about) if about is not None else None
-            spool.join(number, Path(target), force=force, about=told)
+        with spool.locked(shared=True):
+            if kind == "pack":
+                spool.pack(number, pack)
+            else:
+                target, force, about = rest
+                told = load_about(about) if about is not None else None
+                spool.join(number, Path(target), force=force, about=told)
     except Mp4dsError as error:
         return str(error)
     except OSError as error:
