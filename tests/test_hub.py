@@ -16,8 +16,8 @@ import yaml
 import mp4ds
 from commands import call
 from hub_server import REPOSITORY, Hub, hub_server
+from mp4ds.plugins.card import card
 from mp4ds.plugins.demo import demo
-from mp4ds.plugins.reporting.card import card
 from waiting import WATCHDOG_S
 
 HOME = f"hf://datasets/{REPOSITORY}"

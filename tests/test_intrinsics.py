@@ -30,8 +30,7 @@ from mp4ds.format.manifest import StaticTransform
 from mp4ds.format.sidecars import dump_document, load_manifest
 from mp4ds.messages.transforms import Transform
 from mp4ds.messages.wire import CalibrationFields
-from mp4ds.plugins import info
-from mp4ds.plugins.info import CameraCalibrations, Intrinsics, ListedCalibration, intrinsics
+from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, ListedCalibration, intrinsics
 from scenes import INFO, PERIOD, START, TF, Record, Scene, calibration, scene
 from sources import SOURCES, write_bag, write_mcap
 
@@ -184,7 +183,7 @@ def test_what_belongs_to_no_other_is_listed_too(packed: bool, tmp_path: Path) ->
 def test_calibrations_without_end_are_counted(
     packed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(info, "MAX_LISTED", 3)
+    monkeypatch.setattr("mp4ds.plugins.intrinsics.MAX_LISTED", 3)
     path = SOURCES["bag-none"](tmp_path, focused(scene("mono8"), range(100, 108)))[0]
     if packed:
         mp4ds.pack(path, tmp_path / "dataset")

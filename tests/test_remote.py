@@ -22,7 +22,8 @@ from mp4ds.cli import app_for
 from mp4ds.errors import OptionError, PartsFailedError, RemoteError, SourceError
 from mp4ds.files.urls import KEPT_BYTES, RemoteFile, RemotePath, Segments, expect, location
 from mp4ds.packing.options import PackOptions
-from mp4ds.plugins.info import info, intrinsics
+from mp4ds.plugins.info import info
+from mp4ds.plugins.intrinsics import intrinsics
 from mp4ds.records import Excerpt, Message
 from remote_servers import Request, Server, web_server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores, web

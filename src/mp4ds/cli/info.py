@@ -19,8 +19,9 @@ from mp4ds.files.urls import location
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.options import SliceOptions
 from mp4ds.plugins import info as facts
-from mp4ds.plugins.reporting.card import card as card_of
-from mp4ds.plugins.reporting.overview import brief
+from mp4ds.plugins.card import card as card_of
+from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, ListedCalibration
+from mp4ds.plugins.intrinsics import intrinsics as intrinsics_of
 
 
 def info(
@@ -136,7 +137,7 @@ def _print_overview(found: Sequence[Path], as_json: bool) -> None:
         for number, path in enumerate(found):
             if tell:
                 tell(path.name, number / len(found))
-            rows.append(brief(path))
+            rows.append(facts.brief(path))
     if as_json:
         print_json(rows)
     else:
@@ -145,7 +146,7 @@ def _print_overview(found: Sequence[Path], as_json: bool) -> None:
 
 def _print_intrinsics(path: str, as_json: bool) -> None:
     with report_errors(as_json), progress_of("reading", as_json):
-        result = facts.intrinsics(path)
+        result = intrinsics_of(path)
     if as_json:
         print_json(result)
     else:
@@ -170,7 +171,7 @@ _MODELS = {
 }
 
 
-def print_intrinsics(result: facts.Intrinsics) -> None:
+def print_intrinsics(result: Intrinsics) -> None:
     """Print the calibrations of all cameras, one after another, and the static transforms."""
     say(f"# {path_text(result.path)}: {result.kind}, {counted(len(result.cameras), 'camera')}")
     say("import numpy as np")
@@ -180,7 +181,7 @@ def print_intrinsics(result: facts.Intrinsics) -> None:
         _print_transforms(result)
 
 
-def _print_camera(camera: facts.CameraCalibrations) -> None:
+def _print_camera(camera: CameraCalibrations) -> None:
     say("")
     sizes = ", ".join(f"{width}x{height}" for width, height in camera.sizes) or "size not known"
     if camera.topic:
@@ -195,9 +196,7 @@ def _print_camera(camera: facts.CameraCalibrations) -> None:
         say(f"# ... and {camera.more} more calibration changes")
 
 
-def _print_calibration(
-    camera: facts.CameraCalibrations, calibration: facts.ListedCalibration
-) -> None:
+def _print_calibration(camera: CameraCalibrations, calibration: ListedCalibration) -> None:
     since = (
         f"from message {calibration.message} at {calibration.log_time} ns"
         if calibration.message is not None
@@ -232,7 +231,7 @@ def _print_matrix(name: str, rows: Sequence[Sequence[float]]) -> None:
         say(line)
 
 
-def _print_transforms(result: facts.Intrinsics) -> None:
+def _print_transforms(result: Intrinsics) -> None:
     say("")
     say("# static transforms: a point p of the child is rotation * p + translation in the parent;")
     say("# (parent, child, translation x y z in metres, rotation x y z w)")

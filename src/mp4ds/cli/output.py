@@ -26,8 +26,7 @@ from mp4ds.records import latched_text
 if TYPE_CHECKING:
     from mp4ds.dataset.checks import Problem
     from mp4ds.packing.options import PackSummary, TopicSummary
-    from mp4ds.plugins.info import Info, ReadingSpeed, TopicInfo
-    from mp4ds.plugins.reporting.overview import Brief
+    from mp4ds.plugins.info import Brief, Info, ReadingSpeed, TopicInfo
     from mp4ds.records import Loss
     from mp4ds.unpacking.options import UnpackSummary
 

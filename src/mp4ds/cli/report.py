@@ -23,8 +23,7 @@ from mp4ds.cli.process import report_errors
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, counted, path_text, size_text
-from mp4ds.plugins.reporting.overview import reports
-from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary
+from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary, reports
 from mp4ds.plugins.reporting.report import report as run_report
 from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.plugins.reporting.stills import StillOptions

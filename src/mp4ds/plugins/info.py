@@ -1,15 +1,16 @@
-"""``info``: what is in a recording or a dataset, its calibrations and static transforms."""
+"""``info``: what is in a recording or a dataset, or in many datasets."""
 
 from __future__ import annotations
 
 import random
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,21 +20,16 @@ from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.views import Matrix, effective
-from mp4ds.errors import Refused, counted
+from mp4ds.errors import Refused, SourceError, counted
 from mp4ds.files.urls import location
-from mp4ds.format.sidecars import names_dataset
-from mp4ds.messages.serializations import MessageSplitter, is_calibration, is_camera, kind_of
-from mp4ds.messages.transforms import Transform, TransformCollector
-from mp4ds.messages.wire import CalibrationFields, CodedFields, ImageFields
+from mp4ds.format.manifest import Manifest
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, names_dataset
+from mp4ds.messages.serializations import MessageSplitter, kind_of
+from mp4ds.messages.wire import CodedFields, ImageFields
 from mp4ds.options import WHOLE, Slice
-from mp4ds.packing.calibrations import StampPairing, pair_camera_infos
-from mp4ds.packing.inspection import MessageInspector
 from mp4ds.packing.job import open_recording
-from mp4ds.records import Channel, Message, latched_text
+from mp4ds.records import Channel, latched_text
 from mp4ds.times import intervals, lost_frames
-
-_T = TypeVar("_T")
 
 
 @dataclass
@@ -50,7 +46,7 @@ class TopicInfo:
         longest_gap_s: The longest time between two messages.
         content: For images the encoding and size, for calibrations the focal length.
         stored: In a dataset, where and how: codec and file.
-        bytes: In a dataset, bytes of the topic's videos.
+        bytes: In a dataset, bytes of the topic's videos and their sidecars.
     """
 
     topic: str
@@ -105,18 +101,14 @@ def info(path: Path | str, asked: Slice = WHOLE) -> Info:
     if asked:
         with open_recording([location(path)], asked=asked) as reader:
             return _recording_info(reader)
-    return _look(path, _dataset_info, _recording_info)
+    with open_any(path) as found:
+        return _dataset_info(found) if isinstance(found, Dataset) else _recording_info(found)
 
 
-def _look(
-    path: Path | str, at_dataset: Callable[[Dataset], _T], at_recording: Callable[[BagReader], _T]
-) -> _T:
-    path = location(path)
-    if names_dataset(path):
-        with Dataset(path) as dataset:
-            return at_dataset(dataset)
-    with open_reader(path) as reader:
-        return at_recording(reader)
+def open_any(path: Path | str) -> Dataset | BagReader:
+    """Open a recording, a dataset, or a video with its sidecar: a context manager."""
+    place = location(path)
+    return Dataset(place) if names_dataset(place) else open_reader(place)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,35 +170,39 @@ def _reading_speed(dataset: Dataset, topic: str) -> ReadingSpeed:
 
 def _recording_info(reader: BagReader) -> Info:
     size = sum(file.stat().st_size for file in reader.files)
-    result = Info(reader.path, reader.format, reader.profile, size)
-    times = reader.times()
-    _add_topics(result, list(reader.channels), times)
-    by_topic = {item.topic: item for item in result.topics}
-    for channel in reader.channels:
+    times, channels = reader.times(), list(reader.channels)
+    topics = _topics(channels, times)
+    by_topic = {item.topic: item for item in topics}
+    for channel in channels:
         item = by_topic[channel.topic]
         if not item.content and kind_of(channel):
             item.content = _content(reader, channel)
+    return _spanned(Info(reader.path, reader.format, reader.profile, size), times, topics)
+
+
+def _spanned(result: Info, times: Mapping[int, NDArray[np.int64]], topics: list[TopicInfo]) -> Info:
+    """With its topics, and the time of its first and last message."""
+    result.topics = topics
+    known = [found for found in times.values() if len(found)]
+    if known:
+        result.start = min(int(found[0]) for found in known)
+        result.end = max(int(found[-1]) for found in known)
     return result
 
 
-def _add_topics(
-    result: Info, channels: list[Channel], times: Mapping[int, NDArray[np.int64]]
-) -> None:
+def _topics(channels: Sequence[Channel], times: Mapping[int, NDArray[np.int64]]) -> list[TopicInfo]:
     by_topic: dict[str, list[Channel]] = {}
     for channel in channels:
         by_topic.setdefault(channel.topic, []).append(channel)
+    topics = []
     for topic, own in sorted(by_topic.items()):
         found = [times[channel.id] for channel in own if channel.id in times]
         merged = np.sort(np.concatenate(found)) if found else np.empty(0, np.int64)
-        types = list(dict.fromkeys(channel.type_name for channel in own))
-        item = _timing(TopicInfo(topic, " | ".join(types)), merged)
+        types = dict.fromkeys(channel.type_name for channel in own)
+        topics.append(_timing(TopicInfo(topic, " | ".join(types)), merged))
         if len(own) > 1:
-            item.content = f"{len(own)} publishers"
-        result.topics.append(item)
-        if len(merged):
-            first, last = int(merged[0]), int(merged[-1])
-            result.start = first if result.start is None else min(result.start, first)
-            result.end = last if result.end is None else max(result.end, last)
+            topics[-1].content = f"{len(own)} publishers"
+    return topics
 
 
 def _timing(item: TopicInfo, times: NDArray[np.int64]) -> TopicInfo:
@@ -244,46 +240,64 @@ def intrinsics_text(width: int, height: int, model: str, k: Any) -> str:
 
 
 def _dataset_info(dataset: Dataset) -> Info:
-    whole = dataset.manifest is not None
+    manifest = dataset.manifest
     files = (
-        [dataset.path / entry.name for entry in dataset.manifest.files]
-        if dataset.manifest
+        [dataset.path / entry.name for entry in manifest.files]
+        if manifest
         else [stream.video_path for stream in dataset.streams]
     )
-    result = Info(
-        dataset.path,
-        "dataset" if whole else "stream",
-        dataset.profile,
-        sum(file.stat().st_size for file in files if file.is_file()),
+    return _spanned(
+        Info(
+            dataset.path,
+            "dataset" if manifest else "stream",
+            dataset.profile,
+            sum(file.stat().st_size for file in files if file.is_file()),
+            notes=notes_of(dataset),
+        ),
+        dataset.times(),
+        topics_of(dataset),
     )
-    _add_topics(result, dataset.channels, dataset.times())
-    by_topic = {item.topic: item for item in result.topics}
+
+
+def topics_of(dataset: Dataset) -> list[TopicInfo]:
+    """The topics of a dataset by name, and where they are stored.
+
+    Raises:
+        FormatError: The dataset is damaged.
+        SourceError: messages.mcap cannot be read.
+    """
+    topics = _topics(dataset.channels, dataset.times())
+    by_topic = {item.topic: item for item in topics}
     for stream in dataset.streams:
         _add_stream(by_topic, stream)
-    if dataset.manifest:
-        result.notes += [
+    return topics
+
+
+def notes_of(dataset: Dataset) -> list[str]:
+    """What else is worth knowing about a dataset."""
+    notes: list[str] = []
+    manifest = dataset.manifest
+    if manifest:
+        notes += [
             f"{item.topic}: {counted(item.messages, 'message')} stored verbatim, the first is "
             f"number {item.first}: {item.reason}"
-            for item in dataset.manifest.verbatim
+            for item in manifest.verbatim
         ]
         if dataset.latched_before:
-            result.notes.append(latched_text(dataset.latched_before))
-        if dataset.manifest.about:
-            result.notes += dataset.manifest.about.lines
-        if dataset.manifest.derived_from:
-            earlier = (f"{item.name} ({item.profile})" for item in dataset.manifest.derived_from)
-            result.notes.append(f"repacked from {', '.join(earlier)}")
-        if dataset.manifest.topics_left_out:
-            left_out = ", ".join(dataset.manifest.topics_left_out)
-            result.notes.append(f"left out when packed: {left_out}")
-    result.notes += [
-        f"{stream.topic}: {stream.sidecar.video.quality}"
-        for stream in dataset.streams
-        if stream.sidecar.video.quality
-    ]
-    if any(stream.sidecar.stamps == "record-float" for stream in dataset.streams):
-        result.notes.append("times are record times stored as float seconds, so they are not exact")
-    return result
+            notes.append(latched_text(dataset.latched_before))
+        if manifest.about:
+            notes += manifest.about.lines
+        if manifest.derived_from:
+            earlier = (f"{item.name} ({item.profile})" for item in manifest.derived_from)
+            notes.append(f"repacked from {', '.join(earlier)}")
+        notes += [f"lost when packed: {loss.file}: {loss.problem}" for loss in manifest.losses]
+        if manifest.topics_left_out:
+            notes.append(f"left out when packed: {', '.join(manifest.topics_left_out)}")
+    sidecars = [(stream.topic, stream.sidecar) for stream in dataset.streams]
+    notes += [f"{topic}: {it.video.quality}" for topic, it in sidecars if it.video.quality]
+    if any(sidecar.stamps == "record-float" for _, sidecar in sidecars):
+        notes.append("times are record times stored as float seconds, so they are not exact")
+    return notes
 
 
 def _add_stream(by_topic: dict[str, TopicInfo], stream: Stream) -> None:
@@ -293,8 +307,8 @@ def _add_stream(by_topic: dict[str, TopicInfo], stream: Stream) -> None:
     item.content = ", ".join(filter(None, (item.content, image)))
     stored = f"{sidecar.video.codec} {sidecar.profile}: {sidecar.video.file}"
     item.stored = ", ".join(filter(None, (item.stored, stored)))
-    size = stream.video_path.stat().st_size if stream.video_path.is_file() else 0
-    item.bytes = (item.bytes or 0) + size
+    files = [file for file in (stream.video_path, stream.path) if file.is_file()]
+    item.bytes = (item.bytes or 0) + sum(file.stat().st_size for file in files)
     info_model = sidecar.camera_info
     if info_model and info_model.calibrations:
         calibration = info_model.calibrations[0]
@@ -308,324 +322,67 @@ def _add_stream(by_topic: dict[str, TopicInfo], stream: Stream) -> None:
             other.stored = f"in {stream.path.name}"
 
 
-# ---------------------------------------------------------------- intrinsics
-
-MAX_LISTED = 1000
-"""Maximum number of listed calibrations of a camera; a self-calibrating one may have more."""
+# ---------------------------------------------------------------- many datasets
 
 
-@dataclass(frozen=True, slots=True)
-class ListedCalibration:
-    """A calibration of a camera, and where it starts to apply.
+@dataclass(frozen=True)
+class Brief:
+    """A dataset's summary from its manifest.
 
     Attributes:
-        message: Number of the message it comes from, within its channel; None if no messages were
-            recorded.
-        log_time: When that was recorded, nanoseconds.
-        frame_id: Coordinate frame.
-        width: Columns of the calibrated image.
-        height: Rows of the calibrated image.
-        distortion_model: Such as ``plumb_bob``, whose `d` is in the order of OpenCV.
-        k: Intrinsic matrix, 3 x 3.
-        d: Distortion parameters.
-        r: Rectification matrix, 3 x 3.
-        p: Projection matrix, 3 x 4.
-        binning: Columns and rows binned into one, or None if both are 0.
-        roi: x_offset, y_offset, height, width, do_rectify, or None if all are 0.
-        k_effective: `k` for the recorded images, cropped and binned; None if equal to `k`.
-        p_effective: `p` for the recorded images; None if equal to `p`.
-    """
-
-    message: int | None
-    log_time: int | None
-    frame_id: str
-    width: int
-    height: int
-    distortion_model: str
-    k: Matrix
-    d: list[float]
-    r: Matrix
-    p: Matrix
-    binning: tuple[int, int] | None
-    roi: dict[str, int] | None
-    k_effective: Matrix | None
-    p_effective: Matrix | None
-
-
-@dataclass
-class CameraCalibrations:
-    """A camera topic and its calibrations.
-
-    Attributes:
-        topic: Of the images; empty for calibrations that belong to no images.
-        info_topic: Of the calibrations; empty if the images have none.
-        frame_id: Coordinate frame of the first image.
-        sizes: Width and height of the images; several if they change, none if unknown.
-        calibrations: Each that differs from the previous one, in recorded order.
-        more: Number of further changes not listed.
-    """
-
-    topic: str
-    info_topic: str = ""
-    frame_id: str = ""
-    sizes: list[tuple[int, int]] = field(default_factory=list)
-    calibrations: list[ListedCalibration] = field(default_factory=list)
-    more: int = 0
-
-
-@dataclass
-class Intrinsics:
-    """The cameras of a recording or dataset.
-
-    Attributes:
-        path: The recording or dataset.
-        kind: ``bag``, ``rosbag2``, ``mcap``, ``dataset`` or ``stream``.
-        cameras: By topic; calibrations without images last.
-        transforms: Static transforms that connect the cameras.
+        path: The dataset.
+        profile: Its profile.
+        format: Of the recording.
+        messages: Number of messages.
+        frames: How many of these are video frames, by topic.
+        start: First log time, nanoseconds; None without messages.
+        end: Last log time, nanoseconds.
+        bytes: Of its files.
+        title: Its title.
     """
 
     path: Path
-    kind: str
-    cameras: list[CameraCalibrations]
-    transforms: list[Transform] = field(default_factory=list)
+    profile: str
+    format: str
+    messages: int
+    frames: dict[str, int]
+    start: int | None
+    end: int | None
+    bytes: int
+    title: str = ""
+
+    @property
+    def seconds(self) -> float:
+        """From the first message to the last."""
+        return 0.0 if self.start is None or self.end is None else (self.end - self.start) / 1e9
 
 
-def intrinsics(path: Path | str) -> Intrinsics:
-    """The intrinsics and extrinsics in a recording, a dataset, or a video with its sidecar.
-
-    Args:
-        path: Its path or URL.
+def brief(path: Path) -> Brief:
+    """Summarise a dataset from its manifest.
 
     Raises:
-        SourceError: It is not a recording or cannot be read.
-        FormatError: The dataset breaks a rule of the format.
+        SourceError: It is not a dataset.
+        FormatError: The manifest breaks a rule of the format.
     """
-    return _look(path, _of_dataset, _of_recording)
+    if not (path / MANIFEST_NAME).is_file():
+        raise SourceError(path, "is not a dataset", "Give folders made by `mp4ds pack`.")
+    return brief_of(path, load_manifest(path / MANIFEST_NAME))
 
 
-def _rows(values: Sequence[float]) -> Matrix:
-    step = len(values) // 3
-    return [list(values[row * step : (row + 1) * step]) for row in range(3)]
-
-
-def _listed(
-    fields: CalibrationFields, frame_id: str, message: int | None, log_time: int | None
-) -> ListedCalibration:
-    k, p = _rows(fields.k), _rows(fields.p)
-    k_effective, p_effective = effective(fields)
-    roi = dict(zip(("x_offset", "y_offset", "height", "width"), fields.roi, strict=True))
-    roi["do_rectify"] = fields.roi_do_rectify
-    return ListedCalibration(
-        message=message,
-        log_time=log_time,
-        frame_id=frame_id,
-        width=fields.width,
-        height=fields.height,
-        distortion_model=fields.distortion_model,
-        k=k,
-        d=list(fields.d),
-        r=_rows(fields.r),
-        p=p,
-        binning=(
-            (fields.binning_x, fields.binning_y) if fields.binning_x or fields.binning_y else None
-        ),
-        roi=roi if any(roi.values()) else None,
-        k_effective=k_effective if k_effective != k else None,
-        p_effective=p_effective if p_effective != p else None,
+def brief_of(path: Path, manifest: Manifest) -> Brief:
+    """The summary of a dataset whose manifest is known."""
+    by_topic: Counter[str] = Counter()
+    for stream in manifest.streams:
+        by_topic[stream.topic] += stream.frames
+    span = manifest.time_range
+    return Brief(
+        path=path,
+        profile=manifest.profile,
+        format=manifest.format,
+        messages=manifest.messages,
+        frames=dict(by_topic),
+        start=span.start if span else None,
+        end=span.end if span else None,
+        bytes=sum(entry.size for entry in manifest.files),
+        title=(manifest.about and manifest.about.title) or "",
     )
-
-
-class _History:
-    """The calibrations of one channel, as its messages come."""
-
-    def __init__(self, channel: Channel) -> None:
-        self.topic = channel.topic
-        self._forms = MessageSplitter(channel)
-        self._messages = 0
-        self._last: tuple[str, CalibrationFields] | None = None
-        self.calibrations: list[ListedCalibration] = []
-        self.more = 0
-
-    def take(self, message: Message, stamps: StampPairing) -> None:
-        number = self._messages
-        self._messages += 1
-        try:
-            _, parts = self._forms.split(message)
-        except Refused:
-            return
-        stamps.add(message.channel, parts)
-        fields = parts.fields
-        if not isinstance(fields, CalibrationFields) or (parts.frame_id, fields) == self._last:
-            return
-        self._last = parts.frame_id, fields
-        if len(self.calibrations) < MAX_LISTED:
-            listed = _listed(fields, parts.frame_id, number, message.log_time)
-            self.calibrations.append(listed)
-        else:
-            self.more += 1
-
-    def give(self, camera: CameraCalibrations) -> None:
-        """Move all of it to the camera."""
-        camera.info_topic = self.topic
-        camera.calibrations += self.calibrations
-        camera.more += self.more
-
-
-# ---------------------------------------------------------------- recordings
-
-
-class _Cameras:
-    """Collects information about cameras in one pass over messages.
-
-    Args:
-        channels: Returns the channels known so far.
-    """
-
-    def __init__(self, channels: Callable[[], Sequence[Channel]]) -> None:
-        self._channels = channels
-        self._histories: dict[int, _History] = {}
-        self._forms: dict[int, MessageSplitter] = {}
-        self._seen: dict[int, tuple[str, tuple[int, int]]] = {}
-        self._stamps = StampPairing()
-        self._known = -1  # number of channels when it was last decided whether stamps are needed
-        self._needs_stamps = False
-        self.transforms = TransformCollector()
-
-    def take(self, message: Message) -> None:
-        channel = message.channel
-        if is_calibration(channel):
-            if channel.id not in self._histories:
-                self._histories[channel.id] = _History(channel)
-            self._histories[channel.id].take(message, self._stamps)
-        elif is_camera(channel):
-            if channel.id not in self._seen or self._wants_stamps():
-                self._take_image(message)
-        else:
-            self.transforms.add(channel, message.data)
-
-    def _wants_stamps(self) -> bool:
-        """Whether names leave a calibration channel unpaired; some formats reveal channels late."""
-        channels = self._channels()
-        if len(channels) != self._known:
-            self._known = len(channels)
-            infos = {channel.id for channel in channels if is_calibration(channel)}
-            self._needs_stamps = bool(infos - set(pair_camera_infos(channels)))
-        return self._needs_stamps
-
-    def _take_image(self, message: Message) -> None:
-        channel = message.channel
-        try:
-            _, parts = self._forms.setdefault(channel.id, MessageSplitter(channel)).split(message)
-        except Refused:
-            return
-        if channel.id not in self._seen:
-            size = parts.fields.width, parts.fields.height
-            if isinstance(parts.fields, CodedFields):
-                size = _coded_size(message, size)
-            self._seen[channel.id] = parts.frame_id, size
-        self._stamps.add(channel, parts, size=self._seen[channel.id][1])
-
-    def cameras(self) -> list[CameraCalibrations]:
-        """All of them, once all channels are known."""
-        channels = self._channels()
-        pairs = pair_camera_infos(channels)
-        pairs.update(self._stamps.decide(pairs))
-        by_topic: dict[str, CameraCalibrations] = {}
-        for channel in filter(is_camera, channels):
-            camera = by_topic.setdefault(channel.topic, CameraCalibrations(channel.topic))
-            frame_id, size = self._seen.get(channel.id, ("", (0, 0)))
-            camera.frame_id = camera.frame_id or frame_id
-            if 0 not in size and size not in camera.sizes:
-                camera.sizes.append(size)
-        topics = {channel.id: channel.topic for channel in channels}
-        alone = []
-        for info_id, history in self._histories.items():
-            if info_id in pairs:
-                history.give(by_topic[topics[pairs[info_id]]])
-            elif history.calibrations:
-                alone.append(CameraCalibrations(""))
-                history.give(alone[-1])
-        return [*by_topic.values(), *alone]
-
-
-def _coded_size(message: Message, told: tuple[int, int]) -> tuple[int, int]:
-    try:
-        key = MessageInspector(message.channel).inspect(message).key
-    except Refused:
-        return told
-    return key.width, key.height
-
-
-def _sorted(cameras: Iterable[CameraCalibrations]) -> list[CameraCalibrations]:
-    return sorted(cameras, key=lambda camera: (not camera.topic, camera.topic, camera.info_topic))
-
-
-def _of_recording(reader: BagReader) -> Intrinsics:
-    found = _Cameras(lambda: reader.channels)
-    for record in reader.records():
-        if isinstance(record, Message):
-            found.take(record)
-    cameras = _sorted(found.cameras())
-    frames = {camera.frame_id for camera in cameras}
-    frames |= {item.frame_id for camera in cameras for item in camera.calibrations}
-    return Intrinsics(reader.path, reader.format, cameras, found.transforms.between(sorted(frames)))
-
-
-# ---------------------------------------------------------------- datasets
-
-
-def _of_dataset(dataset: Dataset) -> Intrinsics:
-    by_topic: dict[str, CameraCalibrations] = {}
-    for stream in dataset.streams:
-        camera = by_topic.setdefault(stream.topic, CameraCalibrations(stream.topic))
-        image = stream.sidecar.image
-        camera.frame_id = camera.frame_id or stream.sidecar.headers[0].frame_id
-        camera.sizes.append((image.width, image.height))
-        _add_intrinsics(camera, stream)
-    manifest = dataset.manifest
-    transforms = [item.to_record() for item in (manifest.transforms if manifest else [])]
-    return Intrinsics(
-        dataset.path,
-        "dataset" if manifest else "stream",
-        _sorted([*by_topic.values(), *_verbatim(dataset)]),
-        transforms,
-    )
-
-
-def _add_intrinsics(camera: CameraCalibrations, stream: Stream) -> None:
-    info = stream.sidecar.camera_info
-    if info is None:
-        return
-    camera.info_topic = info.channel.topic
-    columns = stream.infos.columns if stream.infos else None
-    if columns is None:
-        camera.calibrations += [
-            _listed(item.fields, item.frame_id, None, None) for item in info.calibrations
-        ]
-        return
-    changes = np.flatnonzero(np.diff(columns.variant, prepend=-1))
-    for place in changes[:MAX_LISTED].tolist():
-        item = info.calibrations[int(columns.variant[place])]
-        number, log_time = int(columns.ordinal[place]), int(columns.log_time[place])
-        camera.calibrations.append(_listed(item.fields, item.frame_id, number, log_time))
-    camera.more += max(0, len(changes) - MAX_LISTED)
-
-
-def _verbatim(dataset: Dataset) -> list[CameraCalibrations]:
-    """Cameras without a stream, with all messages in messages.mcap."""
-    models = [stream.sidecar.channel for stream in dataset.streams]
-    models += [item.channel for s in dataset.streams if (item := s.sidecar.camera_info)]
-    owned = {model.to_record(0).identity for model in models}
-    channels = [
-        channel
-        for channel in dataset.channels
-        if (is_camera(channel) or is_calibration(channel)) and channel.identity not in owned
-    ]
-    if not channels:
-        return []
-    found = _Cameras(lambda: channels)
-    ids = {channel.id for channel in channels}
-    for record in dataset.recorded_records():
-        if isinstance(record, Message) and record.channel.id in ids:
-            found.take(record)
-    return found.cameras()

@@ -1,21 +1,19 @@
-"""The page's data about a camera: its columns, timing and calibrations."""
+"""What the page shows of a camera: its columns, timing and calibrations."""
 
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import effective, lens_of
-from mp4ds.errors import OptionError
-from mp4ds.format.models import Calibration
+from mp4ds.errors import FormatError
+from mp4ds.plugins.intrinsics import calibration_changes
+from mp4ds.plugins.reporting.grid import Overlay, overlay_of
 from mp4ds.plugins.reporting.proxies import why_not_seen
 from mp4ds.times import (
     Floats,
@@ -26,78 +24,6 @@ from mp4ds.times import (
     nearest,
     usual_interval,
 )
-
-Scores = Mapping[str, NDArray[np.float32]]
-"""By metric name; one score per frame, NaN if there is none."""
-
-_MOST_SCORE_BYTES = 2**30
-_MOST_MEASURES = 16
-
-
-def read_scores(path: Path) -> dict[str, dict[str, NDArray[np.float32]]]:
-    """Scores of streams, from a JSON file ``{TOPIC: {MEASURE: [number or null, ...]}}``.
-
-    Args:
-        path: The file.
-
-    Returns:
-        By topic or name of a stream's file.
-
-    Raises:
-        OptionError: It cannot be read, or is not such a file.
-    """
-    try:
-        if path.stat().st_size > _MOST_SCORE_BYTES:
-            raise OptionError(f"`scores` {path} is larger than {_MOST_SCORE_BYTES} bytes.")
-        found = json.loads(path.read_bytes())
-    except OSError as error:
-        raise OptionError(f"`scores` {path} cannot be read: {error.strerror}.") from None
-    except (ValueError, RecursionError):
-        raise OptionError(f"`scores` {path} is not valid JSON.") from None
-    if not isinstance(found, dict):
-        raise _unlike(path)
-    return {topic: _measures(path, measures) for topic, measures in found.items()}
-
-
-def _measures(path: Path, measures: object) -> dict[str, NDArray[np.float32]]:
-    if not isinstance(measures, dict) or len(measures) > _MOST_MEASURES:
-        raise _unlike(path)
-    made = {}
-    for name, values in measures.items():
-        is_list = isinstance(values, list) and all(
-            value is None or (isinstance(value, int | float) and not isinstance(value, bool))
-            for value in values
-        )
-        if not is_list:
-            raise _unlike(path)
-        with np.errstate(over="ignore"):
-            numbers = [np.nan if value is None else float(value) for value in values]
-            made[name] = np.array(numbers, np.float32)
-    return made
-
-
-def _unlike(path: Path) -> OptionError:
-    return OptionError(
-        f'`scores` {path} is not of the form {{"/topic": {{"vmaf": [98.7, null, ...]}}}}, with at '
-        f"most {_MOST_MEASURES} metrics per topic."
-    )
-
-
-def scores_of(stream: Stream, scores: Mapping[str, Scores]) -> Scores:
-    """The scores of one stream.
-
-    Raises:
-        OptionError: Their number differs from that of the frames.
-    """
-    found = scores.get(stream.path.stem) or scores.get(stream.topic) or {}
-    for name, values in found.items():
-        if len(values) != len(stream):
-            raise OptionError(
-                f"{stream.topic} has {len(stream)} frames but {len(values)} scores {name!r}: give "
-                "one per frame, or null where there is none."
-            )
-    return found
-
 
 # ---------------------------------------------------------------- timing
 
@@ -284,156 +210,6 @@ def pack_floats(values: NDArray[np.float32]) -> str:
     return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
 
 
-# ---------------------------------------------------------------- grid
-
-_CELLS = 12  # over the width of the image
-_POINTS = 97  # of a line
-_MARGIN = 0.02  # of the image's sides, beyond which a line is cut
-_REACH, _FARTHEST = 2.5, 5  # times the image without distortion, from its principal point
-_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
-_MOST_D = 12  # beyond are the tilts of a sensor
-
-
-@dataclass(frozen=True)
-class Overlay:
-    """Lines over an image.
-
-    Attributes:
-        lines: Each a list of x, y, x, y ... as fractions of the image's width and height.
-        axes: Indices of the `lines` through the principal point.
-        center: x and y of the principal point, as fractions of the width and height.
-        problem: Why there are no lines; empty if there are.
-    """
-
-    lines: list[list[float]]
-    axes: list[int]
-    center: list[float]
-    problem: str = ""
-
-
-def overlay_of(calibration: Calibration, image_size: tuple[int, int], topic: str) -> Overlay:
-    """A grid of evenly spaced straight lines in a plane in front of the camera.
-
-    Args:
-        calibration: Of the camera.
-        image_size: Width and height of the images, pixels.
-        topic: Of the images: on image_proc's rectified topics P applies, without distortion.
-    """
-    k, p = (np.array(matrix) for matrix in effective(calibration.fields))
-    is_rectified = any(part.startswith("image_rect") for part in topic.split("/"))
-    matrix = p[:, :3] if is_rectified else k
-    model, d = ("none", []) if is_rectified else lens_of(calibration)
-    problem = _problem(calibration, matrix, model, d, image_size)
-    if problem:
-        return Overlay([], [], [], problem)
-    width, height = image_size
-    (fx, _, cx), (_, fy, cy) = matrix[0], matrix[1]
-    step = width / fx / _CELLS
-    lines: list[list[float]] = []
-    axes: list[int] = []
-    reach = [
-        min(_REACH * max(center, side - center), _FARTHEST * side)
-        for center, side in ((cx, width), (cy, height))
-    ]
-    ends = reach[0] / fx, reach[1] / fy
-    for axis in (0, 1):
-        along = np.linspace(-ends[1 - axis], ends[1 - axis], _POINTS)
-        for number in range(-int(ends[axis] / step), int(ends[axis] / step) + 1):
-            across = np.full(_POINTS, number * step)
-            x, y = (across, along) if axis == 0 else (along, across)
-            distorted_x, distorted_y, is_sound = _distort(x, y, model, d)
-            u = (fx * distorted_x + matrix[0, 1] * distorted_y + cx + 0.5) / width
-            v = (fy * distorted_y + cy + 0.5) / height
-            for line in _inside(u, v, is_sound):
-                axes += [len(lines)] if number == 0 else []
-                lines.append(line)
-    return Overlay(lines, axes, [round((cx + 0.5) / width, 5), round((cy + 0.5) / height, 5)])
-
-
-def _problem(
-    calibration: Calibration,
-    matrix: Floats,
-    model: str,
-    d: Sequence[float],
-    image_size: tuple[int, int],
-) -> str:
-    """Why no grid is possible."""
-    size = calibration.width, calibration.height
-    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
-        return "the camera is not calibrated"
-    roi = calibration.roi
-    cut = (roi.width or size[0], roi.height or size[1]) if roi else size
-    seen = cut[0] // max(1, calibration.binning_x), cut[1] // max(1, calibration.binning_y)
-    if 0 not in size and seen != image_size:
-        return f"it is for images of {seen[0]}x{seen[1]}, these are {image_size[0]}x{image_size[1]}"
-    if not any(d):
-        return ""
-    if model not in _MODELS:
-        return f"the distortion model {model!r} is not supported here"
-    if not np.isfinite(d).all() or any(d[_MOST_D:]):
-        return "its sensor is tilted, which is not supported"
-    return ""
-
-
-def _distort(
-    x: Floats, y: Floats, model: str, d: Sequence[float]
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Where a lens maps points of the plane at distance 1, and which of them are in view."""
-    if not any(d):
-        return x, y, np.ones(len(x), np.bool_)
-    with np.errstate(all="ignore"):  # far outside the view
-        if model == "equidistant":
-            return _fisheye(x, y, d)
-        return _polynomial(x, y, d)
-
-
-def _fisheye(x: Floats, y: Floats, d: Sequence[float]) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    coefficients = [*d[:4], *[0.0] * (4 - len(d[:4]))]
-    radius = np.hypot(x, y)
-    angle = np.arctan(radius)
-    square = angle * angle
-    factor, slope = np.ones_like(angle), np.ones_like(angle)
-    for power, value in enumerate(coefficients, 1):
-        factor += value * square**power
-        slope += (2 * power + 1) * value * square**power
-    scale = np.where(radius > 0, angle * factor / np.where(radius > 0, radius, 1.0), 1.0)
-    return x * scale, y * scale, (slope > 0) & (factor > 0)
-
-
-def _polynomial(
-    x: Floats, y: Floats, d: Sequence[float]
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = [*d[:_MOST_D], *[0.0] * (_MOST_D - len(d))][
-        :_MOST_D
-    ]
-    square = x * x + y * y
-    above = 1 + square * (k1 + square * (k2 + square * k3))
-    below = 1 + square * (k4 + square * (k5 + square * k6))
-    factor = above / below
-    # beyond its turning point the polynomial is meaningless
-    above_slope = k1 + square * (2 * k2 + square * 3 * k3)
-    below_slope = k4 + square * (2 * k5 + square * 3 * k6)
-    slope = factor + 2 * square * (above_slope * below - above * below_slope) / (below * below)
-    distorted_x = x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x)
-    distorted_y = y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y
-    distorted_x += square * (s1 + square * s2)
-    distorted_y += square * (s3 + square * s4)
-    return distorted_x, distorted_y, (slope > 0) & (below > 0)
-
-
-def _inside(u: Floats, v: Floats, is_sound: NDArray[np.bool_]) -> list[list[float]]:
-    """The parts of a line inside the image."""
-    with np.errstate(invalid="ignore"):
-        seen = is_sound & (np.abs(u - 0.5) < 0.5 + _MARGIN) & (np.abs(v - 0.5) < 0.5 + _MARGIN)
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], seen.astype(np.int8), [0]))))
-    parts = []
-    for start, end in edges.reshape(-1, 2):
-        if end - start > 1:
-            points = np.stack([u[start:end], v[start:end]], axis=1)
-            parts.append(np.round(points, 5).ravel().tolist())
-    return parts
-
-
 # ---------------------------------------------------------------- cameras
 
 _MOST_CALIBRATIONS = 64
@@ -455,7 +231,6 @@ class ReportedCamera:
         is_proxy: Whether that is a proxy.
         note: Why there is a proxy, or nothing to play.
         caption: How the pictures differ from the image.
-        scores: Of its frames.
     """
 
     stream: Stream
@@ -465,17 +240,6 @@ class ReportedCamera:
     is_proxy: bool = False
     note: str = ""
     caption: str = ""
-    scores: Scores = field(default_factory=dict)
-
-    @property
-    def stamps(self) -> NDArray[np.int64]:
-        """Header stamps, nanoseconds."""
-        return self.stream.stamps
-
-    @property
-    def log_times(self) -> NDArray[np.int64]:
-        """Log times, nanoseconds."""
-        return self.stream.log_times
 
     def check(self) -> None:
         """Read its columns.
@@ -485,22 +249,30 @@ class ReportedCamera:
         """
         _ = self.stream.columns
         _ = self.stream.infos and self.stream.infos.columns
-
-    def timing(self) -> Timing:
-        """Its timing statistics."""
-        return timing_of(self.stamps, self.log_times, self.stream.columns.seq)
+        _ = self._scores()
 
     def columns(self) -> dict[str, Any]:
         """All of its columns, for the page."""
         columns: dict[str, Any] = {
             "frames": len(self.stream),
-            "stamp": pack_column(self.stamps),
-            "log_time": pack_column(self.log_times),
-            "scores": {name: pack_floats(values) for name, values in self.scores.items()},
+            "stamp": pack_column(self.stream.stamps),
+            "log_time": pack_column(self.stream.log_times),
+            "scores": self._scores(),
         }
         if self.times is not None:
             columns["ticks"] = pack_column(self.times)
         return columns
+
+    def _scores(self) -> dict[str, str]:
+        """The score of each frame, if some were measured when packing."""
+        quality = self.stream.sidecar.video.quality
+        if quality is None:
+            return {}
+        try:
+            return {quality.metric: pack_floats(quality.decode(len(self.stream)).astype("<f4"))}
+        except ValueError as error:
+            place = f"{self.stream.path} at video.quality.scores"
+            raise FormatError("scores-invalid", place, str(error)) from None
 
     def facts(self, number: int, reference: ReportedCamera | None, untimed: str) -> dict[str, Any]:
         """What the page shows about it besides its columns.
@@ -510,7 +282,7 @@ class ReportedCamera:
             reference: The camera whose stamps it is compared with; None: none.
             untimed: Why its stamps are not compared; empty: they are.
         """
-        sidecar = self.stream.sidecar
+        stream, sidecar = self.stream, self.stream.sidecar
         return {
             "name": self.name,
             "columns": f"report/columns-{number}.js",
@@ -526,9 +298,9 @@ class ReportedCamera:
             "note": self.note,
             "caption": self.caption,
             "shown": self._shown(),
-            "timing": asdict(self.timing()),
+            "timing": asdict(timing_of(stream.stamps, stream.log_times, stream.columns.seq)),
             "untimed": untimed,
-            "offset": None if reference is None else _offset(self.stamps, reference.stamps),
+            "offset": None if reference is None else _offset(stream, reference.stream),
             **self._calibrations(),
         }
 
@@ -546,42 +318,29 @@ class ReportedCamera:
 
     def _calibrations(self) -> dict[str, Any]:
         """Each calibration that differs from the previous one, and its first frame."""
-        info = self.stream.sidecar.camera_info
-        if info is None:
-            return {"calibrations": [], "calibration_topic": "", "calibrations_more": 0}
-        columns = self.stream.infos.columns if self.stream.infos else None
-        changes: NDArray[np.integer[Any]]
-        frames: NDArray[np.integer[Any]]
-        variants: NDArray[np.integer[Any]]
-        if columns is None:
-            changes, frames = np.arange(len(info.calibrations)), np.zeros(1, np.int64)
-            variants = changes
-        else:
-            changes = np.flatnonzero(np.diff(columns.variant, prepend=-1))
-            variants = columns.variant[changes]
-            frames = np.searchsorted(self.log_times, columns.log_time[changes], side="left")
-            frames[0] = 0  # the first one also applies before it
+        info, changes = self.stream.sidecar.camera_info, calibration_changes(self.stream)
         listed: list[dict[str, Any]] = []
-        size = self.stream.image_size
-        pairs = zip(variants.tolist(), frames.tolist(), strict=False)
-        for variant, frame in list(pairs)[:_MOST_CALIBRATIONS]:
-            item = info.calibrations[variant]
+        for number, (item, _, log_time) in enumerate(changes[:_MOST_CALIBRATIONS]):
             made = item.model_dump(exclude={"template"})
-            if len(listed) < _MOST_OVERLAYS:
+            made["from_frame"] = 0  # the first one also applies before it
+            if number and log_time is not None:
+                made["from_frame"] = int(np.searchsorted(self.stream.log_times, log_time))
+            if number < _MOST_OVERLAYS:
+                size = self.stream.image_size
                 made["overlay"] = asdict(
                     overlay_of(item, size, self.stream.topic) if self._is_seen else _NOT_SEEN
                 )
-            listed.append({**made, "from_frame": frame})
+            listed.append(made)
         return {
             "calibrations": listed,
-            "calibration_topic": info.channel.topic,
+            "calibration_topic": info.channel.topic if info else "",
             "calibrations_more": max(0, len(changes) - _MOST_CALIBRATIONS),
         }
 
 
-def _offset(stamps: NDArray[np.int64], reference: NDArray[np.int64]) -> dict[str, float]:
+def _offset(stream: Stream, reference: Stream) -> dict[str, float]:
     """Statistics of the offsets to another camera, milliseconds."""
-    offsets = nearest_offsets(stamps, reference) / 1e6
+    offsets = nearest_offsets(stream.stamps, reference.stamps) / 1e6
     return {
         "median_ms": float(np.median(offsets)),
         "p99_ms": float(np.percentile(np.abs(offsets), 99)),

@@ -8,6 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import xxhash
 from numpy.typing import NDArray
 
 from mp4ds.dataset.stream import Stream
@@ -99,6 +100,12 @@ class Look:
         elif self._view.dtype != np.uint8:
             self._high = _range(_sampled(topic), _LOW, _WHITE)[1]
             self.caption = f"16 bits: white is {self._high:.0f}"
+
+    @classmethod
+    def of(cls, stream: Stream, size: tuple[int, int]) -> Look:
+        """The look of a stream."""
+        with closing(Topic([stream])) as topic:
+            return cls(topic, size)
 
     def picture(self, pixels: Pixels) -> Bytes:
         """A new picture, shape (H, W, 3).
@@ -240,40 +247,35 @@ def proxy_size(image_size: tuple[int, int], width: int) -> tuple[int, int]:
     return sides[0], sides[1]
 
 
-def proxy_key(stream: Stream, size: tuple[int, int]) -> str:
-    """A key that is equal if a proxy would be made the same way again; empty if unknown."""
-    digest = stream.sidecar.video.sha256
-    return (
-        f"{_VERSION} {digest} {size[0]}x{size[1]} crf={_CRF} {_PRESET} g={_GOP}" if digest else ""
-    )
+def proxy_name(stream: Stream, size: tuple[int, int]) -> str:
+    """Name of a proxy's file, the same only if it would be made in the same way again."""
+    how = f"{_VERSION} {stream.sidecar.video.sha256} {size[0]}x{size[1]} {_CRF} {_PRESET} {_GOP}"
+    return f"{stream.path.stem}-{xxhash.xxh64(how.encode()).hexdigest()}.mp4"
 
 
 def make_proxy(
     stream: Stream,
     path: Path,
+    look: Look,
     *,
     size: tuple[int, int],
     times: NDArray[np.int64],
     progress: Callable[[str], None],
-) -> str:
+) -> None:
     """Encode all frames of a stream, each at its own time, as H.264 that every browser plays.
 
     Args:
         stream: The stream.
         path: The file to make.
+        look: Makes its pictures.
         size: Width and height, even.
         times: See `presentation_times`.
         progress: Called with a phrase now and then.
-
-    Returns:
-        Its caption; see `Look`.
 
     Raises:
         VideoError: The stream's video cannot be decoded.
         OSError: It cannot be written.
     """
-    with closing(Topic([stream])) as topic:
-        look = Look(topic, size)
     recipe = recipe_for("rgb24", lossless=False, codec="h264", crf=_CRF, preset=_PRESET)
     span = int(times[-1] - times[0])
     encoder = VideoEncoder(
@@ -298,4 +300,3 @@ def make_proxy(
     except BaseException:
         path.unlink(missing_ok=True)
         raise
-    return look.caption

@@ -1,4 +1,4 @@
-"""``report``: a dataset as an HTML page next to its files.
+"""``report``: a dataset as an HTML page next to its files, or many datasets as a list of pages.
 
 index.html and a folder ``report`` are added to the dataset, or written elsewhere. The page plays
 the dataset's own videos if browsers can, else small proxies; its columns are exact.
@@ -6,22 +6,27 @@ the dataset's own videos if browsers can, else small proxies; its columns are ex
 
 from __future__ import annotations
 
-import json
+import html
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
-import numpy as np
-from numpy.typing import NDArray
-
+from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.stream import Stream
-from mp4ds.errors import FormatError, OptionError, SourceError, TargetExistsError
+from mp4ds.errors import (
+    FormatError,
+    Mp4dsError,
+    OptionError,
+    SourceError,
+    TargetExistsError,
+    counted,
+)
 from mp4ds.files.outputs import (
     as_write_error,
     check_target,
@@ -32,32 +37,28 @@ from mp4ds.files.outputs import (
     write_synced,
 )
 from mp4ds.files.urls import remote
-from mp4ds.options import WHERE, SliceOptions, force, option
-from mp4ds.plugins.reporting.cameras import ReportedCamera, Scores, read_scores, scores_of
-from mp4ds.plugins.reporting.page import (
-    FOLDER_NAME,
-    INDEX_NAME,
-    PROXIES_NAME,
-    TopicRow,
-    index_page,
-    topic_rows,
-    write_folder,
-)
+from mp4ds.options import WHERE, Options, force, iso_text, option
+from mp4ds.plugins.info import Brief, brief
+from mp4ds.plugins.reporting.cameras import ReportedCamera
+from mp4ds.plugins.reporting.page import FOLDER_NAME, INDEX_NAME, PAGE, write_folder
 from mp4ds.plugins.reporting.proxies import (
+    Look,
     make_proxy,
     presentation_times,
-    proxy_key,
+    proxy_name,
     proxy_size,
     why_not_in_browsers,
     why_not_seen,
 )
+from mp4ds.plugins.reporting.stills import StillOptions, frames
 
 PROXIES = ("auto", "all", "none")
-_KEYS_NAME = "proxies.json"
+_PROXIES, _PICTURES = "proxies", "pictures"
+_PICTURE_WIDTH = 240
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportOptions(SliceOptions):
+class ReportOptions(Options):
     """How to make a report."""
 
     output: Path | None = option(
@@ -75,7 +76,6 @@ class ReportOptions(SliceOptions):
     proxy_width: int = option(
         "Maximum width of a proxy.", 640, metavar="PIXELS", least=64, most=3840
     )
-    scores: Path | None = option("Quality scores per frame, to plot.", metavar="JSON")
     force: bool = force("Replace an index.html that is not a report.")
 
     def __post_init__(self) -> None:
@@ -133,7 +133,7 @@ def report(
 
     Args:
         dataset: A dataset, or one video with its sidecar, on this machine.
-        options: How. A slice is first made into a dataset, at `output`.
+        options: How.
         progress: Called with a phrase now and then.
 
     Raises:
@@ -146,21 +146,21 @@ def report(
     """
     chosen = options or ReportOptions()
     tell = progress or (lambda _: None)
-    if chosen.slice:
-        return _report_slice(dataset, chosen, tell)
     with Dataset(dataset) as opened:
-        if remote(opened.path):
-            raise SourceError(opened.path, "is not on this machine", "Copy the dataset first.")
+        _check_local(opened.path)
         if opened.manifest is None and chosen.output is None:
             raise OptionError("A single video has no folder for a report: give `output`.")
         folder = Path(os.path.abspath(chosen.output or opened.path))  # noqa: PTH100 - as named
-        _check_place(folder, force=chosen.force)
-        scores = _scores(opened, chosen.scores)
+        if folder.exists():
+            _check_index(folder, chosen)
+            check_target(folder / FOLDER_NAME, force=True, owned=listed_names)
+        else:
+            check_target(folder, force=False, owned=listed_names)
         try:
             is_new = not folder.exists()
             folder.mkdir(exist_ok=True)
             try:
-                return _write(opened, folder, chosen, scores, tell)
+                return _write(opened, folder, chosen, tell)
             except BaseException:
                 if is_new:
                     with suppress(OSError):
@@ -170,91 +170,48 @@ def report(
             raise as_write_error(error, folder) from error
 
 
-def _report_slice(
-    dataset: Path | str, options: ReportOptions, tell: Callable[[str], None]
-) -> ReportSummary:
-    """The report of a slice, which is first made into a dataset."""
-    from mp4ds.packing.options import PackOptions
-    from mp4ds.packing.pack import pack
-
-    if options.output is None:
-        raise OptionError("Give `output`: where to write the slice as a dataset with its report.")
-    tell("copying the slice")
-    span = PackOptions(
-        start=options.start, end=options.end, duration=options.duration, force=options.force
-    )
-    pack(dataset, options.output, span)
-    whole = replace(options, start=None, end=None, duration=None, output=None)
-    return report(options.output, whole, progress=tell)
+def _check_local(path: Path) -> None:
+    if remote(path):
+        raise SourceError(path, "is not on this machine", "Copy the dataset first.")
 
 
-def _scores(dataset: Dataset, path: Path | None) -> Mapping[str, Scores]:
-    """The scores of a file.
-
-    Raises:
-        OptionError: It has scores for an unknown stream.
-    """
-    scores = read_scores(path) if path else {}
-    for topic in scores:
-        if topic not in dataset:
-            known = ", ".join(dataset.topics) or "none"
-            raise OptionError(f"`scores` {path} has {topic!r}, which is not one of {known}.")
-    return scores
-
-
-def _check_place(folder: Path, *, force: bool) -> None:
-    """Refuse early if something must not be replaced.
-
-    Raises:
-        TargetError: Says what.
-    """
-    if folder.exists():
-        index = folder / INDEX_NAME
-        if os.path.lexists(index) and not is_page(index) and not force:
-            raise TargetExistsError(index)
-        check_target(folder / FOLDER_NAME, force=True, owned=listed_names)
-    else:
-        check_target(folder, force=False, owned=listed_names)
+def _check_index(folder: Path, options: ReportOptions) -> None:
+    """Refuse to replace a page of the user's."""
+    index = folder / INDEX_NAME
+    if os.path.lexists(index) and not is_page(index) and not options.force:
+        raise TargetExistsError(index)
 
 
 def _write(
-    dataset: Dataset,
-    folder: Path,
-    options: ReportOptions,
-    scores: Mapping[str, Scores],
-    tell: Callable[[str], None],
+    dataset: Dataset, folder: Path, options: ReportOptions, tell: Callable[[str], None]
 ) -> ReportSummary:
     target = folder / FOLDER_NAME
     problems: list[str] = []
     with staged(target, force=True, owned=listed_names) as path:
         path.mkdir()
-        proxies = _Proxies(old=target, new=path)
         cameras = []
-        for camera in _cameras(dataset, scores, problems):
+        for camera in _cameras(dataset, problems):
             try:
-                _give_video(camera, folder, options, proxies, tell)
+                _give_video(camera, folder, path, options, tell)
             except FormatError as error:
                 camera.note = str(error)
                 problems.append(str(error))
             cameras.append(camera)
-        proxies.write_keys()
         tell("topics")
-        write_folder(path, dataset, cameras, _topics(dataset, problems), problems)
+        write_folder(path, dataset, cameras, problems)
         write_listing(path)
-    write_synced(folder / INDEX_NAME, index_page())
-    return _summary(dataset, folder, cameras, problems)
+    write_synced(folder / INDEX_NAME, (PAGE / INDEX_NAME).read_bytes())
+    return _summary(folder, cameras, problems)
 
 
-def _cameras(
-    dataset: Dataset, scores: Mapping[str, Scores], problems: list[str]
-) -> Iterator[ReportedCamera]:
+def _cameras(dataset: Dataset, problems: list[str]) -> Iterator[ReportedCamera]:
     """The streams by topic; those whose columns cannot be read become problems."""
     streams = sorted(dataset.streams, key=lambda stream: (stream.topic, stream.path.stem))
     topics = Counter(stream.topic for stream in streams)
     for stream in streams:
         alone = topics[stream.topic] == 1
         name = stream.topic if alone else f"{stream.topic} ({stream.path.stem})"
-        camera = ReportedCamera(stream, name, scores=scores_of(stream, scores))
+        camera = ReportedCamera(stream, name)
         try:
             camera.check()
         except FormatError as error:
@@ -263,19 +220,11 @@ def _cameras(
         yield camera
 
 
-def _topics(dataset: Dataset, problems: list[str]) -> list[TopicRow]:
-    try:
-        return topic_rows(dataset)
-    except (FormatError, SourceError) as error:
-        problems.append(str(error))
-        return []
-
-
 def _give_video(
     camera: ReportedCamera,
     folder: Path,
+    made: Path,
     options: ReportOptions,
-    proxies: _Proxies,
     tell: Callable[[str], None],
 ) -> None:
     """Find or make what the page plays of a camera.
@@ -289,77 +238,41 @@ def _give_video(
     camera.note = unplayable or why_not_seen(stream)
     if options.proxies == "all" or (camera.note and options.proxies == "auto"):
         camera.note = camera.note or "requested"
-        camera.video, camera.caption = proxies.give(stream, camera.times, options.proxy_width, tell)
+        size = proxy_size(stream.image_size, options.proxy_width)
+        name = proxy_name(stream, size)
+        (made / _PROXIES).mkdir(exist_ok=True)
+        old, new = folder / FOLDER_NAME / _PROXIES / name, made / _PROXIES / name
+        look = Look.of(stream, size)
+        # an old video may have no digest, by which to tell whether it has changed
+        if stream.sidecar.video.sha256 is None or not _taken(old, new):
+            make_proxy(stream, new, look, size=size, times=camera.times, progress=tell)
+        camera.video, camera.caption = f"{FOLDER_NAME}/{_PROXIES}/{quote(name)}", look.caption
         camera.is_proxy = True
     elif not unplayable:
-        camera.video = _url(stream.video_path, folder)
+        path = os.path.relpath(stream.video_path.resolve(), folder.resolve())
+        camera.video = quote(Path(path).as_posix())
 
 
-def _url(path: Path, folder: Path) -> str:
-    """URL of a file, relative to a page in a folder."""
-    return quote(Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix())
-
-
-class _Proxies:
-    """The proxies of a report in progress, and those of the previous one."""
-
-    def __init__(self, *, old: Path, new: Path) -> None:
-        self._old = old / PROXIES_NAME
-        self._new = new / PROXIES_NAME
-        self._known: dict[str, list[str]] = {}
-        self._made: dict[str, list[str]] = {}
-        with suppress(OSError, ValueError, AttributeError):
-            found = json.loads((self._old / _KEYS_NAME).read_bytes())
-            self._known = {str(name): [str(part) for part in item] for name, item in found.items()}
-
-    def give(
-        self, stream: Stream, times: NDArray[np.int64], width: int, tell: Callable[[str], None]
-    ) -> tuple[str, str]:
-        """Make a proxy, or reuse an earlier one.
-
-        Returns:
-            Its URL relative to the page, and its caption.
-        """
-        self._new.mkdir(exist_ok=True)
-        name = f"{stream.path.stem}.mp4"
-        size = proxy_size(stream.image_size, width)
-        key = proxy_key(stream, size)
-        known = self._known.get(name, [])
-        if key and len(known) == 2 and known[0] == key and self._take(name):
-            caption = known[1]
-        else:
-            caption = make_proxy(stream, self._new / name, size=size, times=times, progress=tell)
-        self._made[name] = [key, caption]
-        return f"{FOLDER_NAME}/{PROXIES_NAME}/{quote(name)}", caption
-
-    def _take(self, name: str) -> bool:
-        """Reuse an old proxy in the new report."""
+def _taken(old: Path, new: Path) -> bool:
+    """Whether a proxy of the previous report could be taken: its name says how it was made."""
+    try:
+        os.link(old, new)
+    except OSError:
         try:
-            os.link(self._old / name, self._new / name)
+            shutil.copyfile(old, new)
         except OSError:
-            try:
-                shutil.copyfile(self._old / name, self._new / name)
-            except OSError:
-                (self._new / name).unlink(missing_ok=True)
-                return False
-        return True
-
-    def write_keys(self) -> None:
-        """Write the keys of the proxies, for the next report."""
-        if self._made:
-            (self._new / _KEYS_NAME).write_text(json.dumps(self._made))
+            new.unlink(missing_ok=True)
+            return False
+    return True
 
 
-def _summary(
-    dataset: Dataset, folder: Path, cameras: list[ReportedCamera], problems: list[str]
-) -> ReportSummary:
+def _summary(folder: Path, cameras: list[ReportedCamera], problems: list[str]) -> ReportSummary:
     own = [folder / INDEX_NAME, *(p for p in (folder / FOLDER_NAME).rglob("*") if p.is_file())]
-    videos = [c.stream.video_path for c in cameras if c.video and not c.is_proxy]
-    everything = [*own, *(video.resolve() for video in videos)]
-    base = Path(os.path.commonpath([folder.resolve(), *(v.resolve().parent for v in videos)]))
+    videos = [c.stream.video_path.resolve() for c in cameras if c.video and not c.is_proxy]
+    base = Path(os.path.commonpath([folder.resolve(), *(video.parent for video in videos)]))
     return ReportSummary(
         index=folder / INDEX_NAME,
-        files={_place(path, base): path for path in everything},
+        files={_place(path, base): path for path in (*own, *videos)},
         cameras=[
             CameraSummary(
                 c.name, "proxy" if c.is_proxy else "video" if c.video else "nothing", c.note
@@ -374,3 +287,127 @@ def _summary(
 def _place(path: Path, base: Path) -> str:
     resolved = path.parent.resolve() / path.name
     return f"/{resolved.relative_to(base).as_posix()}"
+
+
+# ---------------------------------------------------------------- many datasets
+
+
+@dataclass(frozen=True)
+class OverviewSummary:
+    """A page of several datasets.
+
+    Attributes:
+        index: The page.
+        datasets: Number of datasets shown.
+        problems: What could not be shown.
+    """
+
+    index: Path
+    datasets: int
+    problems: list[str] = field(default_factory=list)
+
+
+def reports(
+    datasets: Paths,
+    folder: Path | str,
+    options: ReportOptions | None = None,
+    *,
+    jobs: int = 1,
+    progress: Callable[[str, float | None], None] | None = None,
+) -> OverviewSummary:
+    """Make the report of each dataset, and a page that shows them all.
+
+    Args:
+        datasets: Datasets, folders of them, or patterns; on this machine.
+        folder: Where to make the page. Each report is in its dataset.
+        options: How the reports are made; without `output`.
+        jobs: Datasets at a time.
+        progress: Called with a phrase, and the share done.
+
+    Raises:
+        SourceError: A path is not a dataset.
+        TargetError: The page cannot be written there.
+        WriteError: The page could not be written.
+    """
+    chosen = options or ReportOptions()
+    found = datasets_in(datasets)
+    for path in found:
+        _check_local(path)
+    place = Path(os.path.abspath(folder))  # noqa: PTH100 - as named
+    _check_index(place, chosen)
+    tell = progress or (lambda *_: None)
+    rows, problems = [], []
+    try:
+        place.mkdir(exist_ok=True)
+        with staged(place / FOLDER_NAME, force=True, owned=listed_names) as made:
+            (made / _PICTURES).mkdir(parents=True)
+            (made / "report.css").write_bytes((PAGE / "report.css").read_bytes())
+            work = partial(_shown, options=chosen, pictures=made / _PICTURES)
+            numbered = [*enumerate(found)]
+            for (number, path), (known, wrong) in each(work, numbered, jobs):
+                tell(f"{number + 1} of {len(found)}: {path.name}", (number + 1) / len(found))
+                problems += wrong
+                rows.append(_row(path, known, number, place, made))
+            write_listing(made)
+        page = _page(html.escape(place.name), _facts(found, problems), rows)
+        write_synced(place / INDEX_NAME, page.encode())
+    except OSError as error:
+        raise as_write_error(error, place) from error
+    return OverviewSummary(place / INDEX_NAME, len(found), problems)
+
+
+def _shown(
+    item: tuple[int, Path], options: ReportOptions, pictures: Path
+) -> tuple[Brief | None, list[str]]:
+    """Make report and picture of one dataset; returns its summary and any problems."""
+    number, path = item
+    try:
+        known = brief(path)
+        problems = report(path, options).problems
+        if known.frames:
+            topic = next(iter(known.frames))
+            with Dataset(path) as dataset:
+                middle = len(dataset[topic]) // 2
+                scale = min(1.0, _PICTURE_WIDTH / dataset[topic].image_size[0])
+            still = StillOptions(topic=topic, at=middle, resize=scale)
+            frames(path, pictures / f"{number}.jpg", still)
+    except Mp4dsError as error:
+        with suppress(Mp4dsError):
+            return brief(path), [str(error)]
+        return None, [str(error)]
+    return known, problems
+
+
+def _page(title: str, facts: str, rows: Sequence[str]) -> str:
+    page = (PAGE / "overview.html").read_text(encoding="utf-8")
+    for name, text in (("title", title), ("facts", facts), ("rows", "\n".join(rows))):
+        page = page.replace(f"<!--{name}-->", text)
+    return page
+
+
+def _facts(found: Sequence[Path], problems: Sequence[str]) -> str:
+    known = [counted(len(found), "dataset")]
+    known += [f"not shown: {html.escape(problem)}" for problem in problems]
+    return "<br>".join(known)
+
+
+def _row(path: Path, known: Brief | None, number: int, place: Path, made: Path) -> str:
+    link = quote(Path(os.path.relpath(path / INDEX_NAME, place)).as_posix())
+    name = html.escape(os.path.relpath(path, place))
+    picture = ""
+    if (made / _PICTURES / f"{number}.jpg").exists():
+        picture = f'<img src="{FOLDER_NAME}/{_PICTURES}/{number}.jpg" alt="" loading="lazy">'
+    cells = ["", "", "", "", ""]
+    if known is not None:
+        if known.title:
+            name += f"<br><span class=muted>{html.escape(known.title)}</span>"
+        start = known.start
+        cells = [
+            "" if start is None else iso_text(start - start % 10**9).replace("T", " ").rstrip("Z"),
+            f"{known.seconds:.1f} s",
+            "<br>".join(f"{html.escape(t)}: {n}" for t, n in sorted(known.frames.items())),
+            f"{known.bytes / 1e6:.1f} MB",
+            html.escape(known.profile),
+        ]
+    body = "".join(f"<td>{cell}</td>" for cell in cells)
+    return f'<tr><td>{picture}</td><td><a href="{link}">{name}</a></td>{body}</tr>'

@@ -353,7 +353,7 @@ var mp4dsReport = (() => {
     view = report.view = new mp4dsPlots.View(player.end);
     timeline = new mp4dsTimeline.Timeline(find("timeline"), player, view);
     const facts = data.summary;
-    find("subtitle").textContent = [facts.start_text, facts.format && `from ${facts.format}`, (facts.sources || []).slice(0, 4).join(", ")].filter(Boolean).join(" · ");
+    find("subtitle").textContent = [facts.start && mp4dsTables.dateText(BigInt(facts.start)).replace(/\.\d+/, ""), facts.format && `from ${facts.format}`, (facts.sources || []).slice(0, 4).join(", ")].filter(Boolean).join(" · ");
     const length = facts.start ? Number(BigInt(facts.end) - BigInt(facts.start)) / 1e9 : player.end / 1e9;
     mp4dsTables.summary(find("summary"), data, length);
     find("timing-hint").textContent = mp4dsTables.timing(find("timing"), data);

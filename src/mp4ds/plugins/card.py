@@ -11,7 +11,7 @@ from typing import Any
 
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
-from mp4ds.plugins.reporting.overview import Brief, brief
+from mp4ds.plugins.info import Brief, brief
 
 _LICENSES = frozenset(
     [
