@@ -490,9 +490,9 @@ def test_no_recovery_while_it_is_packed(killed: tuple[list[Path], Path], tmp_pat
     """The process that packs may live a little longer than its recorder."""
     _, folder = killed
     spool = SpoolFolder(folder)
-    with spool.locked(shared=True), spool.locked(shared=True):
-        with pytest.raises(SourceError, match="is being recorded"):
-            mp4ds.pack(folder, tmp_path / "salvaged", SALVAGE)
+    recorded = pytest.raises(SourceError, match="is being recorded")
+    with spool.locked(shared=True), spool.locked(shared=True), recorded:
+        mp4ds.pack(folder, tmp_path / "salvaged", SALVAGE)
     with spool.locked(), pytest.raises(SourceError, match="is being recovered"):
         spool.locked(shared=True)
 
