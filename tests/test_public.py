@@ -241,7 +241,7 @@ def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
     others = [
         *("typer", "rich", "jsonschema", "google.protobuf", "sqlite3", "fsspec", "PIL"),
         *("rosbags.rosbag2", "mp4ds.bags.rosbag2", "mp4ds.bags.convert"),
-        *("mp4ds.plugins.importing.layouts", "mp4ds.video.libvmaf", "mp4ds.packing.target"),
+        *("mp4ds.plugins.importing.layouts", "mp4ds.video.scores", "mp4ds.packing.target"),
         *("mp4ds.dataset.topic", "mp4ds.packing.coordinator", "mp4ds.plugins.importing.ros_mp4"),
         *("mp4ds.video.vp9", "mp4ds.messages.protobuf"),
     ]

@@ -26,8 +26,7 @@ from mp4ds.packing.target import CrfControl, window_frames
 from mp4ds.plan import QualityTarget, parse_quality
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
-from mp4ds.video.libvmaf import find_ffmpeg
-from mp4ds.video.scores import largest_crf, vmaf_scores
+from mp4ds.video.scores import find_ffmpeg, largest_crf, scores_of
 from round_trips import unpacked
 from scenes import Record, Scene, instant, scene, together
 from sources import SOURCES
@@ -369,7 +368,7 @@ def test_vmaf(tmp_path: Path) -> None:
     chroma = np.full((2, HEIGHT // 2, WIDTH // 2), 128, np.uint8)
     originals = [(luma(n, noises[n // WINDOW]), *chroma) for n in range(WINDOW * len(noises))]
     made = [(y, *chroma) for y in decoded(tmp_path / "dataset/cam_image_raw.mp4")]
-    own = vmaf_scores(originals, made, ffmpeg=find_ffmpeg(), before=originals[1])
+    own = scores_of(originals, made, ["vmaf"], ffmpeg=find_ffmpeg(), before=originals[1])["vmaf"]
     # but for the first and last frames of windows, which tell less of what moves
     inner = np.arange(len(own)) % WINDOW
     same = (inner > 0) & (inner < WINDOW - 1)
@@ -399,7 +398,7 @@ def test_without_libvmaf_it_is_said_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = recording(tmp_path, [0.0])
-    monkeypatch.setattr("mp4ds.video.libvmaf._can_score", lambda path: False)
+    monkeypatch.setattr("mp4ds.video.scores._can_score", lambda path: False)
     with pytest.raises(ScoringError, match=r"pip install 'mp4ds\[vmaf\]'"):
         mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="vmaf=95"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]

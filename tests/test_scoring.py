@@ -22,8 +22,18 @@ import pytest
 from numpy.typing import NDArray
 
 from mp4ds.errors import ScoringError
-from mp4ds.video.libvmaf import VMAF_MODEL, Ffmpeg, find_ffmpeg
-from mp4ds.video.scores import MAX_PSNR, METRICS, Scorer, YuvFrame, psnr, ssim, summary_of
+from mp4ds.video.scores import (
+    MAX_PSNR,
+    METRICS,
+    VMAF_MODEL,
+    Ffmpeg,
+    YuvFrame,
+    find_ffmpeg,
+    psnr,
+    scores_of,
+    ssim,
+    summary_of,
+)
 from waiting import WATCHDOG_S, until
 
 FRAMES = 8
@@ -167,11 +177,10 @@ def test_vmaf_is_that_of_another_build(
     assert Ffmpeg(program).version != ours.version
     original = clip(size, bits=bits, noise=0.005)
     made = coded(original, crf, bits)
-    scores = Scorer(ours).score(original, made)
+    scores = scores_of(original, made, ffmpeg=ours)
     log = vmaf_of_files(program, tmp_path, original, made, bits)
-    assert scores.vmaf is not None
-    assert 0 < scores.vmaf.min() <= scores.vmaf.max() < 100  # of neither bound
-    assert np.abs(scores.vmaf - vmaf_in(log)).max() < 0.01
+    assert 0 < scores["vmaf"].min() <= scores["vmaf"].max() < 100  # of neither bound
+    assert np.abs(scores["vmaf"] - vmaf_in(log)).max() < 0.01
 
 
 @needs_vmaf
@@ -183,12 +192,11 @@ def test_vmaf_is_that_of_the_same_build_on_files(
     """Whatever the frames are: no frame goes astray in the pipe."""
     ours = find_ffmpeg()
     original, made = clip(size, bits=bits), clip(size, bits=bits, noise=0.08)
-    scores = Scorer(ours).score(original, made)
+    scores = scores_of(original, made, ffmpeg=ours)
     log = vmaf_of_files(ours.path, tmp_path, original, made, bits)
-    assert scores.vmaf is not None
-    assert len(set(scores.vmaf)) == FRAMES
-    assert (scores.vmaf == vmaf_in(log)).all()
-    pooled, summary = log["pooled_metrics"]["vmaf"], scores.summaries()["vmaf"]
+    assert len(set(scores["vmaf"])) == FRAMES
+    assert (scores["vmaf"] == vmaf_in(log)).all()
+    pooled, summary = log["pooled_metrics"]["vmaf"], summary_of(scores["vmaf"])
     assert summary.mean == pytest.approx(pooled["mean"], abs=1e-5)
     assert summary.harmonic_mean == pytest.approx(pooled["harmonic_mean"], abs=1e-5)
     assert summary.minimum == pytest.approx(pooled["min"], abs=1e-5)
@@ -201,7 +209,7 @@ def test_psnr_and_ssim_are_those_of_ffmpeg(
     size: tuple[int, int], bits: int, tmp_path: Path
 ) -> None:
     original, made = clip(size, bits=bits), clip(size, bits=bits, noise=0.03)
-    scores = Scorer(None).score(original, made)
+    scores = scores_of(original, made)
     filtered(
         find_ffmpeg().path, tmp_path,
         raw(tmp_path / "made", made), raw(tmp_path / "original", original), size, bits,
@@ -217,7 +225,7 @@ def test_psnr_and_ssim_are_those_of_ffmpeg(
         words = [dict(word.split(":") for word in line.split() if ":" in word) for line in lines]
         theirs = np.array([float(word[key]) for word in words])
         assert len(theirs) == FRAMES
-        assert np.abs(getattr(scores, name) - theirs).max() <= step, name
+        assert np.abs(scores[name] - theirs).max() <= step, name
 
 
 # ---------------------------------------------------------------- what is scored
@@ -226,13 +234,13 @@ def test_psnr_and_ssim_are_those_of_ffmpeg(
 def test_identical_frames_have_the_highest_scores() -> None:
     for bits in (8, 10):
         frames = clip((64, 48), bits=bits, noise=0.05)
-        scores = Scorer(None).score(frames, frames)
-        assert scores.vmaf is None
-        assert len(scores) == FRAMES
+        scores = scores_of(frames, frames)
+        assert {name: len(values) for name, values in scores.items()} == dict.fromkeys(
+            METRICS[1:], FRAMES
+        )
         for name in METRICS[1:4]:
-            assert (getattr(scores, name) == MAX_PSNR[bits]).all()
-        assert np.allclose(scores.ssim, 1.0)
-        assert set(scores.summaries()) == set(METRICS[1:])
+            assert (scores[name] == MAX_PSNR[bits]).all()
+        assert np.allclose(scores["ssim"], 1.0)
 
 
 @needs_vmaf
@@ -240,8 +248,7 @@ def test_the_ceiling_of_noisy_frames_is_below_that_of_clean_ones() -> None:
     ceiling = {}
     for noise in (0.0, 0.05):
         frames = clip((160, 120), noise=noise)
-        vmaf = Scorer(find_ffmpeg()).score(frames, frames).vmaf
-        assert vmaf is not None
+        vmaf = scores_of(frames, frames, ["vmaf"], ffmpeg=find_ffmpeg())["vmaf"]
         ceiling[noise] = float(vmaf.mean())
     assert 95 < ceiling[0.0] <= 100
     assert 95 < ceiling[0.05] <= 100
@@ -276,11 +283,10 @@ def test_summaries() -> None:
 def test_frames_may_be_views_with_padded_rows() -> None:
     frames, made = clip((64, 48)), clip((64, 48), noise=0.02)
     wide = [tuple(np.pad(plane, ((0, 0), (0, 9)))[:, :-9] for plane in frame) for frame in made]
-    scorer = Scorer(find_ffmpeg())
-    plain, padded = scorer.score(frames, made), scorer.score(frames, wide)  # type: ignore[arg-type]
-    assert plain.vmaf is not None
-    assert padded.vmaf is not None
-    assert (plain.vmaf == padded.vmaf).all()
+    ours = find_ffmpeg()
+    plain = scores_of(frames, made, ffmpeg=ours)
+    padded = scores_of(frames, wide, ffmpeg=ours)  # type: ignore[arg-type]
+    assert (plain["vmaf"] == padded["vmaf"]).all()
 
 
 @needs_vmaf
@@ -294,10 +300,10 @@ def test_memory_is_that_of_a_few_frames() -> None:
             y = rng.integers(0, 255, (size[1], size[0]), np.uint8)
             yield y, y[::2, ::2], y[1::2, ::2]
 
-    scorer = Scorer(find_ffmpeg())
+    ours = find_ffmpeg()
     tracemalloc.start()
     try:
-        scorer.score(generated(1), generated(2))
+        scores_of(generated(1), generated(2), ffmpeg=ours)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -324,14 +330,14 @@ def test_frames_that_do_not_match(
     original: list[YuvFrame], made: list[YuvFrame], said: str
 ) -> None:
     with pytest.raises(ScoringError, match=said):
-        Scorer(None).score(original, made)
+        scores_of(original, made)
 
 
 def test_planes_of_no_such_frame() -> None:
     y, u, v = clip((64, 48))[0]
     for frame in ((y, u, v[:, :-1]), (y, u), (y.astype(np.float32), u, v)):
         with pytest.raises(ScoringError):
-            Scorer(None).score([frame], [frame])  # type: ignore[list-item]
+            scores_of([frame], [frame])  # type: ignore[list-item]
 
 
 def program(folder: Path, script: str) -> str:
@@ -357,13 +363,13 @@ def program(folder: Path, script: str) -> str:
 def test_a_process_that_fails(script: str, said: str, tmp_path: Path) -> None:
     frames = clip((322, 242))  # more than a pipe holds
     with pytest.raises(ScoringError, match=said):
-        Scorer(Ffmpeg(program(tmp_path, script))).score(frames, frames)
+        scores_of(frames, frames, ffmpeg=Ffmpeg(program(tmp_path, script)))
 
 
 def test_a_program_that_is_not_there(tmp_path: Path) -> None:
     frames = clip((64, 48))
     with pytest.raises(ScoringError, match="cannot be run"):
-        Scorer(Ffmpeg(str(tmp_path / "none"))).score(frames, frames)
+        scores_of(frames, frames, ffmpeg=Ffmpeg(str(tmp_path / "none")))
 
 
 @pytest.mark.parametrize("on_path", [False, True])
@@ -402,7 +408,7 @@ def test_an_error_of_the_caller_leaves_no_process(monkeypatch: pytest.MonkeyPatc
     ffmpeg = find_ffmpeg()
     monkeypatch.setattr(subprocess, "Popen", recorded)
     with pytest.raises(KeyboardInterrupt):
-        Scorer(ffmpeg).score(clip((64, 48), frames=20), broken())
+        scores_of(clip((64, 48), frames=20), broken(), ffmpeg=ffmpeg)
     assert len(started) == 1
     assert started[0].poll() is not None
 
@@ -412,12 +418,11 @@ import itertools, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # where the tests are run in background
 sys.path.insert(0, {tests!r})
 from test_scoring import clip
-from mp4ds.video.libvmaf import find_ffmpeg
-from mp4ds.video.scores import Scorer
+from mp4ds.video.scores import find_ffmpeg, scores_of
 ffmpeg = find_ffmpeg()
 print("ready", flush=True)
 frames = itertools.cycle(clip((64, 48)))
-Scorer(ffmpeg).score(frames, itertools.cycle(clip((64, 48))))
+scores_of(frames, itertools.cycle(clip((64, 48))), ffmpeg=ffmpeg)
 """
 
 

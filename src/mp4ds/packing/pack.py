@@ -473,7 +473,7 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
         )
     codec = checked_codec(quality, options.codec, options.preset, options.purpose)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
-        from mp4ds.video.libvmaf import find_ffmpeg
+        from mp4ds.video.scores import find_ffmpeg
 
         find_ffmpeg()  # fails before anything is read, saying how to get one
     transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))

@@ -25,10 +25,9 @@ from mp4ds.plan import QualityTarget
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import LEAST_CRF, MAX_CRF, Recipe
 from mp4ds.video.encoder import VideoEncoder, coded_size
-from mp4ds.video.libvmaf import Ffmpeg, find_ffmpeg
 from mp4ds.video.packets import join_segments
 from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
-from mp4ds.video.scores import SMALLEST, largest_crf, psnr_scores, ssim_scores, vmaf_scores
+from mp4ds.video.scores import SMALLEST, Ffmpeg, find_ffmpeg, largest_crf, scores_of
 
 FALLS = {"vmaf": 0.3, "psnr": 0.4, "ssim": 0.001}
 """Metric -> about how much it drops per crf step, near typical targets."""
@@ -245,15 +244,12 @@ class WindowCoder:
         return float(np.mean(scores)) / SCORE_STEPS[self.target.metric]
 
     def _scores(self, frames: PlaneSpool, decoded: Iterable[Planes]) -> NDArray[np.int64]:
-        if self.ffmpeg is not None:
-            # motion in the first frame is measured with the second
-            before = frames.frame(1) if len(frames) > 1 else None
-            found = vmaf_scores(
-                frames, decoded, ffmpeg=self.ffmpeg, threads=self.threads, before=before
-            )
-        else:
-            measure = psnr_scores if self.target.metric == "psnr" else ssim_scores
-            found = measure(frames, decoded)
+        metric = "psnr_y" if self.target.metric == "psnr" else self.target.metric
+        # motion in the first frame is measured with the second
+        before = frames.frame(1) if self.ffmpeg is not None and len(frames) > 1 else None
+        found = scores_of(
+            frames, decoded, [metric], ffmpeg=self.ffmpeg, threads=self.threads, before=before
+        )[metric]
         return np.rint(found * SCORE_STEPS[self.target.metric]).astype(np.int64)
 
 

@@ -6,17 +6,23 @@ optional package imageio-ffmpeg, or one on the PATH.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain, zip_longest
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.errors import ScoringError
-from mp4ds.video.libvmaf import Ffmpeg, VmafProcess, scoring_process
 
 Plane = NDArray[Any]
 """Samples of one plane, uint8 or uint16, shape (rows, columns)."""
@@ -110,33 +116,6 @@ class ScoreSummary:
     minimum: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scores:
-    """Scores of each frame of a clip, float64, shape (frames,).
-
-    Attributes:
-        vmaf: 0 to 100; None if there is no libvmaf.
-        psnr_y: Of luma, dB.
-        psnr_cb: Of blue chroma, dB.
-        psnr_cr: Of red chroma, dB.
-        ssim: Of luma, at most 1.
-    """
-
-    vmaf: NDArray[np.float64] | None
-    psnr_y: NDArray[np.float64]
-    psnr_cb: NDArray[np.float64]
-    psnr_cr: NDArray[np.float64]
-    ssim: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.psnr_y)
-
-    def summaries(self) -> dict[str, ScoreSummary]:
-        """A summary of each of `METRICS`; without VMAF if it was not computed."""
-        found = {name: getattr(self, name) for name in METRICS}
-        return {name: summary_of(values) for name, values in found.items() if values is not None}
-
-
 def summary_of(values: NDArray[np.float64]) -> ScoreSummary:
     """Summarise the scores of frames.
 
@@ -151,7 +130,192 @@ def summary_of(values: NDArray[np.float64]) -> ScoreSummary:
     )
 
 
-# ---------------------------------------------------------------- scorer
+# ---------------------------------------------------------------- libvmaf
+
+VMAF_MODEL = "vmaf_v0.6.1"
+"""For a screen of 1080 rows. That for 4K is not used, whatever the size: scores of cameras of
+different sizes would not compare."""
+
+_ASK_SECONDS = 30
+_END_SECONDS = 5
+_LOG = "vmaf.json"
+_MISSING = (
+    "VMAF needs an ffmpeg with libvmaf. Install one with pip install 'mp4ds[vmaf]', or put one "
+    "on the PATH"
+)
+
+
+@dataclass(frozen=True)
+class Ffmpeg:
+    """An ffmpeg that has libvmaf.
+
+    Attributes:
+        path: The program.
+    """
+
+    path: str
+
+    @cached_property
+    def version(self) -> str:
+        """Its version, as it reports it."""
+        first = _ask(self.path, "-version").partition("\n")[0]
+        found = re.match(r"ffmpeg version (\S+)", first)
+        return found[1] if found else first
+
+
+def find_ffmpeg() -> Ffmpeg:
+    """Find an ffmpeg with libvmaf: the one of the package imageio-ffmpeg, or one on the PATH.
+
+    Raises:
+        ScoringError: There is none; says how to get one.
+    """
+    for path in (_packaged(), shutil.which("ffmpeg")):
+        if path and _can_score(path):
+            return Ffmpeg(path)
+    raise ScoringError(f"{_MISSING}.")
+
+
+def _packaged() -> str | None:
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        return None
+    with suppress(RuntimeError):  # it has no program for this machine
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    return None
+
+
+def _can_score(path: str) -> bool:
+    # options of libvmaf 2 and later; older ones need the models as files
+    return bool(re.search(r"^ +model +<string>", _ask(path, "-h", "filter=libvmaf"), re.MULTILINE))
+
+
+def _ask(path: str, *arguments: str) -> str:
+    with suppress(OSError, subprocess.TimeoutExpired):
+        done = subprocess.run(
+            [path, "-hide_banner", *arguments],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_ASK_SECONDS,
+            check=False,
+        )
+        return done.stdout.decode(errors="replace")
+    return ""
+
+
+@contextmanager
+def scoring_process(
+    ffmpeg: Ffmpeg, *, width: int, height: int, pixel_format: str, threads: int
+) -> Iterator[VmafProcess]:
+    """An ffmpeg that scores the frames written to it; it ends with the block.
+
+    Args:
+        ffmpeg: The program.
+        width: Columns of a frame, even.
+        height: Rows of a frame, even.
+        pixel_format: ``yuv420p`` or ``yuv420p10le``.
+        threads: For libvmaf.
+
+    Raises:
+        ScoringError: It cannot be started.
+    """
+    with tempfile.TemporaryDirectory(prefix="mp4ds-") as name:
+        folder = Path(name)
+        with (folder / "stderr").open("wb") as stderr:
+            command = _command(ffmpeg.path, width, height, pixel_format, threads)
+            try:
+                process: Any = subprocess.Popen(
+                    command,
+                    cwd=folder,  # a name without a path needs no escapes in a filter
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=stderr,
+                    start_new_session=True,  # Ctrl-C is for the one that ends it
+                )
+            except OSError as error:
+                raise ScoringError(f"{ffmpeg.path} cannot be run: {error.strerror}.") from None
+            try:
+                yield VmafProcess(process, folder)
+            finally:
+                _end(process)
+
+
+def _command(path: str, width: int, height: int, pixel_format: str, threads: int) -> list[str]:
+    # one picture with the decoded frame over its original: one pipe, and no frame goes astray
+    graph = (
+        f"[0:v]split[above][below];[above]crop={width}:{height}:0:0:exact=1[decoded];"
+        f"[below]crop={width}:{height}:0:{height}:exact=1[reference];"
+        f"[decoded][reference]libvmaf=model=version={VMAF_MODEL}:n_threads={threads}"
+        f":log_fmt=json:log_path={_LOG}"
+    )
+    given = ["-f", "rawvideo", "-pix_fmt", pixel_format, "-video_size", f"{width}x{2 * height}"]
+    return [
+        *(path, "-hide_banner", "-loglevel", "error"),
+        *given,
+        *("-framerate", "25", "-i", "pipe:0", "-filter_complex", graph, "-f", "null", "-"),
+    ]
+
+
+def _end(process: Any) -> None:
+    """End it if it is still running."""
+    with suppress(OSError):
+        process.stdin.close()
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(_END_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+class VmafProcess:
+    """A running ffmpeg, of `scoring_process`."""
+
+    def __init__(self, process: Any, folder: Path) -> None:
+        self._process = process
+        self._folder = folder
+
+    def write(self, reference: tuple[NDArray[Any], ...], decoded: tuple[NDArray[Any], ...]) -> None:
+        """Write the next frame and its original.
+
+        Raises:
+            ScoringError: It has ended; says with what.
+        """
+        try:
+            for above, below in zip(decoded, reference, strict=True):
+                for plane in (above, below):
+                    self._process.stdin.write(np.ascontiguousarray(plane).data)
+        except OSError:
+            self._process.wait()
+            raise self._failure() from None
+
+    def finish(self) -> NDArray[np.float64]:
+        """VMAF of each frame, after the last one.
+
+        Raises:
+            ScoringError: It failed; says with what.
+        """
+        try:
+            self._process.stdin.close()
+        except OSError:
+            self._process.wait()
+            raise self._failure() from None
+        if self._process.wait():
+            raise self._failure()
+        try:
+            log = json.loads((self._folder / _LOG).read_bytes())
+            return np.array([frame["metrics"]["vmaf"] for frame in log["frames"]], np.float64)
+        except (OSError, ValueError, KeyError, TypeError):
+            raise self._failure() from None
+
+    def _failure(self) -> ScoringError:
+        lines = (self._folder / "stderr").read_text(errors="replace").strip().splitlines()
+        said = f": {lines[-1].strip()}" if lines else ""
+        return ScoringError(f"libvmaf failed (code {self._process.returncode}){said}.")
+
+
+# ---------------------------------------------------------------- scoring
 
 YuvFrame = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 """Luma and two chroma planes of half its width and height: uint8, or uint16 with 10 bits used."""
@@ -161,130 +325,69 @@ SMALLEST = 16
 """Samples of a side; libvmaf and SSIM cannot score less."""
 
 
-class Scorer:
-    """Scores clips; can be reused.
-
-    Args:
-        ffmpeg: The ffmpeg for VMAF, from `find_ffmpeg`; None: only PSNR and SSIM.
-        threads: Of libvmaf.
-    """
-
-    def __init__(self, ffmpeg: Ffmpeg | None, *, threads: int = 1) -> None:
-        self._ffmpeg = ffmpeg
-        self._threads = threads
-
-    def score(self, reference: Iterable[YuvFrame], decoded: Iterable[YuvFrame]) -> Scores:
-        """Compare each frame with its original; only one pair is in memory at a time.
-
-        Args:
-            reference: The originals, all of one size, with even width and height of at least 16.
-            decoded: As many frames, of the same size and type.
-
-        Raises:
-            ScoringError: They do not match, there are none, or libvmaf failed.
-        """
-        pairs = _pairs(reference, decoded)
-        first = _first(pairs)
-        bits = _FORMATS[first[0][0].dtype][1]
-        measured: list[tuple[float, ...]] = []
-        with ExitStack() as stack:
-            process = None
-            if self._ffmpeg is not None:
-                process = stack.enter_context(_process_for(first[0], self._ffmpeg, self._threads))
-            for original, made in chain([first], pairs):
-                if process is not None:
-                    process.write(original, made)
-                measured.append(_measure(original, made, bits))
-            vmaf = process.finish() if process is not None else None
-        if vmaf is not None and len(vmaf) != len(measured):
-            raise ScoringError(f"libvmaf scored {len(vmaf)} of {len(measured)} frames.")
-        psnr_y, psnr_cb, psnr_cr, similarity = np.array(measured, np.float64).T
-        return Scores(vmaf, psnr_y, psnr_cb, psnr_cr, similarity)
+# metric -> how it is measured, and of which plane
+_OF_PLANES: Mapping[str, tuple[Callable[..., float], int]] = {
+    "psnr_y": (psnr, 0),
+    "psnr_cb": (psnr, 1),
+    "psnr_cr": (psnr, 2),
+    "ssim": (ssim, 0),
+}
 
 
-def psnr_scores(reference: Iterable[YuvFrame], decoded: Iterable[YuvFrame]) -> NDArray[np.float64]:
-    """PSNR of the luma of each frame, dB. See `Scorer.score`."""
-    return _luma_scores(psnr, reference, decoded)
-
-
-def ssim_scores(reference: Iterable[YuvFrame], decoded: Iterable[YuvFrame]) -> NDArray[np.float64]:
-    """SSIM of the luma of each frame. See `Scorer.score`."""
-    return _luma_scores(ssim, reference, decoded)
-
-
-def _luma_scores(
-    measure: Callable[..., float], reference: Iterable[YuvFrame], decoded: Iterable[YuvFrame]
-) -> NDArray[np.float64]:
-    pairs = _pairs(reference, decoded)
-    first = _first(pairs)
-    bits = _FORMATS[first[0][0].dtype][1]
-    every = chain([first], pairs)
-    return np.array([measure(a[0], b[0], bits=bits) for a, b in every], np.float64)
-
-
-def vmaf_scores(
+def scores_of(
     reference: Iterable[YuvFrame],
     decoded: Iterable[YuvFrame],
+    metrics: Sequence[str] = METRICS,
     *,
-    ffmpeg: Ffmpeg,
+    ffmpeg: Ffmpeg | None = None,
     threads: int = 1,
     before: YuvFrame | None = None,
-) -> NDArray[np.float64]:
-    """VMAF of each frame.
+) -> dict[str, NDArray[np.float64]]:
+    """Compare each frame with its original; only one pair is in memory at a time.
 
     Args:
-        reference: As for `Scorer.score`.
-        decoded: As for `Scorer.score`.
-        ffmpeg: From `find_ffmpeg`.
+        reference: The originals, all of one size, with even width and height of at least 16.
+        decoded: As many frames, of the same size and type.
+        metrics: Some of `METRICS`.
+        ffmpeg: From `find_ffmpeg`; None: VMAF is left out.
         threads: Of libvmaf.
         before: The original before the first one, for libvmaf's motion feature: without it, the
             first frame counts as still and scores lower.
 
+    Returns:
+        Scores of each frame by metric, shape (frames,).
+
     Raises:
-        ScoringError: As for `Scorer.score`.
+        ScoringError: They do not match, there are none, or libvmaf failed.
     """
     pairs = _pairs(reference, decoded)
-    first = _first(pairs)
-    count = 0
-    with _process_for(first[0], ffmpeg, threads) as process:
-        if before is not None:
-            process.write(before, before)
-        for original, made in chain([first], pairs):
-            process.write(original, made)
-            count += 1
-        found = process.finish()
-    if before is not None:
-        found = found[1:]
-    if len(found) != count:
-        raise ScoringError(f"libvmaf scored {len(found)} of {count} frames.")
-    return found
-
-
-def _process_for(
-    frame: YuvFrame, ffmpeg: Ffmpeg, threads: int
-) -> AbstractContextManager[VmafProcess]:
-    height, width = frame[0].shape
-    pixel_format = _FORMATS[frame[0].dtype][0]
-    return scoring_process(
-        ffmpeg, width=width, height=height, pixel_format=pixel_format, threads=threads
-    )
-
-
-def _first(pairs: Iterator[tuple[YuvFrame, YuvFrame]]) -> tuple[YuvFrame, YuvFrame]:
-    """The first of them.
-
-    Raises:
-        ScoringError: There is none.
-    """
     first = next(pairs, None)
     if first is None:
         raise ScoringError("There are no frames to score.")
-    return first
-
-
-def _measure(original: YuvFrame, made: YuvFrame, bits: int) -> tuple[float, ...]:
-    noise = [psnr(a, b, bits=bits) for a, b in zip(original, made, strict=True)]
-    return (*noise, ssim(original[0], made[0], bits=bits))
+    (height, width), (pixel_format, bits) = first[0][0].shape, _FORMATS[first[0][0].dtype]
+    by_plane = [name for name in metrics if name in _OF_PLANES]
+    measured: list[list[float]] = []
+    with ExitStack() as stack:
+        process = None
+        if ffmpeg is not None and "vmaf" in metrics:
+            opened = scoring_process(
+                ffmpeg, width=width, height=height, pixel_format=pixel_format, threads=threads
+            )
+            process = stack.enter_context(opened)
+            if before is not None:
+                process.write(before, before)
+        for original, made in chain([first], pairs):
+            if process is not None:
+                process.write(original, made)
+            measures = (_OF_PLANES[name] for name in by_plane)
+            measured.append([one(original[at], made[at], bits=bits) for one, at in measures])
+        vmaf = process.finish()[before is not None :] if process is not None else None
+    found = dict(zip(by_plane, np.array(measured, np.float64).T, strict=True))
+    if vmaf is None:
+        return found
+    if len(vmaf) != len(measured):
+        raise ScoringError(f"libvmaf scored {len(vmaf)} of {len(measured)} frames.")
+    return {"vmaf": vmaf, **found}
 
 
 def _pairs(

@@ -54,9 +54,8 @@ from mp4ds.plugins.evaluating.trials import (
 )
 from mp4ds.video.codecs import AV1, LOSSY_GOP, MAX_CRF, check_codec, codec_name
 from mp4ds.video.images import jpeg_bytes
-from mp4ds.video.libvmaf import Ffmpeg, find_ffmpeg
 from mp4ds.video.planes import rgb_of
-from mp4ds.video.scores import METRICS, Scorer
+from mp4ds.video.scores import METRICS, Ffmpeg, find_ffmpeg, scores_of, summary_of
 
 _DEFAULT_PRESETS = {
     **dict.fromkeys(AV1, ("6", "8")),
@@ -353,9 +352,9 @@ class _Run:
         with closing(clip.open(folder)) as frames:
             picture = clip.picture(frames.frame(clip.detail_frame), clip.recipe)
             write_synced(self.result.output / truth, picture)
-            scorer = Scorer(self.ffmpeg, threads=options.encoder_threads)
             # without which the scores of settings say little
-            ceiling = scorer.score(frames, frames).summaries()
+            scores = scores_of(frames, frames, ffmpeg=self.ffmpeg, threads=options.encoder_threads)
+        ceiling = {name: summary_of(values) for name, values in scores.items()}
         reachable = reachable_score(goal, ceiling)
         cells, notes = self._cells(camera.topic, name, clip, folder, tell)
         found = CameraEvaluation(

@@ -22,7 +22,6 @@ from mp4ds.packing.engine import ProcessEngine, serve
 from mp4ds.video.codecs import LOSSY_GOP, Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import png_file
-from mp4ds.video.libvmaf import Ffmpeg, find_ffmpeg
 from mp4ds.video.planes import (
     PLANES_FORMAT,
     Planes,
@@ -31,7 +30,7 @@ from mp4ds.video.planes import (
     packet_sizes,
     rgb_of,
 )
-from mp4ds.video.scores import Scorer, ScoreSummary
+from mp4ds.video.scores import Ffmpeg, ScoreSummary, find_ffmpeg, scores_of, summary_of
 
 CELLS, PICTURES = "cells", "pictures"
 """The folders of an evaluation for measurements, and for the details shown."""
@@ -287,8 +286,10 @@ def run(trial: Trial) -> Cell:
                     write_synced(trial.output / trial.picture, clip.picture(planes, recipe))
                 yield planes
 
-        scores = Scorer(ffmpeg, threads=trial.threads).score(frames, watched(decoded_planes(video)))
-    return Cell(setting=setting, scores=scores.summaries(), picture=trial.picture, **figures)
+        decoded = watched(decoded_planes(video))
+        scores = scores_of(frames, decoded, ffmpeg=ffmpeg, threads=trial.threads)
+    summaries = {name: summary_of(values) for name, values in scores.items()}
+    return Cell(setting=setting, scores=summaries, picture=trial.picture, **figures)
 
 
 def _encoded(trial: Trial, frames: PlaneSpool, recipe: Recipe, video: Path) -> dict[str, Any]:
