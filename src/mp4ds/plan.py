@@ -6,7 +6,6 @@ File names follow spec/index.md, "File names"; the visual table is that of the p
 
 from __future__ import annotations
 
-import glob
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -193,12 +192,6 @@ class Selection:
         if self._topics and not _matches(topic, self._topics):
             return False
         return not _matches(topic, self._exclude)
-
-    @property
-    def names(self) -> Sequence[str] | None:
-        """The only topics that can be chosen; None if a glob can match others."""
-        is_exact = self._topics and not any(map(glob.has_magic, self._topics))
-        return self._topics if is_exact else None
 
     def check(self, topics: Iterable[str]) -> None:
         """Refuse a pattern that matches nothing: it is a typing error, or data would be missed.

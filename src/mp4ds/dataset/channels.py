@@ -190,19 +190,3 @@ def channel_groups(streams: Sequence[Stream], recorded: Sequence[Channel]) -> li
                 groups[identity] = ChannelGroup(channel, [], ids)
             groups[identity].parts.append(part)
     return list(groups.values())
-
-
-def log_times(
-    groups: Sequence[ChannelGroup], recorded: Mapping[int, NDArray[np.int64]]
-) -> dict[int, NDArray[np.int64]]:
-    """Sorted log times of every message, nanoseconds, by channel id.
-
-    Args:
-        groups: The channels that have messages in videos.
-        recorded: Those of messages.mcap, by the channel ids there.
-    """
-    found = {key: [times] for key, times in recorded.items()}
-    for group in groups:
-        others = [found.pop(key)[0] for key in group.recorded_ids if key in found]
-        found[group.channel.id] = [*others, *(part.columns.log_time for part in group.parts)]
-    return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items() if arrays}

@@ -21,16 +21,14 @@ from mp4ds.dataset.channels import (
     Read,
     by_time,
     channel_groups,
-    log_times,
 )
 from mp4ds.dataset.columns import Choice, everything, last_of, within
 from mp4ds.dataset.images import Images, VideoImages
-from mp4ds.dataset.messages import MessagesFile, RecordedMessage, SalvagedMessages, as_recorded
+from mp4ds.dataset.messages import MessagesFile, RecordedMessage, as_recorded
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.verbatim import VerbatimImages, verbatim_images
 from mp4ds.errors import (
-    FormatError,
     OptionError,
     SourceError,
     SourceNotFoundError,
@@ -40,10 +38,9 @@ from mp4ds.errors import (
 from mp4ds.files.sources import HOW_TO_OPEN, is_folder, video_at
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
-from mp4ds.format.manifest import Manifest, StreamEntry
+from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
 from mp4ds.messages.serializations import is_camera
-from mp4ds.plan import calibration_topics
 from mp4ds.records import Channel, Excerpt, Message, Record, Schema
 from mp4ds.times import Sync, synchronize
 
@@ -71,15 +68,11 @@ class Dataset:
         manifest: Of the folder; None for one video.
         streams: Its streams; none for a video without a sidecar, see `mp4ds.open`.
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams.
-        unread: What is wrong with files that cannot be read, and that have nothing that is wanted.
         is_salvaged: Whether messages may be missing; see `mp4ds.dataset.salvage`.
 
     Args:
         path: The folder, a manifest, a sidecar, or a video next to its sidecar; or its URL.
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams, 1 to 100.
-        selected: Whether a topic is wanted: damage of files that only have others is no error.
-            None: all are.
-        among: The only topics that can be wanted; None if that is not known.
 
     Raises:
         SourceNotFoundError: The path does not exist.
@@ -89,14 +82,7 @@ class Dataset:
 
     is_salvaged = False
 
-    def __init__(
-        self,
-        path: Path | str,
-        *,
-        jpeg_quality: int = 95,
-        selected: Callable[[str], bool] | None = None,
-        among: Collection[str] | None = None,
-    ) -> None:
+    def __init__(self, path: Path | str, *, jpeg_quality: int = 95) -> None:
         self.path = location(path)
         if not self.path.exists():
             raise SourceNotFoundError(self.path)
@@ -117,75 +103,15 @@ class Dataset:
                 problem = f"is a folder of {counted(len(inside), 'dataset')}, not a dataset"
                 remedy = f"Open one of them, such as {inside[0].parent}."
             raise SourceError(self.path, problem, remedy)
-        self.streams: list[Stream] = []
-        self.unread: list[str] = []
-        self._selected = selected
         self._video: VideoImages | None = None
         if self.path.is_dir():
             self.manifest = load_manifest(self.path / MANIFEST_NAME)
-            for entry in self.manifest.streams:
-                self._open_stream(entry)
+            sidecars = [self.path / entry.sidecar for entry in self.manifest.streams]
         else:
             is_video = self.path.suffix == ".mp4"
-            sidecar = self.path.with_suffix(".yaml") if is_video else self.path
-            self.streams.append(Stream(sidecar, jpeg_quality=jpeg_quality))
+            sidecars = [self.path.with_suffix(".yaml") if is_video else self.path]
+        self.streams = [Stream(sidecar, jpeg_quality=jpeg_quality) for sidecar in sidecars]
         self._file = MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
-        if selected is not None:
-            try:
-                self._file.check_index()
-            except FormatError as error:
-                self._do_without_messages(error, among)
-
-    def _open_stream(self, entry: StreamEntry) -> None:
-        path, wanted = self.path / entry.sidecar, self._selected
-        topics = [entry.topic, *calibration_topics(entry.topic)]
-        try:
-            stream = Stream(path, jpeg_quality=self.jpeg_quality)
-            topics = stream.topics
-            if wanted is not None and not any(map(wanted, topics)):
-                stream.check_size()
-            self.streams.append(stream)
-        except FormatError as error:
-            if wanted is None or any(map(wanted, topics)):
-                raise
-            self.unread.append(str(error))
-
-    def _do_without_messages(
-        self, error: FormatError, among: Collection[str] | None = None
-    ) -> None:
-        """Go on without messages.mcap, which is damaged.
-
-        Raises:
-            FormatError: It has, or may have, messages that are wanted.
-        """
-        wanted = self._selected
-        if wanted is None:
-            raise error
-        is_known = among is not None and self._are_in_videos(filter(wanted, among))
-        if not is_known and self._may_hold(wanted):
-            raise error
-        self.unread.append(str(error))
-        self._file = MessagesFile(None)
-
-    def _are_in_videos(self, topics: Iterable[str]) -> bool:
-        """Whether all messages of some topics are in videos or their sidecars."""
-        verbatim = {entry.topic for entry in self.manifest.verbatim} if self.manifest else set()
-        known = {topic for stream in self.streams for topic in stream.topics}
-        return known - verbatim >= set(topics)
-
-    def _may_hold(self, wanted: Callable[[str], bool]) -> bool:
-        """Whether messages.mcap, which is damaged, has, or may have, wanted messages."""
-        if self._file.path is None:
-            return False
-        try:
-            file = SalvagedMessages(self._file.path)
-        except FormatError:
-            return True
-        there = [channel.topic for channel in file.channels if file.counts.get(channel.id)]
-        lost = [loss.topics for loss in file.losses if loss.messages != 0]
-        return any(map(wanted, there)) or any(
-            not topics or any(map(wanted, topics)) for topics in lost
-        )
 
     @classmethod
     def of(
@@ -199,8 +125,7 @@ class Dataset:
         """A folder whose sidecars have already been read, or a video without a sidecar."""
         dataset = cls.__new__(cls)
         dataset.path, dataset.manifest, dataset.jpeg_quality = path, manifest, 95
-        dataset.streams, dataset.unread = list(streams), []
-        dataset._selected, dataset._file, dataset._video = None, file, video
+        dataset.streams, dataset._file, dataset._video = list(streams), file, video
         return dataset
 
     if not TYPE_CHECKING:  # else every name would pass for known
@@ -329,22 +254,21 @@ class Dataset:
         return [*self._verbatim_channels, *(group.channel for group in self._groups)]
 
     @property
-    def listed_topics(self) -> list[str]:
-        """Topics of the streams that the manifest lists, even if a sidecar is in `unread`."""
-        return [entry.topic for entry in self.manifest.streams] if self.manifest else []
-
-    @property
     def all_topics(self) -> list[str]:
-        """The topics of all channels, and the `listed_topics`."""
+        """The topics of all channels, and of streams of which a sidecar is lost."""
         topics = (channel.topic for channel in self.channels)
-        return list(dict.fromkeys([*topics, *self.listed_topics]))
+        return list(dict.fromkeys([*topics, *self._listed_topics]))
 
     @property
     def camera_topics(self) -> list[str]:
-        """Topics with images, in videos or stored verbatim."""
+        """Topics with images, in videos or stored verbatim; also if a sidecar is lost."""
         listed = self.manifest.verbatim if self.manifest else []
         verbatim = [entry.topic for entry in listed if self._verbatim_cameras(entry.topic)]
-        return list(dict.fromkeys([*self.topics, *verbatim]))
+        return list(dict.fromkeys([*self.topics, *self._listed_topics, *verbatim]))
+
+    @property
+    def _listed_topics(self) -> list[str]:
+        return [entry.topic for entry in self.manifest.streams] if self.manifest else []
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
@@ -365,13 +289,10 @@ class Dataset:
         """Check messages.mcap against its SHA-256: not all of its contents have their own checksum.
 
         Raises:
-            FormatError: See `verify_file`; and it has messages that are wanted.
+            FormatError: See `verify_file`.
         """
-        if self.manifest and not self.is_salvaged and self._file.path:
-            try:
-                self._file.verify(self.manifest)
-            except FormatError as error:
-                self._do_without_messages(error)
+        if self.manifest and not self.is_salvaged:
+            self._file.verify(self.manifest)
 
     def verify_sidecars(self, selected: Callable[[str], bool] = lambda _: True) -> None:
         """Check sidecars against their SHA-256: an edited one may look valid.
@@ -545,9 +466,21 @@ class Dataset:
         parts = [part for group in groups for part in group.parts_of(read)]
         return by_time(recorded, *parts)
 
-    def times(self) -> dict[int, NDArray[np.int64]]:
-        """Sorted log times of every message, nanoseconds, by channel id; decodes no frame."""
-        return log_times(self._groups, self._file.times())
+    def times(self, topics: Collection[str] | None = None) -> dict[int, NDArray[np.int64]]:
+        """Sorted log times of every message, nanoseconds, by channel id; decodes no frame.
+
+        Args:
+            topics: Only of these topics; None for all.
+        """
+        recorded = dict(self._file.times())
+        found = {}
+        for group in self._groups:
+            own = [recorded.pop(key) for key in group.recorded_ids if key in recorded]
+            if topics is None or group.channel.topic in topics:
+                own += [part.columns.log_time for part in group.parts]
+                found[group.channel.id] = np.sort(np.concatenate(own))
+        wanted = {item.id for item in self.channels if topics is None or item.topic in topics}
+        return found | {key: times for key, times in recorded.items() if key in wanted}
 
     @property
     def slice_start(self) -> int | None:

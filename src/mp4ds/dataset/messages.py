@@ -71,14 +71,6 @@ class MessagesFile:
             )
         return reader
 
-    def check_index(self) -> None:
-        """Open it.
-
-        Raises:
-            FormatError: ``file-missing`` or ``messages-unreadable``.
-        """
-        _ = self._reader
-
     @property
     def channels(self) -> Sequence[Channel]:
         """Its channels."""

@@ -75,8 +75,21 @@ class Stream(Images):
 
     @cached_property
     def columns(self) -> DecodedColumns:
-        """One value per frame: its times, and what fills its message; checked on first use."""
-        self.check_size()
+        """One value per frame: its times, and what fills its message; checked on first use.
+
+        Raises:
+            FormatError: ``column-invalid``; or the video is missing, or too short for so many.
+        """
+        try:
+            size = self.video_path.stat().st_size
+        except OSError as error:
+            raise FormatError(
+                "file-missing", self.video_path, f"cannot be read: {error.strerror}"
+            ) from None
+        if self.sidecar.frames > size:  # a coded frame takes at least a byte
+            raise FormatError(
+                "frame-count", self.path, f"declares {self.sidecar.frames} frames in {size} bytes"
+            )
         count, variants = self.sidecar.frames, len(self.sidecar.headers)
         return decode_columns(self.sidecar.columns, count, variants, str(self.path))
 
@@ -92,23 +105,6 @@ class Stream(Images):
         return MessageRebuilder(
             self.sidecar, self.columns, str(self.path), jpeg_quality=self._jpeg_quality
         )
-
-    def check_size(self) -> None:
-        """Refuse a video that is missing, or too short for so many frames.
-
-        Raises:
-            FormatError: ``file-missing`` or ``frame-count``.
-        """
-        try:
-            size = self.video_path.stat().st_size
-        except OSError as error:
-            raise FormatError(
-                "file-missing", self.video_path, f"cannot be read: {error.strerror}"
-            ) from None
-        if self.sidecar.frames > size:  # a coded frame takes at least a byte
-            raise FormatError(
-                "frame-count", self.path, f"declares {self.sidecar.frames} frames in {size} bytes"
-            )
 
     @property
     def stamps(self) -> NDArray[np.int64]:

@@ -31,7 +31,7 @@ from mp4ds.errors import (
 from mp4ds.files.outputs import Owned, staged
 from mp4ds.files.uploads import uploaded
 from mp4ds.files.urls import RemotePath, location, remote
-from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.plan import FileNames, Selection
 from mp4ds.records import (
     EVERYTHING,
@@ -64,8 +64,8 @@ def unpack(
     """Write a dataset's recording.
 
     Every message of a lossless stream is checked against its digest, and each sidecar, and
-    messages.mcap unless a slice is taken, against the manifest. Damage is an error, unless only
-    topics that are left out have it, or `salvage` asks for what can be read.
+    messages.mcap unless a slice is taken, against the manifest. Damage is an error, unless it is
+    in videos of topics that are left out, or `salvage` asks for what can be read.
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
@@ -104,7 +104,7 @@ def _unpack_here(
     progress: Callable[[UnpackProgress], None] | None,
 ) -> UnpackSummary:
     with ExitStack() as stack:
-        whole, losses = _opened(dataset, chosen, to)
+        whole, losses = _opened(dataset, chosen)
         stack.enter_context(whole)
         given = location(output) if output else default_output(whole.path, to)
         target = Path(os.path.abspath(given))  # noqa: PTH100
@@ -149,35 +149,11 @@ def _unpack_here(
             raise WriteError(target, error) from error
 
 
-def _opened(
-    dataset: Path | str, options: UnpackOptions, to: str = ""
-) -> tuple[Dataset, list[Loss]]:
+def _opened(dataset: Path | str, options: UnpackOptions) -> tuple[Dataset, list[Loss]]:
     """The dataset, and what is lost of it by files that cannot be read."""
-    selected = options.selected
     if options.salvage:
-        return open_damaged(dataset, selected=selected, jpeg_quality=options.jpeg_quality)
-    among = _with_images(dataset) if to == "images" else None
-    opened = Dataset(
-        dataset,
-        jpeg_quality=options.jpeg_quality,
-        selected=lambda topic: selected(topic) and (among is None or topic in among),
-        among=selected.names if among is None else among,
-    )
-    return opened, []
-
-
-def _with_images(dataset: Path | str) -> set[str] | None:
-    """Topics that have images by the manifest; None if there is none that can be read."""
-    path = location(dataset)
-    path = (path.parent if path.name == MANIFEST_NAME else path) / MANIFEST_NAME
-    if not path.exists():
-        return None
-    try:
-        manifest = load_manifest(path)
-    except FormatError:  # reported when the dataset is opened
-        return None
-    topics = {entry.topic for entry in manifest.streams}
-    return topics | {entry.topic for entry in manifest.verbatim}
+        return open_damaged(dataset, selected=options.selected, jpeg_quality=options.jpeg_quality)
+    return Dataset(dataset, jpeg_quality=options.jpeg_quality), []
 
 
 def _needs_messages(dataset: Dataset, selected: Selection) -> bool:
@@ -193,18 +169,15 @@ def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
         OptionError: A pattern matches no topic.
     """
     if to == "images":
-        pictured = dict.fromkeys([*dataset.listed_topics, *dataset.camera_topics])
-        selected.check(pictured)
-        others = set(dataset.all_topics) - pictured.keys()
-        return sorted({*others, *(topic for topic in pictured if not selected(topic))})
+        selected.check(dataset.camera_topics)
+        others = set(dataset.all_topics) - set(dataset.camera_topics)
+        return sorted({*others, *(one for one in dataset.camera_topics if not selected(one))})
     selected.check(dataset.all_topics)
     return [topic for topic in dataset.all_topics if not selected(topic)]
 
 
 def _notes(dataset: Dataset, selected: Selection) -> Iterator[str]:
     """What else the output does not have of the recording."""
-    for problem in dataset.unread:
-        yield f"damaged, but not needed for the selected topics: {problem}"
     for stream in dataset.streams:
         if stream.sidecar.digests is None and selected(stream.topic):
             yield (
@@ -364,7 +337,7 @@ def _unpack_recording(
         topics = _Topics(writer, converter, selected, summary, may_skip=options.skip_unconvertible)
         topics.declare(dataset, republisher)
         wanted = {item.topic for item in dataset.channels if selected(item.topic)}
-        total = _total(dataset, wanted)
+        total = _total(dataset, selected)
         if span != EVERYTHING:
             total = len(latched) + _count_in(dataset, wanted, span)
         done = found = 0
@@ -395,19 +368,17 @@ def _unpack_recording(
     summary.omitted.update(omitted)
 
 
-def _total(dataset: Dataset, topics: Collection[str]) -> int:
-    """How many messages there should be of some topics."""
+def _total(dataset: Dataset, selected: Selection) -> int:
+    """How many messages there should be of the selected topics."""
     counts = dataset.counts()
-    is_whole = all(item.topic in topics for item in dataset.channels) and not dataset.unread
-    if dataset.manifest and is_whole and dataset.manifest.messages:
+    if dataset.manifest and dataset.manifest.messages and all(map(selected, dataset.all_topics)):
         return dataset.manifest.messages
-    return sum(counts.get(item.id, 0) for item in dataset.channels if item.topic in topics)
+    return sum(counts.get(item.id, 0) for item in dataset.channels if selected(item.topic))
 
 
 def _count_in(dataset: Dataset, topics: Collection[str], span: Excerpt) -> int:
     """How many messages of some topics there are in a span."""
-    wanted = {item.id for item in dataset.channels if item.topic in topics}
-    return sum(len(in_span(one, span)) for key, one in dataset.times().items() if key in wanted)
+    return sum(len(in_span(one, span)) for one in dataset.times(topics).values())
 
 
 def _account_for(missing: int, losses: list[Loss]) -> None:

@@ -71,7 +71,7 @@ def export(
     target = Path(os.path.abspath(output))  # noqa: PTH100
     write = _WRITERS[to] if to in _WRITERS else _lerobot_writer()
     with ExitStack() as stack, advising(HOW_TO_SALVAGE):
-        opened = [stack.enter_context(Dataset(path, selected=chosen.uses)) for path in paths]
+        opened = [stack.enter_context(Dataset(path)) for path in paths]
         path = stack.enter_context(
             staged(
                 target,

@@ -256,10 +256,7 @@ class ExportSource:
         self.dataset = dataset
         self.exported: Counter[str] = Counter()
         self.left_out: dict[str, Counter[str]] = {}
-        self.notes = [
-            f"damaged, but not needed for the selected topics: {problem}"
-            for problem in dataset.unread
-        ]
+        self.notes: list[str] = []
         options.selected.check(dataset.all_topics)
         self._options = options
         dataset.verify_sidecars(options.chosen)

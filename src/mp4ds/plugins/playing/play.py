@@ -81,7 +81,7 @@ def open_player(
             without=frozenset({_CLOCK} if chosen.leads or chosen.follow_clock else ()),
         )
         opened = [
-            stack.enter_context(Dataset(place, jpeg_quality=chosen.jpeg_quality, selected=wanted))
+            stack.enter_context(Dataset(place, jpeg_quality=chosen.jpeg_quality))
             for place in places
         ]
         timeline = Timeline(

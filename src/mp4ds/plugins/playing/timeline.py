@@ -546,8 +546,7 @@ class _Part:
 
     def _span(self) -> tuple[int, int] | None:
         """Log times of the first and the last message of the topics played."""
-        ids = {item.id for item in self._dataset.channels if item.topic in self._topics}
-        times = [times for key, times in self._dataset.times().items() if key in ids and len(times)]
+        times = [one for one in self._dataset.times(self._topics).values() if len(one)]
         if not times:
             return None
         first, last = min(int(item[0]) for item in times), max(int(item[-1]) for item in times)
@@ -565,7 +564,8 @@ class _Part:
 
     def messages(self, start_ns: int, is_late: IsLate, ahead: Ahead) -> Iterator[Due]:
         """Messages from a time on."""
-        frames = [stream.columns for stream in self._dataset.streams]
+        streams = [item for item in self._dataset.streams if item.topic in self._topics]
+        frames = [stream.columns for stream in streams]
 
         def in_time(columns: DecodedColumns) -> Iterator[int]:
             if not any(columns is item for item in frames):
