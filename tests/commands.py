@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import mp4ds
-from mp4ds.cli import app_for, output
+from mp4ds.cli import commands as command_line
 from waiting import WATCHDOG_S
 
 ROOT = Path(mp4ds.__file__).parents[1]
@@ -40,10 +40,9 @@ def without_progress(err: str) -> str:
 def call(*arguments: object, screen: Callable[[], io.StringIO] = io.StringIO) -> Result:
     """A command in this process: its exit code and what it wrote, but for its progress."""
     out, err = screen(), screen()
-    output._quiet = False  # whatever the command before was asked for
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            app_for()([str(argument) for argument in arguments])
+            command_line.main([str(argument) for argument in arguments])
             code: Any = 0
         except SystemExit as exit_:
             code = exit_.code or 0

@@ -8,14 +8,12 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
-import typer
 
 import mp4ds
 from commands import typed
-from mp4ds.cli import COMMANDS, app_for
+from mp4ds.cli import COMMANDS, commands
 from mp4ds.plugins.demo import demo
 from sources import SOURCES, scene
 from waiting import WATCHDOG_S
@@ -145,8 +143,9 @@ def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_list_of_commands_says_what_each_says_of_itself(name: str) -> None:
-    group: Any = typer.main.get_command(app_for(name))
-    assert (group.commands[name].help or "").splitlines()[0] == COMMANDS[name][1]
+    command = commands.get_command(None, name)
+    assert command is not None
+    assert (command.help or "").splitlines()[0] == COMMANDS[name][1]
 
 
 def test_every_command_is_in_the_list() -> None:

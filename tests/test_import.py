@@ -21,17 +21,17 @@ import av
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 from PIL import Image
 from rosbags.highlevel import AnyReader
-from typer.testing import CliRunner
 
 import mp4ds
 from conftest import real
 from in_parts import InlineEngine, facts, leftovers
-from mp4ds.cli import app_for
+from mp4ds.cli import commands
 from mp4ds.errors import Refused, SourceError
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.messages.transforms import quaternion_of
@@ -706,7 +706,7 @@ def test_tum(tmp_path: Path) -> None:
 
 
 def run(*arguments: object) -> Any:
-    return CliRunner().invoke(app_for(), list(map(str, arguments)), catch_exceptions=False)
+    return CliRunner().invoke(commands, list(map(str, arguments)), catch_exceptions=False)
 
 
 def spoil(path: Path, text: str) -> Callable[[Path], None]:

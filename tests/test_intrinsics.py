@@ -13,18 +13,18 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.highlevel import AnyReader
-from typer.testing import CliRunner
 
 import mp4ds
 from conftest import real
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
-from mp4ds.cli import app_for
+from mp4ds.cli import commands
 from mp4ds.dataset.views import effective
 from mp4ds.format.manifest import StaticTransform
 from mp4ds.format.sidecars import dump_document, load_manifest
@@ -347,7 +347,7 @@ def test_effective_matrices_are_told_where_they_differ(
 
 def command(path: Path, *options: str) -> tuple[str, dict[str, Any]]:
     """What the command prints, and the names that this sets when it is run as Python."""
-    result = CliRunner().invoke(app_for(), ["info", str(path), "--intrinsics", *options])
+    result = CliRunner().invoke(commands, ["info", str(path), "--intrinsics", *options])
     assert result.exit_code == 0, result.output
     names: dict[str, Any] = {}
     if "--json" not in options:
@@ -448,7 +448,7 @@ def test_errors_are_those_of_info(options: list[str], tmp_path: Path) -> None:
     (tmp_path / "words.txt").write_text("no recording")
     for name in ("words.txt", "nothing.bag"):
         arguments = ["info", str(tmp_path / name), "--intrinsics", *options]
-        result = CliRunner().invoke(app_for(), arguments)
+        result = CliRunner().invoke(commands, arguments)
         assert result.exit_code == 2
         assert name in result.output
 

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 import mp4ds
 from mp4ds.bags import latched
 from mp4ds.bags.formats import open_reader, open_writer
-from mp4ds.cli import app_for
+from mp4ds.cli import commands
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.options import Slice, parse_time
 from mp4ds.packing.options import PackOptions
@@ -187,7 +187,7 @@ def test_what_is_printed(tmp_path: Path) -> None:
         ["pack", str(source), "-o", str(tmp_path / "whole")],
         ["unpack", str(tmp_path / "whole"), "--start", str(FIRST)],
     ):
-        result = CliRunner().invoke(app_for(), command)
+        result = CliRunner().invoke(commands, command)
         assert result.exit_code == 0, result.output
         has_any = command[0] == "info" or "--start" in command
         assert (

@@ -153,7 +153,7 @@ def test_signals(drive: Path, number: signal.Signals, code: int) -> None:
     ("arguments", "code", "words"),
     [
         (["{}", "--ros1", "--ros2"], 2, "--ros1 contradicts --ros2"),
-        (["{}", "--ros2", "-s", "3"], 2, "to start later, use --start-offset"),
+        (["{}", "--ros2", "-s", "3"], 2, "'3' is not one of 'sqlite3', 'mcap'"),
         (["{}", "--ros2", "--log-level", "loud"], 2, "--log-level 'loud'"),
         (["{}", "--ros2", "--publish-service-requests"], 2, "services are not called"),
         (["{}", "--ros1", "--wait-for-all-acked", "5"], 2, "needs --ros2"),

@@ -12,29 +12,29 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import click
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
 
+from mp4ds.cli.output import be_json
 from mp4ds.cli.progress import (
     Events,
-    Lines,
     Log,
-    LogOf,
+    Pace,
     PackState,
     duration_text,
-    left_text,
-    on_terminal,
-    progress_to,
+    pack_progress,
 )
 from mp4ds.packing.options import PackProgress
 from mp4ds.plugins.demo import demo
+from test_terminal import Screen
 from waiting import WATCHDOG_S, until
 
 HOUR = 3600.0
@@ -86,42 +86,41 @@ class Clock:
 # ---------------------------------------------------------------- where it stands
 
 
-def paced(share: Callable[[float], float | None], seconds: int, **values: Any) -> PackState:
-    """A job that was told of each second."""
-    clock = Clock()
-    job = PackState(clock=clock)
-    for n in range(seconds + 1):
-        clock.seconds = 1000.0 + n
-        job.take(told(share(n), **values))
+def state_of(*states: PackProgress) -> PackState:
+    job = PackState()
+    for state in states:
+        job.states[state.dataset] = state
     return job
 
 
-@pytest.mark.parametrize(("begin", "before"), [(0.0, 0), (0.8, 192)])
-def test_the_time_left_is_by_what_this_run_did(begin: float, before: int) -> None:
-    job = paced(lambda n: begin + n * (1 - begin) / 1000, 400, before=before)
-    assert job.seconds_left == pytest.approx(600, abs=5)
-    assert job.share == pytest.approx(begin + 0.4 * (1 - begin))
-
-
-@pytest.mark.parametrize(
-    "state",
-    [told(None, parts=0), told(0.5, phase="planning"), told(None, phase="planning", parts=0)],
-    ids=["nothing-tells", "planning", "planning-unknown"],
-)
-def test_nothing_is_told_that_is_not_known(state: PackProgress) -> None:
-    clock = Clock()
-    job = PackState(clock=clock)
-    for n in range(100):
-        clock.seconds = 1000.0 + n
-        job.take(state)
-        assert job.seconds_left is None
-    assert job.share in (None, 0.0)
-
-
 def test_parts_tell_where_the_work_does_not() -> None:
-    job = PackState()
-    job.take(told(None, tasks_done=119))
-    assert job.share == 119 / 240
+    assert state_of(told(None, tasks_done=119)).share == pytest.approx(119 / 240)
+
+
+def test_datasets_count_by_their_size() -> None:
+    joining = told(1.0, dataset="a", gigabytes=10, phase="joining")
+    job = state_of(joining, told(0.5, dataset="b", gigabytes=30))
+    assert job.share == pytest.approx(25 / 40)
+
+
+@pytest.mark.parametrize("before", [0.0, 0.8])
+def test_the_time_left_is_by_what_this_run_did(before: float) -> None:
+    clock = Clock()
+    pace = Pace(clock)
+    for n in range(401):
+        clock.seconds = 1000.0 + n
+        left = pace.left(before + n * (1 - before) / 1000)
+        assert n > 2 or left is None
+    assert left == pytest.approx(600, abs=5)
+
+
+@pytest.mark.parametrize("shares", [[None] * 9, [0.0] * 9, [0.5] * 9])
+def test_no_time_left_is_told_that_is_not_known(shares: list[float | None]) -> None:
+    clock = Clock()
+    pace = Pace(clock)
+    for share in shares:
+        clock.seconds += 1
+        assert pace.left(share) is None
 
 
 # ---------------------------------------------------------------- anything at all
@@ -156,25 +155,23 @@ def jobs(draw: st.DrawFn) -> list[tuple[float, PackProgress]]:
 def test_whatever_is_told_nothing_silly_is_shown(
     reports: list[tuple[float, PackProgress]], width: int, height: int
 ) -> None:
-    clock, log, events = Clock(0.0), io.StringIO(), io.StringIO()
-    screen = io.StringIO()
-    console = Console(
-        file=screen, force_terminal=True, width=width, height=height, color_system=None
-    )
-    tellers = (
-        Log(PackState(clock=clock), Lines(log), now=clock.now),
-        Events(PackState(clock=clock), Lines(events), now=clock.now),
-    )
-    with on_terminal(console) as show:
+    clock, lines, events = Clock(0.0), io.StringIO(), io.StringIO()
+    log = Log(lines, clock=clock, now=clock.now)
+    stream = Events(events, clock=clock, now=clock.now)
+    job = PackState()
+    size = {"COLUMNS": str(width), "LINES": str(height), "TERM": "xterm"}
+    with mock.patch.dict(os.environ, size), shown_on(Screen()) as screen, pack_progress() as take:
         for now, state in reports:
             clock.seconds = now
-            show(state)
-            for teller in tellers:
-                teller.take(state)
-    assert all(letter.isprintable() or letter in "\n\r\x1b" for letter in screen.getvalue())
-    for teller in tellers:
-        teller.end("done")
-    for line in log.getvalue().splitlines():
+            take(state)
+            stream.take(state)
+            job.states[state.dataset] = state
+            log.show(job.rows())
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue())
+    assert all(letter.isprintable() or letter in "\n\r" for letter in text)
+    log.end("done")
+    stream.end("done")
+    for line in lines.getvalue().splitlines():
         assert re.fullmatch(r"\d\d:\d\d:\d\d packing [ -~]+", line)
     parsed(events.getvalue())
 
@@ -185,10 +182,10 @@ def test_whatever_is_told_nothing_silly_is_shown(
 def logged(work: Work, seconds: float, *, outcome: str = "done", step: float = 0.5) -> list[str]:
     """The lines of a pack."""
     clock, stream = Clock(), io.StringIO()
-    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
+    log = Log(stream, clock=clock, now=clock.now)
     for n in range(int(seconds / step) + 1):
         clock.seconds = 1000.0 + n * step
-        log.take(told(work(n * step)))
+        log.show(state_of(told(work(n * step))).rows())
     log.end(outcome)
     return stream.getvalue().splitlines()
 
@@ -200,77 +197,48 @@ def test_a_short_pack_logs_nothing() -> None:
 
 def test_the_log_of_a_pack() -> None:
     lines = logged(lambda now: now / 300, 300)
-    assert lines[0] == "12:00:00 packing drive: started 2024-05-01 | 50.0 GB to pack"
-    assert lines[1] == (
-        "12:00:10 packing drive: 3 % | /cam0 1200/36000, "
-        "/cam1 1200/36000 | parts 8/240 | 1.7 GB -> 166.7 MB | 5 min left"
+    assert lines[0] == (
+        "12:00:10 packing drive: 3 % | parts 8/240  1.7 GB -> 166.7 MB | /cam0 1200/36000, "
+        "/cam1 1200/36000 | 5 min left"
     )
     assert lines[-1] == (
-        "12:05:00 packing drive: done after 5 min | parts 240/240 | 50.0 GB -> 5.0 GB"
+        "12:05:00 packing drive: done after 5 min | parts 240/240  50.0 GB -> 5.0 GB"
     )
-    assert [line[:8] for line in lines[2:-1]] == [f"12:0{n}:10" for n in range(1, 5)]
-
-
-def test_a_resumed_pack_tells_what_was_done_before() -> None:
-    clock, stream = Clock(), io.StringIO()
-    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
-    for n in range(100):
-        clock.seconds = 1000.0 + n
-        log.take(told(0.8 + n / 10_000, before=192))
-    assert "192 parts were already done" in stream.getvalue().splitlines()[0]
 
 
 def test_the_log_of_several_datasets() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
-    for name in ("a", "b", "c"):
-        log.take(told(0.0, dataset=name))
-    for n in range(1, 100):
+    log = Log(stream, clock=clock, now=clock.now)
+    for n in range(1, 12):
         clock.seconds = 1000.0 + n
-        log.take(told(n / 100, dataset="a"))
-        log.take(told(n / 200, dataset="b", failed=1))
-    log.take(told(1.0, dataset="a", phase="joining", note="cam0.mp4"))
-    clock.seconds += 70
-    log.tick()
-    lines = stream.getvalue().splitlines()
-    assert re.fullmatch(
-        r"12:00:10 packing 3 datasets: 4 % \| a 10 %, b 4 % \| parts 34/720 \| 1 failed \| "
-        r"7.2 GB -> 725.0 MB \| \d+ min left",
-        lines[1],
-    )
-    assert "a joining cam0.mp4, b 49 %" in lines[-1]
+        a = told(1.0, dataset="a", phase="joining", note="cam0.mp4")
+        log.show(state_of(a, told(n / 100, dataset="b", failed=1)).rows())
+    (line,) = stream.getvalue().splitlines()
+    assert re.search(r"packing 2 datasets: 55 % \| parts 264/480  1 failed  ", line)
+    assert "a joining cam0.mp4  parts 240/240  50.0 GB -> 5.0 GB, b parts 24/240" in line
 
 
 def test_hostile_names_reach_no_log() -> None:
     clock, stream = Clock(), io.StringIO()
-    log = Log(PackState(clock=clock), Lines(stream), now=clock.now)
+    log = Log(stream, clock=clock, now=clock.now)
     topics = {HOSTILE + "\udcff" + str(n) + "x" * n: (n, None) for n in range(1000)}
     for n in range(20):
         clock.seconds = 1000.0 + n
-        log.take(told(0.1, dataset=HOSTILE, topics=topics, note=HOSTILE))
-    lines = stream.getvalue().splitlines()
-    assert len(lines) == 2
-    assert all(re.fullmatch(r"[ -~]{1,4000}", line) for line in lines)
-    assert "and 980 more" in lines[1]
+        log.show(state_of(told(0.1, dataset=HOSTILE, topics=topics, note=HOSTILE)).rows())
+    (line,) = stream.getvalue().splitlines()
+    assert re.fullmatch(r"[ -~]{1,4000}", line)
+    assert "and 980 more" in line
 
 
-class _Broken(io.StringIO):
-    writes = 0
-
-    def write(self, text: str) -> int:
-        self.writes += 1
-        raise BrokenPipeError
-
-
-def test_a_pack_does_not_fail_for_want_of_a_log() -> None:
-    stream = _Broken()
-    lines = Lines(stream)
-    lines.write("one")
-    lines.write("two")
-    assert stream.writes == 1
-    closed = io.StringIO()
-    closed.close()
-    Lines(closed).write("one")
+@pytest.mark.parametrize("stream", [io.TextIOWrapper(io.BytesIO()), open(os.devnull)])  # noqa: SIM115, PTH123
+def test_a_pack_does_not_fail_for_want_of_a_log(stream: Any) -> None:
+    """The stream is closed, or cannot be written to."""
+    if stream.writable():
+        stream.close()
+    log = Log(stream, clock=Clock())
+    log.show(state_of(told(0.5)).rows())
+    log.end("done")
+    Events(stream).take(told(0.5))
 
 
 @pytest.mark.parametrize(
@@ -289,7 +257,6 @@ def test_a_pack_does_not_fail_for_want_of_a_log() -> None:
 )
 def test_durations(seconds: float, text: str) -> None:
     assert duration_text(seconds) == text
-    assert left_text(seconds) == (f"{text} left" if seconds else "")
 
 
 # ---------------------------------------------------------------- --json
@@ -341,7 +308,7 @@ def parsed(text: str) -> list[dict[str, Any]]:
 
 def test_the_events_of_a_pack() -> None:
     clock, stream = Clock(), io.StringIO()
-    events = Events(PackState(clock=clock), Lines(stream), now=clock.now)
+    events = Events(stream, clock=clock, now=clock.now)
     for n in range(1001):
         clock.seconds = 1000.0 + n / 10
         events.take(told(n / 1000, note=HOSTILE))
@@ -370,23 +337,38 @@ def test_the_events_of_a_pack() -> None:
     assert found[-1]["seconds"] == 100.0
 
 
-# ---------------------------------------------------------------- while a pack runs
+def test_the_last_event_is_not_lost_and_none_is_told_twice() -> None:
+    clock, stream = Clock(), io.StringIO()
+    events = Events(stream, clock=clock, now=clock.now)
+    for n in range(5):
+        clock.seconds = 1000.0 + n / 10
+        events.take(told(n / 4))
+    events.end("done")
+    assert [event.get("done") for event in parsed(stream.getvalue())] == [None, 0.0, 1.0, None]
 
 
-class _Counting:
-    def __init__(self) -> None:
-        self.calls: list[str] = []
-        self.ticked = threading.Event()
+def test_each_dataset_is_told_of_once_a_second() -> None:
+    clock, stream = Clock(), io.StringIO()
+    events = Events(stream, clock=clock, now=clock.now)
+    for n in range(81):
+        clock.seconds = 1000.0 + n / 8
+        for name in ("a", "b"):
+            events.take(told(n / 80, dataset=name))
+    events.end("interrupted")
+    found = parsed(stream.getvalue())[1:-1]
+    for name in ("a", "b"):
+        own = [event for event in found if event["dataset"].endswith(name)]
+        assert len(own) == 11
+        assert own[-1]["done"] == 1.0
 
-    def take(self, state: PackProgress) -> None:
-        self.calls.append("take")
 
-    def tick(self) -> None:
-        self.calls.append("tick")
-        self.ticked.set()
+def test_a_pack_that_does_not_begin_has_no_events() -> None:
+    stream = io.StringIO()
+    Events(stream).end("failed")
+    assert stream.getvalue() == ""
 
-    def end(self, outcome: str) -> None:
-        self.calls.append(outcome)
+
+# ---------------------------------------------------------------- while a command runs
 
 
 @pytest.mark.parametrize(
@@ -399,59 +381,79 @@ class _Counting:
         (SystemExit, "interrupted"),
     ],
 )
-def test_the_end_is_told_however_it_comes(error: type[BaseException] | None, outcome: str) -> None:
-    teller, threads = _Counting(), threading.active_count()
-    with (
-        suppress(ValueError, MemoryError, KeyboardInterrupt, SystemExit),
-        progress_to(teller, tick_seconds=0.01) as take,
-    ):
-        take(told(0.5))
-        assert teller.ticked.wait(WATCHDOG_S)
-        if error is not None:
-            raise error
-    *others, last = teller.calls
-    assert last == outcome
-    assert others.count("take") == 1
-    assert set(others) == {"take", "tick"}
-    assert threading.active_count() == threads
+def test_the_end_is_told_however_it_comes(
+    error: type[BaseException] | None, outcome: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with click.Context(click.Command("pack")), suppress(error or ValueError):
+        be_json()
+        with pack_progress() as take:
+            take(told(0.5))
+            if error is not None:
+                raise error
+    assert parsed(capsys.readouterr().err)[-1]["outcome"] == outcome
 
 
-# ---------------------------------------------------------------- other commands
+def test_a_short_pack_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with pack_progress() as take:
+        take(told(0.0))
+        take(told(1.0))
+    assert capsys.readouterr() == ("", "")
 
 
-def test_a_line_every_ten_seconds() -> None:
-    stream, seconds = io.StringIO(), [0.0]
-    tell = LogOf("validating", Lines(stream), clock=lambda: seconds[0])
-    for second in range(40):
-        seconds[0] = float(second)
-        tell(f"frame {second}\x1b", second / 80)
-    tell("hashing")
-    lines = stream.getvalue().splitlines()
-    assert [line.partition(" ")[2] for line in lines] == [
-        "validating: frame 10\\x1b | 12 % | 70 s left",
-        "validating: frame 20\\x1b | 25 % | 60 s left",
-        "validating: frame 30\\x1b | 37 % | 50 s left",
-    ]
+def test_a_short_pack_does_not_import_rich() -> None:
+    program = (
+        "import sys, mp4ds.cli.progress as p\n"
+        "with p.pack_progress(): pass\n"
+        "print([name for name in sys.modules if name.split('.')[0] == 'rich'])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert (result.stdout, result.stderr) == ("[]\n", "")
 
 
 # ---------------------------------------------------------------- terminals
 
 
-def screen(*states: PackProgress) -> str:
+@contextmanager
+def shown_on(screen: io.StringIO) -> Iterator[io.StringIO]:
+    """Let standard error be a screen."""
+    with mock.patch.object(sys, "stderr", screen):
+        yield screen
+
+
+def on_screen(*states: PackProgress, monkeypatch: pytest.MonkeyPatch) -> str:
     """What a terminal shows at last."""
-    stream = io.StringIO()
-    console = Console(file=stream, force_terminal=True, width=120, height=24, color_system=None)
-    with on_terminal(console) as take:
+    for name, value in (("COLUMNS", "120"), ("LINES", "24"), ("TERM", "xterm")):
+        monkeypatch.setenv(name, value)
+    with shown_on(Screen()) as screen, pack_progress() as take:
         for state in states:
             take(state)
-    return stream.getvalue()
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue())
 
 
-def test_a_terminal_shows_each_topic() -> None:
-    text = screen(told(0.3, cameras=14))
-    assert re.search(r"packing drive .* 30% parts 72/240  15\.0 GB -> 1\.5 GB", text)
+def test_a_terminal_shows_each_topic(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = on_screen(told(0.3, cameras=14), monkeypatch=monkeypatch)
+    assert re.search(r"packing drive .* 30 % +parts 72/240  15\.0 GB -> 1\.5 GB", text)
     for n in range(14):
-        assert re.search(rf"  /cam{n} .* 30% 10800/36000", text)
+        assert re.search(rf"  /cam{n} .* 30 % +10800/36000", text)
+
+
+def test_a_terminal_shows_each_dataset(monkeypatch: pytest.MonkeyPatch) -> None:
+    joining = told(1.0, dataset="a", phase="joining", note="cam0.mp4")
+    text = on_screen(told(0.5, dataset="b"), joining, monkeypatch=monkeypatch)
+    assert re.search(r"packing 2 datasets .* 75 % +parts 360/480", text)
+    assert re.search(r"  a .*100 % +joining cam0\.mp4  parts 240/240  50\.0 GB -> 5\.0 GB", text)
+    assert re.search(r"  b .* 50 % +parts 120/240  25\.0 GB -> 2\.5 GB", text)
+
+
+def test_a_terminal_shows_hostile_names_harmlessly(monkeypatch: pytest.MonkeyPatch) -> None:
+    topics = {HOSTILE: (1, None), "[red]/[/red]": (2, 3), "{task.id}": (3, 4)}
+    state = told(0.5, topics=topics, phase="joining", note=HOSTILE)
+    text = on_screen(state, monkeypatch=monkeypatch)
+    assert "\x1b" not in text
+    assert "[red]/[/red]" in text
+    assert "{task.id}" in text
 
 
 @pytest.fixture
@@ -505,6 +507,18 @@ def test_events_of_the_command(drives: list[Path], tmp_path: Path) -> None:
         assert last["tasks_done"] == last["tasks_total"] > 1
         counts = [(topic["done"], topic["total"]) for topic in last["topics"].values()]
         assert counts == [(frames, frames)] * 2
+
+
+def test_events_of_a_pack_in_one_go(drives: list[Path], tmp_path: Path) -> None:
+    result = subprocess.run(
+        command(drives[0], "--output", tmp_path / "x", "--json"),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = parsed(result.stderr)
+    assert found[-2]["done"] == found[-2]["job_done"] == 1.0
+    assert found[-2]["tasks_total"] == 0
 
 
 @pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])

@@ -206,7 +206,7 @@ def test_all_is_documented(name: str) -> None:
 
 # ---------------------------------------------------------------- importing
 
-HEAVY = ["numpy", "av", "pydantic", "yaml", "rosbags", "mcap", "jsonschema", "typer", "rich"]
+HEAVY = ["numpy", "av", "pydantic", "yaml", "rosbags", "mcap", "jsonschema", "click", "rich"]
 
 
 def test_importing_is_cheap() -> None:
@@ -220,9 +220,9 @@ def test_importing_is_cheap() -> None:
         ("mp4ds.FormatError", ["numpy", "av", "pydantic"]),
         ("mp4ds.__version__", ["numpy", "av", "pydantic"]),
         ("import mp4ds.cli", ["numpy", "av", "pydantic", "rosbags", "mcap"]),
-        ("mp4ds.open", ["typer", "rich", "jsonschema"]),
-        ("mp4ds.pack", ["typer", "rich", "jsonschema"]),
-        ("mp4ds.evaluate", ["typer", "rich", "jsonschema", "distributed", "dask"]),
+        ("mp4ds.open", ["click", "rich", "jsonschema"]),
+        ("mp4ds.pack", ["click", "rich", "jsonschema"]),
+        ("mp4ds.evaluate", ["click", "rich", "jsonschema", "distributed", "dask"]),
     ],
 )
 def test_what_is_used_is_imported(code: str, absent: list[str]) -> None:
@@ -239,7 +239,7 @@ def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
     assert (dataset / "dataset.yaml").is_file()
     assert {"mp4ds.bags.ros1", "mp4ds.packing.writer"} <= set(loaded)
     others = [
-        *("typer", "rich", "jsonschema", "google.protobuf", "sqlite3", "fsspec", "PIL"),
+        *("click", "rich", "jsonschema", "google.protobuf", "sqlite3", "fsspec", "PIL"),
         *("rosbags.rosbag2", "mp4ds.bags.rosbag2", "mp4ds.bags.convert"),
         *("mp4ds.plugins.importing.layouts", "mp4ds.video.scores", "mp4ds.packing.target"),
         *("mp4ds.dataset.topic", "mp4ds.packing.coordinator", "mp4ds.plugins.importing.ros_mp4"),

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import re
 import subprocess
+from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from commands import call
-from mp4ds.cli.record_words import known_words, spelled
+from commands import call, refused
+from mp4ds.cli.record import DIALECT, record_command
 from mp4ds.errors import OptionError
+from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.ros.names import NodeNames
 from roscore import RECORD
 
 ROOT = Path(__file__).parents[1]
@@ -28,66 +33,97 @@ JAZZY = {
 }
 """Options of Jazzy's `ros2 bag record`, by name: it is not installed here."""
 
-VALUED = {"-o", "--output", "-e", "--regex", "-x", "--exclude-regex", "-d", "-b", "--max-size"}
+
+def meant(typed: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What the recorder would be asked for: topics, output, and options that are not usual."""
+    asked: dict[str, Any] = {}
+
+    def opened(topics: Sequence[str], output: str | None, options: RecordOptions, **_: Any) -> None:
+        usual = RecordOptions(to=options.to)
+        found = {item.name: getattr(options, item.name) for item in fields(options)}
+        asked.update({k: v for k, v in found.items() if v != getattr(usual, k)})
+        asked.update({"topics": tuple(topics)} if topics else {})
+        asked.update({"output": output} if output else {})
+        raise OptionError("enough")
+
+    monkeypatch.setattr("mp4ds.cli.record.open_recorder", opened)
+    refused(call("record", *typed.split()), 2, "enough")
+    return asked
+
+
+A_AND_B = {"topics": ("/a", "/b")}
+ALL = {"all": True}
 
 
 @pytest.mark.parametrize(
-    ("typed", "meant"),
+    ("typed", "expected"),
     [
-        ("-o drive -a", "-o drive -a"),
-        ("-O drive.bag /a /b", "--output drive.bag /a /b"),
-        ("--ros2 --topics /a /b -o d", "--ros2 -o d /a /b"),
-        ("--exclude-topics /a /b -a", "--exclude /a --exclude /b -a"),
-        ("--ros2 -a -b 4000000000 -s mcap", "--ros2 -a --max-size 4000000000"),
-        ("--ros1 -a -b 512", "--ros1 -a -b 512"),
-        ("--ros2 -a --max-cache-size 104857600", "--ros2 -a --buffsize 104"),
-        ("--ros1 -a --split --duration=60", "--ros1 -a --max-bag-duration 60"),
-        ("--ros1 -a --split --size 1024", "--ros1 -a --max-size 1024M"),
-        ("--ros1 -a --duration 5m", "--ros1 -a --duration 300"),
-        ("--ros1 --topic /a --topic /b", "--ros1 /a /b"),
-        ("--ros1 -e /cam.* /imu -j", "--ros1 --regex ^(?:/cam.*|/imu)$"),
-        ("--ros2 -e cam /imu", "--ros2 -e cam /imu"),
-        ("--ros1 -a -x /rosout.*", "--ros1 -a -x ^(?:/rosout.*)$"),
-        ("--ros2 -a -x rosout", "--ros2 -a -x rosout"),
-        ("-a --ros-args -r __node:=eye -r __ns:=/robot", "-a"),
-        ("-a __name:=eye", "-a"),
+        ("-o drive -a", {"output": "drive"} | ALL),
+        ("-O drive.bag /a /b", {"output": "drive.bag"} | A_AND_B),
+        ("--ros2 --topics /a /b -o d", {"output": "d"} | A_AND_B),
+        ("--exclude-topics /a /b -a", {"exclude": ("/a", "/b")} | ALL),
+        ("--ros2 -a -b 4000000000 -s mcap", {"max_size": 4_000_000_000} | ALL),
+        ("--ros1 -a -b 512", {"buffer": 512} | ALL),
+        ("--ros2 -a --max-cache-size 104857600", {"buffer": 104} | ALL),
+        ("--ros1 -a --split --duration=60", {"max_duration": 60} | ALL),
+        ("--ros1 -a --split --size 1024", {"max_size": 2**30} | ALL),
+        ("--ros1 -a --duration 5m", {"duration": 300} | ALL),
+        ("--ros1 --topic /a --topic /b", A_AND_B),
+        ("--ros1 -e /cam.* /imu -j", {"regex": "^(?:/cam.*|/imu)$"}),
+        ("--ros2 -e cam /imu", {"regex": "cam", "topics": ("/imu",)}),
+        ("--ros1 -a -x /rosout.*", {"exclude_regex": "^(?:/rosout.*)$"} | ALL),
+        ("--ros2 -a -x rosout", {"exclude_regex": "rosout"} | ALL),
+        (
+            "-a --ros-args -r __node:=eye -r __ns:=/robot",
+            {"names": NodeNames("eye", "/robot")} | ALL,
+        ),
+        ("-a __name:=eye", {"names": NodeNames("eye")} | ALL),
         (
             "--ros2 --services /arm /leg/_service_event",
-            "--ros2 /arm/_service_event /leg/_service_event",
+            {"topics": ("/arm/_service_event", "/leg/_service_event")},
         ),
-        ("--ros2 -a --exclude-services /arm", "--ros2 -a --exclude /arm/_service_event"),
+        ("--ros2 -a --exclude-services /arm", {"exclude": ("/arm/_service_event",)} | ALL),
         (
             "--ros2 --topic-types a_msgs/msg/A b_msgs/msg/B --custom-data x=1 y=2 --all-services",
-            "--ros2 --topic-types a_msgs/msg/A --topic-types b_msgs/msg/B"
-            " --custom-data x=1 --custom-data y=2 --all-services",
+            {
+                "topic_types": ("a_msgs/msg/A", "b_msgs/msg/B"),
+                "custom_data": ("x=1", "y=2"),
+                "all_services": True,
+            },
         ),
-        ("--ros2 -a --storage-preset-profile fastwrite", "--ros2 -a"),
+        ("--ros2 -a --storage-preset-profile fastwrite", ALL),
     ],
 )
-def test_words(typed: str, meant: str) -> None:
-    words, _ = spelled(typed.split(), VALUED.__contains__)
-    assert words == meant.split()
+def test_words(typed: str, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert meant(typed, monkeypatch) == expected
 
 
 def test_options_of_jazzy_are_taken() -> None:
     """But for those that the page says are not."""
-    shown = call("record", "--help").out
-    known = {*known_words(), *re.findall(r"--[a-z][\w-]*", shown)}
-    assert JAZZY - known == {"--snapshot-mode"}
+    assert JAZZY - record_command.known == {"--snapshot-mode"}
 
 
-def test_a_value_that_is_missing() -> None:
-    with pytest.raises(OptionError, match="--storage requires an argument"):
-        spelled(["--ros2", "-a", "-s"], VALUED.__contains__)
-    with pytest.raises(OptionError, match="'1G' is not a number of bytes"):
-        spelled(["--max-cache-size", "1G"], VALUED.__contains__)
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("--ros2 -a -s", "requires an argument"),
+        ("--topics", "--topics requires an argument"),
+        ("--max-cache-size 1G", "'1G' is not a valid integer"),
+        ("--duration soon", "--duration 'soon' is not a number of seconds"),
+    ],
+)
+def test_a_value_that_is_wrong(typed: str, said: str) -> None:
+    done = call("record", *typed.split())
+    assert done.code == 2
+    assert said in done.err
 
 
 def test_the_page_lists_the_options_of_both_recorders() -> None:
     """Those of rosbag record as it tells them, those of rosbag2 by name."""
     table = (ROOT / "docs/recording.md").read_text().partition("## Options")[2]
     listed = set(re.findall(r"(?<![\w-])--?[a-zA-Z][\w-]*", table))
-    assert known_words() - {"--ros-args", "-r", "--size"} <= listed | {"--compression-mode"}
+    theirs = {*DIALECT.lists, *(flag for item in record_command.params for flag in item.opts)}
+    assert theirs & JAZZY <= listed | {"--compression-mode"}
     assert JAZZY - listed == set()
     if not Path(RECORD).exists():
         pytest.skip("ROS 1 is not installed")

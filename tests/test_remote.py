@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import mp4ds
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.bags.formats import open_sources
-from mp4ds.cli import app_for
+from mp4ds.cli import commands
 from mp4ds.errors import OptionError, PartsFailedError, RemoteError, SourceError
 from mp4ds.files.urls import KEPT_BYTES, RemoteFile, RemotePath, Segments, expect, location
 from mp4ds.packing.options import PackOptions
@@ -425,9 +425,9 @@ def test_problems_of_a_dataset_are_found_there(
 
 def run(*arguments: str) -> tuple[int, str]:
     """Exit code of a command, and what it says on stderr."""
-    from typer.testing import CliRunner
+    from click.testing import CliRunner
 
-    result = CliRunner().invoke(app_for(), list(arguments))
+    result = CliRunner().invoke(commands, list(arguments))
     assert result.exception is None or isinstance(result.exception, SystemExit)
     assert "Traceback" not in result.output
     return result.exit_code, result.output

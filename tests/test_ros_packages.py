@@ -15,11 +15,10 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-import typer
 
 import mp4ds
 from mp4ds.bags.formats import open_sources
-from mp4ds.cli import app_for
+from mp4ds.cli import commands
 from mp4ds.errors import SourceError
 from mp4ds.files.sources import UNFINISHED
 from mp4ds.records import Message
@@ -104,18 +103,18 @@ def test_launch_files_of_ros2(command: str, tmp_path: Path) -> None:
         cwd=tmp_path,
     ).splitlines()
     assert told[:4] == ["-m", "mp4ds", command, "--ros2"]
-    made: Any = typer.main.get_command(app_for(command))
-    context = made.commands[command].make_context(command, told[3:])
+    made: Any = commands.get_command(None, command)
+    context = made.make_context(command, told[3:])
     assert context.params["ros2"]
     if command == "play":
-        assert context.params["datasets"] == ["drive"]
+        assert context.params["datasets"] == ("drive",)
         assert context.params["loop"]
         assert context.params["clock"]
         assert context.params["paused"]
-        assert context.params["topics"] == ["/camera/*", "/tf"]
+        assert context.params["topics"] == ("/camera/*", "/tf")
     else:
-        assert context.params["topics"] == ["/camera/*", "/tf"]
-        assert context.params["exclude"] == ["/a*"]
+        assert context.params["topics"] == ("/camera/*", "/tf")
+        assert context.params["exclude"] == ("/a*",)
         assert context.params["output"] == "live"
 
 

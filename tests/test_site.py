@@ -17,11 +17,11 @@ from typing import Any
 from urllib.parse import unquote, urljoin, urlsplit
 
 import pytest
-import typer
 
 import mp4ds
 from chromium import chromium
-from mp4ds.cli import app_for
+from mp4ds.cli import COMMANDS
+from mp4ds.cli import commands as command_line
 from waiting import WATCHDOG_S
 
 ROOT = Path(__file__).parents[1]
@@ -144,10 +144,10 @@ def test_a_link_that_leads_nowhere_is_found(html: str, problem: str, tmp_path: P
 
 
 def commands() -> dict[str, Any]:
-    group: Any = typer.main.get_command(app_for())
-    below = group.commands.pop("import").commands
-    group.commands.pop("repack")  # another name of `pack`
-    return {**group.commands, **{f"import-{name}": one for name, one in below.items()}}
+    found: dict[str, Any] = {name: command_line.get_command(None, name) for name in COMMANDS}
+    found.pop("repack")  # another name of `pack`
+    below = found.pop("import").commands
+    return {**found, **{f"import-{name}": one for name, one in below.items()}}
 
 
 @pytest.mark.parametrize("name", sorted(commands()))

@@ -80,7 +80,7 @@ HOMES = {
     "fsspec": ("files",),
     "google": ("messages",),
     "torch": ("torch",),
-    "typer": ("cli",),
+    "click": ("cli",),
     "rich": ("cli",),
     "dask": ("plugins/cluster.py",),
     "dask_jobqueue": ("plugins/cluster.py",),

@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
 from commands import Result, typed
-from mp4ds.cli import app_for, play_words, record_words
+from mp4ds.cli import commands as command_line
 from ros2_sides import alone_in_ros2
 from test_examples import ROOT
 
@@ -123,18 +122,13 @@ def test_there_are_tutorials_and_they_run_something() -> None:
 # ---------------------------------------------------------------- options that pages name
 
 
-WORDS = {"play": play_words.known_words, "record": record_words.known_words}
-
-
 @cache
 def options_of(command: str) -> set[str]:
-    group = typer.main.get_command(app_for())
-    assert hasattr(group, "commands")
-    known = group.commands[command]
+    known: Any = command_line.get_command(None, command)
     below = getattr(known, "commands", {}).values()
     params = [option for each in (known, *below) for option in each.params]
     names = {name for option in params for name in (*option.opts, *option.secondary_opts)}
-    words = WORDS.get(command, lambda: ())()  # of nodes, as users of ROS type them
+    words = getattr(known, "known", ())  # of nodes, as users of ROS type them
     return {name for name in names if name.startswith("-")} | {"--help", "-h", *words}
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 import mp4ds
 from in_parts import InlineEngine, facts
-from mp4ds.cli import app_for
+from mp4ds.cli import commands
 from mp4ds.errors import (
     OptionError,
     PartsFailedError,
@@ -414,10 +414,10 @@ def test_from_a_url_to_a_url(
 
 
 def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -> None:
-    from typer.testing import CliRunner
+    from click.testing import CliRunner
 
     def run(*arguments: str) -> Any:
-        result = CliRunner().invoke(app_for(), [*arguments, "--json"])
+        result = CliRunner().invoke(commands, [*arguments, "--json"])
         assert result.exit_code == 0, result.output
         return json.loads(result.stdout)
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import typer
+import click
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
@@ -23,7 +23,8 @@ from mkdocs.structure.nav import Navigation
 from mkdocs.structure.pages import Page
 
 import mp4ds
-from mp4ds.cli import app_for
+from mp4ds.cli import COMMANDS
+from mp4ds.cli import commands as command_line
 from mp4ds.options import Options, declared_in
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -154,9 +155,9 @@ def _dest(dest: str, uri: str) -> str:
 
 def commands() -> dict[str, Any]:
     """All commands of the command line, those of groups by both words."""
-    group: Any = typer.main.get_command(app_for())
-    found = {}
-    for name, command in group.commands.items():
+    found: dict[str, Any] = {}
+    for name in COMMANDS:
+        command: Any = command_line.get_command(None, name)
         if hasattr(command, "commands"):
             found.update({f"{name} {below}": one for below, one in command.commands.items()})
         elif name not in _HIDDEN:
@@ -171,7 +172,7 @@ def command_page(name: str) -> str:
 
 def command_text(name: str, command: Any, examples: list[tuple[str, str, Page | str]]) -> str:
     """The page of a command."""
-    context = typer.Context(command, info_name=f"mp4ds {name}")
+    context = click.Context(command, info_name=f"mp4ds {name}")
     kinds = [kind for kind in getattr(command.callback, "kinds", ()) if is_public(kind)]
     parts = [f"# mp4ds {name}\n", _paragraphs(command.help)]
     usage = " ".join(["mp4ds", name, *command.collect_usage_pieces(context)])

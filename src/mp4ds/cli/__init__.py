@@ -8,124 +8,97 @@ from __future__ import annotations
 import os
 import sys
 from importlib import import_module
-from typing import Annotated, NoReturn
+from typing import Any, NoReturn
 
-import typer
+import click
 
 from mp4ds._version import __version__
-from mp4ds.cli.options import Command, QuietFlag, quietable
-from mp4ds.cli.output import be_quiet, say
-from mp4ds.cli.process import DEBUG, exit_code_of, prepare_process
-
-_COMPLETE = "_MP4DS_COMPLETE"  # set by shells for completion
+from mp4ds.cli.options import quiet_option
+from mp4ds.cli.output import say
+from mp4ds.cli.process import DEBUG, exit_code_of, prepare_process, report_errors
 
 COMMANDS = {
-    "pack": ("packing", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
-    "repack": ("packing", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
-    "unpack": (
-        "unpacking",
-        "Turn a dataset back into a recording: a bag, rosbag2, MCAP or images.",
-    ),
-    "import": (
-        "importing",
-        "Make a dataset from images, or from a video made by the paper's tool.",
-    ),
+    "pack": ("pack", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
+    "repack": ("pack", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
+    "unpack": ("unpack", "Turn a dataset back into a recording: a bag, rosbag2, MCAP or images."),
+    "import": ("imports", "Make a dataset from images, or from a video made by the paper's tool."),
     "export": (
-        "unpacking",
+        "export",
         "Export a dataset to another tool's format, keeping what that format supports.",
     ),
-    "play": (
-        "play",
-        "Play back datasets, publishing to ROS 1 or ROS 2.",
-    ),
-    "record": (
-        "record",
-        "Record topics of a live robot, ROS 1 or ROS 2, into a dataset.",
-    ),
+    "play": ("play", "Play back datasets, publishing to ROS 1 or ROS 2."),
+    "record": ("record", "Record topics of a live robot, ROS 1 or ROS 2, into a dataset."),
     "report": (
         "report",
         "Make an HTML report: synchronised cameras, timing, topics, calibrations.",
     ),
-    "frames": (
-        "report",
-        "Save one frame as an image, or many frames as a contact sheet.",
-    ),
+    "frames": ("report", "Save one frame as an image, or many frames as a contact sheet."),
     "evaluate": (
         "evaluate",
         "Compare encoder settings on clips of a recording: quality, size and time.",
     ),
     "validate": (
-        "validate",
+        "info",
         "Check datasets and list every problem; exits with 1 if there are any.",
     ),
     "info": ("info", "Show what is in a recording or a dataset."),
     "demo": (
-        "demo",
+        "imports",
         "Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf.",
     ),
 }
-"""Commands -> their module, and what they do."""
+"""Commands -> their module, which is imported for them alone, and what they do."""
 
 
-def app_for(*names: str, is_completing: bool = False) -> typer.Typer:
-    """The command line.
+class Commands(click.Group):
+    """The command line, with the commands of the table."""
 
-    Args:
-        names: Commands to build, with the modules that they use; the others are only listed.
-            None: build all.
-        is_completing: Whether a shell asks for completions, or for the completion script.
-    """
-    app = typer.Typer(
-        name="mp4ds",
-        help="Turn robot camera recordings into ordinary mp4 files, and back again exactly.",
-        no_args_is_help=True,
-        add_completion=is_completing,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )
-    app.callback(invoke_without_command=True)(_top)
-    for name, (home, does) in COMMANDS.items():
-        if names and name not in names:
-            app.command(name, short_help=does)(_listed)
-            continue
-        module = import_module(f"mp4ds.cli.{home}")
-        if name == "import":
-            app.add_typer(module.imports, short_help=does)
-        else:
-            made = getattr(module, name.replace("-", "_"))
-            kind = getattr(module, "COMMAND", Command)
-            app.command(name, short_help=does, cls=kind)(quietable(made))
-    return app
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The names."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context | None, cmd_name: str) -> click.Command | None:
+        """The command of a name."""
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = getattr(
+            import_module(f"mp4ds.cli.{COMMANDS[cmd_name][0]}"), f"{cmd_name}_command"
+        )
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write what they do, without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, does) for name, (_, does) in COMMANDS.items()])
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command, and report its errors."""
+        with report_errors():
+            return super().invoke(ctx)
 
 
-def _top(
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-    quiet: QuietFlag = False,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Show tracebacks of errors.")
-    ] = False,
-) -> None:
-    if quiet:
-        be_quiet()
+@click.group(
+    cls=Commands,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+@click.option("--version", is_flag=True, help="Print the version.")
+@quiet_option
+@click.option("--verbose", "-v", is_flag=True, help="Show tracebacks of errors.")
+@click.pass_context
+def commands(context: click.Context, version: bool, verbose: bool) -> None:
+    """Turn robot camera recordings into ordinary mp4 files, and back again exactly."""
     if verbose:
         os.environ[DEBUG] = "1"
     if version:
         say(f"mp4ds {__version__}")
-        raise typer.Exit
-
-
-def _listed() -> None:
-    """Placeholder for a command in the list of commands."""
+        context.exit()
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help(), err=True)
+        context.exit(2)
 
 
 def main() -> NoReturn:
     """Run the command line and exit."""
-    arguments = sys.argv[1:]
     prepare_process()
-    command = next((word for word in arguments if not word.startswith("-")), "")
-    # completion is not built for a command that runs
-    is_completing = _COMPLETE in os.environ or not command or command not in COMMANDS
-    names = () if _COMPLETE in os.environ else (command,)
-    app = app_for(*names, is_completing=is_completing)
-    sys.exit(exit_code_of(lambda: app(args=arguments), as_json="--json" in arguments))
+    sys.exit(exit_code_of(lambda: commands.main(sys.argv[1:])))

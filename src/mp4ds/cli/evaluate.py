@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import chain
-from typing import Annotated, Optional
 
-import typer
-
-from mp4ds.cli.options import JsonFlag, takes
-from mp4ds.cli.output import Column, print_json, print_table, say
-from mp4ds.cli.process import report_errors
+from mp4ds.cli.options import argument, command, option, takes
+from mp4ds.cli.output import Column, print_table, say, show
 from mp4ds.cli.progress import progress_of
 from mp4ds.errors import counted, interrupted, path_text
-from mp4ds.plugins.evaluating.evaluate import EvaluateOptions
-from mp4ds.plugins.evaluating.evaluate import evaluate as run
+from mp4ds.options import WHERE
+from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
 from mp4ds.plugins.evaluating.page import told
 from mp4ds.plugins.evaluating.results import Evaluation
 
@@ -57,36 +52,26 @@ def print_evaluation(result: Evaluation) -> None:
     say(f"{path_text(result.output)}/index.html: {tried} tried{known}")
 
 
+@command()
+@argument("source", "SOURCE", "A .bag, rosbag2 folder, .mcap, dataset, video or folder of images.")
+@option(
+    "--output",
+    "-o",
+    panel=WHERE,
+    metavar="DIR",
+    help="Folder for the results; default: NAME_evaluation.",
+)
 @takes(EvaluateOptions)
-def evaluate(
-    options: Callable[[], EvaluateOptions],
-    source: Annotated[
-        str,
-        typer.Argument(help="A .bag, rosbag2 folder, .mcap, dataset, video or folder of images."),
-    ],
-    output: Annotated[
-        Optional[str],  # noqa: UP045 - read at run time by typer
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="DIR",
-            help="Folder for the results; default: NAME_evaluation.",
-        ),
-    ] = None,
-    as_json: JsonFlag = False,
-) -> None:
+def evaluate_command(source: str, output: str | None, options: EvaluateOptions) -> None:
     """Compare encoder settings on clips of a recording: quality, size and time.
 
     Writes a folder with tables, plots and a page, and recommends options for `mp4ds pack`. To
     resume an interrupted evaluation, run the same command again.
     """
-    with report_errors(as_json), progress_of("evaluating", as_json) as tell:
-        try:
-            result = run(source, options(), output=output, progress=tell)
-        except (KeyboardInterrupt, SystemExit) as error:
-            kept = "results so far are kept: run the same command again to resume"
-            raise interrupted(error, kept) from None
-    if as_json:
-        print_json(result)
-    else:
-        print_evaluation(result)
+    try:
+        with progress_of("evaluating") as tell:
+            result = evaluate(source, options, output=output, progress=tell)
+    except (KeyboardInterrupt, SystemExit) as error:
+        kept = "results so far are kept: run the same command again to resume"
+        raise interrupted(error, kept) from None
+    show(result, print_evaluation)

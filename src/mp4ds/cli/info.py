@@ -1,100 +1,148 @@
-"""``mp4ds info``; calibrations as Python code."""
+"""``mp4ds info`` and ``mp4ds validate``: what is in recordings and datasets."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Annotated, Optional
 
-import typer
+import click
 
-from mp4ds.cli.options import JsonFlag
-from mp4ds.cli.output import print_info, print_json, print_overview, print_speeds, say
-from mp4ds.cli.process import report_errors
+from mp4ds.cli.options import argument, command, datasets_argument, jobs_option, option, takes
+from mp4ds.cli.output import Column, number, print_table, say, show
 from mp4ds.cli.progress import progress_of
-from mp4ds.dataset.collections import datasets_in
-from mp4ds.errors import OptionError, SourceError, counted, path_text
+from mp4ds.dataset.checks import Problem, validate
+from mp4ds.dataset.collections import datasets_in, each
+from mp4ds.errors import OptionError, SourceError, counted, path_text, size_text
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
-from mp4ds.options import SliceOptions
+from mp4ds.options import HOW, SliceOptions, iso_text
 from mp4ds.plugins import info as facts
 from mp4ds.plugins.card import card as card_of
-from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, ListedCalibration
-from mp4ds.plugins.intrinsics import intrinsics as intrinsics_of
+from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, ListedCalibration, intrinsics
+
+_SPEED_COLUMNS = [
+    Column("topic", "topic"),
+    Column("per frame"),
+    Column("ms, random access"),
+    Column("ms, in order"),
+]
+_OVERVIEW_COLUMNS = [
+    Column("dataset", "topic"),
+    Column("begins", "text", spare=1),
+    Column("seconds"),
+    Column("messages", spare=3),
+    Column("cameras", spare=2),
+    Column("frames"),
+    Column("size"),
+    Column("profile", "text", spare=4),
+]
+_INFO_COLUMNS = [
+    Column("topic", "topic"),
+    Column("type", "type", spare=1),
+    Column("messages"),
+    Column("Hz"),
+    Column("jitter ms", spare=6),
+    Column("gaps", spare=4),
+    Column("longest s", spare=5),
+    Column("size", spare=2),
+    Column("content", "text"),
+    Column("stored", "text", spare=3),
+]
 
 
-def info(
-    paths: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="PATH...",
-            help="A .bag, rosbag2 folder, .mcap, dataset or sidecar; or datasets, or a folder of "
-            "them.",
-        ),
-    ],
-    intrinsics: Annotated[
-        bool,
-        typer.Option("--intrinsics", help="Print the cameras' calibrations as Python code."),
-    ] = False,
-    speed: Annotated[
-        bool,
-        typer.Option("--speed", help="Read some frames of a dataset and show how long one takes."),
-    ] = False,
-    checksums: Annotated[
-        bool,
-        typer.Option(
-            "--checksums", help="Print the SHA-256 of a dataset's files in the format of sha256sum."
-        ),
-    ] = False,
-    card: Annotated[
-        bool,
-        typer.Option("--card", help="Print a dataset card for Hugging Face: README.md."),
-    ] = False,
-    start: Annotated[
-        Optional[str],  # noqa: UP045 - read at run time by typer
-        typer.Option("--start", metavar="TIME", help="Begin at this time, written as for `pack`."),
-    ] = None,
-    end: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--end", metavar="TIME", help="Stop before this time."),
-    ] = None,
-    duration: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(
-            "--duration",
-            metavar="SECONDS",
-            help="Length of the slice: seconds from --start, or before --end.",
-        ),
-    ] = None,
-    as_json: JsonFlag = False,
-) -> None:
+@command()
+@argument(
+    "paths",
+    "PATH...",
+    "A .bag, rosbag2 folder, .mcap, dataset or sidecar; or datasets, or a folder of them.",
+    nargs=-1,
+    required=True,
+)
+@option(
+    "--intrinsics",
+    "what",
+    flag_value="intrinsics",
+    panel=HOW,
+    help="Print the cameras' calibrations as Python code.",
+)
+@option(
+    "--speed",
+    "what",
+    flag_value="speed",
+    panel=HOW,
+    help="Read some frames of a dataset and show how long one takes.",
+)
+@option(
+    "--checksums",
+    "what",
+    flag_value="checksums",
+    panel=HOW,
+    help="Print the SHA-256 of a dataset's files in the format of sha256sum.",
+)
+@option(
+    "--card",
+    "what",
+    flag_value="card",
+    panel=HOW,
+    help="Print a dataset card for Hugging Face: README.md.",
+)
+@takes(SliceOptions)
+def info_command(paths: Sequence[str], what: str | None, options: SliceOptions) -> None:
     """Show what is in a recording or a dataset."""
-    if intrinsics and speed:
-        with report_errors(as_json):
-            raise OptionError("Give --intrinsics or --speed, not both.")
-    with report_errors(as_json):
-        found = _found(paths)
-        asked = SliceOptions(start=start, end=end, duration=duration).slice
-        if len(found) > 1 and (intrinsics or speed or asked or checksums):
-            raise OptionError("These options work with one recording or dataset only.")
-    if intrinsics:
-        _print_intrinsics(paths[0], as_json)
-    elif speed:
-        _print_speeds(paths[0], as_json)
-    elif checksums:
-        _print_checksums(found[0], as_json)
-    elif card:
-        _print_card(found, as_json)
-    elif len(found) > 1:
-        _print_overview(found, as_json)
-    else:
-        with report_errors(as_json):
-            result = facts.info(found[0], asked)
-        if as_json:
-            print_json(result)
+    found = _found(paths)
+    if len(found) > 1 and (options.slice or what not in (None, "card")):
+        raise OptionError("These options work with one recording or dataset only.")
+    with progress_of("reading") as tell:
+        if what == "intrinsics":
+            show(intrinsics(paths[0]), _print_intrinsics)
+        elif what == "speed":
+            show(facts.reading_speeds(paths[0]), _print_speeds)
+        elif what == "checksums":
+            show(_checksums(found[0]), _print_checksums)
+        elif what == "card":
+            show({"card": card_of(found)}, _print_card)
+        elif len(found) == 1:
+            show(facts.info(found[0], options.slice), _print_info)
         else:
-            print_info(result)
+            rows = []
+            for done, path in enumerate(found):
+                tell(path.name, done / len(found))
+                rows.append(facts.brief(path))
+            show(rows, _print_overview)
+
+
+@command()
+@datasets_argument
+@option(
+    "--deep",
+    is_flag=True,
+    panel=HOW,
+    help="Also hash and decode every file and check every message's digest.",
+)
+@jobs_option
+def validate_command(datasets: Sequence[str], deep: bool, jobs: int | None) -> None:
+    """Check datasets and list every problem; exits with 1 if there are any."""
+    places = datasets_in(datasets)
+    found: dict[Path, list[Problem]] = {}
+    with progress_of("validating") as tell:
+        if len(places) == 1:
+            found[places[0]] = validate(places[0], deep=deep, progress=tell)
+        else:
+            for path, problems in each(partial(validate, deep=deep), places, jobs):
+                found[path] = problems
+                tell(f"{len(found)} of {len(places)} datasets", len(found) / len(places))
+    result = [{"path": path, "deep": deep, "problems": item} for path, item in found.items()]
+    show(
+        result[0] if len(result) == 1 else result,
+        lambda _: _print_validation(found, deep=deep),
+    )
+    if any(found.values()):
+        raise click.exceptions.Exit(1)
 
 
 def _found(paths: Sequence[str]) -> list[Path]:
@@ -107,59 +155,127 @@ def _found(paths: Sequence[str]) -> list[Path]:
         return [location(paths[0])]  # a recording's folder, or nothing
 
 
-def _print_checksums(path: Path, as_json: bool) -> None:
-    """Print the hashes of a dataset's files from its manifest, and that of the manifest itself."""
-    with report_errors(as_json):
-        if not (path / MANIFEST_NAME).is_file():
-            raise OptionError(f"{path} is not a dataset; only datasets have checksums.")
-        told = {item.name: item.sha256 for item in load_manifest(path / MANIFEST_NAME).files}
-        told[MANIFEST_NAME] = digest_file(path / MANIFEST_NAME)[1]
-    if as_json:
-        print_json(told)
-        return
-    for name, sha256 in told.items():
+def _checksums(path: Path) -> dict[str, str]:
+    """The hashes of a dataset's files from its manifest, and that of the manifest itself."""
+    if not (path / MANIFEST_NAME).is_file():
+        raise OptionError(f"{path} is not a dataset; only datasets have checksums.")
+    known = {item.name: item.sha256 for item in load_manifest(path / MANIFEST_NAME).files}
+    return known | {MANIFEST_NAME: digest_file(path / MANIFEST_NAME)[1]}
+
+
+def _print_checksums(found: Mapping[str, str]) -> None:
+    for name, sha256 in found.items():
         say(f"{sha256}  {name}")
 
 
-def _print_card(found: Sequence[Path], as_json: bool) -> None:
-    with report_errors(as_json):
-        text = card_of(found)
-    if as_json:
-        print_json({"card": text})
-        return
-    for line in text.splitlines():
+def _print_card(found: Mapping[str, str]) -> None:
+    for line in found["card"].splitlines():
         say(line)
 
 
-def _print_overview(found: Sequence[Path], as_json: bool) -> None:
-    with report_errors(as_json), progress_of("reading", as_json) as tell:
-        rows = []
-        for number, path in enumerate(found):
-            if tell:
-                tell(path.name, number / len(found))
-            rows.append(facts.brief(path))
-    if as_json:
-        print_json(rows)
+def _print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None:
+    """Print all problems of datasets, and how thorough the check was."""
+    for problem in chain.from_iterable(found.values()):
+        say(path_text(problem))
+    count = sum(map(len, found.values()))
+    problems = counted(count, "problem") if count else "no problems"
+    if not deep:
+        depth = "; frames were not decoded (--deep does)"
+    elif not count:
+        depth = "; every video was decoded, every message with a digest checked"
     else:
-        print_overview(rows)
+        depth = ""  # what is missing or broken was not
+    if len(found) == 1:
+        say(f"{path_text(next(iter(found)))}: {problems}{depth}")
+        return
+    wrong = sum(map(bool, found.values()))
+    where = f" in {wrong} of them" if wrong else ""
+    say(f"{len(found)} datasets: {problems}{where}{depth}")
 
 
-def _print_intrinsics(path: str, as_json: bool) -> None:
-    with report_errors(as_json), progress_of("reading", as_json):
-        result = intrinsics_of(path)
-    if as_json:
-        print_json(result)
-    else:
-        print_intrinsics(result)
+def _print_overview(rows: Sequence[facts.Brief]) -> None:
+    """Print a line for each dataset, and totals."""
+    base = os.path.commonpath([str(row.path.parent) for row in rows])
+    table = [
+        [
+            os.path.relpath(str(row.path), base) if base else str(row.path),
+            _moment(row.start),
+            f"{row.seconds:.1f}",
+            str(row.messages),
+            str(len(row.frames)),
+            str(sum(row.frames.values())),
+            size_text(row.bytes),
+            row.profile,
+        ]
+        for row in rows
+    ]
+    total = [
+        f"{len(rows)} datasets",
+        "",
+        f"{sum(row.seconds for row in rows):.1f}",
+        str(sum(row.messages for row in rows)),
+        str(len({topic for row in rows for topic in row.frames})),
+        str(sum(sum(row.frames.values()) for row in rows)),
+        size_text(sum(row.bytes for row in rows)),
+        "",
+    ]
+    print_table(_OVERVIEW_COLUMNS, [*table, total])
 
 
-def _print_speeds(path: str, as_json: bool) -> None:
-    with report_errors(as_json), progress_of("reading", as_json):
-        speeds = facts.reading_speeds(path)
-    if as_json:
-        print_json(speeds)
-    else:
-        print_speeds(speeds)
+def _moment(time_ns: int | None) -> str:
+    """A time in UTC; empty if there is none."""
+    if time_ns is None:
+        return ""
+    return iso_text(time_ns - time_ns % 10**9)
+
+
+def _print_info(result: facts.Info) -> None:
+    """Print what is in a recording or dataset."""
+    kind = f"{result.kind}, profile {result.profile or '-'}"
+    say(f"{path_text(result.path)}: {kind}, {size_text(result.bytes)}")
+    if result.start is not None and result.end is not None:
+        start = datetime.fromtimestamp(result.start / 1e9, timezone.utc)
+        say(
+            f"{start:%Y-%m-%d %H:%M:%S} UTC, {(result.end - result.start) / 1e9:.2f} s, "
+            f"{counted(sum(topic.messages for topic in result.topics), 'message')}"
+        )
+    cameras = [topic for topic in result.topics if topic.content or topic.stored]
+    others = [topic for topic in result.topics if not topic.content and not topic.stored]
+    rows = [_info_row(topic) for topic in (*cameras, *others)]
+    if print_table(_INFO_COLUMNS, rows):
+        say("shortened to fit; in full: --json, or `| less -S`")
+    for note in result.notes:
+        say(note)
+
+
+def _print_speeds(speeds: Sequence[facts.ReadingSpeed]) -> None:
+    """Print how long reading frames takes."""
+    rows = [
+        [
+            item.topic,
+            size_text(item.bytes_per_frame),
+            number(item.random_ms, 1),
+            number(item.in_order_ms, 1),
+        ]
+        for item in speeds
+    ]
+    if rows:
+        print_table(_SPEED_COLUMNS, rows)
+
+
+def _info_row(topic: facts.TopicInfo) -> list[str]:
+    return [
+        topic.topic,
+        topic.type_name,
+        str(topic.messages),
+        number(topic.rate_hz, 2),
+        number(topic.jitter_ms, 2),
+        str(topic.gaps) if topic.gaps else "",
+        number(topic.longest_gap_s, 3),
+        size_text(topic.bytes) if topic.bytes is not None else "",
+        topic.content,
+        topic.stored,
+    ]
 
 
 # ---------------------------------------------------------------- calibrations
@@ -171,7 +287,7 @@ _MODELS = {
 }
 
 
-def print_intrinsics(result: Intrinsics) -> None:
+def _print_intrinsics(result: Intrinsics) -> None:
     """Print the calibrations of all cameras, one after another, and the static transforms."""
     say(f"# {path_text(result.path)}: {result.kind}, {counted(len(result.cameras), 'camera')}")
     say("import numpy as np")

@@ -1,68 +1,197 @@
-"""Commands that run as ROS nodes, and accept ROS arguments from users and launch files."""
+"""Commands that run as ROS nodes: they take the arguments of ROS, and those of ROS's own tools."""
 
 from __future__ import annotations
 
 import os
+import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-from mp4ds.cli.options import Command
+import click
+
+from mp4ds.cli.options import Command, option
 from mp4ds.cli.output import be_quiet
-from mp4ds.cli.process import DEBUG, report_errors
+from mp4ds.cli.process import DEBUG
 from mp4ds.errors import OptionError
+from mp4ds.options import HOW, WHERE, Options
+from mp4ds.options import option as field_option
 from mp4ds.plugins.ros.names import PLAIN, NodeNames, node_arguments
 
+_NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?")
 _NAMES = "mp4ds.names"  # key of the ROS arguments in click's context
-_QUIET = {"error", "fatal"}
+_LEVELS = ("", "debug", "info", "warn", "error", "fatal")
 
 
-class NodeCommand(Command):
-    """A command that is a node: takes ``__name:=x``, ``--ros-args`` and the like."""
+@dataclass(frozen=True, kw_only=True)
+class RosOptions(Options):
+    """Options of all nodes."""
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments other than ROS arguments."""
-        with report_errors("--json" in args):
-            words, ctx.meta[_NAMES] = self.spelled(ctx, args)
-        parsed: list[str] = super().parse_args(ctx, words)
-        return parsed
+    ros1: bool = field_option("Use ROS 1.", False, panel=WHERE)
+    ros2: bool = field_option("Use ROS 2, with rclpy, or else Cyclone DDS.", False, panel=WHERE)
+    log_level: str = field_option("Log level: debug, info, warn, error or fatal.", "", panel=HOW)
+    disable_keyboard_controls: bool = field_option("Disable the keyboard controls.", False)
+    progress: bool = field_option("Show the progress.", True, "--progress/--no-progress")
 
-    def valued(self, ctx: Any) -> set[str]:
-        """Options that take a value."""
-        return {
-            name
-            for option in self.get_params(ctx)
-            if option.param_type_name == "option" and not getattr(option, "is_flag", False)
-            for name in option.opts
-        }
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.ros1 and self.ros2:
+            raise OptionError("--ros1 contradicts --ros2.")
+        if self.log_level not in _LEVELS:
+            raise OptionError(f"`log_level` {self.log_level!r} is not {', '.join(_LEVELS[1:])}.")
 
-    def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
-        """The arguments of the command, and the ROS arguments.
-
-        Raises:
-            OptionError: A ROS argument is not valid.
-        """
-        del ctx
-        return node_arguments(args, rules_of=())
+    @property
+    def to(self) -> str | None:
+        """The ROS version; None for the one that is sourced."""
+        return "ros1" if self.ros1 else "ros2" if self.ros2 else None
 
 
-def names_in(ctx: Any) -> NodeNames:
-    """The ROS arguments of a command."""
-    names: NodeNames = ctx.meta.get(_NAMES, PLAIN)
+def node_names(options: RosOptions) -> NodeNames:
+    """The ROS arguments of the command that runs; from now on as much is printed as they say."""
+    names: NodeNames = click.get_current_context().meta.get(_NAMES, PLAIN)
+    level = options.log_level or names.log_level
+    if level == "debug":
+        os.environ[DEBUG] = "1"
+    if level in ("warn", "error", "fatal"):
+        be_quiet()
+    if level in ("error", "fatal"):
+        warnings.simplefilter("ignore")
     return names
 
 
-def say_as_much(level: str) -> None:
-    """Set how much is printed, by a log level of ROS 2; empty: leave it.
+@dataclass(frozen=True)
+class Dialect:
+    """How the arguments of ROS's own tools differ from those of others.
 
-    Raises:
-        OptionError: There is no such level.
+    Attributes:
+        lists: Options that take several values -> the option that takes each of them here, empty
+            for an argument, and what each value ends with.
+        letters: ROS version -> short options that mean something else in it -> what they mean.
+        defaults: Options that may be without their number -> ROS version, or empty -> the number.
+        remaps: Options that take remappings.
+        takes_paths: Whether its arguments are paths: without one, a list ends before a file.
     """
-    if level not in ("", "debug", "info", "warn", *_QUIET):
-        raise OptionError(f"`log_level` {level!r} is not debug, info, warn, error or fatal.")
-    if level == "debug":
-        os.environ[DEBUG] = "1"
-    if level in ("warn", *_QUIET):
-        be_quiet()
-    if level in _QUIET:
-        warnings.simplefilter("ignore")
+
+    lists: Mapping[str, tuple[str, str]]
+    letters: Mapping[str, Mapping[str, str]]
+    defaults: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    remaps: Collection[str] = ()
+    takes_paths: bool = False
+
+    def translated(self, words: Sequence[str], valued: Collection[str]) -> list[str]:
+        """Arguments as this command takes them.
+
+        Args:
+            words: As users type them, without ROS arguments.
+            valued: Options of this command that take a value.
+
+        Raises:
+            OptionError: An option has no value.
+        """
+        version = next((name for name in ("ros1", "ros2") if f"--{name}" in words), "")
+        letters = self.letters.get(version, {})
+        defaults = {name: by.get(version, by[""]) for name, by in self.defaults.items()}
+        return [*self._translate([*self._split(words, letters)][::-1], valued, defaults)]
+
+    def _split(self, words: Sequence[str], letters: Mapping[str, str]) -> Iterator[str]:
+        """Values split off from options of several, and letters as the options they mean."""
+        for word in words:
+            name, has_value, value = word.partition("=")
+            if name in self.lists and has_value:
+                yield from (name, value)
+            elif word in letters:
+                yield letters[word]
+            elif word[:2] in letters and not word.startswith("--"):
+                yield from (letters[word[:2]], word[2:])
+            else:
+                yield word
+
+    def _translate(
+        self, left: list[str], valued: Collection[str], defaults: Mapping[str, str]
+    ) -> Iterator[str]:
+        has_arguments = False
+        while left:
+            word = left.pop()
+            if word == "--":
+                yield from [word, *reversed(left)]
+                return
+            if word in self.lists:
+                name, ending = self.lists[word]
+                has_arguments |= not name
+                if not left or left[-1].startswith("-"):
+                    raise OptionError(f"{word} requires an argument.")
+                is_first = True
+                while left and (is_first or self._goes_on(name, left[-1], has_arguments)):
+                    is_first = False
+                    yield from filter(None, (name, left.pop().removesuffix(ending) + ending))
+                continue
+            yield word
+            if not word.startswith("-") or len(word) == 1:
+                has_arguments = True
+            elif word in defaults and not (left and _NUMBER.fullmatch(left[-1])):
+                yield defaults[word]
+            elif word in valued and left:
+                yield left.pop()
+
+    def _goes_on(self, name: str, word: str, has_arguments: bool) -> bool:
+        """Whether a word is one more value of a list, and not an option or argument."""
+        if word.startswith("-") and len(word) > 1:
+            return False
+        if name in self.remaps:
+            return ":=" in word
+        is_path = "://" in word or os.path.exists(word)  # noqa: PTH110 - is no argument yet
+        return not (self.takes_paths and is_path and not has_arguments)
+
+
+class NodeCommand(Command):
+    """A command that is a node.
+
+    Args:
+        dialect: That of ROS's own tool for the same purpose.
+    """
+
+    def __init__(self, *args: Any, dialect: Dialect, **values: Any) -> None:
+        super().__init__(*args, **values)
+        self.dialect = dialect
+
+    def translated(self, ctx: click.Context, words: list[str]) -> list[str]:
+        """The arguments other than ROS arguments, as this command has them."""
+        words, ctx.meta[_NAMES] = node_arguments(words, rules_of=tuple(self.dialect.remaps))
+        return self.dialect.translated(words, self.valued)
+
+    @property
+    def valued(self) -> set[str]:
+        """Options that take a value."""
+        return {
+            flag
+            for item in self.params
+            if isinstance(item, click.Option) and not item.is_flag
+            for flag in item.opts
+        }
+
+    @property
+    def known(self) -> set[str]:
+        """All options that are accepted, shown in the help or not."""
+        own = {flag for item in self.params for flag in (*item.opts, *item.secondary_opts)}
+        letters = {letter for found in self.dialect.letters.values() for letter in found}
+        return {*own, *self.dialect.lists, *letters, "--ros-args", "-r"}
+
+
+def accepted(*flags: str, values: int = 0) -> Callable[[Any], Any]:
+    """Options of ROS's own tools that have no meaning here.
+
+    Args:
+        flags: The options.
+        values: How many values each takes.
+    """
+    kind: dict[str, Any] = {"nargs": values, "type": str} if values else {"is_flag": True}
+
+    def decorate(function: Any) -> Any:
+        for flag in flags:
+            function = option(
+                f"ignored{flag.replace('-', '_')}", flag, hidden=True, expose_value=False, **kind
+            )(function)
+        return function
+
+    return decorate

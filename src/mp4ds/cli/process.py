@@ -17,11 +17,11 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn
 
-import typer
+import click
 
 from mp4ds._version import __version__
 from mp4ds.cli.options import in_flags
-from mp4ds.cli.output import complain, print_json, printed
+from mp4ds.cli.output import complain, is_json, print_json, printed
 from mp4ds.errors import Mp4dsError, sentence_of
 
 _NOTHING_LEFT = "no partial output was left behind"
@@ -34,39 +34,36 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 @contextmanager
-def report_errors(as_json: bool) -> Iterator[None]:
+def report_errors() -> Iterator[None]:
     """Turn errors into one sentence and an exit code."""
     try:
         yield
-    except (typer.Exit, typer.Abort, typer.BadParameter):
+    except (click.ClickException, click.exceptions.Exit, click.Abort):
         raise
     except KeyboardInterrupt as interrupt:
-        _fail(str(interrupt) or f"interrupted; {_NOTHING_LEFT}", 130, as_json)
+        _fail(str(interrupt) or f"interrupted; {_NOTHING_LEFT}", 130)
     except SystemExit as ended:  # by SIGTERM; without words of its own, its argument is its code
-        told = ended.args[0] if ended.args and isinstance(ended.args[0], str) else ""
-        _fail(told or f"terminated; {_NOTHING_LEFT}", ended.code, as_json)
+        said = ended.args[0] if ended.args and isinstance(ended.args[0], str) else ""
+        _fail(said or f"terminated; {_NOTHING_LEFT}", ended.code)
     except Mp4dsError as error:
-        _fail(in_flags(str(error)), error.exit_code, as_json)
+        _fail(in_flags(str(error)), error.exit_code)
     except OSError as error:
         # a path that the system itself refuses, wherever it occurs
-        code = 2 if error.errno in _BAD_PATH else 1
-        _fail(sentence_of(error), code, as_json)
+        _fail(sentence_of(error), 2 if error.errno in _BAD_PATH else 1)
     except MemoryError:
-        _fail(_NO_MEMORY, 1, as_json)
+        _fail(_NO_MEMORY, 1)
     except Exception as error:
         # errors of other calls on a system that is out of memory
         if any(words in str(error) for words in _MEMORY_REFUSED):
-            _fail(_NO_MEMORY, 1, as_json)
-        _fail(_unexpected(error), 1, as_json, versions=_versions())
+            _fail(_NO_MEMORY, 1)
+        _fail(_unexpected(error), 1, versions=_versions())
 
 
-def _fail(
-    message: str, code: Any, as_json: bool, *, versions: dict[str, str] | None = None
-) -> NoReturn:
+def _fail(message: str, code: Any, *, versions: dict[str, str] | None = None) -> NoReturn:
     if os.environ.get(DEBUG):
         for line in traceback.format_exc().splitlines():
             complain(line)
-    if as_json:
+    if is_json():
         with suppress(Mp4dsError):  # nobody reads it
             print_json(
                 {"error": message, "exit_code": code} | ({"versions": versions} if versions else {})
@@ -74,7 +71,7 @@ def _fail(
     complain(message)
     if versions:
         complain(", ".join(f"{name} {version}" for name, version in versions.items()))
-    raise typer.Exit(code)
+    raise click.exceptions.Exit(code)
 
 
 def _unexpected(error: Exception) -> str:
@@ -200,22 +197,21 @@ def _allow_files() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
-def exit_code_of(command: Callable[[], object], *, as_json: bool) -> int:
+def exit_code_of(command: Callable[[], object]) -> int:
     """Run the command line to its end, even if nobody reads its output.
 
     Args:
         command: Runs it; raises `SystemExit` with its exit code.
-        as_json: Whether errors are printed as JSON.
     """
     code = 0
     try:
-        with report_errors(as_json), printed():  # the commands report everything else themselves
+        with report_errors(), printed():  # the commands report everything else themselves
             try:
                 command()
             except SystemExit as ended:
                 code = int(ended.code or 0)
             sys.stdout.flush()
-    except typer.Exit as ended:
+    except click.exceptions.Exit as ended:
         code = code or ended.exit_code
     for stream in (sys.stdout, sys.stderr):
         _let_go(stream)

@@ -5,97 +5,109 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Optional
 
-import typer
+import click
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
 from mp4ds.cli.keyboard import Keyboard
-from mp4ds.cli.nodes import NodeCommand, names_in, say_as_much
-from mp4ds.cli.options import JsonFlag, takes
-from mp4ds.cli.output import complain, is_quiet, print_json, print_pack, say
-from mp4ds.cli.process import caught_signals, report_errors
-from mp4ds.cli.record_words import spelled
-from mp4ds.errors import OptionError, counted, path_text
+from mp4ds.cli.nodes import Dialect, NodeCommand, RosOptions, accepted, node_names
+from mp4ds.cli.options import argument, command, option, takes
+from mp4ds.cli.output import complain, is_json, is_quiet, say, show
+from mp4ds.cli.pack import print_pack
+from mp4ds.cli.process import caught_signals
+from mp4ds.errors import counted, path_text
 from mp4ds.files.sources import salvage_command
+from mp4ds.options import WHERE
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.record import RecordProgress, RecordSummary, open_recorder
-from mp4ds.plugins.ros.names import NodeNames
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
+from mp4ds.plugins.ros.names import SERVICE_EVENTS
 
 _LOG_S = 10.0
 _SHOWN = 20  # topics
 _UNTIMED = "their log time is negative or too large"
+_MB = 10**6
+
+DIALECT = Dialect(
+    lists={
+        "--topics": ("", ""),
+        "--topic": ("", ""),
+        "--services": ("", SERVICE_EVENTS),
+        "--exclude": ("--exclude", ""),
+        "--exclude-topics": ("--exclude", ""),
+        "--exclude-services": ("--exclude", SERVICE_EVENTS),
+        "--topic-types": ("--topic-types", ""),
+        "--exclude-topic-types": ("--exclude-topic-types", ""),
+        "--custom-data": ("--custom-data", ""),
+    },
+    letters={
+        "ros1": {"-e": "--match", "--regex": "--match"},
+        "ros2": {"-b": "--max-size", "-s": "--storage"},
+    },
+)
+"""What `rosbag record` and `ros2 bag record` write in another way."""
 
 
-class RecordCommand(NodeCommand):
-    """The command; it also takes the options of ROS's own recorders."""
-
-    def spelled(self, ctx: Any, args: Sequence[str]) -> tuple[list[str], NodeNames]:
-        """Translate arguments in the style of ROS's own recorders."""
-        return spelled(args, self.valued(ctx).__contains__)
-
-
-COMMAND = RecordCommand
-
-
+@command(cls=NodeCommand, dialect=DIALECT)
+@argument("topics", "TOPIC...", "Topic names, or globs in quotes; -a records all.", nargs=-1)
+@option(
+    "--output",
+    "--output-name",
+    "-o",
+    "-O",
+    panel=WHERE,
+    metavar="DATASET",
+    help="Folder to create; default: named after the time.",
+)
+@option("--match", is_flag=True, hidden=True)
+@option("--split", is_flag=True, hidden=True)
+@option("--size", type=int, hidden=True)
+@option("--max-cache-size", "cache", type=int, hidden=True)
+@accepted("-j", "--bz2", "--lz4", "--tcpnodelay")
+@accepted("--storage", "--storage-preset-profile", "--storage-config-file", values=1)
+@accepted("--compression-mode", "--compression-format", "--chunksize", values=1)
+@accepted("--compression-queue-size", "--compression-threads", values=1)
+@accepted("--compression-threads-priority", "--serialization-format", values=1)
+@takes(RosOptions, "ros")
 @takes(RecordOptions)
-def record(
-    options: Callable[[], RecordOptions],
-    context: typer.Context,
-    topics: Annotated[
-        Optional[list[str]],  # noqa: UP045 - read at run time by typer
-        typer.Argument(metavar="TOPIC...", help="Topic names, or globs in quotes; -a records all."),
-    ] = None,
-    output: Annotated[
-        Optional[str],  # noqa: UP045 - read at run time by typer
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="DATASET",
-            help="Folder to create; default: named after the time.",
-        ),
-    ] = None,
-    ros1: Annotated[bool, typer.Option("--ros1", help="Record from ROS 1.")] = False,
-    ros2: Annotated[
-        bool, typer.Option("--ros2", help="Record from ROS 2, with rclpy, or else Cyclone DDS.")
-    ] = False,
-    log_level: Annotated[
-        str,
-        typer.Option("--log-level", help="Log verbosity: debug, info, warn, error or fatal."),
-    ] = "",
-    no_keyboard: Annotated[
-        bool, typer.Option("--disable-keyboard-controls", help="Disable the keyboard controls.")
-    ] = False,
-    progress: Annotated[
-        bool,
-        typer.Option("--progress/--no-progress", help="Show topics while recording."),
-    ] = True,
-    as_json: JsonFlag = False,
+def record_command(
+    topics: Sequence[str],
+    output: str | None,
+    match: bool,
+    split: bool,
+    size: int | None,
+    cache: int | None,
+    ros: RosOptions,
+    options: RecordOptions,
 ) -> None:
     """Record topics of a live robot, ROS 1 or ROS 2, into a dataset.
 
     Ctrl-C ends the recording. It is lossless by default, with the fastest encoder settings. What
     cannot be packed in time waits on disk. Keys: space pauses and resumes, q ends.
     """
-    with report_errors(as_json), ExitStack() as stack:
-        if ros1 and ros2:
-            raise OptionError("--ros1 contradicts --ros2.")
-        kind = "ros1" if ros1 else "ros2" if ros2 else None
-        names = names_in(context)
-        say_as_much(log_level or names.log_level)
-        is_silent = as_json or not progress or is_quiet()
-        report = stack.enter_context(record_progress(is_quiet=is_silent))
-        told = replace(options(), to=kind, names=names)
+    options = replace(options, to=ros.to, names=node_names(ros))
+    if match:  # with -e, topics are regular expressions for rosbag record
+        topics, options = (), replace(options, regex=_whole(topics))
+    if ros.ros1 and options.exclude_regex:  # where ROS 2 searches, ROS 1 matches
+        options = replace(options, exclude_regex=_whole([options.exclude_regex]))
+    if split:
+        options = replace(options, duration=None, max_duration=options.duration)
+    if size is not None:
+        options = replace(options, max_size=f"{size}M")
+    if cache is not None:
+        options = replace(options, buffer=max(1, cache // _MB))
+    is_shown = ros.progress and not is_json() and not is_quiet()
+    with ExitStack() as stack:
+        report = stack.enter_context(_progress(is_shown=is_shown))
         # a launch file cannot leave out an argument: an empty one is none
-        opened = open_recorder(topics or (), output or None, told, progress=report)
+        opened = open_recorder(topics, output or None, options, progress=report)
         recorder = stack.enter_context(opened)
         if not is_quiet():
             complain(f"recording from {recorder.address}")
         stack.enter_context(caught_signals(recorder.stop))
-        if not no_keyboard:
+        if not ros.disable_keyboard_controls:
             stack.enter_context(Keyboard({" ": recorder.toggle_paused, "q": recorder.stop}))
         try:
             summary = recorder.run()
@@ -106,35 +118,29 @@ def record(
                 if commands
                 else "interrupted; everything recorded is in datasets"
             ) from None
-    if as_json:
-        print_json(summary)
-    else:
-        print_record(summary)
+    show(summary, _print)
     if summary.dropped or summary.lost or summary.untimed:
-        raise typer.Exit(1)
+        raise click.exceptions.Exit(1)
+
+
+def _whole(patterns: Sequence[str]) -> str:
+    return f"^(?:{'|'.join(patterns)})$"
 
 
 @contextmanager
-def record_progress(*, is_quiet: bool) -> Iterator[Callable[[RecordProgress], None]]:
-    """On a terminal, a table of the topics; in a log, a line every 10 s; warnings in both.
-
-    Args:
-        is_quiet: Print warnings only.
-    """
-    from rich.console import Console
-    from rich.live import Live
-
+def _progress(*, is_shown: bool) -> Iterator[Callable[[RecordProgress], None]]:
+    """On a terminal, a table of the topics; in a log, a line every 10 s; warnings in both."""
     console = Console(stderr=True)
-    told: set[str] = set()
+    warned: set[str] = set()
     next_line = 0.0
 
     def warn(state: RecordProgress) -> None:
         for warning in state.warnings:
-            if warning not in told:
-                told.add(warning)
+            if warning not in warned:
+                warned.add(warning)
                 complain(warning)
-        if state.state.startswith("waiting") and state.state not in told:
-            told.add(state.state)
+        if state.state.startswith("waiting") and state.state not in warned:
+            warned.add(state.state)
             complain(f"{state.state}: recording starts when it publishes a time")
         for topic, item in state.topics.items():
             for count, what in (
@@ -142,18 +148,18 @@ def record_progress(*, is_quiet: bool) -> Iterator[Callable[[RecordProgress], No
                 (item.lost, "the middleware is losing messages"),
                 (item.untimed, f"leaving out messages: {_UNTIMED}"),
             ):
-                if count and (line := f"{topic}: {what}") not in told:
-                    told.add(line)
+                if count and (line := f"{topic}: {what}") not in warned:
+                    warned.add(line)
                     complain(line)
 
     def log(state: RecordProgress) -> None:
         nonlocal next_line
         warn(state)
-        if state.seconds >= next_line and not is_quiet:
+        if state.seconds >= next_line and is_shown:
             next_line = state.seconds + _LOG_S
             complain(_line(state))
 
-    if is_quiet or not console.is_terminal:
+    if not is_shown or not console.is_terminal:
         yield log
         return
     with Live(console=console, auto_refresh=False, transient=True) as live:
@@ -182,9 +188,6 @@ def _line(state: RecordProgress) -> str:
 
 
 def _table(state: RecordProgress) -> Table:
-    from rich.table import Table
-    from rich.text import Text
-
     table = Table(title=_line(state), title_justify="left", box=None, pad_edge=False)
     for name in ("topic", "messages", "Hz", "MB/s", "lost"):
         table.add_column(
@@ -205,7 +208,7 @@ def _table(state: RecordProgress) -> Table:
     return table
 
 
-def print_record(summary: RecordSummary) -> None:
+def _print(summary: RecordSummary) -> None:
     """Print what was recorded."""
     for made in summary.datasets:
         if any(topic.messages for topic in made.topics):

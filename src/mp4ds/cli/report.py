@@ -3,100 +3,95 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
-import typer
+import click
 
-from mp4ds.cli.options import (
-    DatasetArgument,
-    DatasetsArgument,
-    JobsOption,
-    JsonFlag,
-    cores,
-    takes,
-)
-from mp4ds.cli.output import print_json, printed, say
-from mp4ds.cli.process import report_errors
+from mp4ds.cli.options import argument, command, datasets_argument, jobs_option, option, takes
+from mp4ds.cli.output import is_json, printed, say, show
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, counted, path_text, size_text
-from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary, reports
-from mp4ds.plugins.reporting.report import report as run_report
+from mp4ds.options import WHERE
+from mp4ds.plugins.reporting.report import (
+    OverviewSummary,
+    ReportOptions,
+    ReportSummary,
+    report,
+    reports,
+)
 from mp4ds.plugins.reporting.server import ReportServer
-from mp4ds.plugins.reporting.stills import StillOptions
-from mp4ds.plugins.reporting.stills import frames as run_frames
+from mp4ds.plugins.reporting.stills import StillOptions, StillSummary, frames
+
+_PLAYS = {"video": "its own video", "proxy": "a proxy", "nothing": "nothing"}
 
 
+@command()
+@datasets_argument
+@option("--serve", is_flag=True, panel=WHERE, help="Serve it to browsers on this machine.")
+@option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    panel=WHERE,
+    metavar="N",
+    help="Port for --serve; 0 picks a free one.",
+)
+@jobs_option
 @takes(ReportOptions)
-def report(
-    options: Callable[[], ReportOptions],
-    datasets: DatasetsArgument,
-    serve: Annotated[
-        bool, typer.Option("--serve", help="Serve the report to browsers on this machine.")
-    ] = False,
-    port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="Port for --serve; 0 picks a free one.")
-    ] = 0,
-    jobs: JobsOption = None,
-    as_json: JsonFlag = False,
+def report_command(
+    datasets: Sequence[str], serve: bool, port: int, jobs: int | None, options: ReportOptions
 ) -> None:
     """Make an HTML report: synchronised cameras, timing, topics, calibrations.
 
     Open its index.html in a browser, from disk or with --serve; it works offline. Several datasets,
     or a folder of them, get an overview page with a picture of each and links to their reports.
     """
-    with report_errors(as_json):
-        found, chosen = datasets_in(datasets), options()
-        if len(found) > 1:
-            if serve:
-                raise OptionError("--serve works with one dataset only.")
-            _reports(datasets, found, chosen, cores(jobs), as_json)
-            return
-        with progress_of("reporting", as_json) as tell:
-            summary = run_report(found[0], chosen, progress=tell)
-        if as_json:
-            print_json(
-                {
-                    "index": summary.index,
-                    "bytes": summary.bytes,
-                    "cameras": summary.cameras,
-                    "problems": summary.problems,
-                }
-            )
-        else:
-            _print_report(summary)
+    found = datasets_in(datasets)
+    if len(found) > 1:
         if serve:
-            _serve(summary, port, as_json)
+            raise OptionError("--serve works with one dataset only.")
+        summaries = _reports(datasets, found, options, jobs)
+        show(summaries, _print_reports)
+        if summaries.problems:
+            raise click.exceptions.Exit(1)
+        return
+    with progress_of("reporting") as tell:
+        summary = report(found[0], options, progress=tell)
+    if is_json():
+        names = ("index", "bytes", "cameras", "problems")
+        show({name: getattr(summary, name) for name in names}, say)
+    else:
+        _print_report(summary)
+    if serve:
+        with ReportServer(summary.files, summary.start, port=port) as server:
+            with printed():
+                stream = sys.stderr if is_json() else sys.stdout
+                print(f"{server.url} (Ctrl-C ends)", file=stream, flush=True)
+            server.serve()
     if summary.problems:
-        raise typer.Exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _reports(
-    datasets: Sequence[str],
-    found: Sequence[Path],
-    options: ReportOptions,
-    jobs: int,
-    as_json: bool,
-) -> None:
+    datasets: Sequence[str], found: Sequence[Path], options: ReportOptions, jobs: int | None
+) -> OverviewSummary:
     """Make the reports of several datasets, and the page that leads to them."""
     folder = options.output
     if folder is None and len(datasets) == 1 and Path(datasets[0]).is_dir():
         folder = Path(datasets[0])
     if folder is None:
         raise OptionError("Give `output`: where to write the overview page of several datasets.")
-    with progress_of("reporting", as_json) as tell:
-        summary = reports(found, folder, replace(options, output=None), jobs=jobs, progress=tell)
-    if as_json:
-        print_json(summary)
-    else:
-        for problem in summary.problems:
-            say(f"not shown: {problem}")
-        say(f"{path_text(summary.index)}: {counted(summary.datasets, 'dataset')}")
-    if summary.problems:
-        raise typer.Exit(1)
+    with progress_of("reporting") as tell:
+        return reports(found, folder, replace(options, output=None), jobs=jobs, progress=tell)
+
+
+def _print_reports(summary: OverviewSummary) -> None:
+    for problem in summary.problems:
+        say(f"not shown: {problem}")
+    say(f"{path_text(summary.index)}: {counted(summary.datasets, 'dataset')}")
 
 
 def _print_report(summary: ReportSummary) -> None:
@@ -108,38 +103,30 @@ def _print_report(summary: ReportSummary) -> None:
     say(f"{path_text(summary.index)}: {size_text(summary.bytes)}")
 
 
-_PLAYS = {"video": "its own video", "proxy": "a proxy", "nothing": "nothing"}
-
-
-def _serve(summary: ReportSummary, port: int, as_json: bool) -> None:
-    with ReportServer(summary.files, summary.start, port=port) as server:
-        told = sys.stderr if as_json else sys.stdout
-        with printed():
-            print(f"{server.url} (Ctrl-C ends)", file=told, flush=True)
-        server.serve()
-
-
+@command()
+@argument("dataset", "DATASET", "A dataset, or a sidecar next to its video.")
+@option(
+    "--output",
+    "-o",
+    required=True,
+    panel=WHERE,
+    metavar="IMAGE",
+    type=click.Path(path_type=Path),
+    help="The .png or .jpg to write.",
+)
 @takes(StillOptions)
-def frames(
-    options: Callable[[], StillOptions],
-    dataset: DatasetArgument,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="IMAGE", help="The .png or .jpg to write.")
-    ],
-    as_json: JsonFlag = False,
-) -> None:
+def frames_command(dataset: str, output: Path, options: StillOptions) -> None:
     """Save one frame as an image, or many frames as a contact sheet."""
-    with report_errors(as_json):
-        summary = run_frames(dataset, output, options())
-    if as_json:
-        print_json(summary)
-        return
+    show(frames(dataset, output, options), _print_still)
+
+
+def _print_still(summary: StillSummary) -> None:
     first, last = summary.frames[0], summary.frames[-1]
+    place = path_text(summary.output)
     if first is last:
-        place = f"{path_text(summary.output)}: frame {first.index} of {summary.topic}"
-        say(f"{place}, stamp {first.stamp_ns} ns")
+        say(f"{place}: frame {first.index} of {summary.topic}, stamp {first.stamp_ns} ns")
     else:
         say(
-            f"{path_text(summary.output)}: {len(summary.frames)} frames of {summary.topic}, from "
-            f"frame {first.index} to {last.index}"
+            f"{place}: {len(summary.frames)} frames of {summary.topic}, from frame {first.index} "
+            f"to {last.index}"
         )

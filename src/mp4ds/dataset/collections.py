@@ -88,14 +88,14 @@ def _is_hidden(dataset: Path, folder: Path) -> bool:
 
 
 def each(
-    work: Callable[[_Item], _Made], items: Sequence[_Item], jobs: int = 1
+    work: Callable[[_Item], _Made], items: Sequence[_Item], jobs: int | None = 1
 ) -> Iterator[tuple[_Item, _Made]]:
     """Process items in parallel.
 
     Args:
         work: A function that other processes can import, with picklable arguments.
         items: Its arguments.
-        jobs: Number of processes; if 1, this one.
+        jobs: Number of processes; if 1, this one; None for one per core.
 
     Yields:
         Each item with its result, in order.
@@ -103,13 +103,14 @@ def each(
     Raises:
         Mp4dsError: A process died, perhaps out of memory; otherwise whatever the work raises.
     """
-    if min(jobs, len(items)) < 2:
+    workers = min(jobs or available_cores(), len(items))
+    if workers < 2:
         for item in items:
             yield item, work(item)
         return
     before = set(multiprocessing.active_children())
     with ProcessPoolExecutor(
-        min(jobs, len(items)), multiprocessing.get_context("spawn"), initializer=_leave_to_parent
+        workers, multiprocessing.get_context("spawn"), initializer=_leave_to_parent
     ) as pool:
         try:
             yield from zip(items, pool.map(partial(_worked, work), items), strict=True)
@@ -126,6 +127,13 @@ def each(
                 process.kill()  # one that has not ended would be waited for without end
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def available_cores() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _leave_to_parent() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.collections import available_cores
 from mp4ds.files.sources import SourceState
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.options import Slice
@@ -137,13 +138,6 @@ def _memory() -> int:
         with suppress(OSError, ValueError):
             total = min(total, int(Path(name).read_text()))
     return total
-
-
-def available_cores() -> int:
-    """Processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @dataclass(frozen=True, slots=True)

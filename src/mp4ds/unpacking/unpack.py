@@ -192,7 +192,7 @@ def unpack_each(
     folder: Path | str | None = None,
     options: UnpackOptions | None = None,
     *,
-    jobs: int = 1,
+    jobs: int | None = 1,
     progress: Callable[[UnpackProgress], None] | None = None,
 ) -> list[UnpackSummary]:
     """Write the recordings of several datasets; see `unpack`.
@@ -203,7 +203,7 @@ def unpack_each(
         folder: Where to write, each named after its dataset; created if missing. None: each next to
             its dataset.
         options: How.
-        jobs: Datasets to process in parallel.
+        jobs: Datasets to process in parallel; None for one per core.
         progress: Called after each dataset, with their counts.
 
     Raises:

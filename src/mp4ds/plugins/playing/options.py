@@ -114,7 +114,13 @@ class PlayOptions(ReductionOptions):
         "",
         panel=WHERE,
     )
-    clock: float | None = argument("Publish /clock at this rate in Hz; default: do not publish it.")
+    clock: float | None = option(
+        "Publish /clock at this rate; the default of the rate is 100, or 40 with --ros2.",
+        None,
+        "--clock",
+        "--hz",
+        metavar="[HZ]",
+    )
     clock_topics: Sequence[str] = option(
         "Publish /clock just before each message on these topics.", (), metavar="TOPIC"
     )

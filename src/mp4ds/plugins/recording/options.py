@@ -22,6 +22,16 @@ from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, Selection, parse_quali
 from mp4ds.plugins.ros.names import PLAIN, SERVICE_EVENTS, NodeNames
 
 
+def _parse_duration(value: str | float) -> float:
+    """Seconds of ``90``, ``5m`` or ``2h``."""
+    text = str(value)
+    factor = {"m": 60, "h": 3600}.get(text[-1:], 1)
+    try:
+        return float(text[:-1] if factor > 1 else text) * factor
+    except ValueError:
+        raise OptionError(f"{value!r} is not a number of seconds, such as 2.5.") from None
+
+
 @dataclass(frozen=True, kw_only=True)
 class RecordOptions(Options):
     """How to record."""
@@ -62,11 +72,13 @@ class RecordOptions(Options):
         "-x",
         panel=WHAT,
     )
-    duration: float | None = option(
-        "Stop after N seconds.",
+    duration: Parsed[float | None] = option(
+        "Stop after so many seconds; also 5m, 2h.",
         None,
         "--duration",
         panel=WHAT,
+        metavar="SECONDS",
+        parse=_parse_duration,
     )
     max_duration: float | None = option(
         "Start a new dataset after this many seconds; 0: never.",
@@ -80,6 +92,7 @@ class RecordOptions(Options):
         "Start a new dataset at this size, such as 4G.",
         None,
         "--max-size",
+        "--max-bag-size",
         metavar="SIZE",
         parse=parse_size,
         panel=WHAT,

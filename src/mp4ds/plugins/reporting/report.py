@@ -312,7 +312,7 @@ def reports(
     folder: Path | str,
     options: ReportOptions | None = None,
     *,
-    jobs: int = 1,
+    jobs: int | None = 1,
     progress: Callable[[str, float | None], None] | None = None,
 ) -> OverviewSummary:
     """Make the report of each dataset, and a page that shows them all.
@@ -321,7 +321,7 @@ def reports(
         datasets: Datasets, folders of them, or patterns; on this machine.
         folder: Where to make the page. Each report is in its dataset.
         options: How the reports are made; without `output`.
-        jobs: Datasets at a time.
+        jobs: Datasets at a time; None for one per core.
         progress: Called with a phrase, and the share done.
 
     Raises:

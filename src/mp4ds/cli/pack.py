@@ -1,0 +1,167 @@
+"""``mp4ds pack``, also known as ``mp4ds repack``, and what is printed of datasets that are made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import mp4ds
+from mp4ds.cli.options import argument, command, option, parse_share, takes
+from mp4ds.cli.output import Column, number, print_table, say, show
+from mp4ds.cli.progress import pack_progress
+from mp4ds.errors import OptionError, counted, path_text, size_text
+from mp4ds.options import LONG, WHERE, seconds_text
+from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary
+from mp4ds.records import Loss, latched_text
+
+_LOSSES_SHOWN = 20
+_COLUMNS = [
+    Column("topic", "topic"),
+    Column("type", "type", spare=3),
+    Column("messages"),
+    Column("frames", spare=2),
+    Column("raw", spare=1),
+    Column("packed"),
+    Column("ratio"),
+    Column("stored in", "text"),
+]
+
+
+@command()
+@argument(
+    "sources",
+    "SOURCE...",
+    "A .bag, rosbag2 folder, .mcap or dataset; or the parts of a split recording.",
+    nargs=-1,
+    required=True,
+)
+@option(
+    "--output",
+    "-o",
+    panel=WHERE,
+    metavar="DATASET",
+    help="Folder to create; if it ends in a slash, one dataset per SOURCE is made in it. Default: "
+    "named after SOURCE, in the current folder.",
+)
+@option("--shard", panel=LONG, metavar="I/N", help="Pack only share I of N shares of the parts.")
+@takes(PackOptions)
+def pack_command(
+    sources: Sequence[str], output: str | None, shard: str | None, options: PackOptions
+) -> None:
+    """Pack a recording into a dataset of mp4 files, or repack a dataset.
+
+    Lossless by default: `mp4ds unpack` restores every message exactly. To resume a long pack that
+    was interrupted, run the same command again. Repacking a dataset keeps exact what was exact.
+    """
+    into = output if output and output.endswith("/") else None
+    if shard and (options.join or into):
+        raise OptionError("`shard` cannot be combined with `join` or with several datasets.")
+    with pack_progress(whole=not shard) as progress:
+        if shard:
+            mp4ds.pack_share(sources, output, parse_share(shard), options, progress=progress)
+            done = f"share {shard} is packed; once all shares are, run --join to make the dataset"
+            show([], lambda _: say(done))
+            return
+        if into:
+            summaries = mp4ds.pack_each(sources, into, options, progress=progress)
+        else:
+            summaries = [mp4ds.pack(sources, output, options, progress=progress)]
+    show(summaries if into else summaries[0], lambda _: [*map(print_pack, summaries)])
+
+
+repack_command = pack_command
+
+
+def print_pack(summary: PackSummary) -> None:
+    """Print what became of each topic."""
+    cameras = [topic for topic in summary.topics if topic.frames]
+    others = [topic for topic in summary.topics if not topic.frames]
+    rows = [_pack_row(topic) for topic in (*cameras, *others)]
+    print_table(_COLUMNS, rows)
+    for topic in summary.topics:
+        for reason, (count, first) in topic.verbatim.items():
+            share = f"{count} of {counted(topic.messages, 'message')}"
+            say(
+                f"{topic.topic}: {share} stored verbatim in messages.mcap: {reason} (first: "
+                f"message {first})"
+            )
+        for note in topic.notes:
+            say(f"{topic.topic}: {note}")
+    for what, count in summary.skipped.items():
+        say(f"not packed exactly: {what} ({count})")
+    if summary.left_out:
+        say(f"left out: {', '.join(summary.left_out)}")
+    print_latched(summary.latched, summary.latched_left_out)
+    print_losses(summary.losses, "listed in dataset.yaml")
+    if not any(topic.files for topic in summary.topics):
+        say("no topic became a video: all messages are stored unchanged in messages.mcap")
+    if summary.not_copied:
+        say(f"re-encoded, because it cannot be copied: {summary.not_copied}")
+    if summary.is_copy:
+        say(f"{path_text(summary.dataset)}: {size_text(summary.dataset_bytes)}, copied")
+        return
+    say(
+        f"{path_text(summary.dataset)}: {size_text(summary.source_bytes)} -> "
+        f"{size_text(summary.dataset_bytes)}{_change(summary)}, of which messages.mcap "
+        f"{size_text(summary.messages_bytes)}"
+    )
+    if summary.larger:
+        say(f"larger than its source: {summary.larger}")
+
+
+def _change(summary: PackSummary) -> str:
+    """How much smaller a dataset is than its source; empty if the source has no bytes."""
+    if not summary.source_bytes:
+        return ""
+    ratio = summary.source_bytes / summary.dataset_bytes
+    return f" ({ratio:.2f} times smaller)" if ratio >= 1 else f" ({1 / ratio:.2f} times as large)"
+
+
+def print_losses(losses: Sequence[Loss], where: str) -> None:
+    """Print what could not be read, and where the rest is listed."""
+    for loss in losses[:_LOSSES_SHOWN]:
+        say(f"lost: {_loss_text(loss)}")
+    if len(losses) > _LOSSES_SHOWN:
+        say(f"lost: {counted(len(losses) - _LOSSES_SHOWN, 'more place')}, {where}")
+
+
+def _loss_text(loss: Loss) -> str:
+    place = f" at byte {loss.offset}" if loss.offset is not None else ""
+    size = f", {size_text(loss.size)}" if loss.size is not None else ""
+    messages = ""
+    if loss.messages is not None:
+        messages = f"; {counted(loss.messages, 'message') if loss.messages else 'no messages'}"
+    topics = f" of {', '.join(loss.topics)}" if loss.topics else ""
+    if loss.frames is None:
+        return f"{loss.file}{place}{size}: {loss.problem}{messages}{topics}"
+    first, last = loss.frames
+    frames = f"frame {first}" if first == last else f"frames {first} to {last}"
+    times = dict.fromkeys(seconds_text(time) for time in (loss.start, loss.end) if time is not None)
+    logged = f", log time {' to '.join(times)}" if times else ""
+    return f"{loss.file}: {frames}{topics}{logged}: {loss.problem}"
+
+
+def _pack_row(topic: TopicSummary) -> list[str]:
+    stored = ", ".join(topic.files)
+    if not stored:
+        modelled = topic.messages and topic.frames == topic.messages
+        stored = "sidecar" if modelled else "messages.mcap"
+    ratio = topic.raw_bytes / topic.packed_bytes if topic.packed_bytes else 0
+    return [
+        topic.topic,
+        topic.type_name,
+        str(topic.messages),
+        str(topic.frames) if topic.files else "",
+        size_text(topic.raw_bytes) if topic.raw_bytes else "",
+        size_text(topic.packed_bytes) if topic.packed_bytes else "",
+        number(ratio or None, 2),
+        stored,
+    ]
+
+
+def print_latched(latched: Mapping[str, int], left_out: Sequence[str]) -> None:
+    """Print which latched messages from before a slice were included, by topic."""
+    if latched:
+        say(latched_text(latched))
+    if left_out:
+        topics = ", ".join(left_out)
+        say(f"left out, as too large: latched messages from before the start: {topics}")
