@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
@@ -52,6 +54,23 @@ def join(parts: list[Path], folder: Path) -> Path:
     with ExitStack() as stack:
         concat([stack.enter_context(Dataset(part)) for part in parts], folder)
     return folder
+
+
+@pytest.fixture
+def few_files() -> Iterator[None]:
+    """Fewer than twelve more files may be open."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    opened = max(int(path.name) for path in Path("/dev/fd").iterdir()) + 1
+    resource.setrlimit(resource.RLIMIT_NOFILE, (opened + 10, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+@pytest.mark.usefixtures("few_files")
+def test_files_of_all_parts_are_not_open_at_once(whole: Path, tmp_path: Path) -> None:
+    """A long recording has a part for every few seconds."""
+    join(cut(whole, tmp_path / "parts", 12), tmp_path / "joined")
+    assert validate(tmp_path / "joined") == []
 
 
 @pytest.mark.parametrize("count", [2, 5])

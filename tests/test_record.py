@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from coded_scenes import CODED
 from commands import call, tree
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.mcap import McapWriter
@@ -100,6 +101,46 @@ def test_what_comes_is_there(source: str, encoding: str, tmp_path: Path, compare
         stream = dataset["/cam/image_raw"]
         assert stream[7].intrinsics.k[0] > 0  # calibrations have found their images
         assert stream[13].data.shape[0] == 48
+
+
+@pytest.mark.parametrize("kind", ["video-h264", "video-h265", "video-h264-headers-once"])
+def test_packets_on_both_sides_of_a_cut(kind: str, tmp_path: Path, compare: Compare) -> None:
+    """Pieces are cut at key frames of the video, whatever else is cut in between."""
+    paths = write(tmp_path, "rosbag2-mcap-v5", CODED[kind](frames=40))
+    (made,) = recorded(PlayedSource(paths), tmp_path / "live").datasets
+    assert {item.topic: item.frames for item in made.topics}["/cam/video"] == 40
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    assert compare(paths, again(tmp_path / "live", tmp_path, "rosbag2")) == []
+    with mp4ds.open(tmp_path / "live") as dataset:
+        assert len(dataset.streams) == 1
+
+
+@pytest.mark.parametrize("case", ["late at a cut", "a clock that jumps back"])
+def test_times_that_are_not_in_order(case: str, tmp_path: Path) -> None:
+    """As threads take turns, or a simulation starts over: all is there, by log time."""
+    paths = write(tmp_path)
+    first = next(iter(messages(paths))).log_time
+    sent: list[tuple[str, int, bytes]] = []
+
+    def altered(message: Message, number: int) -> Message:
+        time = message.log_time
+        if case == "late at a cut":
+            time -= 120_000_000 * (number % 7 == 3)
+        elif time - first > 1_200_000_000:
+            time -= 1_000_000_000
+        sent.append((message.channel.topic, time, bytes(message.data)))
+        return replace(message, log_time=time)
+
+    topics = {message.channel.topic for message in messages(paths)}
+    recorded(PlayedSource(paths, altered=dict.fromkeys(topics, altered)), tmp_path / "live")
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    found = [
+        (message.channel.topic, message.log_time, bytes(message.data))
+        for message in messages([again(tmp_path / "live", tmp_path)])
+    ]
+    assert sorted(found) == sorted(sent)
+    times = [time for _, time, _ in found]
+    assert times == sorted(times)
 
 
 def test_quality(tmp_path: Path, compare: Compare) -> None:
