@@ -1,15 +1,18 @@
-"""The options of a player."""
+"""The options of a player, and the topics that they choose."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from mp4ds.errors import OptionError
 from mp4ds.options import WHAT, WHERE, Parsed, argument, jpeg_quality, option
+from mp4ds.plan import Selection
 from mp4ds.plugins.ros.names import PLAIN, NodeNames
+from mp4ds.plugins.ros.node import CLOCK
 from mp4ds.unpacking.pictures import ReductionOptions
 
 KINDS = {"raw": "raw", "compressed": "jpeg", "ffmpeg": "ffmpeg"}
@@ -216,3 +219,102 @@ class PlayOptions(ReductionOptions):
     def leads(self) -> bool:
         """Whether it publishes /clock."""
         return self.clock is not None or bool(self.clock_topics) or self.clock_topics_all
+
+
+# ---------------------------------------------------------------- topics
+
+
+def rooted(topic: str) -> str:
+    """The name of a topic with its leading slash, which users may leave out."""
+    return "/" + topic.strip().lstrip("/")
+
+
+class Names:
+    """Renames topics: by `remap` or else `prefix`, then by the node's remappings.
+
+    Those of the node may name topics that are not played.
+
+    Raises:
+        OptionError: A rule is not valid.
+    """
+
+    def __init__(self, options: PlayOptions) -> None:
+        self._node = options.names
+        self._rules: dict[str, str] = {}
+        for rule in options.remap:
+            old, found, new = rule.partition(":=")
+            if not (found and old.strip("/ ") and new.strip("/ ")):
+                raise OptionError(
+                    f"`remap` {rule!r} is not a remapping; write it as /old/topic:=/new/topic."
+                )
+            self._rules[rooted(old)] = new
+        self._prefix = options.prefix.rstrip("/")
+
+    def check(self, topics: Iterable[str]) -> None:
+        """Refuse rules for topics that do not exist.
+
+        Raises:
+            OptionError: Names the topic.
+        """
+        known = {rooted(topic) for topic in topics}
+        for old in self._rules:
+            if old not in known:
+                raise OptionError(f"`remap` {old!r}: there is no such topic to play.")
+
+    def __call__(self, topic: str) -> str:
+        """The name that a topic is published under."""
+        new = self._rules.get(rooted(topic))
+        if new is None:
+            new = f"{self._prefix}/{topic.lstrip('/')}" if self._prefix else topic
+        return self._node.renamed(new)
+
+
+class Wanted:
+    """Which topics are played: all, or those that `topics` or `regex` include; none excluded.
+
+    A recorded /clock is not played beside another one.
+
+    Raises:
+        OptionError: A regular expression is not valid.
+    """
+
+    def __init__(self, options: PlayOptions) -> None:
+        self._globs = Selection(options.topics, options.exclude)
+        self._by_glob = Selection(options.topics) if options.topics or not options.regex else None
+        self._excluded = Selection((), options.exclude)
+        self._regex = _expression("regex", options.regex)
+        self._exclude_regex = _expression("exclude_regex", options.exclude_regex)
+        self._has_clock = not (options.leads or options.follow_clock)
+
+    def __call__(self, topic: str) -> bool:
+        """Whether a topic is played."""
+        if not self._excluded(topic) or (topic == CLOCK and not self._has_clock):
+            return False
+        if self._exclude_regex and self._exclude_regex.fullmatch(topic):
+            return False
+        is_found = self._regex is not None and self._regex.fullmatch(topic) is not None
+        return is_found or (self._by_glob is not None and self._by_glob(topic))
+
+    def check(self, topics: Iterable[str]) -> None:
+        """Refuse patterns that match no topic.
+
+        Raises:
+            OptionError: Names the pattern and the topics of the recording.
+        """
+        known = list(topics)
+        self._globs.check(known)
+        for name, regex in (("regex", self._regex), ("exclude_regex", self._exclude_regex)):
+            if regex is not None and not any(regex.fullmatch(topic) for topic in known):
+                raise OptionError(
+                    f"`{name}` {regex.pattern!r} fully matches no topic; use .* for any text, as "
+                    "in '.*camera.*'."
+                )
+
+
+def _expression(option: str, text: str) -> re.Pattern[str] | None:
+    try:
+        return re.compile(text) if text else None
+    except re.error as error:
+        raise OptionError(
+            f"`{option}` {text!r} is not a valid regular expression: {error}."
+        ) from None

@@ -12,13 +12,12 @@ from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.salvage import HOW_TO_SALVAGE
 from mp4ds.errors import OptionError, advising
-from mp4ds.plugins.playing.options import KINDS, PlayOptions
+from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary
-from mp4ds.plugins.playing.timeline import Names, Timeline, Wanted
+from mp4ds.plugins.playing.timeline import Timeline
 from mp4ds.plugins.ros.node import Node, NodeOptions, open_node, sourced
 from mp4ds.plugins.ros.qos import load_overrides
 
-_CLOCK = "/clock"
 _IMMEDIATE_WAIT_S = 2.0
 _NODES = {"ros1": "mp4ds_play", "ros2": "rosbag2_player"}
 
@@ -70,30 +69,13 @@ def open_player(
     kind = chosen.to or ("" if node else sourced("play"))
     world = node.world if node else kind
     chosen = replace(chosen, names=chosen.names.in_world(world))
-    places = datasets_in(datasets)
     with ExitStack() as stack:
         stack.enter_context(advising(HOW_TO_SALVAGE))
-        wanted = Wanted(
-            chosen.topics,
-            chosen.exclude,
-            regex=chosen.regex,
-            exclude_regex=chosen.exclude_regex,
-            without=frozenset({_CLOCK} if chosen.leads or chosen.follow_clock else ()),
-        )
         opened = [
             stack.enter_context(Dataset(place, jpeg_quality=chosen.jpeg_quality))
-            for place in places
+            for place in datasets_in(datasets)
         ]
-        timeline = Timeline(
-            opened,
-            world=world,
-            wanted=wanted,
-            names=Names(chosen.remap, chosen.prefix, chosen.names),
-            kind=KINDS[chosen.publish_as] if chosen.publish_as else None,
-            reduction=chosen.reduction,
-            jpeg_quality=chosen.jpeg_quality,
-            read_ahead=chosen.read_ahead,
-        )
+        timeline = Timeline(opened, chosen, world)
         node = node or stack.enter_context(_opened(kind, chosen))
         follow = chosen.follow_clock
         if follow is None:

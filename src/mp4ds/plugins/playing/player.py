@@ -15,7 +15,8 @@ from typing import Any
 from mp4ds.errors import OptionError, PublishError, Refused
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Lateness, Pace, Ticks
-from mp4ds.plugins.playing.timeline import Due, Playback, Restamper, Timeline, quick_switches
+from mp4ds.plugins.playing.stamps import Restamper
+from mp4ds.plugins.playing.timeline import Due, Playback, Timeline, quick_switches
 from mp4ds.plugins.ros.node import Node, Service, action
 from mp4ds.records import Channel
 
@@ -293,8 +294,10 @@ class Player:
         self._done.seconds = time.monotonic() - began
         is_whole = self._is_resting or not self._is_stopped
         self._done.stopped = not (is_whole and self._node.is_alive)
-        self._done.as_recorded = self._timeline.as_recorded
-        self._done.thinned = self._timeline.thinned
+        for republisher in self._timeline.republishers:
+            self._done.thinned.update(republisher.thinned)
+            for topic, reasons in republisher.as_recorded.items():
+                self._done.as_recorded[topic] = dict(reasons)
         return self._done
 
     def _begin(self) -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import heapq
-import re
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -19,166 +18,11 @@ from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import LatchedMessages, has_late, latched_depth
 from mp4ds.dataset.columns import DecodedColumns, everything
 from mp4ds.dataset.dataset import Ahead, Dataset
-from mp4ds.errors import ConversionError, OptionError
-from mp4ds.plan import Selection
-from mp4ds.plugins.playing.stamps import HeaderStamps
-from mp4ds.plugins.ros.names import PLAIN, NodeNames
+from mp4ds.errors import OptionError
+from mp4ds.plugins.playing.options import KINDS, Names, PlayOptions, Wanted, rooted
 from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import Reduction
 from mp4ds.unpacking.republish import Republisher
-
-
-class Names:
-    """Renames topics.
-
-    Args:
-        remap: ``old:=new`` rules for single topics; the leading slash is optional.
-        prefix: Prefix for all topics that are not remapped.
-        node: ROS remappings, applied after the others; they may name topics that are not played.
-
-    Raises:
-        OptionError: A rule is not valid.
-    """
-
-    def __init__(
-        self,
-        remap: Sequence[str] = (),
-        prefix: str = "",
-        node: NodeNames = PLAIN,
-    ) -> None:
-        self._node = node
-        self._rules: dict[str, str] = {}
-        for rule in remap:
-            old, found, new = rule.partition(":=")
-            if not (found and old.strip("/ ") and new.strip("/ ")):
-                raise OptionError(
-                    f"`remap` {rule!r} is not a remapping; write it as /old/topic:=/new/topic."
-                )
-            self._rules[_rooted(old)] = new
-        self._prefix = prefix.rstrip("/")
-
-    def check(self, topics: Iterable[str]) -> None:
-        """Refuse rules for topics that do not exist.
-
-        Raises:
-            OptionError: Names the topic.
-        """
-        known = {_rooted(topic) for topic in topics}
-        for old in self._rules:
-            if old not in known:
-                raise OptionError(f"`remap` {old!r}: there is no such topic to play.")
-
-    def __call__(self, topic: str) -> str:
-        """The name that a topic is published under."""
-        new = self._rules.get(_rooted(topic))
-        if new is None:
-            new = f"{self._prefix}/{topic.lstrip('/')}" if self._prefix else topic
-        return self._node.renamed(new)
-
-
-class Wanted:
-    """Which topics are played.
-
-    Args:
-        topics: Globs of topics to play; all topics if neither these nor `regex` are given.
-        exclude: Globs of topics not to play.
-        regex: Topics that fully match it are played, too, as with ``ros2 bag play``.
-        exclude_regex: Topics that fully match it are not played.
-        without: Topics that are never played.
-
-    Raises:
-        OptionError: A regular expression is not valid.
-    """
-
-    def __init__(
-        self,
-        topics: Sequence[str] = (),
-        exclude: Sequence[str] = (),
-        *,
-        regex: str = "",
-        exclude_regex: str = "",
-        without: frozenset[str] = frozenset(),
-    ) -> None:
-        self._by_glob = Selection(topics)
-        self._has_globs = bool(topics)
-        self._excluded = Selection((), exclude)
-        self._globs = Selection(topics, exclude)
-        self._regex = _expression("regex", regex)
-        self._exclude_regex = _expression("exclude_regex", exclude_regex)
-        self._without = without
-
-    def __call__(self, topic: str) -> bool:
-        """Whether a topic is played."""
-        if topic in self._without or not self._excluded(topic):
-            return False
-        if self._exclude_regex and self._exclude_regex.fullmatch(topic):
-            return False
-        if self._regex is None:
-            return self._by_glob(topic)
-        return (self._has_globs and self._by_glob(topic)) or bool(self._regex.fullmatch(topic))
-
-    def check(self, topics: Iterable[str]) -> None:
-        """Refuse patterns that match no topic.
-
-        Raises:
-            OptionError: Names the pattern and the topics of the recording.
-        """
-        known = list(topics)
-        self._globs.check(known)
-        for name, regex in (("regex", self._regex), ("exclude_regex", self._exclude_regex)):
-            if regex is not None and not any(regex.fullmatch(topic) for topic in known):
-                raise OptionError(
-                    f"`{name}` {regex.pattern!r} fully matches no topic; use .* for any text, as "
-                    "in '.*camera.*'."
-                )
-
-
-def _expression(option: str, text: str) -> re.Pattern[str] | None:
-    try:
-        return re.compile(text) if text else None
-    except re.error as error:
-        raise OptionError(
-            f"`{option}` {text!r} is not a valid regular expression: {error}."
-        ) from None
-
-
-def _rooted(topic: str) -> str:
-    return "/" + topic.strip().lstrip("/")
-
-
-# ---------------------------------------------------------------- restamp
-
-
-class Restamper:
-    """Replaces the header stamps of messages. Equal stamps stay equal."""
-
-    def __init__(self) -> None:
-        self._stamps: dict[int, tuple[Channel, HeaderStamps]] = {}
-
-    def restamped(
-        self, channel: Channel, payload: bytes | memoryview, wall_of: Callable[[int], int]
-    ) -> bytes | memoryview:
-        """A message with new stamps; unchanged if it has none.
-
-        Args:
-            channel: Channel of the message.
-            payload: The serialized message.
-            wall_of: Maps recording time to wall-clock time, both in nanoseconds.
-
-        Raises:
-            ConversionError: The message is not of the channel's type.
-        """
-        if id(channel) not in self._stamps:
-            self._stamps[id(channel)] = (channel, HeaderStamps(channel))
-        stamps = self._stamps[id(channel)][1]
-        if not stamps.has_any:
-            return payload
-        try:
-            return memoryview(stamps.moved(payload, wall_of))
-        except ValueError as error:
-            problem = f"cannot replace the stamp of a message: {error}"
-            raise ConversionError(channel.topic, problem) from None
-
 
 # ---------------------------------------------------------------- read ahead
 
@@ -347,13 +191,8 @@ class Timeline:
 
     Args:
         datasets: Open datasets; not closed here.
+        options: How to play them.
         world: Convert messages to this: ``ros1`` or ``ros2``; None: as recorded.
-        wanted: The topics to play.
-        names: The names to publish them under.
-        kind: Convert images to this, one of `republish.KINDS`; None: as recorded.
-        reduction: Smaller or fewer images.
-        jpeg_quality: Quality of JPEG images that are encoded, 1 to 100.
-        read_ahead: Frames of each stream to decode ahead.
 
     Attributes:
         channels: All channels that are published.
@@ -366,26 +205,15 @@ class Timeline:
     """
 
     def __init__(
-        self,
-        datasets: Sequence[Dataset],
-        *,
-        world: str | None,
-        wanted: Wanted,
-        names: Names,
-        kind: str | None = None,
-        reduction: Reduction = Reduction(),  # noqa: B008 - frozen
-        jpeg_quality: int = 95,
-        read_ahead: int = 8,
+        self, datasets: Sequence[Dataset], options: PlayOptions, world: str | None
     ) -> None:
+        wanted, names = Wanted(options), Names(options)
         topics = [topic for dataset in datasets for topic in dataset.all_topics]
         wanted.check(topics)
         names.check(topic for topic in topics if wanted(topic))
-        self._read_ahead = read_ahead
-        self._names = {_rooted(topic): names(topic) for topic in topics if wanted(topic)}
-        self._parts = [
-            _Part(dataset, world, wanted, names, kind, reduction, jpeg_quality)
-            for dataset in datasets
-        ]
+        self._read_ahead = options.read_ahead
+        self._names = {rooted(topic): names(topic) for topic in topics if wanted(topic)}
+        self._parts = [_Part(dataset, options, wanted, names, world) for dataset in datasets]
         self.channels = [channel for part in self._parts for channel in part.published]
         spans = [part.span for part in self._parts if part.span]
         if not spans:
@@ -394,24 +222,9 @@ class Timeline:
         self.end_ns = max(last for _, last in spans)
 
     @property
-    def as_recorded(self) -> dict[str, dict[str, int]]:
-        """Images that could not be converted as requested: topic -> reason -> number."""
-        return {
-            topic: dict(reasons)
-            for part in self._parts
-            if part.republisher
-            for topic, reasons in part.republisher.as_recorded.items()
-        }
-
-    @property
-    def thinned(self) -> dict[str, int]:
-        """Number of frames left out as requested so far, by topic."""
-        return {
-            topic: count
-            for part in self._parts
-            if part.republisher
-            for topic, count in part.republisher.thinned.items()
-        }
+    def republishers(self) -> list[Republisher]:
+        """What converts or reduces images, of each dataset, if anything does."""
+        return [part.republisher for part in self._parts if part.republisher]
 
     def play(
         self,
@@ -440,9 +253,9 @@ class Timeline:
             OptionError: No such topic is played.
         """
         for topic in topics:
-            if _rooted(topic) not in self._names:
+            if rooted(topic) not in self._names:
                 raise OptionError(f"`{option}` {topic!r}: there is no such topic to play.")
-        return frozenset(self._names[_rooted(topic)] for topic in topics)
+        return frozenset(self._names[rooted(topic)] for topic in topics)
 
     def latched(self, time_ns: int) -> list[Due]:
         """The latched messages that a late subscriber would have got by a time."""
@@ -510,26 +323,23 @@ class _Part:
     def __init__(
         self,
         dataset: Dataset,
-        world: str | None,
+        options: PlayOptions,
         wanted: Wanted,
         names: Names,
-        kind: str | None,
-        reduction: Reduction,
-        jpeg_quality: int,
+        world: str | None,
     ) -> None:
         self._dataset = dataset
         self._converter = Converter(world)
         self._names = names
         self.republisher: Republisher | None = None
-        if kind is not None or reduction != Reduction():
-            encoding = "ros1" if (world or dataset.profile) == "ros1" else "cdr"
+        if options.publish_as is not None or options.reduction != Reduction():
             self.republisher = Republisher(
                 dataset,
-                kind,
-                encoding=encoding,
+                KINDS[options.publish_as] if options.publish_as else None,
+                encoding="ros1" if (world or dataset.profile) == "ros1" else "cdr",
                 selected=wanted,
-                jpeg_quality=jpeg_quality,
-                reduction=reduction,
+                jpeg_quality=options.jpeg_quality,
+                reduction=options.reduction,
             )
         self._wanted = wanted
         self._topics = {item.topic for item in dataset.channels if wanted(item.topic)}
