@@ -192,14 +192,6 @@ def body_of(name: str) -> str:
     return "packet"
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9"])
-def test_the_odd_ones_are_those_that_are_stored_verbatim(codec: str, tmp_path: Path) -> None:
-    recorded = CODED[f"video-{codec}-mid-gop"]()
-    done = journey(tmp_path, SOURCES["mcap-ros2-none"], recorded, "mcap")
-    (entry,) = mp4ds.open(done.dataset).manifest.verbatim  # type: ignore[union-attr]
-    assert (entry.topic, entry.messages, entry.first) == ("/cam/video", 2, 0)
-
-
 def test_the_place_of_an_odd_one(tmp_path: Path) -> None:
     done = journey(tmp_path, SOURCES["bag-none"], CODED["jpeg-empty-one"](), "bag")
     (entry,) = mp4ds.open(done.dataset).manifest.verbatim  # type: ignore[union-attr]

@@ -28,7 +28,6 @@ from mp4ds.errors import SourceError
 from mp4ds.records import (
     EVERYTHING,
     Channel,
-    ChannelStats,
     Excerpt,
     Message,
     MetadataRecord,
@@ -43,7 +42,6 @@ NOT_INDEXED = {
     "mcap-unchunked",
     "mcap-unindexed",
 }
-INDEXED = [name for name in SOURCES if name not in NOT_INDEXED]
 NO_MESSAGES = Excerpt(topics=frozenset())
 
 Row = tuple[int, int, int, bytes]
@@ -146,12 +144,6 @@ def test_what_an_excerpt_has() -> None:
         assert not empty.has_messages
 
 
-def test_stats_of_two_parts() -> None:
-    none, one, two = ChannelStats(0, 0, 0), ChannelStats(2, 5, 9), ChannelStats(1, 7, 20)
-    assert none.plus(one) == one.plus(none) == one
-    assert one.plus(two) == ChannelStats(3, 5, 20)
-
-
 # ---------------------------------------------------------------- all kinds of sources
 
 
@@ -204,31 +196,6 @@ def test_parts_of_real_bags(name: str) -> None:
     with open_reader(real(name)) as reader:
         assert reader.is_indexed
         check(reader)
-
-
-def test_parts_of_real_mcap_files() -> None:
-    files = sorted(real("mcap").rglob("*.mcap"))
-    indexed = 0
-    for file in files:
-        with open_reader(file) as reader:
-            indexed += reader.is_indexed
-            check(reader)
-    assert 20 < indexed < len(files)
-
-
-def test_parts_of_real_rosbag2_folders() -> None:
-    folders = [path.parent for path in real("rosbag2").rglob("metadata.yaml")]
-    assert folders
-    read = 0
-    for folder in folders:
-        try:
-            reader = open_reader(folder)
-        except SourceError:
-            continue
-        with reader:
-            check(reader)
-            read += 1
-    assert read > 3
 
 
 def test_several_excerpts_at_once(tmp_path: Path) -> None:

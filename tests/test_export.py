@@ -39,12 +39,9 @@ from export_scenes import (
     stamps_of,
 )
 from mp4ds.format.models import Calibration
-from mp4ds.messages.transforms import quaternion_of
 from mp4ds.options import seconds_text
 from mp4ds.plugins.exporting.folders import PoseTrack, colmap_model, euroc_distortion
 from mp4ds.plugins.exporting.job import ExportJob
-from mp4ds.plugins.exporting.motion import in_order, inverse, pose_matrix
-from mp4ds.times import nearest
 from scenes import PERIOD, Record, Scene, scene
 from waiting import WATCHDOG_S
 
@@ -269,16 +266,6 @@ def test_pycolmap_distorts_as_opencv(model: str, tmp_path: Path) -> None:
         assert camera.img_from_cam(point) == pytest.approx(expected, abs=1e-3)
 
 
-def test_a_topic_of_two_lines(tmp_path: Path) -> None:
-    made = scene("rgb8", frames=2, with_info=False)
-    topic = "/cam\n1.5 rgb/other.png"
-    images = [message for message in made.messages if message.topic == "/cam/image_raw"]
-    odd = Scene([replace(message, topic=topic) for message in images])
-    mp4ds.export(pack_drive(tmp_path, odd), "tum", tmp_path / "out")
-    lines = (tmp_path / "out/rgb.txt").read_text().splitlines()
-    assert len([line for line in lines if not line.startswith("#")]) == 2
-
-
 @pytest.mark.parametrize("to", ["colmap", "euroc", "tum"])
 def test_an_unsuitable_topic_of_poses_is_refused_first(
     to: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -420,16 +407,6 @@ def test_import_takes_what_export_wrote(to: str, dataset: Path, tmp_path: Path) 
         assert {one.pose.orientation.w for one in found} == {1.0}
 
 
-def test_images_for_colmap_are_a_plain_folder(dataset: Path, tmp_path: Path) -> None:
-    export(dataset, "colmap", tmp_path / "out")
-    images = mp4ds.PackOptions(images=mp4ds.ImageFolder())
-    mp4ds.pack(tmp_path / "out/images/front_image_raw", tmp_path / "again", images)
-    with mp4ds.open(tmp_path / "again") as again:
-        (stream,) = again
-        assert [frame.stamp_ns for frame in stream] == stamps_of(MADE, COLOUR)
-        assert (stream[3].data == pixels_of(COLOUR, 3)).all()
-
-
 def test_cameras_without_a_common_frame(dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(mp4ds.OptionError, match="not every camera has a frame at this time"):
         export(dataset, "euroc", tmp_path / "out", topics=[COLOUR, GREY], tolerance_ns=0)
@@ -437,20 +414,6 @@ def test_cameras_without_a_common_frame(dataset: Path, tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- poses
-
-
-def test_quaternions_and_matrices() -> None:
-    rng = np.random.default_rng(5)
-    for turn in [*rng.normal(size=(20, 4)), np.array([1.0, 0, 0, 0]), np.array([0, 0, 0, 1.0])]:
-        matrix = pose_matrix((0, 0, 0), turn)[:3, :3]
-        assert matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-12)
-        found = np.array(quaternion_of(matrix))
-        unit = turn / np.linalg.norm(turn)
-        assert abs(float(found @ unit)) == pytest.approx(1.0)
-        pose = pose_matrix(rng.normal(size=3), turn)
-        assert inverse(pose) @ pose == pytest.approx(np.eye(4), abs=1e-12)
-    quarter = pose_matrix((0, 0, 0), (0.0, 0.0, 0.5**0.5, 0.5**0.5))[:3, :3]
-    assert quarter @ [1, 0, 0] == pytest.approx([0, 1, 0])
 
 
 def test_poses_between_two() -> None:
@@ -473,12 +436,6 @@ def test_a_quaternion_of_zeros_is_no_pose() -> None:
     assert track.times.tolist() == [1, 3]
     assert middle is not None
     assert middle[:3, 3].tolist() == [2, 0, 0]
-
-
-def test_rows_that_come_too_early() -> None:
-    rows = [(time, (float(time),)) for time in (3, 1, 2, 5, 4, 9, 7)]
-    assert [time for time, _ in in_order(rows, window=2)] == [1, 2, 3, 4, 5, 7, 9]
-    assert [time for time, _ in in_order(rows)] == [1, 2, 3, 4, 5, 7, 9]
 
 
 # ---------------------------------------------------------------- which frames, and how
@@ -520,26 +477,6 @@ def test_mosaics(pixels: str, tmp_path: Path) -> None:
         assert (image[::2, ::2, 0] == mosaic[::2, ::2]).all()
 
 
-def test_frames_of_one_time(tmp_path: Path) -> None:
-    made = scene("mono8", frames=6, with_info=False)
-    first, second, third, *others = stamps_of(made, "/cam/image_raw")
-    changed = Scene([_stamped(message, {third: second}) for message in made.messages])
-    summary = mp4ds.export(pack_drive(tmp_path, changed), "euroc", tmp_path / "out")
-    assert summary.messages["/cam/image_raw"] == 5
-    reason = "another frame has the same time, and therefore the same name"
-    assert summary.left_out["/cam/image_raw"] == {reason: 1}
-    rows = (tmp_path / "out/mav0/cam0/data.csv").read_text().splitlines()[1:]
-    assert [int(row.split(",")[0]) for row in rows] == [first, second, *others]
-
-
-def _stamped(message: Record, instead: dict[int, int]) -> Record:
-    header = message.values.get("header", {})
-    if message.topic != "/cam/image_raw" or header["stamp"] not in instead:
-        return message
-    header = {**header, "stamp": instead[header["stamp"]]}
-    return replace(message, values={**message.values, "header": header})
-
-
 def test_what_png_cannot_hold(tmp_path: Path) -> None:
     dataset = pack_drive(tmp_path, scene("32FC1", frames=3, with_info=False))
     summary = mp4ds.export(dataset, "euroc", tmp_path / "out")
@@ -552,18 +489,6 @@ def test_what_png_cannot_hold(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- LeRobot
-
-
-@pytest.mark.parametrize(
-    ("times", "wanted", "found"),
-    [
-        ([0, 10, 20], [-5, 0, 4, 5, 6, 20, 99], [0, 0, 0, 0, 1, 2, 2]),
-        ([7], [0, 9], [0, 0]),
-        ([0, 0, 10], [0, 10], [0, 2]),
-    ],
-)
-def test_the_nearest_time(times: list[int], wanted: list[int], found: list[int]) -> None:
-    assert nearest(np.array(times), np.array(wanted)).tolist() == found
 
 
 @pytest.fixture(scope="module")
@@ -796,16 +721,6 @@ def test_bad_options(
     with pytest.raises(mp4ds.OptionError, match=words):
         mp4ds.export(dataset, to, tmp_path / "out", mp4ds.ExportOptions(**options))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_not_ours_is_kept(dataset: Path, tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/thesis.txt").write_text("mine")
-    with pytest.raises(mp4ds.TargetError, match="was not written by mp4ds"):
-        mp4ds.export(dataset, "euroc", tmp_path / "out", mp4ds.ExportOptions(force=True))
-    assert (tmp_path / "out/thesis.txt").read_text() == "mine"
-    with pytest.raises(mp4ds.OptionError, match="holds a single dataset"):
-        mp4ds.export([dataset, dataset], "euroc", tmp_path / "two")
 
 
 def test_who_made_it_goes_along(dataset: Path, tmp_path: Path) -> None:

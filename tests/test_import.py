@@ -6,8 +6,6 @@ The folders are written with OpenCV, Pillow and text; what comes out is read wit
 from __future__ import annotations
 
 import hashlib
-import json
-import os
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -29,12 +27,10 @@ from PIL import Image
 from rosbags.highlevel import AnyReader
 
 import mp4ds
-from conftest import real
 from in_parts import InlineEngine, facts, leftovers
 from mp4ds.cli import commands
 from mp4ds.errors import Refused, SourceError
 from mp4ds.format.sidecars import load_manifest
-from mp4ds.messages.transforms import quaternion_of
 from mp4ds.packing.options import ImageFolder
 from mp4ds.plugins.importing import parsing
 from mp4ds.plugins.importing.layouts import open_images
@@ -163,22 +159,6 @@ def test_files_are_read_to_the_bit(name: str, tmp_path: Path) -> None:
     assert found == encoding
     assert pixels.dtype == expected.dtype.newbyteorder("<")
     assert np.array_equal(pixels, expected)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "depth/slambook2_rgbd/depth/1.pgm",
-        "depth/slambook2_rgbd/color/1.png",
-        "images/image_pipeline_wide_stereo_pgm/left0003.pgm",
-    ],
-)
-def test_files_of_others_are_read_as_opencv_reads_them(name: str) -> None:
-    path = real(name)
-    encoding, pixels = read_image(path)
-    expected = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert expected is not None
-    assert np.array_equal(pixels, expected[..., ::-1] if encoding == "rgb8" else expected)
 
 
 def test_what_cannot_be_had_as_it_is_is_refused(tmp_path: Path) -> None:
@@ -394,13 +374,6 @@ projection_matrix:
 """
 
 
-def test_names_of_files_are_no_formulas(tmp_path: Path) -> None:
-    plain(tmp_path / "in", ["=1.png", "2.png"])
-    mp4ds.pack(tmp_path / "in", tmp_path / "ds", folder(rate="2", topic="@cam"))
-    lines = attachments(tmp_path / "ds" / "messages.mcap")["images.csv"].decode().splitlines()
-    assert lines[1:] == ["'@cam,0,2.png", "'@cam,500000000,./=1.png"]
-
-
 def test_jpeg_files_are_kept_beside_others(tmp_path: Path) -> None:
     for number in range(3):
         save(tmp_path / "in" / f"{number}.jpg", image(number, 3))
@@ -435,36 +408,6 @@ def test_in_parts_is_as_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert leftovers(tmp_path) == []
 
 
-def test_an_import_goes_on_unless_the_images_have_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place = euroc(tmp_path)
-    options = mp4ds.PackOptions(images=mp4ds.ImageFolder(), codec="ffv1", gop=2, window=2)
-
-    def use(engine: InlineEngine) -> InlineEngine:
-        monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: engine)
-        return engine
-
-    use(InlineEngine(lambda name: name == "00001-0"))
-    with pytest.raises(mp4ds.PartsFailedError):
-        mp4ds.pack(place, tmp_path / "ds", options)
-    other = replace(options, images=mp4ds.ImageFolder(layout="euroc"))
-    with pytest.raises(mp4ds.OptionError, match="different `images`"):
-        mp4ds.pack(place, tmp_path / "ds", other)
-    shown = sorted((place / CAM0 / "data").iterdir())[3]
-    before, times_of = shown.read_bytes(), shown.stat()
-    save(shown, image(77))
-    with pytest.raises(SourceError, match="has changed since"):
-        mp4ds.pack(place, tmp_path / "ds", options)
-    shown.write_bytes(before)
-    os.utime(shown, ns=(times_of.st_atime_ns, times_of.st_mtime_ns))
-    engine = use(InlineEngine())
-    mp4ds.pack(place, tmp_path / "ds", options)
-    assert "00000-0" not in engine.ran
-    assert mp4ds.validate(tmp_path / "ds", deep=True) == []
-    assert leftovers(tmp_path) == []
-
-
 @pytest.mark.parametrize(
     ("model", "values", "name", "due"),
     [
@@ -486,15 +429,6 @@ def test_models_of_calibrations(
     assert list(found.d) == due
     assert list(found.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1]
     assert list(found.p) == [5, 0, 1, 0, 0, 6, 2, 0, 0, 0, 1, 0]
-
-
-def test_a_mosaic_is_called_one(tmp_path: Path) -> None:
-    plain(tmp_path / "in", ["0.png", "1.png"])
-    mp4ds.pack(tmp_path / "in", tmp_path / "ds", folder(rate="2", encoding="bayer_rggb8"))
-    with mp4ds.open(tmp_path / "ds") as dataset:
-        frame = dataset["/camera/image_raw"][1]
-        assert frame.encoding == "bayer_rggb8"
-        assert np.array_equal(frame.data, image(1))
 
 
 # ---------------------------------------------------------------- EuRoC
@@ -644,21 +578,6 @@ def test_euroc_tells_what_it_leaves_out(tmp_path: Path) -> None:
         "files of leica0, which is not a camera, IMU or pose": 1,
         "rows of state_groundtruth_estimate0 of which only the pose was taken": 1,
     }
-
-
-def test_quaternions_turn_as_their_matrices_do() -> None:
-    rng = np.random.default_rng(4)
-    for _ in range(50):
-        matrix = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        matrix *= np.linalg.det(matrix)
-        x, y, z, w = quaternion_of(matrix)
-        assert w >= 0
-        vector = rng.normal(size=3)
-        part = np.cross([x, y, z], vector) * 2
-        assert np.allclose(vector + w * part + np.cross([x, y, z], part), matrix @ vector)
-    for bad in (np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)):
-        with pytest.raises(ValueError, match="rotation"):
-            quaternion_of(bad)
 
 
 # ---------------------------------------------------------------- TUM
@@ -844,26 +763,6 @@ def test_bad_plain_folders_are_refused(
         (tmp_path / name).write_text(text)
     refused(run("import", "images", "in", "-o", "ds", *options), words)
     assert {path.name for path in tmp_path.iterdir()} == {"in", *texts}
-
-
-def test_targets_are_kept(tmp_path: Path) -> None:
-    plain(tmp_path / "in", ["a.png"])
-    arguments = ("import", "images", tmp_path / "in", "--rate", 5, "-o")
-    refused(run(*arguments, tmp_path / "in" / "ds"), "overlaps")
-    done = run(*arguments, tmp_path / "ds", "--json", "--codec", "ffv1")
-    assert done.exit_code == 0
-    assert json.loads(done.stdout)["topics"][0]["frames"] == 1
-    refused(run(*arguments, tmp_path / "ds"), "--force")
-    assert run(*arguments, tmp_path / "ds", "--force").exit_code == 0
-    refused(run("import", "images", tmp_path / "none", "-o", tmp_path / "x"), "no such file")
-    refused(
-        run("import", "images", tmp_path / "in" / "a.png", "-o", tmp_path / "x"), "not a folder"
-    )
-    options = replace(folder(rate="1"), salvage=True)
-    with pytest.raises(mp4ds.OptionError, match="salvage"):
-        mp4ds.pack(tmp_path / "in", tmp_path / "x", options)
-    with pytest.raises(mp4ds.OptionError, match="Only one folder"):
-        mp4ds.pack([tmp_path / "in", tmp_path / "ds"], tmp_path / "x", folder(rate="1"))
 
 
 # ---------------------------------------------------------------- pairs of the paper's tool

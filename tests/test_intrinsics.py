@@ -19,18 +19,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
-from rosbags.highlevel import AnyReader
 
 import mp4ds
-from conftest import real
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.cli import commands
 from mp4ds.dataset.views import effective
-from mp4ds.format.manifest import StaticTransform
-from mp4ds.format.sidecars import dump_document, load_manifest
 from mp4ds.messages.transforms import Transform
 from mp4ds.messages.wire import CalibrationFields
-from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, ListedCalibration, intrinsics
+from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, intrinsics
 from scenes import INFO, PERIOD, START, TF, Record, Scene, calibration, scene
 from sources import SOURCES, write_bag, write_mcap
 
@@ -136,14 +132,6 @@ def test_a_dataset_says_what_its_recording_says(source: str, tmp_path: Path) -> 
     check_focused(camera_of(packed), made)
 
 
-def test_a_stream_of_version_0() -> None:
-    camera = camera_of(intrinsics(Path(__file__).parent / "fixtures" / "v0" / "drive.yaml"))
-    (item,) = camera.calibrations
-    assert (item.message, item.log_time) == (None, None)
-    assert item.frame_id == camera.frame_id == "GS3_left_L"
-    assert item.k[0][0] > 0
-
-
 def named(made: Scene, names: dict[str, str]) -> Scene:
     messages = [replace(record, topic=names.get(record.topic, record.topic))
                 for record in made.messages]  # fmt: skip
@@ -247,16 +235,6 @@ def test_static_transforms_of_foxglove(tmp_path: Path) -> None:
     assert intrinsics(tmp_path / "drive.mcap").transforms == PATH
 
 
-def test_static_transforms_of_a_manifest(tmp_path: Path) -> None:
-    mp4ds.pack(SOURCES["bag-none"](tmp_path, scene("mono8")), tmp_path / "dataset")
-    path = tmp_path / "dataset" / "dataset.yaml"
-    manifest = load_manifest(path)
-    models = [StaticTransform.from_record(item) for item in PATH]
-    path.write_bytes(dump_document(manifest.model_copy(update={"transforms": models})))
-    assert load_manifest(path).transforms == models
-    assert intrinsics(tmp_path / "dataset").transforms == PATH
-
-
 # ---------------------------------------------------------------- effective K
 
 Pixels = st.integers(0, 2000)
@@ -292,15 +270,6 @@ def test_effective_matrices_project_into_the_recorded_image(
         scale = np.maximum(1, binning)
         expected = (full[:2] / full[2] - np.array(offset)) / scale
         np.testing.assert_allclose(seen[:2] / seen[2], expected, rtol=1e-9, atol=1e-6)
-
-
-def test_effective_matrices_of_image_geometry() -> None:
-    """Figures worked out by hand from REP 104."""
-    k, p = effective(fields((2, 4), (100, 40, 200, 300)))
-    assert k == [[350.0, 1.0, 110.25], [0.0, 177.5, 50.0625], [0.0, 0.0, 1.0]]
-    assert p == [
-        [350.0, 1.0, 110.25, -35.25], [0.0, 177.5, 50.0625, 0.75], [0.0, 0.0, 1.0, 0.0]
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -377,19 +346,6 @@ def test_what_is_printed_is_python_for_opencv(packed: bool, tmp_path: Path) -> N
     assert maps[0].shape == (48, 64)
 
 
-def test_transforms_are_printed_as_they_are(tmp_path: Path) -> None:
-    path = SOURCES["bag-none"](tmp_path, Scene([static(), *scene("mono8").messages]))[0]
-    _, names = command(path)
-    assert names["transforms"] == [
-        (parent, child, list(t), list(r)) for parent, child, t, r in LINKS[:2]
-    ]
-    text = json.loads(command(path, "--json")[0])
-    assert text["transforms"] == [
-        {"parent": parent, "child": child, "translation": list(t), "rotation": list(r)}
-        for parent, child, t, r in LINKS[:2]
-    ]
-
-
 def test_json(tmp_path: Path) -> None:
     path = SOURCES["bag-none"](tmp_path, focused(scene("mono8")))[0]
     result = json.loads(command(path, "--json")[0])
@@ -441,71 +397,3 @@ def test_a_camera_without_calibration_and_one_that_is_not_calibrated(tmp_path: P
     assert "no distortion model" in text
     assert "# not calibrated: K is zero\n" in text
     assert names["D"].shape == (0,)
-
-
-@pytest.mark.parametrize("options", [[], ["--json"]])
-def test_errors_are_those_of_info(options: list[str], tmp_path: Path) -> None:
-    (tmp_path / "words.txt").write_text("no recording")
-    for name in ("words.txt", "nothing.bag"):
-        arguments = ["info", str(tmp_path / name), "--intrinsics", *options]
-        result = CliRunner().invoke(commands, arguments)
-        assert result.exit_code == 2
-        assert name in result.output
-
-
-# ---------------------------------------------------------------- real recordings
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "bags/fiducials_aruco_marker_raspicam.bag",
-        "bags/librealsense_depth_color.bag",
-        "bags/ecto_ros_camera_info.bag",
-        "rosbag2/geocamxyz_test_bag_sqlite3",
-    ],
-)
-def test_real_recordings(name: str) -> None:
-    path = real(name)
-    expected: dict[str, list[tuple[int, int, Any]]] = {}
-    with AnyReader([path]) as reader:
-        own = [item for item in reader.connections if "CameraInfo" in item.msgtype]
-        last: dict[str, Any] = {}
-        count: dict[str, int] = {}
-        for connection, time, data in reader.messages(own):
-            message = reader.deserialize(data, connection.msgtype)
-            message.header.stamp.sec = message.header.stamp.nanosec = 0
-            number = count.get(connection.topic, 0)
-            count[connection.topic] = number + 1
-            said = repr(replace_seq(message))
-            if last.get(connection.topic) != said:
-                expected.setdefault(connection.topic, []).append((number, time, message))
-            last[connection.topic] = said
-    result = intrinsics(path)
-    found = {camera.info_topic: camera for camera in result.cameras if camera.calibrations}
-    assert found.keys() == expected.keys()
-    for topic, messages in expected.items():
-        listed = found[topic].calibrations
-        assert len(listed) == len(messages)
-        for item, (number, time, message) in zip(listed, messages, strict=True):
-            check_message(item, number, time, message)
-    command(path)
-
-
-def replace_seq(message: Any) -> Any:
-    if hasattr(message.header, "seq"):
-        message.header.seq = 0
-    return message
-
-
-def check_message(item: ListedCalibration, number: int, time: int, message: Any) -> None:
-    def get(name: str) -> Any:
-        return getattr(message, name, None) if hasattr(message, name) else getattr(
-            message, name.upper()
-        )  # fmt: skip
-
-    assert (item.message, item.log_time) == (number, time)
-    assert (item.width, item.height) == (message.width, message.height)
-    assert item.frame_id == message.header.frame_id
-    for name, mine in (("k", item.k), ("d", item.d), ("r", item.r), ("p", item.p)):
-        assert np.ravel(mine).tolist() == get(name).tolist()

@@ -114,17 +114,6 @@ KEYS = {
     "down": (ESC + b"[B", "set_rate", 0.909090909),
     "t": (b"t", "toggle_topic_pauses", 1.0),
 }
-IGNORED = {
-    "letters": b"xqm\n\t",
-    "shifted": b"SB",
-    "function": ESC + b"OP" + ESC + b"[15~",
-    "home": ESC + b"[H",
-    "delete": ESC + b"[3~",
-    "control-right": ESC + b"[1;5C",
-    "escape": ESC + ESC,
-    "letter-of-europe": "é€".encode(),
-    "long": ESC + b"[" + b"1;" * 5000 + b"C",
-}
 
 
 @pytest.mark.parametrize("name", KEYS)
@@ -136,52 +125,6 @@ def test_each_key(name: str, terminal: Terminal) -> None:
         until(lambda: bool(controls.calls))
     assert controls.calls == [call]
     assert controls.rate == rate
-
-
-@pytest.mark.parametrize("name", KEYS)
-def test_a_key_that_comes_byte_by_byte(name: str, terminal: Terminal) -> None:
-    typed, call, _ = KEYS[name]
-    controls = RecordedControls()
-    with Keyboard(player_keys(controls), fd=terminal.fd):
-        for n in range(len(typed)):
-            assert not controls.calls
-            terminal.type(typed[n : n + 1])
-            time.sleep(0.03)
-        until(lambda: bool(controls.calls))
-    assert controls.calls == [call]
-
-
-@pytest.mark.parametrize("name", IGNORED)
-def test_other_keys_are_ignored(name: str, terminal: Terminal) -> None:
-    controls = RecordedControls()
-    with Keyboard(player_keys(controls), fd=terminal.fd):
-        for n in range(0, len(IGNORED[name]), 1000):
-            terminal.type(IGNORED[name][n : n + 1000])
-            time.sleep(0.02)
-        terminal.type(b" ")
-        until(lambda: bool(controls.calls))
-    assert controls.calls == ["toggle_paused"]
-
-
-def test_many_keys_at_once(terminal: Terminal) -> None:
-    controls = RecordedControls()
-    typed = b"".join(keys for keys, _, _ in KEYS.values()) * 100
-    expected = [call for _, call, _ in KEYS.values()] * 100
-    with Keyboard(player_keys(controls), fd=terminal.fd):
-        terminal.type(typed)
-        until(lambda: len(controls.calls) >= len(expected))
-    assert controls.calls == expected
-
-
-def test_faster_and_slower_cancel(terminal: Terminal) -> None:
-    controls = RecordedControls()
-    with Keyboard(player_keys(controls), fd=terminal.fd):
-        terminal.type((ESC + b"[A") * 5)
-        until(lambda: len(controls.calls) == 5)
-        assert controls.rate == pytest.approx(1.1**5)
-        terminal.type((ESC + b"[B") * 5)
-        until(lambda: len(controls.calls) == 10)
-    assert controls.rate == pytest.approx(1, abs=1e-8)
 
 
 @pytest.mark.parametrize("size", range(1, 6))
@@ -206,42 +149,6 @@ def test_the_terminal_is_as_it_was_after_the_end(terminal: Terminal) -> None:
     assert "keys" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_the_terminal_is_as_it_was_after_an_exception(terminal: Terminal) -> None:
-    before = terminal.attributes
-
-    def fail() -> None:
-        with Keyboard(player_keys(RecordedControls()), fd=terminal.fd):
-            assert terminal.gives_keys
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fail()
-    assert terminal.attributes == before
-
-
-def test_it_works_outside_of_the_main_thread(terminal: Terminal) -> None:
-    before, controls = terminal.attributes, RecordedControls()
-
-    def use() -> None:
-        with Keyboard(player_keys(controls), fd=terminal.fd):
-            terminal.type(b" ")
-            until(lambda: bool(controls.calls))
-
-    thread = threading.Thread(target=use)
-    thread.start()
-    thread.join()
-    assert controls.calls == ["toggle_paused"]
-    assert terminal.attributes == before
-
-
-def test_the_terminal_goes_away() -> None:
-    hand, fd = os.openpty()
-    with Keyboard(player_keys(RecordedControls()), fd=fd):
-        os.close(hand)
-        until(lambda: "keys" not in [thread.name for thread in threading.enumerate()])
-    os.close(fd)
-
-
 def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
     controls = RecordedControls()
     reading, writing = os.pipe()
@@ -253,17 +160,6 @@ def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
     os.close(reading)
     os.close(writing)
     assert not controls.calls
-
-
-@pytest.mark.parametrize("stdin", [None, "closed"])
-def test_no_standard_input(
-    stdin: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    file = (tmp_path / "stdin").open("w+")
-    file.close()
-    monkeypatch.setattr(sys, "stdin", file if stdin else None)
-    with Keyboard(player_keys(RecordedControls())):
-        assert "keys" not in [thread.name for thread in threading.enumerate()]
 
 
 # ---------------------------------------------------------------- signals, in a session of its own

@@ -19,7 +19,6 @@ import mp4ds
 from coded_scenes import CODED, MakeScene
 from commands import call
 from definitions import COMPRESSED, IMAGE, INFO
-from foxglove_scenes import FOXGLOVE
 from mp4ds.dataset.columns import DecodedColumns
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, OptionError
@@ -32,8 +31,7 @@ from mp4ds.unpacking.republish import Republisher
 from pictures import picture, pixels
 from republished import CAMERAS, Read, file_picture, psnr, read
 from scenes import Record, Scene, odd_scene, scene
-from sources import SOURCES
-from test_republish import Packed, on, still
+from test_republish import Packed, still
 
 TOPIC = "/cam/image_raw"
 RAW = [
@@ -186,14 +184,6 @@ def test_a_mosaic_in_a_png_file_becomes_colours(tmp_path: Path) -> None:
         assert psnr(file_picture(message.value.data.tobytes()), small) > 25
 
 
-@pytest.mark.parametrize("resize", [1.0, (64, 48)])
-def test_the_same_size_stays_as_recorded(packed: Callable[..., Packed], resize: Any) -> None:
-    for name in ("raw-padded", "jpeg-rgb", "video-h264"):
-        made = packed(name)
-        plain = made.unpack("mcap", None)[1]
-        assert rows(made.unpack("mcap", None, resize=resize)[1]) == rows(plain)
-
-
 @pytest.mark.parametrize("name", ["raw-mono8", "jpeg-rgb", "video-h264"])
 @pytest.mark.parametrize("to", TARGETS)
 def test_calibrations_are_made_to_match(packed: Callable[..., Packed], name: str, to: str) -> None:
@@ -214,25 +204,6 @@ def test_calibrations_are_made_to_match(packed: Callable[..., Packed], name: str
         assert np.isclose(k[2], 64 / 2 * 40 / 64 - 0.5)
         assert np.isclose(k[4], 0.9 * 64 * 30 / 48)
         assert (value.binning_x, value.binning_y, value.roi.width) == (0, 0, 0)
-
-
-def test_cameras_of_foxglove(tmp_path: Path) -> None:
-    """Their smaller images are ROS messages; their calibrations stay and are told."""
-    for name in ("raw-rgb8", "jpeg-rgb", "video-h264"):
-        made = Packed(tmp_path / name, FOXGLOVE[name](), "mcap-protobuf")
-        with mp4ds.open(made.folder / "dataset") as dataset:
-            infos = [s.sidecar.camera_info for s in dataset.streams if s.sidecar.camera_info]
-            counts = {info.channel.topic: info.messages for info in infos if info.messages}
-        summary, messages = made.unpack("mcap", None, resize=0.5)
-        assert {topic: sum(r.values()) for topic, r in summary.as_recorded.items()} == counts
-        topic = summary.republished[made.topic].topic
-        found = [message for message in messages if message.topic == topic]
-        for message, frame in zip(found, frames_of(made, 0.5), strict=True):
-            image = image_of(message)
-            if name == "jpeg-rgb":
-                assert psnr(image, frame.data[..., ::-1]) > 38
-            else:
-                assert np.array_equal(image, frame.data)
 
 
 def test_other_topics_stay(packed: Callable[..., Packed]) -> None:
@@ -341,28 +312,6 @@ def test_calibrations_whose_stamps_no_image_has(tmp_path: Path) -> None:
     assert summary.thinned == {TOPIC: 6, "/cam/camera_info": 6}
 
 
-def test_every_stream_by_itself(tmp_path: Path) -> None:
-    """A topic that changes its size, and a second camera; with calibrations that are not asked."""
-    second = on("/other/image_raw", scene("rgb8", frames=5))
-    changing = odd_scene("size-change", frames=9)
-    messages = sorted([*second.messages, *changing.messages], key=lambda record: record.log_time)
-    made = Packed(tmp_path, Scene(messages), "bag-none")
-    summary, found = made.unpack("bag", None, every=2, exclude=["/chatter"])
-    assert summary.thinned == {"/odd/image": 4, "/other/image_raw": 2}
-    heights = [message.value.height for message in found if message.topic == "/odd/image"]
-    assert heights == [24, 24, 12, 12, 12]
-
-
-def test_calibrations_stay_where_images_are_not_wanted(packed: Callable[..., Packed]) -> None:
-    made = packed("raw-mono8")
-    summary, messages = made.unpack("mcap", None, every=2, resize=0.5, exclude=[TOPIC])
-    plain = made.unpack("mcap", None, exclude=[TOPIC])[1]
-    assert rows(messages) == rows(plain)
-    assert summary.thinned == {}
-    summary, messages = made.unpack("mcap", None, every=2, exclude=["/cam/camera_info"])
-    assert summary.thinned == {TOPIC: 4}
-
-
 @pytest.mark.parametrize("how", [{"every": 2}, {"resize": 0.5}, {"every": 2, "resize": 0.5}])
 def test_damage_is_found(how: dict[str, Any], tmp_path: Path) -> None:
     """The whole video is compared with its hash where messages have no digests; all are counted."""
@@ -427,15 +376,6 @@ def messages_of(
 # ---------------------------------------------------------------- image files
 
 
-def test_frames_named_like_formulas(tmp_path: Path) -> None:
-    (source,) = SOURCES["mcap-ros2-none"](tmp_path, scene("mono8", frames=1, frame_id="=1+\u00fc"))
-    mp4ds.pack(source, tmp_path / "ds")
-    mp4ds.unpack(tmp_path / "ds", "images", tmp_path / "out")
-    (stamps,) = (tmp_path / "out").glob("*/stamps.csv")
-    (row,) = csv.DictReader(stamps.read_text(encoding="utf-8").splitlines())
-    assert row["frame_id"] == "'=1+\u00fc"
-
-
 @pytest.mark.parametrize("image_format", ["png", "jpeg"])
 @pytest.mark.parametrize("name", ["raw-rgb8", "raw-bayer_rggb8", "jpeg-rgb", "video-h264"])
 def test_folders_of_images(
@@ -477,14 +417,6 @@ def test_a_camera_of_the_rate_loses_nothing(rate: float, jitter: int) -> None:
         times = camera(rate, jitter=round(min(jitter, 0.2e9 / rate)), seed=seed)
         assert at_most(rate, times).all()
         assert at_most(2 * rate, times).all()
-
-
-@pytest.mark.parametrize("jitter", [0, 3_000_000])
-@pytest.mark.parametrize("part", [1, 2, 3, 4, 5, 7, 30])
-def test_parts_of_a_rate(part: int, jitter: int) -> None:
-    """Frames at equal distances, whatever the jitter."""
-    kept = np.flatnonzero(at_most(30 / part, camera(30.0, jitter=jitter)))
-    assert kept.tolist() == list(range(0, 600, part))
 
 
 @pytest.mark.parametrize("jitter", [0, 3_000_000])
@@ -538,22 +470,6 @@ def test_times_are_stamps_or_log_times(stamps: str) -> None:
 def test_what_is_no_reduction(options: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match=r"`(resize|every|max_rate)` .* use "):
         Reduction(**options)
-
-
-@pytest.mark.parametrize("options", [{"resize": 0.5}, {"every": 2}, {"max_rate": 3.0}], ids=repr)
-@pytest.mark.parametrize("kind", ["compressed-video", "ffmpeg"])
-def test_video_is_given_as_it_is(
-    packed: Callable[..., Packed], kind: str, options: dict[str, Any]
-) -> None:
-    with pytest.raises(OptionError, match="Use raw, jpeg or png"):
-        packed("raw-mono8").unpack("mcap", kind, **options)
-
-
-def test_a_size_beyond_what_images_have(packed: Callable[..., Packed], tmp_path: Path) -> None:
-    dataset = packed("raw-mono8").folder / "dataset"
-    with pytest.raises(OptionError, match="cannot be resized to 16000"):
-        mp4ds.unpack(dataset, "mcap", tmp_path / "x.mcap", UnpackOptions(resize=16000.0))
-    assert not (tmp_path / "x.mcap").exists()
 
 
 def test_the_command_line(packed: Callable[..., Packed], tmp_path: Path) -> None:

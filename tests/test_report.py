@@ -26,15 +26,12 @@ import av
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED
-from mp4ds.errors import OptionError, SourceError, TargetError, TargetExistsError
-from mp4ds.format.models import Calibration, Roi
-from mp4ds.plugins.info import info
+from mp4ds.errors import OptionError, SourceError
+from mp4ds.format.models import Calibration
 from mp4ds.plugins.reporting.cameras import (
-    ReportedCamera,
     axis_of,
     nearest_offsets,
     overlay_of,
@@ -44,7 +41,7 @@ from mp4ds.plugins.reporting.cameras import (
 from mp4ds.plugins.reporting.page import as_script
 from mp4ds.plugins.reporting.proxies import Look, pictures_in_order, proxy_size
 from mp4ds.plugins.reporting.report import ReportOptions, report
-from mp4ds.plugins.reporting.server import ReportServer, byte_range
+from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.times import lost_frames
 from report_scenes import (
     COLOUR,
@@ -52,8 +49,6 @@ from report_scenes import (
     FRAMES,
     HEIGHT,
     LATE,
-    LOST,
-    REPEATED,
     WIDTH,
     blocks,
     pack_cameras,
@@ -171,33 +166,10 @@ def test_figures_where_there_are_none(stamps: list[int], rate: float | None) -> 
     assert (timing.rate_hz, timing.lost, timing.seq_missing) == (rate, 0, None)
 
 
-@pytest.mark.filterwarnings("error")
-def test_figures_of_impossible_stamps() -> None:
-    stamps = np.array([INT64.min, INT64.max, 0, INT64.max, INT64.min], np.int64)
-    timing = timing_of(stamps, stamps[::-1].copy(), None)
-    assert timing.backward == 2
-    assert timing.longest_ms == pytest.approx(2**64 / 1e6)
-
-
 def test_lost_frames_by_the_rule() -> None:
     steps = np.array([10, 10, 10, 15, 15.1, 24.9, 25, 10, 100, 10, 0, -30, 10], float)
     assert lost_frames(steps).tolist() == [0, 0, 0, 0, 1, 1, 2, 0, 9, 0, 0, 0, 0]
     assert not len(lost_frames(np.empty(0)))
-
-
-def test_late_frames_are_not_lost_ones() -> None:
-    late = np.array([10, 10, 16, 4, 10, 3, 17, 10, 10, 19, 2, 9, 10], float)
-    assert not lost_frames(late).any()
-    lost = np.array([10, 10, 20, 10, 22, 8, 7, 26, 7, 10, 10], float)
-    assert np.flatnonzero(lost_frames(lost)).tolist() == [2, 4, 7]
-
-
-def test_a_single_lost_frame_is_a_gap_to_all(drive: Path) -> None:
-    gaps = {topic.topic: topic.gaps for topic in info(drive).topics}
-    assert (gaps[COLOUR], gaps[DEPTH]) == (0, 1)
-    with mp4ds.open(drive) as dataset:
-        stream = dataset[DEPTH]
-        assert timing_of(stream.stamps, stream.log_times, None).gaps == 1
 
 
 def test_offsets_to_the_nearest_frame() -> None:
@@ -284,13 +256,6 @@ def test_there_is_no_grid_without_a_reason(
     assert not overlay.lines
 
 
-def test_the_grid_of_a_part_of_the_sensor() -> None:
-    roi = Roi(x_offset=100, y_offset=50, width=400, height=300, do_rectify=0)
-    lens = calibration("plumb_bob", [-0.2], binning_x=2, binning_y=2, roi=roi)
-    overlay = overlay_of(lens, (200, 150), "/cam/image_raw")
-    assert overlay.center == pytest.approx([(100 + 0.5) / 200, (100 + 0.5) / 150], abs=1e-4)
-
-
 @pytest.mark.parametrize("value", [1e-300, 1e300, 1e18])
 def test_a_grid_of_impossible_numbers_is_bounded(value: float) -> None:
     lens = calibration("plumb_bob", [value, -value], k=[value, 0, value, 0, value, value, 0, 0, 1])
@@ -375,11 +340,6 @@ def test_a_second_report_takes_the_proxies_of_the_first(copy: Path) -> None:
     assert not proxy.exists()
 
 
-def test_all_get_proxies_where_asked(copy: Path) -> None:
-    summary = report(copy, ReportOptions(proxies="all"))
-    assert [camera.plays for camera in summary.cameras] == ["proxy", "proxy"]
-
-
 def test_a_report_elsewhere_plays_the_videos_where_they_are(copy: Path, tmp_path: Path) -> None:
     odd = tmp_path / "a #1 100% ü?"
     odd.mkdir()
@@ -429,21 +389,6 @@ def test_a_remote_dataset_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch
     assert not (copy.parent / "page").exists()
 
 
-def test_what_is_no_report_stays(copy: Path) -> None:
-    (copy / "index.html").write_text("<h1>mine</h1>")
-    with pytest.raises(TargetExistsError, match=r"index\.html"):
-        report(copy)
-    assert not (copy / "report").exists()
-    report(copy, ReportOptions(force=True))
-    assert "mp4ds report" in (copy / "index.html").read_text()
-    shutil.rmtree(copy / "report")
-    (copy / "report").mkdir()
-    (copy / "report" / "thesis.tex").write_text("mine")
-    with pytest.raises(TargetError, match="was not written by mp4ds"):
-        report(copy, ReportOptions(force=True))
-    assert (copy / "report" / "thesis.tex").read_text() == "mine"
-
-
 def test_a_failure_leaves_what_was_there(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     report(copy)
     before = sorted(p.relative_to(copy) for p in copy.rglob("*"))
@@ -488,14 +433,6 @@ def test_hostile_names_are_only_text(tmp_path: Path) -> None:
             assert b"<" not in text.removeprefix(b"/* made by mp4ds report */")
     page = (dataset / "index.html").read_text()
     assert "alert" not in page
-
-
-def test_scripts_hold_any_value() -> None:
-    value = {"a": [float("nan"), float("inf"), -0.5, 2**70, None, True, "</script>\u2028"]}
-    text = as_script(value)
-    assert text.isascii()
-    assert "<" not in text
-    assert json.loads(text) == {"a": [None, None, -0.5, 2**70, None, True, "</script>\u2028"]}
 
 
 def test_no_code_of_the_page_makes_elements_of_text() -> None:
@@ -574,18 +511,6 @@ def test_sizes_of_proxies(image: tuple[int, int], width: int, size: tuple[int, i
     assert proxy_size(image, width) == size
 
 
-def test_depth_gets_colours_where_it_has_values(drive: Path) -> None:
-    with mp4ds.open(drive) as dataset:
-        stream = dataset[DEPTH]
-        pixels = stream[3].data
-        look = Look(stream, stream.image_size)
-        picture = look.picture(pixels)
-        assert (picture[pixels == 0] == 0).all()
-        assert picture[pixels != 0].max(axis=-1).min() > 50
-        low, high = map(float, re.findall(r"[0-9.e+]+", look.caption.partition(":")[2]))
-        assert pixels.min() <= low < high <= 65535
-
-
 # ---------------------------------------------------------------- scores
 
 
@@ -601,20 +526,6 @@ def test_scores_of_a_pack_are_plotted(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- options
-
-
-@pytest.mark.parametrize("options", [{"proxies": "some"}, {"proxy_width": 10}])
-def test_wrong_options_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(OptionError, match="`prox"):
-        ReportOptions(**options)
-
-
-def test_datasets_without_cameras_have_a_page(tmp_path: Path) -> None:
-    made = scene("mono8", frames=4)
-    others = Scene([m for m in made.messages if not m.topic.startswith("/cam")])
-    dataset = pack_cameras(tmp_path, others)
-    assert report(dataset).cameras == []
-    assert data_of(dataset)["cameras"] == []
 
 
 def test_a_topic_of_two_sizes_has_two_cameras(tmp_path: Path) -> None:
@@ -681,25 +592,12 @@ def test_ranges_that_are_not_there(server: ReportServer, asked: str) -> None:
     assert headers["Content-Range"] == "bytes */1024"
 
 
-@pytest.mark.parametrize("asked", ["bytes=-", "lines=1-2", "bytes=1-2,5-6", "bytes=a-b", "x" * 999])
-def test_other_ranges_give_all(asked: str) -> None:
-    assert byte_range(asked, 7) == (0, 7)
-
-
 @pytest.mark.parametrize(
     "path", ["/", "/secret", "/../secret", "/d/../secret", "/%2e%2e/secret", "/d/", "/gone"]
 )
 def test_nothing_else_is_served(server: ReportServer, path: str) -> None:
     status, _, body = ask(server, path)
     assert (status, body) == (404, b"")
-
-
-def test_whole_files_and_heads(server: ReportServer) -> None:
-    status, headers, body = ask(server, "/index.html?x=1")
-    assert (status, body, headers["Accept-Ranges"]) == (200, b"page", "bytes")
-    status, headers, body = ask(server, "/d/a%20b.mp4", "HEAD")
-    assert (status, body, headers["Content-Length"]) == (200, b"", "1024")
-    assert ask(server, "/index.html", "POST")[0] == 501
 
 
 def test_other_sites_and_users_get_nothing(server: ReportServer) -> None:
@@ -752,11 +650,6 @@ def test_odd_requests_print_nothing(
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_port_that_is_taken(server: ReportServer) -> None:
-    with pytest.raises(OptionError, match=f"`port` {server.port}"):
-        ReportServer({}, "/", port=server.port)
-
-
 # ---------------------------------------------------------------- the command
 
 
@@ -806,31 +699,6 @@ def test_serving_until_interrupted(copy: Path) -> None:
     finally:
         process.kill()
         process.communicate()
-
-
-def test_what_a_camera_tells_of_its_calibrations(drive: Path) -> None:
-    with mp4ds.open(drive) as dataset:
-        facts = ReportedCamera(dataset[COLOUR].streams[0], COLOUR).facts(0, None, "")
-    (listed,) = facts["calibrations"]
-    assert listed["from_frame"] == 0
-    assert listed["distortion_model"] == "plumb_bob"
-    assert facts["calibration_topic"] == "/front/camera_info"
-
-
-def matching(picture: NDArray[Any], pictures: list[NDArray[Any]]) -> int:
-    """Number of the picture that is most like one."""
-    return int(np.argmin([np.abs(blocks(picture) - blocks(other)).mean() for other in pictures]))
-
-
-def test_the_scene_is_as_it_says(drive: Path) -> None:
-    """What the other tests rely on: frames that differ, and times with what they look for."""
-    with mp4ds.open(drive) as dataset:
-        pictures = [frame.data for frame in dataset[COLOUR].get(range(FRAMES), format="rgb")]
-        stamps = dataset[DEPTH].stamps
-    assert [matching(picture, pictures) for picture in pictures] == list(range(FRAMES))
-    assert len(stamps) == FRAMES - 1
-    assert np.flatnonzero(np.diff(stamps) == 0).tolist() == [REPEATED - 2]
-    assert int(np.argmax(np.diff(stamps)[: LOST + 1])) == LOST - 1
 
 
 @pytest.mark.slow

@@ -319,18 +319,6 @@ def test_foxglove_cameras_as_every_kind(packed: Pack, name: str, kind: str, to: 
     check(made, summary, messages, name, kind, to, fate)
 
 
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["foxglove-raw-mono8", "foxglove-jpeg-rgb", "foxglove-video-h264"])
-def test_foxglove_cameras_of_ros2(packed: Pack, name: str, kind: str) -> None:
-    made = packed(name, "mcap-foxglove-ros2")
-    summary, messages = made.unpack("bag", kind)
-    fate = fate_of(FOXGLOVE_FATES[name], name, kind)
-    if (name, kind) == ("foxglove-video-h264", "compressed-video"):
-        fate = ALREADY[kind]
-    check(made, summary, messages, name, kind, "bag", fate)
-
-
 def check(
     made: Packed,
     summary: UnpackSummary,
@@ -537,15 +525,6 @@ def test_files_stay_byte_for_byte(packed: Pack, name: str, source: str, kind: st
     assert found == [record.values["data"] for record in made.cameras]
 
 
-def test_a_png_of_depths_stays_byte_for_byte(packed: Pack) -> None:
-    """Without the header that compressedDepth puts before it."""
-    made = packed("depth-16UC1-png", "mcap-ros2-zstd")
-    messages = made.unpack("mcap", "png", topics=[made.topic])[1]
-    assert {message.value.format for message in messages} == {"16UC1; png compressed "}
-    found = [message.value.data.tobytes() for message in messages]
-    assert found == [record.values["data"][12:] for record in made.cameras]
-
-
 @pytest.mark.parametrize("name", ["jpeg-exif-trailing", "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
 def test_unpacked_images_are_the_recorded_files(packed: Pack, name: str, tmp_path: Path) -> None:
     made = packed(name, "mcap-ros2-zstd")
@@ -593,16 +572,6 @@ def test_jpeg_pixels_are_those_of_opencv(packed: Pack, name: str) -> None:
         assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), image)
 
 
-def test_unpacked_jpeg_images_have_the_quality(packed: Pack, tmp_path: Path) -> None:
-    made = packed("raw-bgr8", "mcap-ros2-zstd")
-    sizes = []
-    for quality in (20, 95):
-        options = UnpackOptions(image_format="jpeg", jpeg_quality=quality, force=True)
-        mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "images", options)
-        sizes.append(sum(p.stat().st_size for p in (tmp_path / "images").rglob("*.jpg")))
-    assert 2 * sizes[0] < sizes[1]
-
-
 # ---------------------------------------------------------------- transcoded JPEG
 
 TRANSCODED = PackOptions(transcode=True, quality="crf=20")
@@ -625,14 +594,6 @@ def test_transcoded_jpeg_returns_as_jpeg(packed: Pack, name: str) -> None:
         again = kept(made, made.unpack("mcap", "jpeg", jpeg_quality=quality)[1])
         assert [m.payload for m in again] == [m.payload for m in found]
     assert sizes[30] < 0.8 * sizes[95]
-
-
-def test_transcoded_jpeg_as_video(packed: Pack) -> None:
-    made = packed("jpeg-rgb", "mcap-ros2-zstd", TRANSCODED)
-    found = made.unpack("mcap", "compressed-video", topics=[made.topic])[1]
-    assert {message.value.format for message in found} == {"av1"}
-    for image, original in zip(shown(found), truth(made.cameras), strict=True):
-        assert psnr(image, original) > 22
 
 
 # ---------------------------------------------------------------- video without decoding
@@ -948,20 +909,6 @@ def test_two_publishers_of_a_topic(tmp_path: Path) -> None:
     check_times(made, found, "bag")
     assert {m.metadata["callerid"] for m in found} == {"/first", "/second"}
     assert {m.topic for m in found} == {"/cam/image_raw/compressed"}
-
-
-def test_a_pair_alone(packed: Pack, tmp_path: Path) -> None:
-    made = packed("jpeg-rgb", "bag-none")
-    for suffix in ("yaml", "mp4"):
-        name = f"cam_image_raw_compressed.{suffix}"
-        (tmp_path / name).write_bytes((made.folder / "dataset" / name).read_bytes())
-    output = tmp_path / "out.mcap"
-    mp4ds.unpack(
-        tmp_path / "cam_image_raw_compressed.mp4", "mcap", output, UnpackOptions(images="raw")
-    )
-    found = [message for message in read(output) if message.type_name == IMAGE]
-    check_times(made, found, "bag")
-    assert psnr(halved(shown(found)[0]), halved(truth(made.cameras)[0])) > 31
 
 
 def test_a_profile_of_neither_ros(packed: Pack) -> None:

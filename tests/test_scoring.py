@@ -32,7 +32,6 @@ from mp4ds.video.scores import (
     psnr,
     scores_of,
     ssim,
-    summary_of,
 )
 from waiting import WATCHDOG_S, until
 
@@ -186,25 +185,6 @@ def test_vmaf_is_that_of_another_build(
 @needs_vmaf
 @pytest.mark.parametrize("bits", [8, 10])
 @pytest.mark.parametrize("size", SIZES, ids=str)
-def test_vmaf_is_that_of_the_same_build_on_files(
-    size: tuple[int, int], bits: int, tmp_path: Path
-) -> None:
-    """Whatever the frames are: no frame goes astray in the pipe."""
-    ours = find_ffmpeg()
-    original, made = clip(size, bits=bits), clip(size, bits=bits, noise=0.08)
-    scores = scores_of(original, made, ffmpeg=ours)
-    log = vmaf_of_files(ours.path, tmp_path, original, made, bits)
-    assert len(set(scores["vmaf"])) == FRAMES
-    assert (scores["vmaf"] == vmaf_in(log)).all()
-    pooled, summary = log["pooled_metrics"]["vmaf"], summary_of(scores["vmaf"])
-    assert summary.mean == pytest.approx(pooled["mean"], abs=1e-5)
-    assert summary.harmonic_mean == pytest.approx(pooled["harmonic_mean"], abs=1e-5)
-    assert summary.minimum == pytest.approx(pooled["min"], abs=1e-5)
-
-
-@needs_vmaf
-@pytest.mark.parametrize("bits", [8, 10])
-@pytest.mark.parametrize("size", SIZES, ids=str)
 def test_psnr_and_ssim_are_those_of_ffmpeg(
     size: tuple[int, int], bits: int, tmp_path: Path
 ) -> None:
@@ -271,14 +251,6 @@ def test_differences_of_either_sign_do_not_wrap_around() -> None:
     assert ssim(low, high) < 0.01
 
 
-def test_summaries() -> None:
-    found = summary_of(np.array([1.0, 3.0, 3.0, 3.0]))
-    assert found.mean == 2.5
-    assert found.harmonic_mean == pytest.approx(4 / (1 / 2 + 3 / 4) - 1)
-    assert found.minimum == 1
-    assert found.percentile_5 == pytest.approx(1.3)
-
-
 @needs_vmaf
 def test_frames_may_be_views_with_padded_rows() -> None:
     frames, made = clip((64, 48)), clip((64, 48), noise=0.02)
@@ -331,13 +303,6 @@ def test_frames_that_do_not_match(
 ) -> None:
     with pytest.raises(ScoringError, match=said):
         scores_of(original, made)
-
-
-def test_planes_of_no_such_frame() -> None:
-    y, u, v = clip((64, 48))[0]
-    for frame in ((y, u, v[:, :-1]), (y, u), (y.astype(np.float32), u, v)):
-        with pytest.raises(ScoringError):
-            scores_of([frame], [frame])  # type: ignore[list-item]
 
 
 def program(folder: Path, script: str) -> str:

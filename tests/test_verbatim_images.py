@@ -81,24 +81,6 @@ def test_all_images_are_written(tmp_path: Path) -> None:
     assert {row[3] for row in rows_of(folder)} == {"cam"}
 
 
-def test_fewer_and_smaller_ones(tmp_path: Path) -> None:
-    dataset = packed(tmp_path, mixed())
-    options = UnpackOptions(every=3, resize=0.5)
-    summary = mp4ds.unpack(dataset, "images", tmp_path / "images", options)
-    folder = tmp_path / "images" / "cam_image_raw"
-    assert sorted(path.name for path in folder.glob("*.png")) == [
-        f"{n:02d}.png" for n in range(0, FRAMES, 3)
-    ]
-    sizes = {cv2.imread(str(path)).shape[:2] for path in folder.glob("*.png")}
-    assert sizes == {(24, 32)}
-    assert summary.thinned == {TOPIC: FRAMES - 4}
-    part = UnpackOptions(start=0.05, duration=0.2)
-    mp4ds.unpack(dataset, "images", tmp_path / "part", part)
-    recording = mp4ds.unpack(dataset, "mcap", tmp_path / "part.mcap", part)
-    written = [*(tmp_path / "part").glob("*/*.png")]
-    assert len(written) == recording.messages[TOPIC] < FRAMES
-
-
 def png(pixels: NDArray[Any], *flags: int) -> bytes:
     ok, data = cv2.imencode(".png", pixels, flags)
     assert ok
@@ -252,20 +234,6 @@ def test_messages_with_the_same_log_time(tmp_path: Path) -> None:
         found = dataset[TOPIC]
         for number, pixels in enumerate(pictures(made)):
             assert np.array_equal(found[number].data, pixels), number
-
-
-def test_nothing_is_read_where_nothing_is_verbatim(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = packed(tmp_path, scene("mono8"))
-
-    def refuse(*_: object) -> None:
-        pytest.fail("messages.mcap was opened")
-
-    monkeypatch.setattr("mp4ds.dataset.messages.McapReader", refuse)
-    with Dataset(folder) as dataset:
-        assert len(dataset[TOPIC]) == 8
-        assert "/imu" not in dataset
 
 
 def test_verbatim_images_of_a_damaged_dataset(tmp_path: Path) -> None:
