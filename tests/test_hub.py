@@ -1,4 +1,4 @@
-"""Datasets on the Hugging Face Hub: read where they are by hf://, with a card of what was told."""
+"""Datasets on the Hugging Face Hub: read where they are by hf://."""
 
 from __future__ import annotations
 
@@ -7,16 +7,12 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import yaml
 
 import mp4ds
-from commands import call
 from hub_server import REPOSITORY, Hub, hub_server
-from mp4ds.plugins.card import card
 from mp4ds.plugins.demo import demo
 from waiting import WATCHDOG_S
 
@@ -99,80 +95,3 @@ def test_a_repository_that_is_not_there_is_a_sentence(hub: Hub, tmp_path: Path) 
         "hf://datasets/someone/nothing/first: no such file or folder. Check the path.",
         "hf://datasets/someone/drives/third: no such file or folder. Check the path.",
     ]
-
-
-# ---------------------------------------------------------------- card
-
-ABOUT = {
-    "title": "A workshop | *two* arms",
-    "description": "Lamps off.\nDoors <open>.",
-    "authors": [{"name": "A lab", "affiliation": "A university"}, {"name": "B"}],
-    "license": "CC-BY-4.0",
-    "doi": "10.1234/abc",
-    "links": ["https://example.org/paper"],
-    "keywords": ["slam", "robotics"],
-}
-
-
-def packed(folder: Path, name: str, about: dict[str, object] | None) -> Path:
-    demo(folder / f"{name}.bag", seconds=0.2)
-    options = mp4ds.PackOptions(codec="h264")
-    if about is not None:
-        (folder / "about.yaml").write_text(yaml.safe_dump(about))
-        options = replace(options, about=folder / "about.yaml")
-    mp4ds.pack(folder / f"{name}.bag", folder / name, options)
-    return folder / name
-
-
-def metadata_of(text: str) -> dict[str, object]:
-    found: dict[str, object] = yaml.safe_load(text.split("---\n")[1])
-    return found
-
-
-def test_a_card_has_what_was_told(tmp_path: Path) -> None:
-    path = packed(tmp_path, "drive 1", ABOUT)
-    text = card([path])
-    assert metadata_of(text) == {
-        "pretty_name": ABOUT["title"],
-        "license": "cc-by-4.0",
-        "tags": ["robotics", "video", "ros", "mp4ds", "slam"],
-        "task_categories": ["robotics"],
-        "size_categories": ["n<1K"],
-    }
-    assert "# A workshop \\| \\*two\\* arms" in text
-    assert "Lamps off. Doors \\<open\\>." in text
-    assert "**Authors**: A lab (A university); B" in text
-    assert "<https://doi.org/10.1234/abc> <https://example.org/paper>" in text
-    assert "mp4ds info 'hf://datasets/OWNER/NAME/drive 1'" in text
-    assert 'dataset["/left/image_raw"]' in text
-    row = next(line for line in text.splitlines() if line.startswith("| drive 1"))
-    assert "| 6 | 0.2 |" in row
-
-
-@pytest.mark.parametrize(
-    ("licenses", "expected"),
-    [
-        (["CC-BY-4.0", "CC-BY-4.0"], {"license": "cc-by-4.0"}),
-        (["House rules"], {"license": "other", "license_name": "House rules"}),
-        (["MIT", "CC0-1.0"], {"license": "other", "license_name": "MIT, CC0-1.0"}),
-        ([None], {}),
-    ],
-)
-def test_licenses(licenses: list[str | None], expected: dict[str, str], tmp_path: Path) -> None:
-    paths = [
-        packed(tmp_path, f"drive{number}", {"license": license_id} if license_id else None)
-        for number, license_id in enumerate(licenses)
-    ]
-    found = metadata_of(card(paths))
-    assert {key: found[key] for key in found if key.startswith("license")} == expected
-
-
-def test_the_hub_reads_the_metadata(tmp_path: Path) -> None:
-    hub = pytest.importorskip("huggingface_hub")
-    found = hub.DatasetCard(card([packed(tmp_path, "drive", ABOUT)]))
-    assert (found.data.license, found.data.pretty_name) == ("cc-by-4.0", ABOUT["title"])
-    assert found.data.tags == ["robotics", "video", "ros", "mp4ds", "slam"]
-
-
-def test_info_prints_it(drives: Path) -> None:
-    assert call("info", drives, "--card").out == card([drives / "first", drives / "second"])

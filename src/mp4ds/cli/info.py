@@ -22,7 +22,6 @@ from mp4ds.files.urls import location
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.options import HOW, SliceOptions, iso_text
 from mp4ds.plugins import info as facts
-from mp4ds.plugins.card import card as card_of
 from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, ListedCalibration, intrinsics
 
 _SPEED_COLUMNS = [
@@ -84,18 +83,11 @@ _INFO_COLUMNS = [
     panel=HOW,
     help="Print the SHA-256 of a dataset's files in the format of sha256sum.",
 )
-@option(
-    "--card",
-    "what",
-    flag_value="card",
-    panel=HOW,
-    help="Print a dataset card for Hugging Face: README.md.",
-)
 @takes(SliceOptions)
 def info_command(paths: Sequence[str], what: str | None, options: SliceOptions) -> None:
     """Show what is in a recording or a dataset."""
     found = _found(paths)
-    if len(found) > 1 and (options.slice or what not in (None, "card")):
+    if len(found) > 1 and (options.slice or what):
         raise OptionError("These options work with one recording or dataset only.")
     with progress_of("reading") as tell:
         if what == "intrinsics":
@@ -104,8 +96,6 @@ def info_command(paths: Sequence[str], what: str | None, options: SliceOptions) 
             show(facts.reading_speeds(paths[0]), _print_speeds)
         elif what == "checksums":
             show(_checksums(found[0]), _print_checksums)
-        elif what == "card":
-            show({"card": card_of(found)}, _print_card)
         elif len(found) == 1:
             show(facts.info(found[0], options.slice), _print_info)
         else:
@@ -166,11 +156,6 @@ def _checksums(path: Path) -> dict[str, str]:
 def _print_checksums(found: Mapping[str, str]) -> None:
     for name, sha256 in found.items():
         say(f"{sha256}  {name}")
-
-
-def _print_card(found: Mapping[str, str]) -> None:
-    for line in found["card"].splitlines():
-        say(line)
 
 
 def _print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None:
