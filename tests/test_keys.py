@@ -9,7 +9,7 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,50 +27,15 @@ class RecordedControls:
     """A player that keeps what it was asked for."""
 
     def __init__(self) -> None:
-        self.is_paused = False
         self.rate = 1.0
         self.calls: list[str] = []
 
-    def pause(self) -> None:
-        raise NotImplementedError
-
-    def resume(self) -> None:
-        raise NotImplementedError
-
-    def toggle_paused(self) -> None:
-        self.calls.append("toggle_paused")
-
-    def set_rate(self, rate: float) -> bool:
+    def set_rate(self, rate: float) -> None:
         self.calls.append("set_rate")
         self.rate = rate
-        return True
 
-    def play_next(self) -> bool:
-        self.calls.append("play_next")
-        return True
-
-    def step_back(self) -> bool:
-        self.calls.append("step_back")
-        return True
-
-    def burst(self, messages: int) -> int:
-        raise NotImplementedError
-
-    def seek(self, time_ns: int) -> int:
-        raise NotImplementedError
-
-    def play(self, start_ns: int, end_ns: int | None) -> bool:
-        raise NotImplementedError
-
-    def toggle_topic_pauses(self) -> None:
-        self.calls.append("toggle_topic_pauses")
-
-    @property
-    def start_ns(self) -> int:
-        return 0
-
-    def stop(self) -> None:
-        raise NotImplementedError
+    def __getattr__(self, name: str) -> Callable[[], None]:
+        return lambda: self.calls.append(name)
 
 
 @dataclass

@@ -203,17 +203,6 @@ def playing(core: Core, dataset: Path) -> Iterator[tuple[subprocess.Popen[str], 
         player.wait(WATCHDOG_S)
 
 
-def test_pause_service(roscore: Core, drive: Path) -> None:
-    with playing(roscore, drive) as (_, receiver, node):
-        for wanted, told in (("true", "paused"), ("false", "resumed")):
-            _, output, _ = roscore.run("rosservice", "call", f"{node}/pause_playback", wanted)
-            assert f"Playback is now {told}" in output
-            if wanted == "true":
-                wait_until(lambda: not receiver.silence(1))  # what was on its way has come
-            else:
-                receiver.take(30)
-
-
 def test_ends_with_its_node(roscore: Core, drive: Path) -> None:
     with playing(roscore, drive) as (player, _, node):
         assert roscore.run("rosnode", "kill", node)[0] == 0
@@ -242,11 +231,3 @@ def test_ros_names_the_node_and_its_topics(roscore: Core, drive: Path) -> None:
         player.send_signal(signal.SIGINT)
         assert player.wait(WATCHDOG_S) == 0
         receiver.end()
-
-
-def test_no_master(roscore: Core, drive: Path) -> None:
-    uri = "http://127.0.0.1:9/"
-    code, _, errors = roscore.run(*mp4ds_play(drive), ROS_MASTER_URI=uri)
-    assert code == 1
-    assert re.search(rf"{uri}: no ROS master answers", errors.replace("\n", " "))
-    assert "Traceback" not in errors

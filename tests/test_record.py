@@ -81,8 +81,6 @@ def reasons(summary: mp4ds.PackSummary, topic: str) -> dict[str, int]:
     [
         ("bag-none", "bayer_rggb8"),
         ("bag-none", "16UC1"),
-        ("bag-none", "rgb8"),
-        ("rosbag2-mcap-v5", "mono8"),
         ("rosbag2-sqlite3-v5", "32FC1"),
         ("rosbag2-mcap-v5", "yuv422_yuy2"),
     ],
@@ -103,7 +101,7 @@ def test_what_comes_is_there(source: str, encoding: str, tmp_path: Path, compare
         assert stream[13].data.shape[0] == 48
 
 
-@pytest.mark.parametrize("kind", ["video-h264", "video-h265", "video-h264-headers-once"])
+@pytest.mark.parametrize("kind", ["video-h265", "video-h264-headers-once"])
 def test_packets_on_both_sides_of_a_cut(kind: str, tmp_path: Path, compare: Compare) -> None:
     """Pieces are cut at key frames of the video, whatever else is cut in between."""
     paths = write(tmp_path, "rosbag2-mcap-v5", CODED[kind](frames=40))
@@ -316,8 +314,8 @@ def test_datasets_of_a_length(tmp_path: Path, compare: Compare) -> None:
 
 
 def test_datasets_of_a_size(tmp_path: Path, compare: Compare) -> None:
-    paths = write(tmp_path, of=scene("mono8", frames=60, width=320, height=240))
-    summary = recorded(PlayedSource(paths), tmp_path / "live", max_size=500_000)
+    paths = write(tmp_path, of=scene("mono8", frames=40, width=160, height=120))
+    summary = recorded(PlayedSource(paths), tmp_path / "live", max_size=200_000)
     made = [item.dataset for item in summary.datasets]
     assert len(made) > 1
     mp4ds.pack(made, tmp_path / "whole")
@@ -354,6 +352,7 @@ def test_packing_that_is_too_slow(
     tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The spool keeps what is not packed yet, beyond what the buffer holds; nothing is dropped."""
+    monkeypatch.setattr(spool, "WINDOW_NS", 2_000_000_000)
     paths = write(tmp_path, of=scene("bayer_rggb8", frames=60, width=320, height=240))
     is_received = threading.Event()
     pack = PackingProcess.pack
@@ -435,10 +434,7 @@ def test_a_buffer_that_is_full(tmp_path: Path) -> None:
     assert buffer.received == {message.channel.topic: 5}
 
 
-@pytest.mark.parametrize("field", ["log_time", "publish_time"])
-def test_times_that_no_recording_can_hold(
-    field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_times_that_no_recording_can_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Such messages are left out and counted; the others are recorded."""
     paths = write(tmp_path, of=scene("mono8", frames=20))
     times = {
@@ -451,20 +447,20 @@ def test_times_that_no_recording_can_hold(
         15: 2**32 * 10**9 - 1,
     }
 
-    def altered(message: Message, number: int) -> Message:
+    def altered(field: str, message: Message, number: int) -> Message:
         return replace(message, **{field: times[number]}) if number in times else message
 
-    source = PlayedSource(paths, altered={"/cam/image_raw": altered, "/imu": altered})
-    Opened(source, monkeypatch)
+    fields = {"/cam/image_raw": "log_time", "/imu": "publish_time"}
+    each = {topic: partial(altered, field) for topic, field in fields.items()}
+    Opened(PlayedSource(paths, altered=each), monkeypatch)
     told = call("record", "--ros1", "-a", "-o", tmp_path / "live", "--no-progress")
     assert told.code == 1
     why = "their log time is negative or too large"
-    for topic in ("/cam/image_raw", "/imu"):
+    for topic in fields:
         assert f"{topic}: 5 messages left out: {why}" in told.out
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
     with mp4ds.open(tmp_path / "live") as dataset:
         assert len(dataset["/cam/image_raw"]) == 15
-    shutil.rmtree(tmp_path / "live")
 
 
 def messages(paths: list[Path]) -> Iterator[Message]:
@@ -500,13 +496,14 @@ def test_a_disk_that_is_full(
 # ---------------------------------------------------------------- power cuts
 
 
-@pytest.fixture
-def killed(tmp_path: Path) -> tuple[list[Path], Path]:
+@pytest.fixture(scope="module")
+def left(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path]:
     """A recording, and a folder in which it was being recorded when the recorder was killed."""
-    paths = write(tmp_path, of=scene("bayer_rggb8", frames=400, width=64, height=48))
-    folder = tmp_path / "live.recording"
-    command = [sys.executable, str(HERE / "record_scenes.py"), str(paths[0]), folder.stem, "2"]
-    process = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.DEVNULL)
+    place = tmp_path_factory.mktemp("killed")
+    paths = write(place, of=scene("bayer_rggb8", frames=400, width=64, height=48))
+    folder = place / "live.recording"
+    command = [sys.executable, str(HERE / "record_scenes.py"), str(paths[0]), folder.stem, "4"]
+    process = subprocess.Popen(command, cwd=place, stdin=subprocess.DEVNULL)
 
     def is_half_packed() -> bool:
         last = max(folder.glob("*.mcap"), default=None)
@@ -525,6 +522,13 @@ def killed(tmp_path: Path) -> tuple[list[Path], Path]:
 
     until(is_left)
     return paths, folder
+
+
+@pytest.fixture
+def killed(left: tuple[list[Path], Path], tmp_path: Path) -> tuple[list[Path], Path]:
+    """The same, to be changed."""
+    shutil.copytree(left[1], tmp_path / "live.recording")
+    return left[0], tmp_path / "live.recording"
 
 
 def test_no_recovery_while_it_is_packed(killed: tuple[list[Path], Path], tmp_path: Path) -> None:
@@ -580,7 +584,7 @@ def test_a_spool_that_is_torn(killed: tuple[list[Path], Path], tmp_path: Path) -
     paths, folder = killed
     last = max(folder.glob("*.mcap"))
     data = last.read_bytes()
-    for number, cut in enumerate((0, 1, 30, len(data) // 2, len(data) - 5000, len(data) - 1)):
+    for number, cut in enumerate((0, 30, len(data) // 2, len(data) - 1)):
         for kind, rest in (("cut", b""), ("zeros", bytes(len(data) - cut))):
             last.write_bytes(data[:cut] + rest)
             made = tmp_path / f"made{number}{kind}"

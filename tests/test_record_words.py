@@ -41,6 +41,7 @@ def meant(typed: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     def opened(topics: Sequence[str], output: str | None, options: RecordOptions, **_: Any) -> None:
         usual = RecordOptions(to=options.to)
         found = {item.name: getattr(options, item.name) for item in fields(options)}
+        found = {k: getattr(v, "pattern", v) for k, v in found.items()}  # of expressions
         asked.update({k: v for k, v in found.items() if v != getattr(usual, k)})
         asked.update({"topics": tuple(topics)} if topics else {})
         asked.update({"output": output} if output else {})

@@ -172,6 +172,18 @@ def parse_resize(value: str | float | tuple[int, int]) -> float | tuple[int, int
         ) from None
 
 
+def parse_pattern(value: str | re.Pattern[str]) -> re.Pattern[str] | None:
+    """A regular expression; None for an empty text.
+
+    Raises:
+        OptionError: It is not valid.
+    """
+    try:
+        return re.compile(value) if value else None
+    except re.error as error:
+        raise OptionError(f"{value!r} is not a valid regular expression: {error}.") from None
+
+
 def parse_words(value: str | Sequence[_T]) -> Sequence[str | _T]:
     """The words of a comma-separated list."""
     if not isinstance(value, str):

@@ -23,7 +23,7 @@ from mp4ds.bags import protocols
 from mp4ds.bags.files import (
     SALVAGE_REMEDY,
     DamageError,
-    most_held,
+    ZstdStream,
     most_unpacked,
     open_source,
     unreadable,
@@ -36,7 +36,6 @@ from mp4ds.bags.mcap_index import (
     read_summary,
 )
 from mp4ds.bags.mcap_records import (
-    MAX_RECORD_BYTES,
     PRIVATE_OPCODE,
     Declared,
     MessageHead,
@@ -87,7 +86,7 @@ def read_chunks(
     """Read an excerpt from the chunks that it needs, by their start times, in any file order.
 
     Args:
-        stream: The file.
+        stream: A stream of known size.
         excerpt: What to read.
         summary: The file's summary.
         between: The records between its chunks.
@@ -168,7 +167,7 @@ class McapReader(BagReader):
 
     Args:
         path: The file.
-        shown: Its name in errors, where it is a decompressed copy.
+        is_compressed: Whether it is compressed with zstd as a whole; then it has no index.
         message_decompress: Decompresses the payload of a message; raises `DamageError` if it
             cannot.
 
@@ -182,12 +181,12 @@ class McapReader(BagReader):
         self,
         path: Path,
         *,
-        shown: Path | None = None,
+        is_compressed: bool = False,
         message_decompress: Callable[[memoryview], bytes] | None = None,
     ) -> None:
         self.path = path
-        self._shown = shown or path
-        self.files = [self._shown]
+        self.files = [path]
+        self._is_compressed = is_compressed
         self._decompress = message_decompress
         self._declared = Declared()
         self._pass: RecordStream | None = None
@@ -216,12 +215,13 @@ class McapReader(BagReader):
                     self._declared.add_channel(channel)  # otherwise its schema is only in the data
 
     def _start_pass(self) -> RecordStream:
-        file = open_source(self.path, self._shown)
-        size = file.seek(0, os.SEEK_END)
-        file.seek(0)
-        # a small compressed file may hold what claims to be large
-        most = MAX_RECORD_BYTES if self._shown == self.path else most_held()
-        stream = RecordStream(file, self._shown, size, most)
+        if self._is_compressed:
+            stream = RecordStream(ZstdStream(self.path), self.path, None)
+        else:
+            file = open_source(self.path)
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
+            stream = RecordStream(file, self.path, size)
         try:
             stream.read_magic()
         except BaseException:
@@ -257,9 +257,7 @@ class McapReader(BagReader):
     @property
     def position(self) -> int:
         """Bytes of the file that `records` has consumed."""
-        if self._pass is None or self._shown == self.path:
-            return self._pass.tell() if self._pass else self._position
-        return self._pass.tell() * self._shown.stat().st_size // max(1, self._pass.size)
+        return self._pass.tell() if self._pass else self._position
 
     @property
     def is_indexed(self) -> bool:
@@ -305,7 +303,7 @@ class McapReader(BagReader):
         self._declared.skipped.clear()
         try:
             yield from read(stream)
-            self._position = self._shown.stat().st_size
+            self._position = self.path.stat().st_size
         finally:
             self._pass = None
             stream.close()
@@ -333,7 +331,7 @@ class McapReader(BagReader):
                 yield record
         if excerpt == EVERYTHING and not summary.covers(count):
             raise SourceError(
-                self._shown,
+                self.path,
                 f"is damaged: its chunks hold {count} messages, which its statistics contradict",
                 SALVAGE_REMEDY,
             )
@@ -344,7 +342,8 @@ class McapReader(BagReader):
 
     def _read_through(self, stream: RecordStream, held: HoldBack | None) -> Iterator[Record]:
         declared = self._declared
-        stream.expect([(stream.tell(), stream.size)])
+        if stream.size is not None:
+            stream.expect([(stream.tell(), stream.size)])
         read = 0
         while True:
             opcode, body = stream.next()
@@ -389,7 +388,7 @@ class McapReader(BagReader):
             data = self._decompress(memoryview(message.data))
         except DamageError as error:
             place = f": message of log time {message.log_time}, topic {message.channel.topic}"
-            raise unreadable(self._shown, place, error, SALVAGE_REMEDY) from None
+            raise unreadable(self.path, place, error, SALVAGE_REMEDY) from None
         return Message(
             message.channel, message.log_time, message.publish_time, message.sequence, data
         )

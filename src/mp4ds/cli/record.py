@@ -91,7 +91,7 @@ def record_command(
     if match:  # with -e, topics are regular expressions for rosbag record
         topics, options = (), replace(options, regex=_whole(topics))
     if ros.ros1 and options.exclude_regex:  # where ROS 2 searches, ROS 1 matches
-        options = replace(options, exclude_regex=_whole([options.exclude_regex]))
+        options = replace(options, exclude_regex=_whole([options.exclude_regex.pattern]))
     if split:
         options = replace(options, duration=None, max_duration=options.duration)
     if size is not None:

@@ -522,10 +522,7 @@ def is_seen(is_there: Callable[[], bool], *folders: Path) -> bool:
     end = time.monotonic() + _SEEN_SECONDS
     while not (seen := is_there()) and time.monotonic() < end:
         for folder in folders:
-            try:
-                list(folder.iterdir())  # which asks the server for its names again
-            except FileNotFoundError:
-                return False
+            list(folder.iterdir())  # which asks the server for its names again
         time.sleep(_LOOK_SECONDS)
     return seen
 

@@ -66,7 +66,7 @@ PackPiece = Callable[[Path, Path, PackOptions], object]
 
 
 class SpoolFolder:
-    """See the module.
+    """The folder, its pieces and parts.
 
     Args:
         path: The folder.

@@ -17,15 +17,16 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.verbatim import VerbatimImages
-from mp4ds.dataset.views import View
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import csv_cell
 from mp4ds.unpacking.pictures import (
     FrameTimes,
     Reduction,
+    Resizing,
     files_of,
     holds_files,
-    resized_view,
+    pictures_of,
+    resizing_of,
 )
 from mp4ds.video.images import ImageFile
 
@@ -44,7 +45,7 @@ class _Files:
         numbers: Their numbers in the topic, shape (frames,).
         is_kept: Which are written, shape (frames,).
         kind: ``png`` or ``jpeg``.
-        view: How their pixels are resized.
+        resizing: How their pixels are resized.
         file: Encodes them; None if their files are written as recorded.
     """
 
@@ -52,7 +53,7 @@ class _Files:
     numbers: NDArray[np.int64]
     is_kept: NDArray[np.bool_]
     kind: str
-    view: View
+    resizing: Resizing
     file: ImageFile | None
 
     def all(self) -> Iterator[tuple[int, bytes | memoryview | None]]:
@@ -65,10 +66,10 @@ class _Files:
         return self._encoded(self.part, self.file)
 
     def _encoded(self, stream: Stream, file: ImageFile) -> Iterator[tuple[int, bytes | None]]:
-        for index, picture in stream.recorded_pictures(marked(self.is_kept), self.view.scale):
+        for index, picture in pictures_of(stream, marked(self.is_kept), self.resizing.scale):
             made = None
             if picture is not None:
-                made = file.encode(stream.pixels(picture, self.view, index))
+                made = file.encode(self.resizing.pixels(stream, picture))
             yield index, made
 
     def _verbatim(self, part: VerbatimImages) -> Iterator[tuple[int, bytes | memoryview | None]]:
@@ -78,8 +79,7 @@ class _Files:
             if self.file is None:
                 yield index, shown.file
             else:
-                pixels = part.pixels((shown.pixels,), self.view, index)
-                yield index, self.file.encode(pixels)
+                yield index, self.file.encode(self.resizing.resize(shown.pixels))
 
 
 @dataclass(frozen=True)
@@ -176,12 +176,12 @@ def topic_images(
         size = reduction.size_of(part)
         keeps_files = size is None and _holds_jpeg(part) and image_format != "png"
         kind = "jpeg" if keeps_files else image_format or "png"
-        view = resized_view(part, size)
+        resizing = resizing_of(part, size)
         try:
             file = None
             if not keeps_files:
-                file = ImageFile(view.encoding.name, kind, quality=jpeg_quality)
-            made.append(_Files(part, numbers, kept, kind, view, file))
+                file = ImageFile(resizing.encoding, kind, quality=jpeg_quality)
+            made.append(_Files(part, numbers, kept, kind, resizing, file))
         except OptionError as error:
             refused[str(error).rstrip(".")] += _readable(part, kept)
     return TopicImages(topic, frames, thinned, refused, made)

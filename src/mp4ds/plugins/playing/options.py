@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mp4ds.errors import OptionError
-from mp4ds.options import WHAT, WHERE, Parsed, argument, jpeg_quality, option
+from mp4ds.options import WHAT, WHERE, Parsed, argument, jpeg_quality, option, parse_pattern
 from mp4ds.plan import Selection
 from mp4ds.plugins.ros.names import PLAIN, NodeNames
 from mp4ds.plugins.ros.node import CLOCK
@@ -100,14 +100,20 @@ class PlayOptions(ReductionOptions):
         parse=_seconds,
     )
     paused: bool = option("Start paused.", False, "--pause", "--start-paused", "-p")
-    regex: str = option(
+    regex: Parsed[re.Pattern[str] | None] = option(
         "Only topics that fully match a regular expression, and those of `topics`.",
-        "",
+        None,
         "-e",
         panel=WHAT,
+        metavar="PATTERN",
+        parse=parse_pattern,
     )
-    exclude_regex: str = option(
-        "Leave out topics that fully match a regular expression.", "", panel=WHAT
+    exclude_regex: Parsed[re.Pattern[str] | None] = option(
+        "Leave out topics that fully match a regular expression.",
+        None,
+        panel=WHAT,
+        metavar="PATTERN",
+        parse=parse_pattern,
     )
     remap: Sequence[str] = option(
         "Rename a topic; repeatable.", (), "-m", metavar="OLD:=NEW", panel=WHERE
@@ -282,8 +288,8 @@ class Wanted:
         self._globs = Selection(options.topics, options.exclude)
         self._by_glob = Selection(options.topics) if options.topics or not options.regex else None
         self._excluded = Selection((), options.exclude)
-        self._regex = _expression("regex", options.regex)
-        self._exclude_regex = _expression("exclude_regex", options.exclude_regex)
+        self._regex = options.regex
+        self._exclude_regex = options.exclude_regex
         self._has_clock = not (options.leads or options.follow_clock)
 
     def __call__(self, topic: str) -> bool:
@@ -309,12 +315,3 @@ class Wanted:
                     f"`{name}` {regex.pattern!r} fully matches no topic; use .* for any text, as "
                     "in '.*camera.*'."
                 )
-
-
-def _expression(option: str, text: str) -> re.Pattern[str] | None:
-    try:
-        return re.compile(text) if text else None
-    except re.error as error:
-        raise OptionError(
-            f"`{option}` {text!r} is not a valid regular expression: {error}."
-        ) from None

@@ -16,6 +16,7 @@ from mp4ds.options import (
     argument,
     force,
     option,
+    parse_pattern,
     parse_size,
 )
 from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, Selection, parse_quality
@@ -56,8 +57,13 @@ class RecordOptions(Options):
     topic_types: Sequence[str] = option(
         "Record topics of this type; repeatable.", (), metavar="TYPE", panel=WHAT
     )
-    regex: str = option(
-        "Record topics whose name matches a regular expression.", "", "-e", panel=WHAT
+    regex: Parsed[re.Pattern[str] | None] = option(
+        "Record topics whose name matches a regular expression.",
+        None,
+        "-e",
+        panel=WHAT,
+        metavar="PATTERN",
+        parse=parse_pattern,
     )
     exclude: Sequence[str] = option(
         "Leave out topics that match; repeatable.", (), "--exclude", metavar="GLOB", panel=WHAT
@@ -65,12 +71,14 @@ class RecordOptions(Options):
     exclude_topic_types: Sequence[str] = option(
         "Leave out topics of this type; repeatable.", (), metavar="TYPE", panel=WHAT
     )
-    exclude_regex: str = option(
+    exclude_regex: Parsed[re.Pattern[str] | None] = option(
         "Leave out topics whose name matches a regular expression.",
-        "",
+        None,
         "--exclude-regex",
         "-x",
         panel=WHAT,
+        metavar="PATTERN",
+        parse=parse_pattern,
     )
     duration: Parsed[float | None] = option(
         "Stop after so many seconds; also 5m, 2h.",
@@ -188,10 +196,10 @@ class Wanted:
                 )
         self._named = Selection([*self._recorded]) if topics else None
         self._types = {*options.topic_types}
-        self._regex = _compiled("regex", options.regex)
+        self._regex = options.regex
         self._left_out = Selection((), [names.resolved(topic.strip()) for topic in options.exclude])
         self._exclude_types = {*options.exclude_topic_types}
-        self._exclude_regex = _compiled("exclude_regex", options.exclude_regex)
+        self._exclude_regex = options.exclude_regex
 
     def __call__(self, topic: str, type_name: str = "") -> bool:
         """Whether a topic is recorded."""
@@ -208,12 +216,3 @@ class Wanted:
     def recorded_as(self, topic: str) -> str:
         """The name under which a topic is recorded."""
         return self._recorded.get(topic, topic)
-
-
-def _compiled(option: str, pattern: str) -> re.Pattern[str] | None:
-    try:
-        return re.compile(pattern) if pattern else None
-    except re.error as error:
-        raise OptionError(
-            f"`{option}` {pattern!r} is not a valid regular expression: {error}."
-        ) from None

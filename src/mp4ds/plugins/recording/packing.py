@@ -59,7 +59,7 @@ class PackingProcess:
         self._close()
 
     def pack(self, folder: Path, number: int) -> None:
-        """See `SpoolFolder.pack`.
+        """Make the part of a piece, which is then removed.
 
         Raises:
             PackingError: It failed.
@@ -69,7 +69,7 @@ class PackingProcess:
     def join(
         self, folder: Path, count: int, target: Path, *, force: bool, about: str | None
     ) -> None:
-        """See `SpoolFolder.join`.
+        """Make the dataset of all parts.
 
         Args:
             folder: The folder.
