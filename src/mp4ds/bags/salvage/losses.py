@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.combined import MORE_LOSSES
@@ -148,8 +147,6 @@ class LossLog:
 
 # ---------------------------------------------------------------- tally
 
-_MAX_TIMES = 10**6
-
 
 class Tally:
     """Messages read from a section of a file, usually a chunk, and those that an index lists.
@@ -174,14 +171,12 @@ class Tally:
     def _begin(self, expected: Mapping[int, int] | None) -> None:
         self._expected = None if expected is None else Counter(expected)
         self._read: Counter[int] = Counter()
-        self._times: Counter[tuple[int, int]] = Counter()
-        self._missing: Counter[int] = Counter()
-        self._strays: Counter[tuple[int, int]] = Counter()
+        self._strays: Counter[int] = Counter()
         self._index_is_whole = False
-        self._listed: list[tuple[int, Mapping[int, int]]] = []
+        self._listed: Counter[int] = Counter()
+        self._listed_times: Counter[tuple[int, int]] = Counter()  # only while messages are held
         self._end: int | None = None
         self._span: tuple[int, int] | None = None
-        self._is_counted = True
         self._is_verified = False
         self._losses: list[Draft] = []
 
@@ -221,7 +216,7 @@ class Tally:
     def gave(self, channel: int, time: int) -> None:
         """Count a message that was read, with its log time in ns."""
         self._log.gave(time)
-        self._met(channel, time)
+        self._read[channel] += 1
 
     def hold(self, channel: int, message: Message) -> None:
         """Hold a message that may not be one."""
@@ -229,27 +224,16 @@ class Tally:
 
     def settle(self) -> list[Message]:
         """Decide which of the held messages to return."""
-        if not self._held:
-            return []
         held, self._held = self._held, []
-        listed, self._listed = self._listed, []
-        if self._index_is_whole:
-            left: Counter[tuple[int, int]] = Counter()
-            for channel, times in listed:
-                for time, count in times.items():
-                    left[channel, time] += count
-            sound = []
-            for channel, message in held:
-                if left[channel, message.log_time] > 0:
-                    left[channel, message.log_time] -= 1
-                    sound.append((channel, message))
-        else:
-            sound = [item for item in held if self._is_possible(item[1].log_time)]
-        for channel, message in sound:
-            self.gave(channel, message.log_time)
-        for channel, times in listed:
-            self._compare(channel, times)
-        return [message for _, message in sound]
+        left, self._listed_times = self._listed_times, Counter()
+        sound = []
+        for channel, message in held:
+            key = channel, message.log_time
+            if left[key] > 0 if self._index_is_whole else self._is_possible(message.log_time):
+                left[key] -= 1
+                sound.append(message)
+                self.gave(channel, message.log_time)
+        return sound
 
     def _is_possible(self, time: int) -> bool:
         return self._span is None or self._span[0] <= time <= self._span[1]
@@ -259,18 +243,10 @@ class Tally:
         """Whether part of the section was skipped."""
         return bool(self._losses)
 
-    def stray(self, channel: int, time: int) -> None:
+    def stray(self, channel: int) -> None:
         """Count a message of an unknown channel, separately from lost ones."""
-        if len(self._strays) < _MAX_TIMES:
-            self._strays[channel, time] += 1
-        self._met(channel, time)
-
-    def _met(self, channel: int, time: int) -> None:
+        self._strays[channel] += 1
         self._read[channel] += 1
-        if len(self._times) < _MAX_TIMES:
-            self._times[channel, time] += 1
-        else:
-            self._is_counted = False
 
     def lost(self, offset: int, size: int | None, problem: str) -> Draft:
         """Record skipped bytes."""
@@ -282,33 +258,20 @@ class Tally:
             self._end = None
         return draft
 
-    def count_matches(self, channel: int, count: int, offset: int) -> bool:
-        """Whether an index at a byte, with a count of a channel's messages, adds nothing new."""
+    def listed(self, channel: int, times: NDArray[Any], offset: int) -> None:
+        """Add the messages that an index at a byte lists, by their log times, ns."""
         self._index_is_whole |= offset == self._end
-        return not self._losses and not self._held and count == self._read[channel]
-
-    def listed(self, channel: int, times: NDArray[Any]) -> None:
-        """Add the messages that an index lists, by their log times, ns."""
-        found, numbers = np.unique(times, return_counts=True)
-        counts = dict(zip(found.tolist(), numbers.tolist(), strict=True))
+        self._listed[channel] += len(times)
         if self._held:
-            self._listed.append((channel, counts))
-        else:
-            self._compare(channel, counts)
-
-    def _compare(self, channel: int, times: Mapping[int, int]) -> None:
-        for time, count in times.items():
-            self._strays.pop((channel, time), None)  # so it is not missing
-            missing = count - self._times[channel, time]
-            if missing > 0:
-                self._missing[channel] += missing
+            self._listed_times.update((channel, time) for time in times.tolist())
 
     def close(self) -> None:
         """End the section, and record what is lost of it."""
-        found = min((self._by_counts(), self._by_times()), key=_total)
-        if found is None:
+        indexes = [self._expected, self._listed if self._index_is_whole else None]
+        found = [self._missing(index) for index in indexes if index is not None]
+        if not found:
             return
-        total, missing = found
+        total, missing = min(found, key=lambda one: one[0])
         topics = [topic for key in missing if (topic := self._topic_of(key))]
         losses = sorted(self._losses, key=lambda draft: draft.size or 0, reverse=True)
         if losses:
@@ -320,27 +283,12 @@ class Tally:
             self._log.lost(None, None, problem).add(0 if self._is_verified else total, topics)
         self._losses = []
 
-    def _by_counts(self) -> tuple[int, Counter[int]] | None:
-        """Number of lost messages, in total and by channel, by the index at the end."""
-        if self._expected is None:
-            return None
-        missing = self._expected - self._read
-        strays: Counter[int] = Counter()
-        for (channel, _), count in self._strays.items():
-            strays[channel] += count
-        # Unlisted messages make up for listed ones.
-        excess = (self._read - self._expected) & strays
+    def _missing(self, expected: Counter[int]) -> tuple[int, Counter[int]]:
+        """Number of messages that an index lists and were not read, in total and by channel."""
+        missing = expected - self._read
+        # what was read as of an unknown channel, and is not listed, makes up for what is listed
+        excess = (self._read - expected) & self._strays
         return max(0, missing.total() - excess.total()), missing
-
-    def _by_times(self) -> tuple[int, Counter[int]] | None:
-        """The same by the index of the stretch itself."""
-        if not self._index_is_whole or not self._is_counted:
-            return None
-        return max(0, self._missing.total() - self._strays.total()), self._missing
-
-
-def _total(found: tuple[int, Counter[int]] | None) -> float:
-    return float("inf") if found is None else found[0]
 
 
 # ---------------------------------------------------------------- readers

@@ -278,14 +278,14 @@ class McapPass(FilePass):
         data: bytes | memoryview = head.data
         if channel is None:
             problem = f"messages of channel {head.channel_id}, whose record is missing"
-            self._lose_message(head.channel_id, head.log_time, offset, problem)
+            self._lose_message(head.channel_id, offset, problem)
             return None
         if self._decompress:
             try:
                 data = self._decompress(head.data)
             except DamageError as error:
                 problem = f"messages of {channel.topic} {lost_by(error)}"
-                loss = self._lose_message(head.channel_id, head.log_time, offset, problem)
+                loss = self._lose_message(head.channel_id, offset, problem)
                 loss.topics[channel.topic] = None
                 return None
         return Message(channel, head.log_time, head.publish_time, head.sequence, data)
@@ -302,8 +302,8 @@ class McapPass(FilePass):
             self._declared.add_channel(record)
         return channels.get(channel_id)
 
-    def _lose_message(self, channel_id: int, time: int, offset: int, problem: str) -> Draft:
-        self._tally.stray(channel_id, time)
+    def _lose_message(self, channel_id: int, offset: int, problem: str) -> Draft:
+        self._tally.stray(channel_id)
         loss = self._log.lost_of_kind(problem, offset, problem)
         loss.add(1, ())
         return loss
@@ -353,8 +353,7 @@ class McapPass(FilePass):
         """Process a message index: what it lists was read, or is lost."""
         channel_id, length = struct.unpack_from("<HI", body)
         pairs = np.frombuffer(body, "<u8", count=min(length, len(body) - 6) // 8, offset=6)
-        if not self._tally.count_matches(channel_id, len(pairs) // 2, offset):
-            self._tally.listed(channel_id, pairs[::2])
+        self._tally.listed(channel_id, pairs[::2], offset)
 
 
 class _Plain(NamedTuple):

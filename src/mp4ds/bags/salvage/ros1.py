@@ -280,7 +280,7 @@ class _Pass(FilePass):
             )
             return None
         if channel is None:
-            self._tally.stray(connection, log_time)
+            self._tally.stray(connection)
             problem = f"messages of connection {connection}, whose record is missing"
             loss = self._log.lost_of_kind(connection, offset, problem)
             loss.add(1, ())
@@ -327,12 +327,9 @@ class _Pass(FilePass):
         self._leave_chunk(frame, used, problems, proven=proven, whole=not found.problem)
 
     def _listed(self, fields: Fields, body: bytes, offset: int) -> None:
-        connection, count = fields.number(b"conn"), fields.number(b"count")
-        if self._tally.count_matches(connection, count, offset):
-            return
         entries = np.frombuffer(body, INDEX_ENTRY, count=len(body) // INDEX_ENTRY.itemsize)
         times = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
-        self._tally.listed(connection, times)
+        self._tally.listed(fields.number(b"conn"), times, offset)
 
     def _enter(self, offset: int, end: int) -> None:
         """Begin a chunk that should end at a byte."""
