@@ -804,6 +804,9 @@ def test_a_pair_becomes_a_dataset(tmp_path: Path) -> None:
         path.name: hashlib.sha256(path.read_bytes()).hexdigest()
         for path in (FIXTURE / "drive.mp4", FIXTURE / "drive.yaml")
     }
+    mp4ds.pack(dataset, tmp_path / "copy")
+    with mp4ds.open(dataset) as opened, mp4ds.open(tmp_path / "copy") as copied:
+        assert copied.streams[0].sidecar.camera_info == opened.streams[0].sidecar.camera_info
 
 
 def test_bad_pairs_are_refused(tmp_path: Path) -> None:

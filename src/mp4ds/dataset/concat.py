@@ -23,7 +23,7 @@ from mp4ds.bags.protocols import in_span, write_record
 from mp4ds.dataset.channels import by_time
 from mp4ds.dataset.columns import DecodedColumns, within
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.segments import Cut, JoinedStream, copy_file
+from mp4ds.dataset.segments import JoinedStream, Segment, copy_file
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Refused
 from mp4ds.files.outputs import digest_file
@@ -123,14 +123,14 @@ class _Part:
         self.selected = selected
         self.is_slice = span.start is not None or span.end is not None
         self._early = Counter(message.channel.identity for message in latched)
-        self.cuts = [self._cut(stream) for stream in dataset.streams]
+        self.segments = [self._segment(stream) for stream in dataset.streams]
 
-    def _cut(self, stream: Stream) -> Cut:
+    def _segment(self, stream: Stream) -> Segment:
         infos: Integers = _NO_TIMES
         if stream.infos and self.selected(stream.infos.channel.topic):
             infos = self._numbers(stream.infos.columns)
         images = self._numbers(stream.columns) if self.selected(stream.topic) else _NO_TIMES
-        return Cut(self.dataset, stream, images, infos)
+        return Segment(self.dataset, stream, images, infos)
 
     def _numbers(self, columns: DecodedColumns) -> Integers:
         """Numbers of the messages in the span."""
@@ -150,11 +150,12 @@ class _Part:
         """
         if self.is_slice and not self.dataset.is_in_time:
             raise Refused("its messages are not ordered by log time")
-        for cut in self.cuts:
-            if len(set(map(self.selected, cut.stream.topics))) > 1:
-                raise Refused(f"{' and '.join(cut.stream.topics)} share one stream")
-            if np.any(np.diff(cut.images) != 1):
-                raise Refused(f"frames of {cut.stream.topic} are not ordered by time")
+        for segment in self.segments:
+            topics = segment.stream.topics
+            if len(set(map(self.selected, topics))) > 1:
+                raise Refused(f"{' and '.join(topics)} share one stream")
+            if np.any(np.diff(segment.images) != 1):
+                raise Refused(f"frames of {topics[0]} are not ordered by time")
 
     @cached_property
     def times(self) -> dict[_Identity, Integers]:
@@ -233,13 +234,13 @@ class _Part:
         """
         topics = {item.topic for item in self.dataset.channels if self.selected(item.topic)}
         recorded = self.dataset.recorded_messages(replace(self.span, topics=frozenset(topics)))
-        orphans = [self._orphans(cut) for cut in self.cuts if not len(cut.images)]
+        orphans = [self._orphans(one) for one in self.segments if not len(one.images)]
         found = by_time(recorded, *orphans)
         return chain(self.latched, found)
 
-    def _orphans(self, cut: Cut) -> Iterator[Message]:
-        infos = cut.stream.infos
-        if infos is None or not len(cut.infos):
+    def _orphans(self, segment: Segment) -> Iterator[Message]:
+        infos = segment.stream.infos
+        if infos is None or not len(segment.infos):
             return iter(())
         channels = {channel.identity: channel for channel in self.dataset.channels}
         found = infos.messages(channels[infos.channel.identity], within(self.span))
@@ -258,9 +259,9 @@ class _Concat:
         self._channels: dict[tuple[int, int], Channel] = {}  # by number of the part, and id there
         self._streams: list[JoinedStream] = []
         for number, part in enumerate(parts):
-            for cut in part.cuts:
-                if len(cut.images):
-                    self._add(cut, part)
+            for segment in part.segments:
+                if len(segment.images):
+                    self._add(segment, part)
             for identity in part.times:
                 self._messages[identity] += part.count(identity)
             self._add_channels(number, part)
@@ -269,17 +270,18 @@ class _Concat:
     def _is_one(self) -> bool:
         return len(self._parts) == 1
 
-    def _add(self, cut: Cut, part: _Part) -> None:
-        stream = next((stream for stream in self._streams if stream.takes(cut)), None)
-        if stream is None:
-            stream = JoinedStream(cut)
-            self._streams.append(stream)
-
-        def offset(channel: ChannelModel) -> int:
-            identity = _identity_of(channel)
-            return self._messages[identity] - part.before(identity)
-
-        stream.add(cut, offset)
+    def _add(self, segment: Segment, part: _Part) -> None:
+        channels = [
+            segment.stream.channel,
+            *([segment.stream.infos.channel] if segment.stream.infos else []),
+        ]
+        offsets = [self._messages[one.identity] - part.before(one.identity) for one in channels]
+        segment = replace(segment, offsets=(offsets[0], offsets[-1]))
+        joined = next((joined for joined in self._streams if joined.takes(segment)), None)
+        if joined is None:
+            self._streams.append(JoinedStream(segment))
+        else:
+            joined.add(segment)
 
     def _add_channels(self, number: int, part: _Part) -> None:
         """Map channels of a part to those that equal them; in a recording, several may be equal."""
@@ -375,11 +377,11 @@ class _Concat:
         names = FileNames()
         stems = [
             first.video_path.stem if self._is_one else names.name_for(first.topic)[0]
-            for first in (stream.cuts[0].stream for stream in self._streams)
+            for first in (stream.first for stream in self._streams)
         ]
         if self._is_one:
-            whole = (stream for stream in self._streams if stream.cuts[0].has_all)
-            self._copied += [stream.cuts[0].stream.video_path.name for stream in whole]
+            whole = (stream for stream in self._streams if stream.segments[0].has_all)
+            self._copied += [stream.first.video_path.name for stream in whole]
 
         def write(stem: str, stream: JoinedStream) -> tuple[str, StreamSidecar]:
             self._report(f"{stem}.mp4")

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,6 @@ from mp4ds.format.models import (
     FACTS,
     Calibration,
     CameraInfo,
-    ChannelModel,
     Header,
     Quality,
     StreamSidecar,
@@ -39,12 +37,11 @@ from mp4ds.video.mp4 import read_sample_entry
 from mp4ds.video.packets import cut_segment, join_segments
 
 Integers = NDArray[np.int64]
-_ModelT = TypeVar("_ModelT")
 _BLOCK = 2**20
 
 
 @dataclass(frozen=True)
-class Cut:
+class Segment:
     """What is copied of a stream.
 
     Attributes:
@@ -52,12 +49,14 @@ class Cut:
         stream: Of the dataset.
         images: Numbers of the frames.
         infos: Numbers of the calibrations.
+        offsets: What is added to the ordinals of images, and of calibrations.
     """
 
     dataset: Dataset
     stream: Stream
     images: Integers
     infos: Integers
+    offsets: tuple[int, int] = (0, 0)
 
     @property
     def has_all(self) -> bool:
@@ -80,138 +79,79 @@ class Cut:
         return [infos.info.calibrations[kind] for kind in kinds.tolist()]
 
 
-class _Distinct(Generic[_ModelT]):
-    """Distinct models, numbered in the order of their first appearance."""
-
-    def __init__(self) -> None:
-        # by their text, in which 0.0 and -0.0 differ, and NaNs are equal
-        self._models: dict[str, _ModelT] = {}
-
-    @property
-    def items(self) -> list[_ModelT]:
-        """All of them."""
-        return list(self._models.values())
-
-    def has_room(self, models: Iterable[_ModelT]) -> bool:
-        """Whether they would not be too many with some more."""
-        return len(self._models.keys() | set(map(repr, models))) <= MAX_VARIANTS
-
-    def add(self, models: Iterable[_ModelT], of: Sequence[_ModelT]) -> list[int]:
-        """Add models.
-
-        Args:
-            models: Those that are used.
-            of: All that a file lists.
-
-        Returns:
-            The number here of each of the latter; 0 for those that are not used.
-        """
-        for model in models:
-            self._models.setdefault(repr(model), model)
-        numbers = {key: number for number, key in enumerate(self._models)}
-        return [numbers.get(repr(model), 0) for model in of]
-
-
-class _Columns:
-    """Columns of segments, one after another."""
-
-    def __init__(self) -> None:
-        self._columns: dict[str, list[Integers]] = {}
-        self._count = 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    def add(
-        self, columns: DecodedColumns, rows: Integers, kinds: Sequence[int], ordinal: int
-    ) -> None:
-        """Add some rows.
-
-        Args:
-            columns: Of a segment.
-            rows: Numbers of its rows.
-            kinds: The new variant for each of its variants.
-            ordinal: What is added to its ordinals.
-        """
-        for name in Columns.model_fields:
-            array = getattr(columns, name)
-            if array is not None:
-                self._columns.setdefault(name, []).append(array[rows])
-        self._columns["variant"][-1] = np.array(kinds, np.int64)[columns.variant[rows]]
-        self._columns["ordinal"][-1] = columns.ordinal[rows] + ordinal
-        self._count += len(rows)
-
-    @cached_property
-    def joined(self) -> dict[str, Integers]:
-        """All rows, by column."""
-        return {name: np.concatenate(arrays) for name, arrays in self._columns.items()}
-
-    def ticks(self) -> list[int]:
-        """When each frame is shown."""
-        clock = PresentationClock()
-        times = self.joined["log_time"].tolist()
-        return list(map(clock.tick, self.joined["stamp"].tolist(), times))
-
-
 class JoinedStream:
     """A stream of the new dataset: segments, in order."""
 
-    def __init__(self, first: Cut) -> None:
-        self.cuts: list[Cut] = []
+    def __init__(self, first: Segment) -> None:
+        self.segments: list[Segment] = []
         self._identity = _common(first.stream.sidecar)
         self._entry = read_sample_entry(first.stream.video_path)
-        self._headers = _Distinct[Header]()
-        self._columns = _Columns()
+        # by their text, in which 0.0 and -0.0 differ, and NaNs are equal
+        self._headers: dict[str, Header] = {}
+        self._calibrations: dict[str, Calibration] = {}
+        self._frames = self._infos = 0
         self._info: CameraInfo | None = None
-        self._calibrations = _Distinct[Calibration]()
-        self._infos = _Columns()
+        self.add(first)
 
-    def takes(self, cut: Cut) -> bool:
+    @property
+    def first(self) -> Stream:
+        """The stream that it begins with."""
+        return self.segments[0].stream
+
+    def takes(self, segment: Segment) -> bool:
         """Whether a segment continues this stream.
 
         Raises:
             VideoError: Its video is damaged.
         """
-        sidecar, info = cut.stream.sidecar, cut.stream.sidecar.camera_info
-        if sidecar.channel != self.cuts[0].stream.sidecar.channel:
+        stream, sidecar = segment.stream, segment.stream.sidecar
+        if sidecar.channel != self.first.sidecar.channel:
             return False  # most often: the rest takes longer to compare
-        if cut.dataset is self.cuts[-1].dataset or _common(sidecar) != self._identity:
+        if segment.dataset is self.segments[-1].dataset or _common(sidecar) != self._identity:
             return False
-        if cut.stream.hidden_frames or self.cuts[0].stream.hidden_frames:
+        if stream.hidden_frames or self.first.hidden_frames:
             return False  # what a slice hides refers to nothing in another segment
-        if exceeds_padding(head.padding for head in (*self._headers.items, *cut.headers)):
+        headers = [*self._headers.values(), *segment.headers]
+        if exceeds_padding(head.padding for head in headers):
             return False
-        if not self._headers.has_room(cut.headers):
+        if not _has_room(self._headers, segment.headers):
             return False
-        if len(self._columns) + len(cut.images) > MAX_FRAMES:
+        if self._frames + len(segment.images) > MAX_FRAMES:
             return False
-        if self._entry.differences(read_sample_entry(cut.stream.video_path)):
+        if self._entry.differences(read_sample_entry(stream.video_path)):
             return False  # JPEG files may differ in chroma subsampling
+        info = sidecar.camera_info
         if info is None or self._info is None:
             return True
         return (
             info.channel == self._info.channel
             and info.wire == self._info.wire
-            and self._calibrations.has_room(cut.calibrations)
-            and len(self._infos) + len(cut.infos) <= MAX_CAMERA_INFOS
+            and _has_room(self._calibrations, segment.calibrations)
+            and self._infos + len(segment.infos) <= MAX_CAMERA_INFOS
         )
 
-    def add(self, cut: Cut, offset: Callable[[ChannelModel], int]) -> None:
-        """Add a segment that `takes` accepts.
+    def add(self, segment: Segment) -> None:
+        """Add the first segment, or one that it `takes`."""
+        self.segments.append(segment)
+        self._frames += len(segment.images)
+        for header in segment.headers:
+            self._headers.setdefault(repr(header), header)
+        info = segment.stream.sidecar.camera_info
+        if info is not None and (not info.messages or len(segment.infos)):
+            self._info = self._info or info
+            self._infos += len(segment.infos)
+            for calibration in segment.calibrations:
+                self._calibrations.setdefault(repr(calibration), calibration)
 
-        Args:
-            cut: The segment.
-            offset: What to add to the ordinals of a channel's messages.
-        """
-        self.cuts.append(cut)
-        stream, sidecar = cut.stream, cut.stream.sidecar
-        kinds = self._headers.add(cut.headers, sidecar.headers)
-        self._columns.add(stream.columns, cut.images, kinds, offset(sidecar.channel))
-        infos = stream.infos
-        if infos is not None and len(cut.infos):
-            self._info = self._info or infos.info
-            kinds = self._calibrations.add(cut.calibrations, infos.info.calibrations)
-            self._infos.add(infos.columns, cut.infos, kinds, offset(infos.info.channel))
+    @cached_property
+    def _columns(self) -> dict[str, Integers]:
+        return _joined(
+            [
+                (part.stream.columns, part.images, part.stream.sidecar.headers, part.offsets[0])
+                for part in self.segments
+            ],
+            self._headers,
+        )
 
     def write(self, stem: str, folder: Path) -> StreamSidecar:
         """Write the video; the sidecar is returned.
@@ -220,71 +160,110 @@ class JoinedStream:
             VideoError: A segment is damaged.
             OSError: It cannot be written.
         """
-        first = self.cuts[0].stream
+        first = self.first
         codec = first.sidecar.video.codec
         path = folder / f"{stem}.mp4"
         self._write_video(path)
         facts = video_facts(path, codec)
-        is_copy = len(self.cuts) == 1 and self.cuts[0].has_all
+        is_copy = len(self.segments) == 1 and self.segments[0].has_all
         if is_copy and first.sidecar.video.sha256 not in (None, facts["sha256"]):
             raise VideoError(
                 "hash-mismatch", first.video_path, "does not match the SHA-256 in its sidecar"
             )
         qualities = [
-            (quality.of(cut.images, len(cut.stream)), len(cut.images))
-            for cut in self.cuts
-            if (quality := cut.stream.sidecar.video.quality) is not None
+            (quality.of(part.images, len(part.stream)), len(part.images))
+            for part in self.segments
+            if (quality := part.stream.sidecar.video.quality) is not None
         ]
         if qualities:
             alone = len(qualities) == 1
             facts["quality"] = qualities[0][0] if alone else Quality.joined(qualities)
         digests = [
-            own.decode(len(cut.stream))[cut.images]
-            for cut in self.cuts
-            if (own := cut.stream.sidecar.digests) is not None
+            own.decode(len(part.stream))[part.images]
+            for part in self.segments
+            if (own := part.stream.sidecar.digests) is not None
         ]
         return first.sidecar.model_copy(
             update={
                 "mp4ds": FORMAT_VERSION,
-                "frames": len(self._columns),
-                "headers": self._headers.items,
+                "frames": self._frames,
+                "headers": list(self._headers.values()),
                 "video": first.sidecar.video.model_copy(update=facts),
                 "camera_info": self._camera_info(),
-                "columns": columns_model(self._columns.joined),
+                "columns": columns_model(self._columns),
                 "digests": digests_model(np.concatenate(digests).tolist()) if digests else None,
             }
         )
 
     def _write_video(self, path: Path) -> None:
-        if len(self.cuts) > 1:
-            for cut in self.cuts:
-                cut.stream.verify_video()
-            join_segments([cut.stream.video_path for cut in self.cuts], self._columns.ticks(), path)
+        if len(self.segments) > 1:
+            for part in self.segments:
+                part.stream.verify_video()
+            join_segments([part.stream.video_path for part in self.segments], self._ticks(), path)
             return
-        (cut,) = self.cuts
-        if cut.has_all:
-            copy_file(cut.stream.video_path, path)
+        (part,) = self.segments
+        if part.has_all:
+            copy_file(part.stream.video_path, path)
         else:
-            frames = range(int(cut.images[0]), int(cut.images[-1]) + 1)
-            codec = cut.stream.sidecar.video.codec
-            cut_segment(cut.stream.video_path, codec, frames, self._columns.ticks(), path)
+            frames = range(int(part.images[0]), int(part.images[-1]) + 1)
+            codec = part.stream.sidecar.video.codec
+            cut_segment(part.stream.video_path, codec, frames, self._ticks(), path)
+
+    def _ticks(self) -> list[int]:
+        """When each frame is shown."""
+        clock = PresentationClock()
+        stamps, log_times = self._columns["stamp"], self._columns["log_time"]
+        return list(map(clock.tick, stamps.tolist(), log_times.tolist()))
 
     def _camera_info(self) -> CameraInfo | None:
-        if self._info is None:
-            return None
+        if self._info is None or not self._infos:
+            return self._info  # with calibrations that no message told
+        columns = _joined(
+            [
+                (infos.columns, part.infos, infos.info.calibrations, part.offsets[1])
+                for part in self.segments
+                if (infos := part.stream.infos) is not None
+            ],
+            self._calibrations,
+        )
         return self._info.model_copy(
             update={
-                "messages": len(self._infos),
-                "calibrations": self._calibrations.items,
-                "columns": columns_model(self._infos.joined),
+                "messages": self._infos,
+                "calibrations": list(self._calibrations.values()),
+                "columns": columns_model(columns),
             }
         )
 
 
+def _has_room(known: Mapping[str, object], models: Iterable[object]) -> bool:
+    """Whether there would not be too many with some more."""
+    return len(known.keys() | set(map(repr, models))) <= MAX_VARIANTS
+
+
+_Rows = tuple[DecodedColumns, Integers, Sequence[object], int]
+"""Columns of a segment, the rows copied, its models, and what is added to the ordinals."""
+
+
+def _joined(segments: Sequence[_Rows], models: Mapping[str, object]) -> dict[str, Integers]:
+    """The columns of segments, one after another, whose variants are numbers of the models."""
+    numbers = {key: number for number, key in enumerate(models)}
+    columns: dict[str, list[Integers]] = {}
+    for own, rows, variants, offset in segments:
+        for name in Columns.model_fields:
+            if (array := getattr(own, name)) is not None:
+                columns.setdefault(name, []).append(array[rows])
+        # those that are not used have no number
+        kinds = np.array([numbers.get(repr(model), 0) for model in variants], np.int64)
+        columns["variant"][-1] = kinds[columns["variant"][-1]]
+        columns["ordinal"][-1] = columns["ordinal"][-1] + offset
+    return {name: np.concatenate(arrays) for name, arrays in columns.items()}
+
+
 def _common(sidecar: StreamSidecar) -> tuple[object, ...]:
     """What all segments of a stream have in common."""
-    video = sidecar.video.model_dump(exclude={*FACTS, "quality"})
+    video, info = sidecar.video.model_dump(exclude={*FACTS, "quality"}), sidecar.camera_info
     return (
+        info if info and not info.messages else None,  # nothing tells when one applied
         *(sidecar.profile, sidecar.stamps, sidecar.channel, sidecar.wire, sidecar.body),
         *(sidecar.image, video, sidecar.digests is None, sidecar.video.quality is None),
         *(name in sidecar.columns.names() for name in ("seq", "pts")),

@@ -92,7 +92,6 @@ def topic_summaries(dataset: Dataset) -> list[TopicSummary]:
         topic.frames += len(stream)
         topic.files.append(stream.video_path.name)
         topic.packed_bytes += stream.video_path.stat().st_size + stream.path.stat().st_size
-        info = stream.sidecar.camera_info
-        if info:
-            found[info.channel.topic].frames += info.messages
+        if stream.infos:
+            found[stream.infos.channel.topic].frames += len(stream.infos)
     return list(found.values())
