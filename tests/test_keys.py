@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from mp4ds.cli.keyboard import Keyboard, Keys
+from mp4ds.cli.keyboard import Keyboard, keys_in
 from mp4ds.cli.play import player_keys
 from waiting import until
 
@@ -92,12 +92,21 @@ def test_each_key(name: str, terminal: Terminal) -> None:
     assert controls.rate == rate
 
 
-@pytest.mark.parametrize("size", range(1, 6))
-def test_keys_wherever_they_are_cut(size: int) -> None:
+def test_a_key_that_comes_byte_by_byte(terminal: Terminal) -> None:
+    typed, call, _ = KEYS["right"]
+    controls = RecordedControls()
+    with Keyboard(player_keys(controls), fd=terminal.fd):
+        for n in range(len(typed)):
+            assert not controls.calls
+            terminal.type(typed[n : n + 1])
+            time.sleep(0.03)
+        until(lambda: bool(controls.calls))
+    assert controls.calls == [call]
+
+
+def test_keys_of_one_piece() -> None:
     typed = b" " + ESC + b"[C" + ESC + b"[1;2A" + ESC + b"s" + ESC + ESC + b"OB" + b"\xc3\xa9b"
-    keys = Keys()
-    found = [key for n in range(0, len(typed), size) for key in keys.feed(typed[n : n + size])]
-    assert found == [" ", "right", "s", "down", "b"]
+    assert [*keys_in(typed)] == [" ", "right", "s", "down", "b"]
 
 
 # ---------------------------------------------------------------- the terminal is given back

@@ -28,9 +28,10 @@ from mp4ds.cli.progress import (
     Events,
     Log,
     Pace,
-    PackState,
     duration_text,
     pack_progress,
+    rows_of,
+    share_of,
 )
 from mp4ds.packing.options import PackProgress
 from mp4ds.plugins.demo import demo
@@ -86,21 +87,18 @@ class Clock:
 # ---------------------------------------------------------------- where it stands
 
 
-def state_of(*states: PackProgress) -> PackState:
-    job = PackState()
-    for state in states:
-        job.states[state.dataset] = state
-    return job
+def states_of(*states: PackProgress) -> dict[Path, PackProgress]:
+    return {state.dataset: state for state in states}
 
 
 def test_parts_tell_where_the_work_does_not() -> None:
-    assert state_of(told(None, tasks_done=119)).share == pytest.approx(119 / 240)
+    assert share_of(states_of(told(None, tasks_done=119))) == pytest.approx(119 / 240)
 
 
 def test_datasets_count_by_their_size() -> None:
     joining = told(1.0, dataset="a", gigabytes=10, phase="joining")
-    job = state_of(joining, told(0.5, dataset="b", gigabytes=30))
-    assert job.share == pytest.approx(25 / 40)
+    job = states_of(joining, told(0.5, dataset="b", gigabytes=30))
+    assert share_of(job) == pytest.approx(25 / 40)
 
 
 @pytest.mark.parametrize("before", [0.0, 0.8])
@@ -158,15 +156,15 @@ def test_whatever_is_told_nothing_silly_is_shown(
     clock, lines, events = Clock(0.0), io.StringIO(), io.StringIO()
     log = Log(lines, clock=clock, now=clock.now)
     stream = Events(events, clock=clock, now=clock.now)
-    job = PackState()
+    states: dict[Path, PackProgress] = {}
     size = {"COLUMNS": str(width), "LINES": str(height), "TERM": "xterm"}
     with mock.patch.dict(os.environ, size), shown_on(Screen()) as screen, pack_progress() as take:
         for now, state in reports:
             clock.seconds = now
             take(state)
             stream.take(state)
-            job.states[state.dataset] = state
-            log.show(job.rows())
+            states[state.dataset] = state
+            log.show(rows_of(states))
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue())
     assert all(letter.isprintable() or letter in "\n\r" for letter in text)
     log.end("done")
@@ -185,7 +183,7 @@ def logged(work: Work, seconds: float, *, outcome: str = "done", step: float = 0
     log = Log(stream, clock=clock, now=clock.now)
     for n in range(int(seconds / step) + 1):
         clock.seconds = 1000.0 + n * step
-        log.show(state_of(told(work(n * step))).rows())
+        log.show(rows_of(states_of(told(work(n * step)))))
     log.end(outcome)
     return stream.getvalue().splitlines()
 
@@ -212,7 +210,7 @@ def test_the_log_of_several_datasets() -> None:
     for n in range(1, 12):
         clock.seconds = 1000.0 + n
         a = told(1.0, dataset="a", phase="joining", note="cam0.mp4")
-        log.show(state_of(a, told(n / 100, dataset="b", failed=1)).rows())
+        log.show(rows_of(states_of(a, told(n / 100, dataset="b", failed=1))))
     (line,) = stream.getvalue().splitlines()
     assert re.search(r"packing 2 datasets: 55 % \| parts 264/480  1 failed  ", line)
     assert "a joining cam0.mp4  parts 240/240  50.0 GB -> 5.0 GB, b parts 24/240" in line
@@ -224,7 +222,7 @@ def test_hostile_names_reach_no_log() -> None:
     topics = {HOSTILE + "\udcff" + str(n) + "x" * n: (n, None) for n in range(1000)}
     for n in range(20):
         clock.seconds = 1000.0 + n
-        log.show(state_of(told(0.1, dataset=HOSTILE, topics=topics, note=HOSTILE)).rows())
+        log.show(rows_of(states_of(told(0.1, dataset=HOSTILE, topics=topics, note=HOSTILE))))
     (line,) = stream.getvalue().splitlines()
     assert re.fullmatch(r"[ -~]{1,4000}", line)
     assert "and 980 more" in line
@@ -236,7 +234,7 @@ def test_a_pack_does_not_fail_for_want_of_a_log(stream: Any) -> None:
     if stream.writable():
         stream.close()
     log = Log(stream, clock=Clock())
-    log.show(state_of(told(0.5)).rows())
+    log.show(rows_of(states_of(told(0.5))))
     log.end("done")
     Events(stream).take(told(0.5))
 

@@ -22,6 +22,30 @@ from __future__ import annotations
 from importlib import import_module
 
 from mp4ds._version import __version__
+from mp4ds.errors import (
+    ClusterError,
+    ConversionError,
+    EncoderRefusedError,
+    FormatError,
+    FrameNotFoundError,
+    Mp4dsError,
+    OptionError,
+    OutOfReachError,
+    PartsFailedError,
+    PublishError,
+    RecordError,
+    RemoteError,
+    SampleError,
+    ScoringError,
+    SegmentsDifferError,
+    SourceError,
+    SourceNotFoundError,
+    TargetError,
+    TargetExistsError,
+    VersionError,
+    VideoError,
+    WriteError,
+)
 
 TYPE_CHECKING = False  # without typing, whose import costs more than all of this
 if TYPE_CHECKING:
@@ -33,30 +57,6 @@ if TYPE_CHECKING:
     from mp4ds.dataset.messages import RecordedMessage
     from mp4ds.dataset.stream import Stream
     from mp4ds.dataset.topic import Frame, Topic
-    from mp4ds.errors import (
-        ClusterError,
-        ConversionError,
-        EncoderRefusedError,
-        FormatError,
-        FrameNotFoundError,
-        Mp4dsError,
-        OptionError,
-        OutOfReachError,
-        PartsFailedError,
-        PublishError,
-        RecordError,
-        RemoteError,
-        SampleError,
-        ScoringError,
-        SegmentsDifferError,
-        SourceError,
-        SourceNotFoundError,
-        TargetError,
-        TargetExistsError,
-        VersionError,
-        VideoError,
-        WriteError,
-    )
     from mp4ds.packing.options import ImageFolder, PackOptions, PackSummary
     from mp4ds.packing.pack import pack, pack_each, pack_share
     from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
@@ -75,42 +75,42 @@ if TYPE_CHECKING:
     from mp4ds.unpacking.unpack import unpack
 
 _HOMES = {
-    "dataset.checks": (
-        "Problem",
-        "validate",
-    ),
-    "dataset.dataset": ("Dataset",),
-    "dataset.messages": ("RecordedMessage",),
-    "dataset.stream": ("Stream",),
-    "dataset.topic": ("Frame", "Topic"),
-    "packing.options": (
-        "ImageFolder",
-        "PackOptions",
-        "PackSummary",
-    ),
-    "packing.pack": (
-        "pack",
-        "pack_each",
-        "pack_share",
-    ),
-    "plugins.evaluating.evaluate": ("EvaluateOptions", "evaluate"),
-    "plugins.evaluating.results": ("Evaluation",),
-    "plugins.exporting.export": ("export",),
-    "plugins.exporting.job": (
-        "ExportOptions",
-        "ExportSummary",
-    ),
-    "plugins.importing.ros_mp4": ("import_ros_mp4",),
-    "plugins.playing.options": ("PlayOptions",),
-    "plugins.playing.play": ("play",),
-    "plugins.playing.player": ("PlaySummary",),
-    "plugins.recording.options": ("RecordOptions",),
-    "plugins.recording.record": ("RecordSummary", "record"),
-    "plugins.reporting.report": ("ReportOptions", "ReportSummary", "report"),
-    "times": ("Sync",),
-    "unpacking.options": ("UnpackOptions", "UnpackSummary"),
-    "unpacking.unpack": ("unpack",),
+    "Dataset": "dataset.dataset",
+    "EvaluateOptions": "plugins.evaluating.evaluate",
+    "Evaluation": "plugins.evaluating.results",
+    "ExportOptions": "plugins.exporting.job",
+    "ExportSummary": "plugins.exporting.job",
+    "Frame": "dataset.topic",
+    "ImageFolder": "packing.options",
+    "PackOptions": "packing.options",
+    "PackSummary": "packing.options",
+    "PlayOptions": "plugins.playing.options",
+    "PlaySummary": "plugins.playing.player",
+    "Problem": "dataset.checks",
+    "RecordOptions": "plugins.recording.options",
+    "RecordSummary": "plugins.recording.record",
+    "RecordedMessage": "dataset.messages",
+    "ReportOptions": "plugins.reporting.report",
+    "ReportSummary": "plugins.reporting.report",
+    "Stream": "dataset.stream",
+    "Sync": "times",
+    "Topic": "dataset.topic",
+    "UnpackOptions": "unpacking.options",
+    "UnpackSummary": "unpacking.options",
+    "evaluate": "plugins.evaluating.evaluate",
+    "export": "plugins.exporting.export",
+    "import_ros_mp4": "plugins.importing.ros_mp4",
+    "open": "dataset.dataset:open_dataset",
+    "pack": "packing.pack",
+    "pack_each": "packing.pack",
+    "pack_share": "packing.pack",
+    "play": "plugins.playing.play",
+    "record": "plugins.recording.record",
+    "report": "plugins.reporting.report",
+    "unpack": "unpacking.unpack",
+    "validate": "dataset.checks",
 }
+"""Names that are imported when they are first used -> their modules."""
 
 __all__ = [
     "ClusterError",
@@ -174,14 +174,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name == "open":
-        return import_module("mp4ds.dataset.dataset").open_dataset
-    if name.endswith("Error") and name in __all__:
-        return getattr(import_module("mp4ds.errors"), name)
-    for module, names in _HOMES.items():
-        if name in names:
-            return getattr(import_module(f"mp4ds.{module}"), name)
-    raise AttributeError(f"module 'mp4ds' has no attribute {name!r}")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mp4ds' has no attribute {name!r}")
+    module, _, own_name = _HOMES[name].partition(":")
+    return getattr(import_module(f"mp4ds.{module}"), own_name or name)
 
 
 def __dir__() -> list[str]:

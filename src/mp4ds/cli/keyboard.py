@@ -20,9 +20,14 @@ except ImportError:  # Windows
 _POLL_S = 0.2
 """How often to check whether the command is in the foreground again."""
 
-_ARROWS = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}
-_MAX_SEQUENCE = 32
-_KEY = re.compile(rb"\x1b[\[O][\x20-\x3f]*([^\x20-\x3f])|\x1b(?![\[O])|[^\x1b]", re.DOTALL)
+_KEY = re.compile(rb"\x1b[\[O][\x20-\x3f]*[^\x20-\x3f]?|.", re.DOTALL)
+_CUT = re.compile(rb"\x1b(?:[\[O][\x20-\x3f]*)?\Z")  # the rest of which will come
+_MOST_CUT = 32
+_ARROWS = {
+    b"\x1b" + kind + letter: name
+    for kind in (b"[", b"O")
+    for letter, name in ((b"A", "up"), (b"B", "down"), (b"C", "right"), (b"D", "left"))
+}
 
 
 class Keyboard:
@@ -34,7 +39,7 @@ class Keyboard:
     end, and while the program is stopped (Ctrl-Z) or in the background, where it reads nothing.
 
     Args:
-        actions: The action of each key, named as by `Keys`; other keys are ignored.
+        actions: The action of each key, named as by `keys_in`; other keys are ignored.
         fd: File descriptor of the terminal; None for standard input.
     """
 
@@ -77,7 +82,7 @@ class Keyboard:
             signal.signal(signal.SIGTSTP, signal.SIG_DFL)
 
     def _read(self, fd: int, wake: int) -> None:
-        keys = Keys()
+        cut = b""
         while True:
             watched = [wake, fd] if self._take(fd) else [wake]
             ready, _, _ = select.select(watched, [], [], _POLL_S)
@@ -91,7 +96,10 @@ class Keyboard:
                 return
             if not data:
                 return
-            for key in keys.feed(data):
+            data = cut + data
+            match = _CUT.search(data)
+            cut = match[0][-_MOST_CUT:] if match else b""
+            for key in keys_in(data[: len(data) - len(cut)]):
                 if action := self._actions.get(key):
                     action()
 
@@ -133,28 +141,16 @@ class Keyboard:
                     return
 
 
-class Keys:
-    """Decodes keys from what a terminal sends, in pieces of any size."""
+def keys_in(data: bytes) -> Iterator[str]:
+    """The keys in what a terminal sends: a character, ``up``, ``down``, ``left`` or ``right``.
 
-    def __init__(self) -> None:
-        self._data = b""
-
-    def feed(self, data: bytes) -> Iterator[str]:
-        """The keys that are complete: a character, ``up``, ``down``, ``left`` or ``right``.
-
-        Other sequences, such as those of function keys, and a lone escape are ignored.
-        """
-        self._data += data
-        place = 0
-        while match := _KEY.match(self._data, place):
-            if match.end() == len(self._data) and match[0] == b"\x1b":
-                break  # more may follow
-            place = match.end()
-            if len(match[0]) == 3 and match[1] in _ARROWS:
-                yield _ARROWS[match[1]]
-            elif len(match[0]) == 1 and match[0].isascii() and match[0] != b"\x1b":
-                yield match[0].decode()
-        self._data = self._data[place:][:_MAX_SEQUENCE]
+    Other sequences, such as those of function keys, and a lone escape are ignored.
+    """
+    for key in _KEY.findall(data):
+        if key in _ARROWS:
+            yield _ARROWS[key]
+        elif len(key) == 1 and key.isascii() and key != b"\x1b":
+            yield key.decode()
 
 
 def _keyed(before: list[Any]) -> list[Any]:

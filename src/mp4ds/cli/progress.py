@@ -252,43 +252,39 @@ def progress_of(doing: str) -> Iterator[ProgressCallback]:
 _EVENT_SECONDS = 1.0
 
 
-class PackState:
-    """Progress of one or several packs.
+States = dict[Path, PackProgress]
+"""Last reported state of each dataset, in the order in which they began."""
 
-    Attributes:
-        states: Last reported state of each dataset, in the order in which they began.
-    """
 
-    def __init__(self) -> None:
-        self.states: dict[Path, PackProgress] = {}
+def share_of(states: States) -> float | None:
+    """Share of packs that is done, by bytes of the sources; None if unknown."""
+    total = packed = 0.0
+    for state in states.values():
+        share, weight = packed_share(state), max(1.0, state.bytes_total)
+        if share is None:
+            return None
+        total, packed = total + weight, packed + weight * share
+    return round(packed / total, _DIGITS) if total else None
 
-    @property
-    def share(self) -> float | None:
-        """Share that is packed, by bytes of the sources; None if unknown."""
-        total = packed = 0.0
-        for state in self.states.values():
-            share, weight = packed_share(state), max(1.0, state.bytes_total)
-            if share is None:
-                return None
-            total, packed = total + weight, packed + weight * share
-        return round(packed / total, _DIGITS) if total else None
 
-    def rows(self) -> list[Row]:
-        """All of it, and each dataset or, of one, each camera."""
-        states = list(self.states.values())
-        if len(states) > 1:
-            rows = [Row(one.dataset.name, _text(one), packed_share(one)) for one in states]
-            return [Row(f"packing {len(states)} datasets", _amounts(*states), self.share), *rows]
-        (state,) = states
-        cameras = [
-            Row(
-                topic,
-                str(done) if total is None else f"{done}/{total}",
-                min(1.0, done / total) if total else None,
-            )
-            for topic, (done, total) in state.topics.items()
-        ]
-        return [Row(f"packing {state.dataset.name}", _text(state), self.share), *cameras]
+def rows_of(states: States) -> list[Row]:
+    """All packs, and each dataset or, of one, each camera."""
+    if len(states) > 1:
+        all_of_it = Row(
+            f"packing {len(states)} datasets", _amounts(*states.values()), share_of(states)
+        )
+        rows = [Row(one.dataset.name, _text(one), packed_share(one)) for one in states.values()]
+        return [all_of_it, *rows]
+    (state,) = states.values()
+    cameras = [
+        Row(
+            topic,
+            str(done) if total is None else f"{done}/{total}",
+            min(1.0, done / total) if total else None,
+        )
+        for topic, (done, total) in state.topics.items()
+    ]
+    return [Row(f"packing {state.dataset.name}", _text(state), share_of(states)), *cameras]
 
 
 def packed_share(state: PackProgress) -> float | None:
@@ -339,16 +335,16 @@ class Events:
     ) -> None:
         self._stream, self._clock, self._now = stream, clock, now
         self._pace = Pace(clock) if timed else None
-        self._job = PackState()
+        self._states: States = {}
         self._began = clock()
         self._written: dict[Path, float] = {}
         self._waiting: set[Path] = set()
 
     def take(self, state: PackProgress) -> None:
         """Take a state, and write the event if one is due."""
-        if not self._job.states:
+        if not self._states:
             self._write("start", dataset=str(state.dataset))
-        self._job.states[state.dataset] = state
+        self._states[state.dataset] = state
         self._waiting.add(state.dataset)
         before = self._written.get(state.dataset)
         if before is None or self._clock() - before >= _EVENT_SECONDS:
@@ -356,16 +352,16 @@ class Events:
 
     def end(self, outcome: str) -> None:
         """Write what was not due yet, and how it ended."""
-        for dataset in [one for one in self._job.states if one in self._waiting]:
-            self._report(self._job.states[dataset])
-        if self._job.states:
+        for dataset in [one for one in self._states if one in self._waiting]:
+            self._report(self._states[dataset])
+        if self._states:
             self._write("end", outcome=outcome, seconds=round(self._clock() - self._began, 3))
 
     def _report(self, state: PackProgress) -> None:
         self._written[state.dataset] = self._clock()
         self._waiting.discard(state.dataset)
         done = packed_share(state) if state.phase == "packing" else state.done
-        share = self._job.share
+        share = share_of(self._states)
         self._write(
             "progress",
             dataset=str(state.dataset),
@@ -412,11 +408,11 @@ def pack_progress(*, whole: bool = True) -> Iterator[Callable[[PackProgress], No
         with _outcome(events.end):
             yield events.take
         return
-    job = PackState()
+    states: States = {}
     with display(timed=whole) as show:
 
         def take(state: PackProgress) -> None:
-            job.states[state.dataset] = state
-            show(job.rows())
+            states[state.dataset] = state
+            show(rows_of(states))
 
         yield take
