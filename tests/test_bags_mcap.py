@@ -21,6 +21,7 @@ from conftest import real
 from mp4ds.bags import protocols
 from mp4ds.bags.files import DamageError, unzstd
 from mp4ds.bags.mcap import McapReader, McapWriter
+from mp4ds.bags.rosbag2 import Rosbag2Reader
 from mp4ds.errors import ConversionError, Mp4dsError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
 
@@ -330,19 +331,19 @@ def test_several_passes_at_once(tmp_path: Path) -> None:
         assert len(list(two)) == len(list(one)) + 1 == len(written)
 
 
-def test_a_decompressed_stream(tmp_path: Path) -> None:
+def test_a_decompressed_copy(tmp_path: Path) -> None:
+    """Errors and progress are those of the compressed file."""
     written = messages(write_all(tmp_path / "a.mcap", scene()))
     packed = tmp_path / "a.mcap.zstd"
     packed.write_bytes(zstandard.compress((tmp_path / "a.mcap").read_bytes()))
-    reader = McapReader(packed, is_compressed=True)
-    assert reader.profile == "ros2"
-    got = messages(reader.records())
-    assert list(map(fields, got)) == list(map(fields, written))
-    assert reader.position == packed.stat().st_size
-    assert sum(map(len, reader.times().values())) == len(written)
+    with Rosbag2Reader(packed) as reader:
+        got = messages(reader.records())
+        assert list(map(fields, got)) == list(map(fields, written))
+        assert reader.position == packed.stat().st_size
+        assert sum(map(len, reader.times().values())) == len(written)
     packed.write_bytes(packed.read_bytes()[:-50])
-    with pytest.raises(SourceError, match="zstd data is cut short"):
-        list(McapReader(packed, is_compressed=True).records())
+    with pytest.raises(SourceError, match=r"a.mcap.zstd: its zstd data is cut short"):
+        Rosbag2Reader(packed)
 
 
 def test_compressed_payloads(tmp_path: Path) -> None:

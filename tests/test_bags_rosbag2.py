@@ -532,7 +532,7 @@ def test_compressed_files(
     monkeypatch.setattr(tempfile, "tempdir", str(work))
     with Rosbag2Reader(folder) as reader:
         known = len(reader.channels)
-        assert known == (4 if storage == "sqlite3" else 0)
+        assert known == 4
         for _ in range(2):
             records = list(reader.records())
             assert list(map(fields, messages(records))) == list(map(fields, scene()))

@@ -335,83 +335,6 @@ def _small_pieces(length: int) -> Iterator[tuple[int, int]]:
 # ---------------------------------------------------------------- files compressed as a whole
 
 
-class ZstdStream:
-    """The content of a compressed file, read once from its start.
-
-    Args:
-        path: The compressed file.
-        to_damage: Whether the content ends where the file is damaged, instead of failing there.
-
-    Attributes:
-        problem: Why the content ended before the file did, a phrase; empty if it did not.
-
-    Raises:
-        SourceError: It cannot be opened, or is empty.
-    """
-
-    def __init__(self, path: Path, *, to_damage: bool = False) -> None:
-        self._path = path
-        self._to_damage = to_damage
-        self._file = open_source(path)
-        self._frame = zstandard.ZstdDecompressor().decompressobj()
-        self._most = most_in_file(path.stat().st_size)
-        self._given = 0
-        self._is_within = False
-        self._left = bytearray()
-        self._ended = False
-        self._consumed = 0
-        self.problem = ""
-
-    def read(self, length: int, /) -> bytes:
-        """Read that many decompressed bytes; fewer at the end only.
-
-        Raises:
-            SourceError: It is damaged, cut short, or decompresses to too much.
-        """
-        while len(self._left) < length and not self._ended:
-            piece = self._file.read(ZSTD_PIECE)
-            if not piece:
-                self._end("its zstd data is cut short" if self._is_within else "")
-            self._take(piece)
-            self._consumed += len(piece)
-        data = bytes(self._left[:length])
-        del self._left[:length]
-        self._given += len(data)
-        if self.problem and len(data) < length and not self._to_damage:
-            raise SourceError(self._path, self.problem, f"Copy it again, or {SALVAGE}")
-        return data
-
-    def tell(self) -> int:
-        """Bytes of the compressed file consumed."""
-        return self._consumed
-
-    def seek(self, offset: int, /) -> int:
-        """Not possible."""
-        raise io.UnsupportedOperation("seek")
-
-    def _take(self, piece: bytes) -> None:
-        while piece:
-            try:
-                self._left += self._frame.decompress(piece)
-            except zstandard.ZstdError as error:
-                self._end(f"its zstd data is damaged near byte {self._consumed}: {error}")
-                return
-            if self._given + len(self._left) > self._most:
-                self._end(f"it unpacks to more than {self._most} bytes, too many for its size")
-                return
-            self._is_within = not self._frame.eof
-            piece = b"" if self._is_within else self._frame.unused_data
-            if not self._is_within:
-                self._frame = zstandard.ZstdDecompressor().decompressobj()
-
-    def _end(self, problem: str) -> None:
-        self._ended, self.problem = True, problem
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
 def copy_file(path: Path, target: Path) -> None:
     """Download a remote file, with the -wal or -journal beside a database that was not closed.
 
@@ -436,7 +359,7 @@ def copy_file(path: Path, target: Path) -> None:
             shutil.copyfileobj(stream, output, _COPY_BYTES)
 
 
-def decompress_file(path: Path, target: Path, *, to_damage: bool = False) -> None:
+def decompress_file(path: Path, target: Path, *, to_damage: bool = False) -> str:
     """Decompress a file into another one.
 
     Args:
@@ -444,12 +367,35 @@ def decompress_file(path: Path, target: Path, *, to_damage: bool = False) -> Non
         target: The file to write.
         to_damage: Whether to decompress a damaged one as far as possible.
 
+    Returns:
+        Why it ended before the file did, a phrase; empty if it did not.
+
     Raises:
         SourceError: The file is damaged, cut short, or decompresses to too much; or to nothing.
         OSError: The target cannot be written.
     """
-    with closing(ZstdStream(path, to_damage=to_damage)) as stream, target.open("wb") as output:
-        while piece := stream.read(_COPY_BYTES):
-            output.write(piece)
+    most = most_in_file(path.stat().st_size)
+    problem, is_within = "", False
+    frame = zstandard.ZstdDecompressor().decompressobj()
+    with closing(open_source(path)) as stream, target.open("wb") as output:
+        while not problem and (piece := stream.read(ZSTD_PIECE)):
+            while piece:
+                try:
+                    output.write(frame.decompress(piece))
+                except zstandard.ZstdError as error:
+                    problem = f"its zstd data is damaged near byte {stream.tell()}: {error}"
+                    break
+                if output.tell() > most:
+                    problem = f"it unpacks to more than {most} bytes, too many for its size"
+                    break
+                is_within = not frame.eof
+                piece = b"" if is_within else frame.unused_data
+                if not is_within:
+                    frame = zstandard.ZstdDecompressor().decompressobj()
+        if is_within and not problem:
+            problem = "its zstd data is cut short"
+        if problem and not to_damage:
+            raise SourceError(path, problem, f"Copy it again, or {SALVAGE}")
         if not output.tell():
-            raise SourceError(path, stream.problem or "holds nothing")
+            raise SourceError(path, problem or "holds nothing")
+    return problem

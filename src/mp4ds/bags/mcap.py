@@ -23,7 +23,7 @@ from mp4ds.bags import protocols
 from mp4ds.bags.files import (
     SALVAGE_REMEDY,
     DamageError,
-    ZstdStream,
+    most_held,
     most_unpacked,
     open_source,
     unreadable,
@@ -36,6 +36,7 @@ from mp4ds.bags.mcap_index import (
     read_summary,
 )
 from mp4ds.bags.mcap_records import (
+    MAX_RECORD_BYTES,
     PRIVATE_OPCODE,
     Declared,
     MessageHead,
@@ -86,7 +87,7 @@ def read_chunks(
     """Read an excerpt from the chunks that it needs, by their start times, in any file order.
 
     Args:
-        stream: A stream of known size.
+        stream: The file.
         excerpt: What to read.
         summary: The file's summary.
         between: The records between its chunks.
@@ -167,7 +168,7 @@ class McapReader(BagReader):
 
     Args:
         path: The file.
-        is_compressed: Whether it is compressed with zstd as a whole; then it has no index.
+        shown: Its name in errors, where it is a decompressed copy.
         message_decompress: Decompresses the payload of a message; raises `DamageError` if it
             cannot.
 
@@ -181,12 +182,12 @@ class McapReader(BagReader):
         self,
         path: Path,
         *,
-        is_compressed: bool = False,
+        shown: Path | None = None,
         message_decompress: Callable[[memoryview], bytes] | None = None,
     ) -> None:
         self.path = path
-        self.files = [path]
-        self._is_compressed = is_compressed
+        self._shown = shown or path
+        self.files = [self._shown]
         self._decompress = message_decompress
         self._declared = Declared()
         self._pass: RecordStream | None = None
@@ -215,13 +216,12 @@ class McapReader(BagReader):
                     self._declared.add_channel(channel)  # otherwise its schema is only in the data
 
     def _start_pass(self) -> RecordStream:
-        if self._is_compressed:
-            stream = RecordStream(ZstdStream(self.path), self.path, None)
-        else:
-            file = open_source(self.path)
-            size = file.seek(0, os.SEEK_END)
-            file.seek(0)
-            stream = RecordStream(file, self.path, size)
+        file = open_source(self.path, self._shown)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        # a small compressed file may hold what claims to be large
+        most = MAX_RECORD_BYTES if self._shown == self.path else most_held()
+        stream = RecordStream(file, self._shown, size, most)
         try:
             stream.read_magic()
         except BaseException:
@@ -257,7 +257,9 @@ class McapReader(BagReader):
     @property
     def position(self) -> int:
         """Bytes of the file that `records` has consumed."""
-        return self._pass.tell() if self._pass else self._position
+        if self._pass is None or self._shown == self.path:
+            return self._pass.tell() if self._pass else self._position
+        return self._pass.tell() * self._shown.stat().st_size // max(1, self._pass.size)
 
     @property
     def is_indexed(self) -> bool:
@@ -303,7 +305,7 @@ class McapReader(BagReader):
         self._declared.skipped.clear()
         try:
             yield from read(stream)
-            self._position = self.path.stat().st_size
+            self._position = self._shown.stat().st_size
         finally:
             self._pass = None
             stream.close()
@@ -331,7 +333,7 @@ class McapReader(BagReader):
                 yield record
         if excerpt == EVERYTHING and not summary.covers(count):
             raise SourceError(
-                self.path,
+                self._shown,
                 f"is damaged: its chunks hold {count} messages, which its statistics contradict",
                 SALVAGE_REMEDY,
             )
@@ -342,8 +344,7 @@ class McapReader(BagReader):
 
     def _read_through(self, stream: RecordStream, held: HoldBack | None) -> Iterator[Record]:
         declared = self._declared
-        if stream.size is not None:
-            stream.expect([(stream.tell(), stream.size)])
+        stream.expect([(stream.tell(), stream.size)])
         read = 0
         while True:
             opcode, body = stream.next()
@@ -388,7 +389,7 @@ class McapReader(BagReader):
             data = self._decompress(memoryview(message.data))
         except DamageError as error:
             place = f": message of log time {message.log_time}, topic {message.channel.topic}"
-            raise unreadable(self.path, place, error, SALVAGE_REMEDY) from None
+            raise unreadable(self._shown, place, error, SALVAGE_REMEDY) from None
         return Message(
             message.channel, message.log_time, message.publish_time, message.sequence, data
         )

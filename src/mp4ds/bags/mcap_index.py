@@ -358,8 +358,6 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
         DamageError: A record of the summary is damaged.
     """
     size = stream.size
-    if size is None:
-        return None
     if size < 2 * len(MAGIC) + FOOTER_BYTES - len(MAGIC):
         raise stream.cut_short()
     stream.seek(size - FOOTER_BYTES)
@@ -408,7 +406,7 @@ def look_between(stream: RecordStream, summary: McapSummary) -> Between:
     """Inspect the records between the chunks; the stream's position is undefined afterwards.
 
     Args:
-        stream: A stream of known size.
+        stream: The file.
         summary: Its summary; its chunks must be sound.
     """
     found = Between(private=Counter(summary.private))

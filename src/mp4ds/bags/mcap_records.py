@@ -20,8 +20,6 @@ from mp4ds.bags.files import (
     SALVAGE_REMEDY,
     DamageError,
     OversizeError,
-    ZstdStream,
-    most_held,
     other_begin,
     unpack,
     unreadable,
@@ -47,7 +45,6 @@ OF_SUMMARY = frozenset(
     }
 )
 CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`, or {SALVAGE}"
-_PIECE_BYTES = 16 * 2**20
 _FRAME = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -76,16 +73,18 @@ class RecordStream:
     Args:
         stream: A binary stream at the start of the file.
         path: The file's name, for errors.
-        size: Bytes in the stream; None if unknown and not seekable.
+        size: Bytes in the stream.
+        most: Bytes that a record may have.
 
     Attributes:
         start: Byte offset of the record that was read last.
     """
 
-    def __init__(self, stream: BinaryIO | ZstdStream, path: Path, size: int | None) -> None:
+    def __init__(self, stream: BinaryIO, path: Path, size: int, most: int) -> None:
         self._stream = stream
         self.path = path
         self.size = size
+        self._most = most
         self._offset = 0
         self.start = 0
 
@@ -99,7 +98,7 @@ class RecordStream:
 
     def seek(self, offset: int) -> None:
         """Continue at a byte offset that an index gave."""
-        if self.size is not None and offset > self.size:
+        if offset > self.size:
             raise DamageError(f"an index points to byte {offset}, past the end")
         self._stream.seek(offset)
         self._offset = offset
@@ -119,29 +118,16 @@ class RecordStream:
 
     def read(self, length: int) -> bytes:
         """Read exactly that many bytes."""
-        if self.size is not None and length > self.size - self._offset:
+        if length > self.size - self._offset:
             raise self.cut_short()
         try:
-            if length <= _PIECE_BYTES or self.size is not None:
-                data = self._stream.read(length)
-            else:
-                data = self._read_in_pieces(length)
+            data = self._stream.read(length)
         except OSError as error:
             raise SourceError(self.path, f"cannot be read: {error.strerror or error}") from None
         if len(data) != length:
             raise self.cut_short()
         self._offset += length
         return data
-
-    def _read_in_pieces(self, length: int) -> bytes:
-        # A stream of unknown size may state any length: allocate only what is there.
-        pieces = io.BytesIO()
-        while (left := length - pieces.tell()) > 0:
-            piece = self._stream.read(min(_PIECE_BYTES, left))
-            if not piece:
-                break
-            pieces.write(piece)
-        return pieces.getvalue()
 
     def next(self) -> tuple[int, bytes]:
         """Read one record.
@@ -157,8 +143,8 @@ class RecordStream:
                 f"holds a record of {length} bytes at byte {self.start}: it is damaged",
                 SALVAGE_REMEDY,
             )
-        if self.size is None and length > (most := most_held()):
-            raise self.damaged(OversizeError(f"it declares {length} bytes", most))
+        if length > self._most:
+            raise self.damaged(OversizeError(f"it declares {length} bytes", self._most))
         return opcode, self.read(length)
 
     def cut_short(self) -> SourceError:

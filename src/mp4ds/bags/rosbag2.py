@@ -87,14 +87,14 @@ class Rosbag2Reader(CombinedReader):
         has_yaml = path.is_dir() and (path / METADATA_FILE).is_file()
         self._head = [path / METADATA_FILE] if has_yaml else []
         self.files = [*self._head, *self._storage_files]
+        if any(self._is_packed[:1]):
+            self._unpack_first()
         mcaps = [reader for reader in self._readers if reader and reader.format == "mcap"]
         self.library = mcaps[0].library if mcaps else ""
         self._storage = "mcap" if mcaps else "sqlite3" if self._readers else ""
         for number, reader in enumerate(self._readers):
             if reader:
                 self._declare(number, reader)
-        if any(self._is_packed[:1]):
-            self._unpack_first()
         self._tables = [reader.tables for reader in self._readers if reader]
         if all(reader is not None and reader.has_all_channels for reader in self._readers):
             self._declare_listed()
@@ -109,19 +109,26 @@ class Rosbag2Reader(CombinedReader):
         return _sibling_info(self.path), [self.path]
 
     def _open_storage(self) -> list[BagReader | None]:
-        """The files' readers; None for a database that must be decompressed or fetched first."""
+        """The files' readers; None for one that must be decompressed or fetched first."""
         return [self._storage_reader(file) for file in self._storage_files]
 
     def _storage_reader(self, file: Path) -> BagReader | None:
         start = _start(file)
-        is_compressed = start.startswith(ZSTD_MAGIC)
-        is_named_mcap = file.name.removesuffix(".zstd").endswith(".mcap")
-        is_listed_mcap = self._info is not None and self._info.storage == "mcap"
-        if start == MCAP_MAGIC or is_named_mcap or is_listed_mcap:
-            return self._of_compression(partial(self._mcap_reader, file, is_compressed))
-        if is_compressed or remote(file):
+        if start.startswith(ZSTD_MAGIC) or (remote(file) and not self._is_mcap(file, start)):
             return None
-        return self._of_compression(partial(self._sqlite_reader, file, file))
+        return self._file_reader(file, file)
+
+    def _is_mcap(self, shown: Path, start: bytes) -> bool:
+        """Whether a storage file, which begins so, is or should be an MCAP file."""
+        is_named = shown.name.removesuffix(".zstd").endswith(".mcap")
+        is_listed = self._info is not None and self._info.storage == "mcap"
+        return start == MCAP_MAGIC or is_named or is_listed
+
+    def _file_reader(self, file: Path, shown: Path) -> BagReader:
+        """The reader of a file, or of its decompressed copy."""
+        is_mcap = self._is_mcap(shown, _start(file))
+        reader = self._mcap_reader if is_mcap else self._sqlite_reader
+        return self._of_compression(partial(reader, file, shown))
 
     def _of_compression(self, opener: Callable[[Decompress | None], BagReader]) -> BagReader:
         """The reader of a file whose messages are, or are not, individually compressed."""
@@ -130,10 +137,8 @@ class Rosbag2Reader(CombinedReader):
         reader = opener(None)
         return opener(unzstd) if self._holds_zstd(reader) else reader
 
-    def _mcap_reader(
-        self, file: Path, is_compressed: bool, decompress: Decompress | None
-    ) -> BagReader:
-        return McapReader(file, is_compressed=is_compressed, message_decompress=decompress)
+    def _mcap_reader(self, file: Path, shown: Path, decompress: Decompress | None) -> BagReader:
+        return McapReader(file, shown=shown, message_decompress=decompress)
 
     def _sqlite_reader(self, file: Path, shown: Path, decompress: Decompress | None) -> BagReader:
         return SqliteReader(file, shown=shown, message_decompress=decompress)
@@ -151,18 +156,17 @@ class Rosbag2Reader(CombinedReader):
     def _unpacked(self, number: int) -> Iterator[BagReader]:
         file = self._storage_files[number]
         with tempfile.TemporaryDirectory(prefix="mp4ds-") as folder:
-            copy = Path(folder) / "storage.db3"
+            copy = Path(folder) / "storage"
             self._unpack(file, copy)
-            yield self._of_compression(partial(self._sqlite_reader, copy, file))
+            with self._file_reader(copy, file) as reader:
+                yield reader
 
     def _unpack(self, file: Path, target: Path) -> None:
         (decompress_file if _start(file).startswith(ZSTD_MAGIC) else copy_file)(file, target)
 
     def _unpack_first(self) -> None:
         """Open the first file, whose channels are needed before anything is read, until then."""
-        reader = self._first_copy.enter_context(self._unpacked(0))
-        self._readers[0] = reader
-        self._declare(0, reader)
+        self._readers[0] = self._first_copy.enter_context(self._unpacked(0))
 
     def _drop_first(self) -> None:
         if any(self._is_packed[:1]):
@@ -231,7 +235,7 @@ class Rosbag2Reader(CombinedReader):
             self._drop_first()
 
     def _part_records(self, number: int, part: BagReader, excerpt: Excerpt) -> Iterator[Record]:
-        if number > 0 and self._is_packed[number]:
+        if number > 0 and self._is_packed[number] and part.tables:
             yield MetadataRecord(TABLES_RECORD, part.tables)
         yield from part.records(excerpt)
 

@@ -453,12 +453,18 @@ class FileSalvage(BagReader):
     def _pass(self, log: LossLog) -> Iterator[Record]:
         """Read everything once, recording what is lost."""
 
+    def _place(self, window: Window) -> int:
+        """Bytes of the file, compressed as it may be, that were read."""
+        if self._shown == self.path:
+            return window.offset
+        return window.offset * self._shown.stat().st_size // max(1, window.size)
+
     def _in_order(self, window: Window, reading: FilePass, *, is_indexed: bool) -> Iterator[Record]:
         """The records of a pass, messages by log time if the file's index tells when to wait."""
         held = HoldBack()
         given = 0
         for record in reading.records():
-            self.position = window.position
+            self.position = self._place(window)
             given += isinstance(record, Message)
             if record is None:
                 if is_indexed:
@@ -468,7 +474,7 @@ class FileSalvage(BagReader):
             else:
                 yield record
         yield from held.release(None)
-        self.position = window.position
+        self.position = self._place(window)
         self._lost_in_all = None if reading.count is None else max(0, reading.count - given)
         if self._is_alone and not reading.found and not self.channels:
             raise SourceError(self.path, f"holds no records of {reading.kind}")

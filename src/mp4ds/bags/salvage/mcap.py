@@ -14,7 +14,7 @@ import numpy as np
 from mcap import records as mcap_records
 from mcap.opcode import Opcode
 
-from mp4ds.bags.files import DamageError, ZstdStream, open_source, recover
+from mp4ds.bags.files import DamageError, most_held, open_source, recover
 from mp4ds.bags.mcap_index import ChunkTable, McapSummary
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
@@ -28,7 +28,7 @@ from mp4ds.bags.mcap_records import (
     unpack_chunk,
 )
 from mp4ds.bags.salvage.losses import Draft, FilePass, FileSalvage, LossLog, lost_by
-from mp4ds.bags.salvage.scan import McapFraming, RecordFrame, Scan, Window
+from mp4ds.bags.salvage.scan import MAX_LENGTH, McapFraming, RecordFrame, Scan, Window
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
 
 # ---------------------------------------------------------------- the summary
@@ -131,6 +131,7 @@ class McapPass(FilePass):
         path: Its name.
         window: At its start.
         log: Where losses are recorded.
+        framing: Of its records.
         declared: Schemas and channels, those of the summary at first.
         summary: Its readable part.
         decompress: Decompresses the payload of a message, if necessary.
@@ -144,11 +145,11 @@ class McapPass(FilePass):
         path: Path,
         window: Window,
         log: LossLog,
+        framing: McapFraming,
         declared: Declared,
         summary: SalvagedSummary,
         decompress: Callable[[memoryview], bytes] | None,
     ) -> None:
-        framing = McapFraming(declared.channels)
         super().__init__(path, window, log, framing, declared.channels, summary.offset or None)
         self._declared = declared
         self._summary = summary
@@ -180,8 +181,6 @@ class McapPass(FilePass):
         yield from self._tally.settle()
         if not ended:
             self._tally.lost(self._window.offset, None, "the file ends before its footer")
-        if problem := self._window.problem:
-            self._log.lost(None, None, problem, join=False)
         self._tally.close()
         for channel_id, schema_id in self._undefined.items():
             topic = self._topic_of(channel_id)
@@ -443,9 +442,8 @@ class McapSalvage(FileSalvage):
 
     Args:
         path: The file.
+        shown: Its name in losses, if it is a decompressed copy, to which their offsets refer.
         is_alone: Whether it is an error, not just a loss, if nothing can be read.
-        is_compressed: Whether it is compressed with zstd as a whole. Offsets of losses then refer
-            to its content.
         message_decompress: Decompresses the payload of a message; raises `DamageError` if it
             cannot.
 
@@ -459,18 +457,15 @@ class McapSalvage(FileSalvage):
         self,
         path: Path,
         *,
+        shown: Path | None = None,
         is_alone: bool = True,
-        is_compressed: bool = False,
         message_decompress: Callable[[memoryview], bytes] | None = None,
     ) -> None:
-        super().__init__(path, is_alone=is_alone)
-        open_source(path).close()
-        self._is_compressed = is_compressed
+        super().__init__(path, shown=shown, is_alone=is_alone)
+        open_source(path, shown).close()
         self._decompress = message_decompress
         self._declared = Declared()
-        self._summary = SalvagedSummary() if is_compressed else read_summary(path)
-        if is_compressed:
-            self._summary.finish()
+        self._summary = read_summary(path)
         self._read_header()
         if not self._summary.is_verified:
             return
@@ -481,7 +476,7 @@ class McapSalvage(FileSalvage):
                 self._declared.add_channel(channel)
 
     def _read_header(self) -> None:
-        with self._window() as window:
+        with Window.of_file(self.path) as window:
             frame = bytes(window.peek(2**16))
         if frame[len(MAGIC) : len(MAGIC) + 1] == bytes([Opcode.HEADER]):
             length = int.from_bytes(frame[9:17], "little")
@@ -490,11 +485,6 @@ class McapSalvage(FileSalvage):
             except DamageError:
                 return
             self.profile, self.library = header.profile, header.library
-
-    def _window(self) -> Window:
-        if self._is_compressed:
-            return Window(ZstdStream(self.path, to_damage=True), self.path)
-        return Window.of_file(self.path)
 
     @property
     def channels(self) -> Sequence[Channel]:
@@ -527,9 +517,12 @@ class McapSalvage(FileSalvage):
 
     def _pass(self, log: LossLog) -> Iterator[Record]:
         self._declared.skipped.clear()
-        with self._window() as window:
+        with Window.of_file(self.path) as window:
+            # a small compressed file may hold what claims to be large
+            longest = MAX_LENGTH if self.path == self._shown else most_held()
+            framing = McapFraming(self._declared.channels, longest)
             reading = McapPass(
-                self.path, window, log, self._declared, self._summary, self._decompress
+                self.path, window, log, framing, self._declared, self._summary, self._decompress
             )
             is_indexed = self._summary.chunks.has_messages
             yield from self._in_order(window, reading, is_indexed=is_indexed)

@@ -234,6 +234,7 @@ class Rosbag2Salvage(Rosbag2Reader):
     def __init__(self, path: Path, *, is_alone: bool = True) -> None:
         self._is_alone = is_alone
         self._of_files: list[Loss] = []
+        self._of_copies: dict[str, Loss] = {}
         super().__init__(path)
 
     def _find_storage(self) -> tuple[BagInfo | None, list[Path]]:
@@ -297,12 +298,8 @@ class Rosbag2Salvage(Rosbag2Reader):
                 self._storage_files.remove(file)
         return readers
 
-    def _mcap_reader(
-        self, file: Path, is_compressed: bool, decompress: Decompress | None
-    ) -> BagReader:
-        return McapSalvage(
-            file, is_alone=False, is_compressed=is_compressed, message_decompress=decompress
-        )
+    def _mcap_reader(self, file: Path, shown: Path, decompress: Decompress | None) -> BagReader:
+        return McapSalvage(file, shown=shown, is_alone=False, message_decompress=decompress)
 
     def _sqlite_reader(self, file: Path, shown: Path, decompress: Decompress | None) -> BagReader:
         expected = self._expected(shown)
@@ -315,7 +312,9 @@ class Rosbag2Salvage(Rosbag2Reader):
         return False
 
     def _unpack(self, file: Path, target: Path) -> None:
-        decompress_file(file, target, to_damage=True)
+        problem = decompress_file(file, target, to_damage=True)
+        if problem:
+            self._of_copies[file.name] = Loss(file.name, None, None, problem, 0)
 
     def _unpack_first(self) -> None:
         with suppress(SourceError):  # it is reported when it is read
@@ -324,7 +323,7 @@ class Rosbag2Salvage(Rosbag2Reader):
     @property
     def losses(self) -> Sequence[Loss]:
         """Files that cannot be read, and what was lost of the others by the last `records`."""
-        return bounded([*self._of_files, *super().losses])
+        return bounded([*self._of_files, *self._of_copies.values(), *super().losses])
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """The metadata record, then everything readable, of which all but the excerpt is dropped.

@@ -15,14 +15,13 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from mp4ds.bags.files import DamageError, ZstdStream, open_source
+from mp4ds.bags.files import DamageError, open_source
 from mp4ds.bags.mcap_records import MAGIC, PRIVATE_OPCODE
 from mp4ds.bags.ros1_records import UINT32, Fields, Op, split_header
 from mp4ds.errors import SourceError
 
 BLOCK = 2**20
 _PIECE = 16 * 2**20
-_MAX_AHEAD = 64 * 2**20
 
 
 class Window:
@@ -31,17 +30,15 @@ class Window:
     Args:
         source: A stream at byte `offset`.
         path: Its name, for errors.
-        size: Bytes of the whole file, if known.
+        size: Bytes of the whole file.
         offset: Position of the stream.
 
     Attributes:
         offset: Byte at which the window begins.
-        size: Bytes of the whole file, None if unknown.
+        size: Bytes of the whole file.
     """
 
-    def __init__(
-        self, source: BinaryIO | ZstdStream, path: Path, *, size: int | None = None, offset: int = 0
-    ) -> None:
+    def __init__(self, source: BinaryIO, path: Path, *, size: int, offset: int = 0) -> None:
         self._source = source
         self._path = path
         self._data = b""
@@ -70,21 +67,9 @@ class Window:
         return window
 
     @property
-    def position(self) -> int:
-        """Bytes of the file that the reader has reached."""
-        return self._source.tell() if isinstance(self._source, ZstdStream) else self.offset
-
-    @property
-    def problem(self) -> str:
-        """Why the content ended before the file did, a phrase; empty if it did not."""
-        return self._source.problem if isinstance(self._source, ZstdStream) else ""
-
-    @property
-    def left(self) -> int | None:
-        """Bytes ahead of the reader; None if unknown."""
-        if self.size is not None:
-            return max(0, self.size - self.offset)
-        return len(self._data) - self._at if self._ended else None
+    def left(self) -> int:
+        """Bytes ahead of the reader."""
+        return max(0, self.size - self.offset)
 
     def peek(self, length: int) -> memoryview:
         """The next bytes; fewer at the end only. Memory is bounded by the file, not by `length`.
@@ -122,13 +107,9 @@ class Window:
             self.offset += step
             length -= step
 
-    def look(self, distance: int, length: int) -> bytes | None:
-        """Bytes far ahead, without reading up to them; None if that is impossible."""
+    def look(self, distance: int, length: int) -> bytes:
+        """Bytes far ahead, without reading up to them."""
         if self._ended or distance + length <= len(self._data) - self._at:
-            return bytes(self.peek(distance + length)[distance:])
-        if self.size is None:
-            if distance > _MAX_AHEAD:
-                return None
             return bytes(self.peek(distance + length)[distance:])
         try:
             if self._probe is None:
@@ -252,11 +233,7 @@ class Scan:
 
     def is_cut(self, frame: RecordFrame) -> bool:
         """Whether the file ends before the record does."""
-        left = self._window.left
-        if left is None:
-            left = len(self._window.peek(min(frame.size, MAX_UNPROVEN)))
-            return left < min(frame.size, MAX_UNPROVEN)
-        return left < frame.size
+        return self._window.left < frame.size
 
     def is_proven(self, frame: RecordFrame) -> bool:
         """Whether a record is complete and, if it is large, followed by another one."""
@@ -267,8 +244,6 @@ class Scan:
     def is_followed(self, size: int) -> bool:
         """Whether a record, or the end, follows after that many bytes."""
         ahead = self._window.look(size, self._framing.lookahead)
-        if ahead is None:
-            return size <= 2**30  # a stream: accepted up to this size
         return not ahead or self._framing.frame(memoryview(ahead)) is not None
 
     def _follows(self, start: int) -> Callable[[int], bool]:
@@ -406,7 +381,7 @@ class Ros1Framing(Framing):
 
 _FRAME = struct.Struct("<BQ")
 _HEAD = _FRAME.size
-_MAX_LENGTH = 2**40
+MAX_LENGTH = 2**40
 _COMPRESSIONS = (b"", b"lz4", b"zstd")
 
 # Bytes of the fields in the bodies of records, a string or map as the format of its length.
@@ -437,9 +412,9 @@ def _table(known: Mapping[int, int], other: int) -> NDArray[np.int64]:
 
 
 # Records that are not searched for have no possible length.
-_SHORTEST_OF = _table(_SHORTEST, _MAX_LENGTH)
+_SHORTEST_OF = _table(_SHORTEST, MAX_LENGTH)
 _LONGEST_OF = _table(
-    {**dict.fromkeys(_SHORTEST, _MAX_LENGTH), Opcode.DATA_END: 4, Opcode.FOOTER: 20}, 0
+    {**dict.fromkeys(_SHORTEST, MAX_LENGTH), Opcode.DATA_END: 4, Opcode.FOOTER: 20}, 0
 )
 
 
@@ -471,6 +446,7 @@ class McapFraming(Framing):
 
     Args:
         channels: Ids of the known channels; may grow.
+        longest: Bytes of a record are fewer.
     """
 
     lookahead = 2**16
@@ -485,15 +461,16 @@ class McapFraming(Framing):
         }
     )
 
-    def __init__(self, channels: Collection[int]) -> None:
+    def __init__(self, channels: Collection[int], longest: int = MAX_LENGTH) -> None:
         self._channels = channels
+        self._longest = longest
 
     def frame(self, view: memoryview) -> RecordFrame | None:
         """The record at the start of these bytes: any that the format allows."""
         if len(view) < _HEAD:
             return None
         opcode, length = _FRAME.unpack_from(view)
-        if length >= _MAX_LENGTH or length < _SHORTEST.get(opcode, 0):
+        if length >= self._longest or length < _SHORTEST.get(opcode, 0):
             return None
         if not 1 <= opcode <= Opcode.DATA_END and opcode < PRIVATE_OPCODE:
             return None
