@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.dataset.views import Crop, Resize, View, view_of
 from mp4ds.errors import FormatError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.encodings import Pixels
+from mp4ds.messages.depth import metres_of
+from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.options import seconds_text
 from mp4ds.records import Channel
 from mp4ds.video.access import FrameReader, open_file_frames
@@ -110,6 +112,63 @@ class Images(ABC):
             OptionError: It is not known.
         """
         return b""
+
+    # ------------------------------------------------------------ views
+
+    def view(
+        self,
+        format: str = "native",  # noqa: A002 - as users write it
+        resize: Resize = None,
+        crop: Crop = None,
+        *,
+        encoding: str | None = None,
+    ) -> View:
+        """A way of returning the frames.
+
+        Args:
+            format: See `Topic`.
+            resize: See `Topic`.
+            crop: See `Topic`.
+            encoding: What the pixels are, if their messages tell that better than the images'
+                encoding; of the same shape and type.
+
+        Raises:
+            OptionError: The format, crop or size is invalid, or not available for these frames.
+        """
+        return view_of(
+            self.topic,
+            ENCODINGS[encoding or self.encoding],
+            self.image_size,
+            format=format,
+            resize=resize,
+            crop=crop,
+            shows_colours=self.shows_colours and encoding in (None, self.encoding),
+        )
+
+    def pixels(self, picture: Picture, view: View, index: int, out: Pixels | None = None) -> Pixels:
+        """The pixels of a frame in a view.
+
+        Args:
+            picture: Of the frame, decoded with the view's scale.
+            view: See `view`.
+            index: Number of the frame.
+            out: Where to write them; None for an array of their own.
+        """
+        if view.scale:
+            if out is None:
+                return picture[0]
+            if picture[0] is not out:  # the decoder may have written there already
+                np.copyto(out, picture[0])
+            return out
+        made: Pixels = np.empty(view.shape, view.dtype) if out is None else out
+        if view.is_plain:
+            self.write_pixels(picture, made)
+            return made
+        encoding = ENCODINGS[self.encoding]
+        pixels: Pixels = np.empty(encoding.shape(*self.image_size), encoding.dtype)
+        self.write_pixels(picture, pixels)
+        view.give(metres_of(pixels, self.depth_header(index)) if view.in_metres else pixels, made)
+        return made
 
     # ------------------------------------------------------------ damage
 

@@ -185,9 +185,7 @@ class Stream(Images):
 
     def pictures(self, scale: Scale | None) -> Iterator[Picture]:
         """All pictures in order, from a separate decoder that uses all cores."""
-        with self.open_video(sequential=True) as decoder:
-            for _, picture in self.pictures_in_order(decoder, scale=scale):
-                yield picture
+        return (picture for _, picture in self.pictures_at(everything, scale))
 
     @property
     def shows_colours(self) -> bool:  # type: ignore[override]
@@ -215,13 +213,12 @@ class Stream(Images):
             )
         return prefix
 
-    def pictures_in_order(
-        self, decoder: VideoDecoder, choice: Choice = everything, scale: Scale | None = None
+    def pictures_at(
+        self, choice: Choice = everything, scale: Scale | None = None
     ) -> Iterator[tuple[int, Picture]]:
-        """The wanted pictures, each with its number.
+        """The wanted pictures in order, each with its number, from a separate decoder.
 
         Args:
-            decoder: From `open_video`.
             choice: Which are wanted. If all are, the video must end after them.
             scale: See `PictureMaker.make`.
 
@@ -231,7 +228,7 @@ class Stream(Images):
         Raises:
             VideoError: See `VideoDecoder.pictures`.
         """
-        with self.naming_frames():
+        with self.open_video(sequential=True) as decoder, self.naming_frames():
             if self.sound is not None:
                 wanted = self.sound_of(choice(self.columns))
                 for index, picture in decoder.decodable_pictures(wanted, scale):
@@ -249,7 +246,7 @@ class Stream(Images):
     def decodable_pictures(
         self, choice: Choice = everything, scale: Scale | None = None
     ) -> Iterator[tuple[int, Picture | None]]:
-        """Like `pictures_in_order`, but None for a picture that cannot be decoded.
+        """Like `pictures_at`, but None for a picture that cannot be decoded.
 
         Args:
             choice: Which are wanted; asked twice.
@@ -312,8 +309,8 @@ class Stream(Images):
                 for index in self.sound_of(unbroken(choice(self.columns), reader.key_numbers)):
                     yield index, rebuilder.packet_payload(index, reader.packet(index))
             return
-        with self.open_video(sequential=True) as decoder, self.naming_frames():
-            for index, picture in self.pictures_in_order(decoder, choice):
+        with self.naming_frames():
+            for index, picture in self.pictures_at(choice):
                 yield index, rebuilder.payload(index, picture)
 
     def _open_packets(self) -> PacketReader:
@@ -389,6 +386,17 @@ class Stream(Images):
                 rebuilder.payload(index, picture)
             except FormatError as error:
                 yield error
+
+    def recorded_pictures(
+        self, choice: Choice = everything, scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture | None]]:
+        """Like `pictures_at`, but None for a packet that cannot be decoded.
+
+        Such packets refer to others that were lost before they were recorded.
+        """
+        if self.sidecar.body == "packet":
+            return self.decodable_pictures(choice, scale)
+        return self.pictures_at(choice, scale)
 
     def verify_video(self) -> None:
         """Check the video against its SHA-256, for when no message digest would reveal damage.

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.images import Images, Integers
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import Crop, Resize, View, output, view_of
+from mp4ds.dataset.views import Crop, Resize, View, output
 from mp4ds.errors import Mp4dsError, OptionError, missing
 from mp4ds.format.models import Calibration
 from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.depth import metres_of
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.times import StampIndex
 from mp4ds.video.access import FrameReader
@@ -585,7 +584,7 @@ class Topic:
                 pictures = self._pictures(owner, own, view, outs)
                 for index, (number, picture) in zip(wanted, pictures, strict=True):
                     first, *others = places[index]
-                    self._give(owner, number, picture, view, out[first])
+                    self.parts[owner].pixels(picture, view, number, out[first])
                     for place in others:
                         np.copyto(out[place], out[first])
 
@@ -636,38 +635,13 @@ class Topic:
         key, views = repr((format, resize, crop)), self._opened.views
         # no more than one of each part: each holds its own tables
         if owner not in views or views[owner][0] != key:
-            part = self.parts[owner]
-            view = view_of(
-                part.topic,
-                ENCODINGS[part.encoding],
-                part.image_size,
-                format=format,
-                resize=resize,
-                crop=crop,
-                shows_colours=part.shows_colours,
-            )
-            views[owner] = key, view
+            views[owner] = key, self.parts[owner].view(format, resize, crop)
         return views[owner][1]
 
     def _views_alike(self, format: str, resize: Resize, crop: Crop) -> list[View]:  # noqa: A002
         views = [self._view(owner, format, resize, crop) for owner in range(len(self.parts))]
         self._check_alike([(view.encoding.name, view.shape) for view in views])
         return views
-
-    def _give(self, owner: int, number: int, picture: Picture, view: View, out: Pixels) -> None:
-        """Write the view of a picture; `number` is that of the frame in its part."""
-        if view.scale:
-            if picture[0] is not out:
-                np.copyto(out, picture[0])
-            return
-        part = self.parts[owner]
-        if view.is_plain:
-            part.write_pixels(picture, out)
-            return
-        encoding = ENCODINGS[part.encoding]
-        pixels: Pixels = np.empty(encoding.shape(*part.image_size), encoding.dtype)
-        part.write_pixels(picture, pixels)
-        view.give(metres_of(pixels, part.depth_header(number)) if view.in_metres else pixels, out)
 
     def _frame(self, owner: int, number: int, index: int, picture: Picture, view: View) -> Frame:
         """A frame.
@@ -680,12 +654,8 @@ class Topic:
             view: How it is returned.
         """
         part = self.parts[owner]
-        if view.scale:
-            data: Pixels = picture[0]
-        else:
-            data = np.empty(view.shape, view.dtype)
-            with self._opened.lock:
-                self._give(owner, number, picture, view, data)
+        with self._opened.lock:  # a view has tables that one thread uses at a time
+            data = part.pixels(picture, view, number)
         log_time = int(part.log_times[number])
         return Frame(
             data=data,

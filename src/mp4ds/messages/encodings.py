@@ -48,6 +48,11 @@ class Encoding:
     even: tuple[int, int] = (1, 1)
 
     @property
+    def is_plain(self) -> bool:
+        """Whether it can be shown, and resized, as it is: neither a mosaic nor YUV."""
+        return not self.mosaic and self.rows == 1 and self.even == (1, 1)
+
+    @property
     def bytes_per_sample(self) -> int:
         """Bytes of a sample."""
         return int(self.dtype[1])

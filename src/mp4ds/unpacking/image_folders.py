@@ -17,16 +17,15 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.verbatim import VerbatimImages
+from mp4ds.dataset.views import View
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import csv_cell
 from mp4ds.unpacking.pictures import (
     FrameTimes,
     Reduction,
-    Resizing,
     files_of,
     holds_files,
-    pictures_of,
-    resizing_of,
+    resized_view,
 )
 from mp4ds.video.images import ImageFile
 
@@ -45,7 +44,7 @@ class _Files:
         numbers: Their numbers in the topic, shape (frames,).
         is_kept: Which are written, shape (frames,).
         kind: ``png`` or ``jpeg``.
-        resizing: How their pixels are resized.
+        view: How their pixels are resized.
         file: Encodes them; None if their files are written as recorded.
     """
 
@@ -53,7 +52,7 @@ class _Files:
     numbers: NDArray[np.int64]
     is_kept: NDArray[np.bool_]
     kind: str
-    resizing: Resizing
+    view: View
     file: ImageFile | None
 
     def all(self) -> Iterator[tuple[int, bytes | memoryview | None]]:
@@ -66,10 +65,10 @@ class _Files:
         return self._encoded(self.part, self.file)
 
     def _encoded(self, stream: Stream, file: ImageFile) -> Iterator[tuple[int, bytes | None]]:
-        for index, picture in pictures_of(stream, marked(self.is_kept), self.resizing.scale):
+        for index, picture in stream.recorded_pictures(marked(self.is_kept), self.view.scale):
             made = None
             if picture is not None:
-                made = file.encode(self.resizing.pixels(stream, picture))
+                made = file.encode(stream.pixels(picture, self.view, index))
             yield index, made
 
     def _verbatim(self, part: VerbatimImages) -> Iterator[tuple[int, bytes | memoryview | None]]:
@@ -79,7 +78,8 @@ class _Files:
             if self.file is None:
                 yield index, shown.file
             else:
-                yield index, self.file.encode(self.resizing.resize(shown.pixels))
+                pixels = part.pixels((shown.pixels,), self.view, index)
+                yield index, self.file.encode(pixels)
 
 
 @dataclass(frozen=True)
@@ -176,12 +176,12 @@ def topic_images(
         size = reduction.size_of(part)
         keeps_files = size is None and _holds_jpeg(part) and image_format != "png"
         kind = "jpeg" if keeps_files else image_format or "png"
-        resizing = resizing_of(part, size)
+        view = resized_view(part, size)
         try:
             file = None
             if not keeps_files:
-                file = ImageFile(resizing.encoding, kind, quality=jpeg_quality)
-            made.append(_Files(part, numbers, kept, kind, resizing, file))
+                file = ImageFile(view.encoding.name, kind, quality=jpeg_quality)
+            made.append(_Files(part, numbers, kept, kind, view, file))
         except OptionError as error:
             refused[str(error).rstrip(".")] += _readable(part, kept)
     return TopicImages(topic, frames, thinned, refused, made)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,10 +16,9 @@ from mp4ds.dataset.columns import Choice, DecodedColumns, everything, unbroken
 from mp4ds.dataset.images import Images
 from mp4ds.dataset.rebuild import form_for
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import size_after, view_of
+from mp4ds.dataset.views import View, size_after
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.models import Header, StreamSidecar
-from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.depth import (
     DEPTHS,
     HEADER_BYTES,
@@ -35,7 +34,6 @@ from mp4ds.times import intervals, usual_interval
 from mp4ds.unpacking.types import VideoFields, type_of
 from mp4ds.video.images import ImageFile
 from mp4ds.video.packets import PacketReader, StandAlonePackets
-from mp4ds.video.pixels import Scale
 
 _NS = 1_000_000_000
 
@@ -201,17 +199,6 @@ class Given:
 
 
 @dataclass(frozen=True, slots=True)
-class Undecoded:
-    """A message that stays as recorded, since its picture cannot be decoded.
-
-    Attributes:
-        payload: The message.
-    """
-
-    payload: bytes | bytearray
-
-
-@dataclass(frozen=True, slots=True)
 class ImageForm:
     """The form to convert images to.
 
@@ -230,36 +217,27 @@ class ImageForm:
     keeps_format: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Maker:
-    """Makes the new form of an image.
-
-    Attributes:
-        resizing: Applied to its pixels first.
-        give: Makes the form from pixels of that size.
-    """
-
-    resizing: Resizing
-    give: Callable[[Pixels], Given]
+Make = Callable[[Pixels], Given]
+"""Makes the new form of an image from its pixels in a view."""
 
 
-def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
-    """The maker for images with a header.
+def _maker(stream: Stream, header: Header, form: ImageForm) -> tuple[View, Make]:
+    """How images with a header get their new form: the view of their pixels, and what makes it.
 
     Raises:
-        Refused: It has no such form; says why.
+        Refused: They have no such form; says why.
     """
+    sidecar = stream.sidecar
     is_inverse = is_inverse_depth(sidecar, header)
     if is_inverse and len(header.prefix) != 2 * HEADER_BYTES:
         raise Refused("the parameters of its quantised depths are missing")
     recorded = encoding_of(sidecar, header)
-    stored = sidecar.image.encoding if is_inverse else recorded
-    resizing = resizer(sidecar, stored, form.size)
-    encoding = recorded if is_inverse else resizing.encoding
+    view = resized_view(stream, form.size, sidecar.image.encoding if is_inverse else recorded)
+    encoding = recorded if is_inverse else view.encoding.name
     if form.kind == "raw":
         prefix = bytes.fromhex(header.prefix)
         as_metres = partial(metres_of, header=prefix) if is_inverse else None
-        return Maker(resizing, partial(_raw, encoding=encoding, convert=as_metres))
+        return view, partial(_raw, encoding=encoding, convert=as_metres)
     try:
         file = ImageFile(encoding, form.kind, quality=form.jpeg_quality)
     except OptionError:
@@ -267,81 +245,23 @@ def maker(sidecar: StreamSidecar, header: Header, form: ImageForm) -> Maker:
     told = format_of(encoding, form, has_mosaic=form.kind == "png")
     if form.keeps_format and encoding == recorded:
         told = header.format or ""
-    return Maker(resizing, lambda pixels: Given(CodedFields(told), file.encode(pixels)))
+    return view, lambda pixels: Given(CodedFields(told), file.encode(pixels))
 
 
-@dataclass(frozen=True, slots=True)
-class Resizing:
-    """How pixels of a stream are resized.
-
-    Attributes:
-        resize: Resizes them.
-        encoding: Their encoding after that.
-        scale: What the decoder can do directly.
-    """
-
-    resize: Callable[[Pixels], Pixels]
-    encoding: str
-    scale: Scale | None
-
-    def pixels(self, stream: Stream, picture: Picture) -> Pixels:
-        """The resized pixels of a picture that was decoded with `scale`."""
-        if self.scale:
-            return picture[0]
-        return self.resize(stream.rebuilder.pixels(picture))
-
-
-def resizing_of(frames: Images, size: tuple[int, int] | None) -> Resizing:
-    """How to resize the pixels of frames of one size and encoding. See `resizer`."""
-    if isinstance(frames, Stream):
-        return resizer(frames.sidecar, frames.encoding, size)
-    return _resizing(frames.topic, frames.encoding, frames.image_size, size, shows_colours=False)
-
-
-def resizer(sidecar: StreamSidecar, encoding: str, size: tuple[int, int] | None) -> Resizing:
-    """How to resize pixels of a stream.
+def resized_view(images: Images, size: tuple[int, int] | None, encoding: str | None = None) -> View:
+    """The view of images for another size.
 
     Bayer mosaics and camera YUV cannot be resized as they are, and become RGB.
 
     Args:
-        sidecar: The stream's.
-        encoding: Of the pixels.
+        images: The images.
         size: Width and height to make; None to keep them.
+        encoding: See `Images.view`.
     """
-    image, topic = sidecar.image, sidecar.channel.topic
-    shows_colours = sidecar.shows_colours and encoding == image.encoding
-    own = image.width, image.height
-    return _resizing(topic, encoding, own, size, shows_colours=shows_colours)
-
-
-def _resizing(
-    topic: str,
-    encoding: str,
-    own: tuple[int, int],
-    size: tuple[int, int] | None,
-    *,
-    shows_colours: bool,
-) -> Resizing:
     if size is None:
-        return Resizing(lambda pixels: pixels, encoding, None)
-    known = ENCODINGS[encoding]
-    is_plain = not known.mosaic and known.rows == 1 and known.even == (1, 1)
-    view = view_of(
-        topic,
-        known,
-        own,
-        format="native" if is_plain else "rgb",
-        resize=size,
-        crop=None,
-        shows_colours=shows_colours,
-    )
-
-    def resize(pixels: Pixels) -> Pixels:
-        made: Pixels = np.empty(view.shape, view.dtype)
-        view.give(np.ascontiguousarray(pixels, known.dtype), made)
-        return made
-
-    return Resizing(resize, view.encoding.name, view.scale)
+        return replace(images.view(encoding=encoding), scale=None)
+    is_plain = ENCODINGS[encoding or images.encoding].is_plain
+    return images.view("native" if is_plain else "rgb", size, encoding=encoding)
 
 
 def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
@@ -408,10 +328,11 @@ VIDEO_KINDS = ("compressed-video", "ffmpeg")
 
 _VIDEO_CODECS = ("h264", "h265", "av1", "vp9")  # formats of Foxglove's CompressedVideo
 
-Frames = Callable[[Choice, bool], Iterator[tuple[int, Given | Undecoded]]]
+Frames = Callable[[Choice, bool], Iterator[tuple[int, Given | bytes | bytearray]]]
 """Yields each wanted frame of a stream with its number, in order.
 
-Packets come with those they refer to, from a key frame on.
+One whose picture cannot be decoded is the message as recorded. Packets come with those they refer
+to, from a key frame on.
 
 Args:
     choice: Which are wanted.
@@ -432,8 +353,8 @@ def frames_of(stream: Stream, form: ImageForm) -> Frames:
         return _video(stream, form.kind)
     if form.size is None and holds_files(stream.sidecar, form.kind):
         return partial(_own_files, stream, _own_formats(stream.sidecar, form))
-    makers = [maker(stream.sidecar, header, form) for header in stream.sidecar.headers]
-    if stream.sidecar.body == "pixels" and makers[0].resizing.scale is None:
+    makers = [_maker(stream, header, form) for header in stream.sidecar.headers]
+    if stream.sidecar.body == "pixels" and makers[0][0].scale is None:
         return partial(_from_pixels, stream, makers[0], form)
     return partial(_from_pictures, stream, makers)
 
@@ -508,10 +429,10 @@ def _own_files(
 
 
 def _from_pixels(
-    stream: Stream, make: Maker, form: ImageForm, choice: Choice, verify: bool
+    stream: Stream, maker: tuple[View, Make], form: ImageForm, choice: Choice, verify: bool
 ) -> Iterator[tuple[int, Given]]:
     """From raw images, checked against their digests."""
-    image = stream.sidecar.image
+    image, (view, make) = stream.sidecar.image, maker
     fields = ImageFields(image.encoding, image.width, image.height, image.step, image.is_bigendian)
     for index, body in _bodies(stream, choice, verify):
         if form.kind == "raw" and form.size is None:
@@ -525,7 +446,11 @@ def _from_pixels(
             step=image.step,
             is_bigendian=bool(image.is_bigendian),
         )
-        yield index, make.give(make.resizing.resize(pixels))
+        if form.size is not None:
+            seen: Pixels = np.empty(view.shape, view.dtype)
+            view.give(np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("=")), seen)
+            pixels = seen
+        yield index, make(pixels)
 
 
 def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int, memoryview]]:
@@ -539,35 +464,21 @@ def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int,
 
 
 def _from_pictures(
-    stream: Stream, makers: list[Maker], choice: Choice, verify: bool
-) -> Iterator[tuple[int, Given | Undecoded]]:
+    stream: Stream, makers: list[tuple[View, Make]], choice: Choice, verify: bool
+) -> Iterator[tuple[int, Given | bytes | bytearray]]:
     """From the decoded pictures of files and packets."""
     if verify:
         _verify(stream)
-    columns, scale = stream.columns, makers[0].resizing.scale
+    columns, scale = stream.columns, makers[0][0].scale
     with ExitStack() as files:
         packets = None
-        for index, picture in pictures_of(stream, choice, scale):
+        for index, picture in stream.recorded_pictures(choice, scale):
             if picture is not None:
-                make = makers[columns.variant[index]]
-                yield index, make.give(make.resizing.pixels(stream, picture))
+                view, make = makers[columns.variant[index]]
+                yield index, make(stream.pixels(picture, view, index))
                 continue
             packets = packets or files.enter_context(_packets(stream))
-            yield index, Undecoded(stream.rebuilder.packet_payload(index, packets.packet(index)))
-
-
-def pictures_of(
-    stream: Stream, choice: Choice, scale: Scale | None
-) -> Iterator[tuple[int, Picture | None]]:
-    """Pictures of a stream; None for a packet that cannot be decoded.
-
-    Such packets refer to others that were lost before they were recorded.
-    """
-    if stream.sidecar.body == "packet":
-        yield from stream.decodable_pictures(choice, scale)
-        return
-    with stream.open_video(sequential=True) as decoder:
-        yield from stream.pictures_in_order(decoder, choice, scale)
+            yield index, stream.rebuilder.packet_payload(index, packets.packet(index))
 
 
 def _packets(stream: Stream) -> PacketReader:

@@ -23,9 +23,9 @@ from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import (
     VIDEO_KINDS,
     Frames,
+    Given,
     ImageForm,
     Reduction,
-    Undecoded,
     frames_of,
     holds_files,
     is_inverse_depth,
@@ -401,9 +401,9 @@ class Republisher:
         for index, frame in frames(_chosen(plan, choice), choice is everything):
             count += 1
             ordinal = int(columns.ordinal[index])
-            if isinstance(frame, Undecoded):
+            if not isinstance(frame, Given):
                 self._keep(recorded.topic, _NOT_DECODED, 1)
-                yield ordinal, message_at(columns, index, recorded, frame.payload)
+                yield ordinal, message_at(columns, index, recorded, frame)
                 continue
             frame_id = headers[int(columns.variant[index])].frame_id
             slots = Slots(int(columns.stamp[index]), columns.slots(index).seq, index)

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from mp4ds.dataset.columns import marked
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import Placement, View, view_of
+from mp4ds.dataset.views import Placement, View
 from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
-from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
+from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import WHAT, Parsed, SliceOptions, force, option
 from mp4ds.plugins.exporting.motion import ros_type
@@ -194,19 +194,16 @@ class ExportedCamera:
         self.stream.verify_video()
         place_of = np.full(len(self.stream), -1, np.int64)
         place_of[self.numbers] = np.arange(len(self))
-        with self.stream.open_video(sequential=True) as decoder:
-            for index, picture in self.stream.pictures_in_order(decoder, marked(place_of >= 0)):
-                pixels: Pixels = np.empty(self.view.shape, self.view.dtype)
-                self.view.give(self.stream.rebuilder.pixels(picture), pixels)
-                yield int(place_of[index]), pixels
+        for index, picture in self.stream.pictures_at(marked(place_of >= 0), self.view.scale):
+            yield int(place_of[index]), self.stream.pixels(picture, self.view, index)
 
 
 def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:
     known = ENCODINGS[stream.encoding]
     colours = options.pixels if options.pixels in ("rgb", "gray") else "native"
-    if options.pixels == "seen" and not is_plain(known):
+    if options.pixels == "seen" and not known.is_plain:
         colours = "rgb"
-    if colours != "native" and not is_plain(known):
+    if colours != "native" and not known.is_plain:
         kind = "a Bayer mosaic" if known.mosaic else "YUV"
         keeps = (
             ", which --pixels native keeps" if known.mosaic and colours != options.pixels else ""
@@ -214,19 +211,7 @@ def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:
         notes.append(f"{stream.topic}: its pixels are converted from {kind}{keeps}")
     if encoding_as(known, "rgb") is None:
         colours = "native"  # depths and other measurements have no colours
-    return view_of(
-        stream.topic,
-        known,
-        stream.image_size,
-        format=colours,
-        resize=options.reduction.resize,
-        crop=None,
-    )
-
-
-def is_plain(encoding: Encoding) -> bool:
-    """Whether an encoding can be shown directly: neither a mosaic nor YUV."""
-    return not encoding.mosaic and encoding.rows == 1 and encoding.even == (1, 1)
+    return stream.view(colours, options.reduction.resize)
 
 
 # ---------------------------------------------------------------- source

@@ -137,14 +137,8 @@ def pictures_in_order(stream: Stream) -> Iterator[tuple[int, Pixels | None]]:
     Raises:
         VideoError: The video is damaged.
     """
-    make = stream.rebuilder.pixels
-    with stream.open_video(sequential=True) as decoder:
-        if stream.sidecar.body == "packet":
-            for index, picture in decoder.decodable_pictures(range(len(stream))):
-                yield index, None if picture is None else make(picture)
-        else:
-            for index, found in enumerate(decoder.pictures()):
-                yield index, make(found)
+    for index, picture in stream.recorded_pictures():
+        yield index, None if picture is None else stream.rebuilder.pixels(picture)
 
 
 def _sampled(topic: Topic) -> list[Pixels]:
