@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
+import pytest
 import xxhash
 import zstandard
 
@@ -30,12 +30,11 @@ from fuzz_changes import (
     changed_sqlite,
     damaged,
 )
-from in_parts import InlineEngine
+from in_parts import InlineExecutor, use
 from mp4ds import Mp4dsError
 from mp4ds.bags.formats import open_sources
-from mp4ds.packing.manifest import PartFacts
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.workplace import Workplace
+from mp4ds.packing.parts import PartsFolder, part_facts
 from mp4ds.plugins.info import info
 from mp4ds.records import Channel, Excerpt, Loss, Message
 from scenes import Scene
@@ -189,15 +188,14 @@ def _work_kinds(folder: Path) -> dict[str, Kind]:
     place = folder / "work"
     place.mkdir()
     (source,) = SOURCES["bag-none"](place, scene("bayer_rggb8", frames=6))
-    engine = InlineEngine(lambda name: name == "00001-0")
     with suppress(Mp4dsError):
-        _pack(source, place / "drive", engine)
+        _pack(source, place / "drive", InlineExecutor(lambda name: name == "00001"))
     work = ".drive.mp4ds-part"
-    part = f"{work}/parts/00000-0"
+    part = f"{work}/00000"
     if not (place / part).is_dir():
         raise RuntimeError("no part was made")
-    # in its copies, the job names this very recording
-    victims = {"job": [f"{work}/job.json"], "part": [f"{part}/part.json"]}
+    # in its copies, the note of the plan names this very recording
+    victims = {"plan": [f"{work}/plan.json"], "part": [f"{part}/part.json"]}
     others = [f"{part}/{p.name}" for p in sorted((place / part).iterdir())]
     victims["part-files"] = [name for name in others if not name.endswith("part.json")]
     check = partial(_check_work, source=source)
@@ -210,52 +208,30 @@ def _work_kinds(folder: Path) -> dict[str, Kind]:
 def _make_work(folder: Path, rng: random.Random, *, good: Path, victims: list[str]) -> None:
     shutil.copytree(good, folder, dirs_exist_ok=True)
     victim = folder / rng.choice(victims)
-    data = victim.read_bytes()
-    if victim.suffix == ".json" and rng.random() < 0.8:  # with a checksum that fits
-        data = _kept(damaged(_text_of(data), rng))
-    else:
-        data = damaged(data, rng)
-    victim.write_bytes(data)
-
-
-_MARK = b',\n"xxh64": "'
-
-
-def _text_of(data: bytes) -> bytes:
-    return data.rpartition(_MARK)[0]
-
-
-def _kept(text: bytes) -> bytes:
-    """A file as a divided pack keeps it, with its checksum."""
-    return text + _MARK + xxhash.xxh64_hexdigest(text).encode() + b'"}\n'
+    victim.write_bytes(damaged(victim.read_bytes(), rng))
 
 
 def _check_work(folder: Path, out: Path, rng: random.Random, *, source: Path) -> str:
     shutil.copytree(folder, out, dirs_exist_ok=True)
-    place = Workplace(out / ".drive.mp4ds-part")
-    job_file = place.folder / "job.json"
-    text = _text_of(job_file.read_bytes())
-    if _kept(text) == job_file.read_bytes():  # let it be one that was begun there
-        inode = place.folder.lstat().st_ino
-        job_file.write_bytes(_kept(re.sub(rb'"place": \d+', b'"place": %d' % inode, text)))
+    place = PartsFolder(out / "drive")
+    # let it be one that was begun there
+    inode, path = place.path.lstat().st_ino, place.path / "plan.json"
+    path.write_bytes(re.sub(rb'"inode": \d+', b'"inode": %d' % inode, path.read_bytes()))
     with suppress(Mp4dsError):
-        job = place.job(shared=rng.random() < 0.5)
-        if job is not None:
-            [place.is_done(task) for task in job.tasks]
-    with suppress(Mp4dsError):
-        PartFacts.load(place.parts / "00000-0")
+        place.note()
+    part_facts(place.path / "00000")
     if rng.random() < 0.25:
-        _pack(source, out / "drive", InlineEngine())
+        _pack(source, out / "drive", InlineExecutor())
         if problems := mp4ds.validate(out / "drive", deep=True):
             raise BrokenRuleError(f"what was packed has a problem: {problems[0]}")
         return "packed"
     return "read"
 
 
-def _pack(source: Path, target: Path, engine: InlineEngine) -> None:
-    packing: Any = import_module("mp4ds.packing.pack")
-    packing._engine = lambda *_: engine
-    mp4ds.pack(source, target, _PACK)
+def _pack(source: Path, target: Path, executor: InlineExecutor) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        use(patch, executor)
+        mp4ds.pack(source, target, _PACK)
 
 
 # ---------------------------------------------------------------- rules

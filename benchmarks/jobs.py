@@ -55,7 +55,7 @@ def run(source: Path, target: Path, options: list[str], until: int = 0) -> tuple
     command = [sys.executable, "-m", "mp4ds", "-q", "pack", source, "-o", target, *options]
     process = subprocess.Popen(list(map(str, command)), start_new_session=True)
     root, cpu, peak = psutil.Process(process.pid), {}, 0
-    parts = target.with_name(f".{target.name}.mp4ds-part") / "parts"
+    parts = target.with_name(f".{target.name}.mp4ds-part")
     while process.poll() is None:
         resident = 0
         try:
@@ -65,7 +65,7 @@ def run(source: Path, target: Path, options: list[str], until: int = 0) -> tuple
         except psutil.Error:  # it has just ended
             pass
         peak = max(peak, resident)
-        if until and len(list(parts.glob("*/part.json"))) >= until:
+        if until and len(list(parts.glob("0*/dataset.yaml"))) >= until:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
             break

@@ -2,44 +2,72 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import pytest
 
 from mp4ds.errors import Mp4dsError
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, load_stream
-from mp4ds.packing.engine import Outcome
-from mp4ds.packing.work import run_task
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.parts import PartPacker
+from mp4ds.packing.processes import CallError
+
+WORK = ".dataset.mp4ds-part"
+
+_ExecutorT = TypeVar("_ExecutorT", bound=Executor)
 
 
-class InlineEngine:
-    """Runs tasks one after the other; see `mp4ds.packing.engine.Engine`.
+class InlineExecutor(Executor):
+    """Makes calls at once, in this thread.
 
     Args:
-        fails: Whether a task is to fail, by its name.
+        fails: Whether a piece is to fail, by its name.
+
+    Attributes:
+        ran: Names of the pieces that were packed.
+        keep_going: Whether calls after one that failed are made.
     """
 
     def __init__(self, fails: Callable[[str], bool] = lambda _: False) -> None:
         self.ran: list[str] = []
+        self.keep_going = False
         self._fails = fails
+        self._has_failed = False
 
-    def run(
-        self,
-        tasks: Sequence[tuple[str, ...]],
-        on_progress: Callable[[tuple[str, ...], dict[str, Any]], None],
-    ) -> Iterator[Outcome]:
-        for task in tasks:
-            folder, name = task
-            if self._fails(name):
-                yield Outcome(task, ("WriteError", "the disk is full"))
-                continue
-            self.ran.append(name)
-            try:
-                run_task(folder, name, lambda told, task=task: on_progress(task, told))
-            except (Mp4dsError, OSError) as error:
-                yield Outcome(task, (type(error).__name__, str(error)))
-            else:
-                yield Outcome(task)
+    def __enter__(self) -> InlineExecutor:
+        self._has_failed = False
+        return self
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        if self._has_failed and not self.keep_going:
+            return future  # nobody waits for it
+        try:
+            if isinstance(fn, PartPacker):
+                (name,) = (piece.name for piece in args)
+                if self._fails(name):
+                    raise CallError("the disk is full")
+                self.ran.append(name)
+            future.set_result(fn(*args, **kwargs))
+        except (Mp4dsError, OSError, CallError) as error:
+            self._has_failed = True
+            future.set_exception(error)
+        return future
+
+
+def use(monkeypatch: pytest.MonkeyPatch, executor: _ExecutorT) -> _ExecutorT:
+    """Have pieces packed by an executor."""
+
+    def chosen(_: object, options: PackOptions) -> Executor:
+        if isinstance(executor, InlineExecutor):
+            executor.keep_going = options.keep_going
+        return executor
+
+    monkeypatch.setattr("mp4ds.packing.pack._executor", chosen)
+    return executor
 
 
 def facts(dataset: Path) -> dict[str, Any]:

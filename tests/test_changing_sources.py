@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 import mp4ds
-from in_parts import InlineEngine, leftovers
+from in_parts import InlineExecutor, leftovers, use
 from mp4ds.errors import SourceError
-from mp4ds.packing import work
+from mp4ds.packing.packer import Packer
 from mp4ds.plugins.importing import ros_mp4
 from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
 from sources import SOURCES, scene
@@ -120,14 +120,14 @@ def test_a_source_that_changes_while_it_is_packed_in_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, file = recording("bag-none", tmp_path / "source")
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: InlineEngine())
-    make = work.Tasks._pack
+    use(monkeypatch, InlineExecutor())
+    make = Packer.run
 
-    def changing(*arguments: Any) -> None:
+    def changing(packer: Packer) -> Any:
         replace(file)
-        make(*arguments)
+        return make(packer)
 
-    monkeypatch.setattr(work.Tasks, "_pack", changing)
+    monkeypatch.setattr(Packer, "run", changing)
     options = mp4ds.PackOptions(codec="ffv1", gop=2, window=2)
     with pytest.raises(mp4ds.PartsFailedError, match="changed while it was being read"):
         mp4ds.pack(path, tmp_path / "dataset", options)

@@ -1,4 +1,4 @@
-"""Tasks on the workers of a Dask cluster, and what becomes of them when machines die."""
+"""Calls on the workers of a Dask cluster, and what becomes of them when machines die."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import ssl
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, as_completed, wait
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
@@ -23,10 +24,10 @@ from distributed import Security
 import cluster_tasks
 from clusters import WITH_NANNY, RealCluster, Relay
 from mp4ds.errors import ClusterError, OptionError
-from mp4ds.packing.engine import Engine, Outcome
+from mp4ds.packing.processes import CallError
 from mp4ds.plugins import cluster as access
-from mp4ds.plugins.cluster import ClusterEngine, Connection
-from waiting import WATCHDOG_S, until
+from mp4ds.plugins.cluster import ClusterExecutor
+from waiting import until
 
 
 @pytest.fixture(autouse=True)
@@ -43,23 +44,18 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCluster]:
         yield cluster
 
 
-def tasks_in(folder: Path, *names: str) -> list[tuple[str, ...]]:
-    return [(str(folder), name) for name in names]
-
-
 def numbered(count: int) -> list[str]:
     return [f"{number:03}" for number in range(count)]
 
 
-def run(engine: Engine, tasks: list[tuple[str, ...]]) -> dict[str, Outcome]:
-    """Run tasks; by name, their outcomes."""
-    outcomes = list(engine.run(tasks, lambda *_: None))
-    assert sorted(outcome.task for outcome in outcomes) == sorted(tasks)
-    return {outcome.task[1]: outcome for outcome in outcomes}
-
-
-def errors(outcomes: dict[str, Outcome]) -> dict[str, tuple[str, str]]:
-    return {name: outcome.error for name, outcome in outcomes.items() if outcome.error}
+def errors(
+    executor: Executor, function: Callable[[str, str], None], folder: Path, *names: str
+) -> dict[str, BaseException]:
+    """Make a call for each name; by name, their errors."""
+    with executor:
+        calls = {name: executor.submit(function, str(folder), name) for name in names}
+        found = {name: call.exception() for name, call in calls.items()}
+    return {name: error for name, error in found.items() if error is not None}
 
 
 def results(folder: Path) -> dict[str, bytes]:
@@ -70,71 +66,69 @@ def started(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.by-*"))
 
 
-# ---------------------------------------------------------------- tasks
+# ---------------------------------------------------------------- calls
 
 
-def test_all_tasks_run(cluster: RealCluster, tmp_path: Path) -> None:
+def test_all_calls_are_made(cluster: RealCluster, tmp_path: Path) -> None:
     names = numbered(12)
-    engine = ClusterEngine(cluster_tasks.write, cluster.address)
-    assert not errors(run(engine, tasks_in(tmp_path, *names)))
+    executor = ClusterExecutor(cluster.address, 12)
+    assert not errors(executor, cluster_tasks.write, tmp_path, *names)
     assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
     assert len({path.suffix for path in started(tmp_path)}) == 2  # processes: both worked
     assert len(started(tmp_path)) == len(names)  # once each
 
 
-def test_no_tasks_need_no_cluster() -> None:
-    engine = ClusterEngine(cluster_tasks.write, "tcp://127.0.0.1:1")
-    assert run(engine, []) == {}
+def test_results_and_arguments(cluster: RealCluster) -> None:
+    with ClusterExecutor(cluster.address, 2) as executor:
+        calls = [executor.submit(int, "11", base=base) for base in range(2, 12)]
+        assert [call.result() for call in calls] == list(range(3, 13))
 
 
-def test_outcomes_come_as_tasks_end(cluster: RealCluster, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, cluster.address)
-    with closing(engine.run(tasks_in(tmp_path, *numbered(50)), lambda *_: None)) as outcomes:
-        next(outcomes)
-        assert len(results(tmp_path)) < 50
+def test_no_calls_need_no_cluster() -> None:
+    with ClusterExecutor("tcp://127.0.0.1:1", 1):
+        pass
 
 
-def test_errors_of_tasks_are_told_and_not_tried_again(cluster: RealCluster, tmp_path: Path) -> None:
+def test_errors_of_calls_are_told_and_not_tried_again(cluster: RealCluster, tmp_path: Path) -> None:
     names = ["source", "disk", "odd", "silent", "memory", "fine"]
-    engine = ClusterEngine(cluster_tasks.fail, cluster.address)
-    found = errors(run(engine, tasks_in(tmp_path, *names)))
-    for name, kind, sentence in [
-        ("source", "SourceError", "drive.bag: is damaged. Copy it again."),
-        ("disk", "OSError", "[Errno 28] No space left on device"),
-        ("odd", "OddError", "strange"),
-        ("silent", "RuntimeError", "RuntimeError"),
-        ("memory", "MemoryError", "out of memory."),
+    executor = ClusterExecutor(cluster.address, 6)
+    found = errors(executor, cluster_tasks.fail, tmp_path, *names)
+    for name, sentence in [
+        ("source", "drive.bag: is damaged. Copy it again."),
+        ("disk", "a file: No space left on device"),
+        ("odd", "strange"),
+        ("silent", "RuntimeError"),
+        ("memory", "out of memory"),
     ]:
-        assert found[name][0] == kind
-        assert re.fullmatch(
-            rf"on worker tcp://127.0.0.1:\d+: {re.escape(sentence)}", found[name][1]
-        )
+        said = rf"on worker tcp://127.0.0.1:\d+: {re.escape(sentence)}"
+        assert isinstance(found[name], CallError)
+        assert re.fullmatch(said, str(found[name]))
     assert "fine" not in found
     assert all((tmp_path / name).read_text() == "once\n" for name in names)
 
 
 def test_a_function_that_the_cluster_lacks(tmp_path: Path) -> None:
     with RealCluster(tmp_path / "dask", workers=1, path=tmp_path) as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address)
-        found = errors(run(engine, tasks_in(tmp_path, "a", "b")))
-    assert {kind for kind, _ in found.values()} == {"Failed"}
-    for _, sentence in found.values():
-        assert "No module named 'cluster_tasks'" in sentence
-        assert "The same version of mp4ds must be installed" in sentence
+        found = errors(ClusterExecutor(cluster.address, 2), cluster_tasks.write, tmp_path, "a", "b")
+    for error in found.values():
+        assert "No module named 'cluster_tasks'" in str(error)
+        assert "The same version of mp4ds must be installed" in str(error)
+    assert len(found) == 2
 
 
-def test_closing_drops_what_waits_and_leaves_the_cluster(
+def test_an_error_of_the_caller_drops_what_waits_and_leaves_the_cluster(
     cluster: RealCluster, tmp_path: Path
 ) -> None:
-    engine = ClusterEngine(cluster_tasks.write, cluster.address)
-    outcomes = engine.run(tasks_in(tmp_path, *numbered(50)), lambda *_: None)
-    with closing(outcomes):
-        assert next(outcomes).error is None
+    with pytest.raises(KeyError), ClusterExecutor(cluster.address, 2) as executor:  # noqa: PT012
+        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in numbered(50)]
+        next(as_completed(calls)).result()
+        raise KeyError
     begun = len(started(tmp_path))
     time.sleep(4 * cluster_tasks.SECONDS)
     assert len(started(tmp_path)) <= begun + 2  # those that workers had fetched
     (tmp_path / "next").mkdir()
-    assert not errors(run(engine, tasks_in(tmp_path / "next", *numbered(4))))
+    executor = ClusterExecutor(cluster.address, 2)
+    assert not errors(executor, cluster_tasks.write, tmp_path / "next", *numbered(4))
     assert cluster.scheduler.poll() is None
     assert all(worker.poll() is None for worker in cluster.workers)
 
@@ -142,21 +136,23 @@ def test_closing_drops_what_waits_and_leaves_the_cluster(
 # ---------------------------------------------------------------- memory
 
 
-def test_a_task_leaves_no_memory_behind(cluster: RealCluster, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.leave_large, cluster.address)
-    assert not errors(run(engine, tasks_in(tmp_path, *numbered(4))))
+def test_a_call_leaves_no_memory_behind(cluster: RealCluster, tmp_path: Path) -> None:
+    executor = ClusterExecutor(cluster.address, 4)
+    assert not errors(executor, cluster_tasks.leave_large, tmp_path, *numbered(4))
     assert len(list(tmp_path.glob("*.freed"))) == 4
 
 
 # ---------------------------------------------------------------- deaths
 
 
-def test_tasks_of_a_killed_worker_run_on_another(tmp_path: Path) -> None:
+def test_calls_of_a_killed_worker_are_made_on_another(tmp_path: Path) -> None:
     names = numbered(8)
-    with RealCluster(tmp_path / "dask") as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address)
-        outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
-        done = [next(outcomes)]
+    with (
+        RealCluster(tmp_path / "dask") as cluster,
+        ClusterExecutor(cluster.address, 8) as executor,
+    ):
+        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in names]
+        next(as_completed(calls))
         victim = cluster.workers[0]
         mine = f"*.by-{victim.pid}"
 
@@ -166,107 +162,83 @@ def test_tasks_of_a_killed_worker_run_on_another(tmp_path: Path) -> None:
         until(is_at_work)
         victim.kill()
         unfinished = [p.stem for p in tmp_path.glob(mine) if not p.with_suffix("").exists()]
-        done += outcomes
-    assert unfinished
-    assert not any(outcome.error for outcome in done)
-    assert sorted(outcome.task[1] for outcome in done) == names
+        assert unfinished
+        assert [call.exception() for call in calls] == [None] * 8
     assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
     for name in unfinished:
         assert len(list(tmp_path.glob(f"{name}.by-*"))) == 2
 
 
-def test_a_task_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
+def test_a_call_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
     config = {
         "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
         "DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION": "1.0",
     }
     # more workers than it kills: on a loaded machine a nanny may not bring one back
     with RealCluster(tmp_path / "dask", workers=4, arguments=WITH_NANNY, config=config) as cluster:
-        engine = ClusterEngine(cluster_tasks.die, cluster.address)
-        found = errors(run(engine, tasks_in(tmp_path, "deadly", *numbered(6))))
+        executor = ClusterExecutor(cluster.address, 7)
+        found = errors(executor, cluster_tasks.die, tmp_path, "deadly", *numbered(6))
     assert set(found) == {"deadly"}
-    kind, sentence = found["deadly"]
-    assert kind == "Killed"
-    assert sentence.startswith("2 workers died on it, perhaps for lack of memory")
+    assert str(found["deadly"]).startswith("2 workers died on it, perhaps for lack of memory")
 
 
 @pytest.mark.slow
 def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -> None:
     names = numbered(8)
-    with RealCluster(tmp_path / "dask") as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address)
-        outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
-        next(outcomes)
+    with (
+        RealCluster(tmp_path / "dask") as cluster,
+        ClusterExecutor(cluster.address, 8) as executor,
+    ):
+        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in names]
+        next(as_completed(calls))
         cluster.scheduler.kill()
-        with pytest.raises(ClusterError, match="run the same command again to resume"):
-            list(outcomes)
+        found = [error for call in calls if (error := call.exception())]
+        assert found
+        assert all(isinstance(error, ClusterError) for error in found)
+        assert all("run the same command again to resume" in str(error) for error in found)
+        with pytest.raises(ClusterError):
+            executor.submit(os.getpid)
     kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("0??")}
     assert 0 < len(kept) < len(names)
     with RealCluster(tmp_path / "dask-2", workers=1) as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address)
-        assert not errors(run(engine, tasks_in(tmp_path, *names)))
+        executor = ClusterExecutor(cluster.address, 8)
+        assert not errors(executor, cluster_tasks.write, tmp_path, *names)
     assert results(tmp_path).keys() >= set(names)
     assert all((tmp_path / name).stat().st_mtime_ns == kept[name] for name in kept)
 
 
 def test_a_broken_connection_is_made_again(cluster: RealCluster, tmp_path: Path) -> None:
     names = numbered(8)
-    with Relay(cluster.address) as relay:
-        engine = ClusterEngine(cluster_tasks.write, relay.address)
-        outcomes = engine.run(tasks_in(tmp_path, *names), lambda *_: None)
-        done = [next(outcomes)]
+    with Relay(cluster.address) as relay, ClusterExecutor(relay.address, 8) as executor:
+        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in names]
+        next(as_completed(calls))
         relay.break_connections()
-        done += outcomes
-    assert sorted(outcome.task[1] for outcome in done) == names
-    assert not any(outcome.error for outcome in done)
+        assert [call.exception() for call in calls] == [None] * 8
     assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
 
 
-def test_a_cluster_without_workers_is_given_up(tmp_path: Path) -> None:
+def test_a_cluster_without_workers_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(access, "_LOOK_SECONDS", 0.5)
     with (
         RealCluster(tmp_path / "dask", workers=0) as cluster,
         dask.config.set({"mp4ds.worker-timeout": "1 s"}),
     ):
-        engine = ClusterEngine(cluster_tasks.write, cluster.address)
-        with pytest.raises(ClusterError, match="has had no worker for 1 s"):
-            run(engine, tasks_in(tmp_path, "a"))
+        executor = ClusterExecutor(cluster.address, 1)
+        found = errors(executor, cluster_tasks.write, tmp_path, "a")
+        assert "has had no worker for 1 s" in str(found["a"])
 
 
 def test_workers_may_come_late(tmp_path: Path) -> None:
-    with RealCluster(tmp_path / "dask", workers=0) as cluster:
-        engine = ClusterEngine(cluster_tasks.write, cluster.address)
-        timer = threading.Timer(1, cluster.add_worker)
-        timer.start()
-        assert not errors(run(engine, tasks_in(tmp_path, "a")))
-        timer.join()
-
-
-@pytest.mark.slow
-def test_a_scheduler_that_was_lost_between_two_runs(tmp_path: Path) -> None:
-    with (
-        RealCluster(tmp_path / "dask", workers=1) as cluster,
-        Connection(cluster.address, 1) as connection,
-    ):
-        engine = ClusterEngine(cluster_tasks.write, connection)
-        assert not errors(run(engine, tasks_in(tmp_path, "a")))
-        cluster.scheduler.kill()
-        with pytest.raises(ClusterError, match="run the same command again to resume"):
-            run(engine, tasks_in(tmp_path, "b"))
-
-
-def test_time_between_two_runs_is_no_waiting(tmp_path: Path) -> None:
     with (
         RealCluster(tmp_path / "dask", workers=0) as cluster,
-        dask.config.set({"mp4ds.worker-timeout": "30 s"}),
-        Connection(cluster.address, 1) as connection,
+        ClusterExecutor(cluster.address, 1) as executor,
     ):
-        _, watch = connection.way()
-        watch.look()  # there is no worker
-        watch._empty_since = time.monotonic() - 60
+        call = executor.submit(os.getpid)
         timer = threading.Timer(1, cluster.add_worker)
         timer.start()
-        engine = ClusterEngine(cluster_tasks.write, connection)
-        assert not errors(run(engine, tasks_in(tmp_path, "a")))
+        call.result()
         timer.join()
 
 
@@ -282,7 +254,7 @@ def test_time_between_two_runs_is_no_waiting(tmp_path: Path) -> None:
 )
 def test_other_addresses_are_refused(address: str) -> None:
     with pytest.raises(OptionError, match=r"tcp://HOST:PORT .* slurm, pbs,"):
-        ClusterEngine(cluster_tasks.write, address)
+        ClusterExecutor(address, 1)
 
 
 @pytest.mark.parametrize(
@@ -296,7 +268,7 @@ def test_a_missing_package_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(OptionError, match=rf"needs {package}.*pip install 'mp4ds\[cluster\]'"):
-        ClusterEngine(cluster_tasks.write, address)
+        ClusterExecutor(address, 1)
 
 
 @pytest.fixture
@@ -307,9 +279,8 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tcp://no-such-host.invalid:8786"])
 def test_nobody_at_the_address(address: str, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, address)
     with pytest.raises(ClusterError, match="no Dask scheduler can be reached"):
-        run(engine, tasks_in(tmp_path, "a"))
+        errors(ClusterExecutor(address, 1), cluster_tasks.write, tmp_path, "a")
 
 
 @pytest.mark.usefixtures("impatient")
@@ -336,18 +307,16 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
         thread = threading.Thread(target=serve, args=(server,))
         thread.start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        engine = ClusterEngine(cluster_tasks.write, address)
         with pytest.raises(ClusterError, match=problem):
-            run(engine, tasks_in(tmp_path, "a"))
+            errors(ClusterExecutor(address, 1), cluster_tasks.write, tmp_path, "a")
         thread.join()
     for connection in kept:
         connection.close()
 
 
 def test_tls_needs_certificates(tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "tls://127.0.0.1:1")
     with pytest.raises(OptionError, match="needs certificates"):
-        run(engine, tasks_in(tmp_path, "a"))
+        errors(ClusterExecutor("tls://127.0.0.1:1", 1), cluster_tasks.write, tmp_path, "a")
 
 
 def is_alive(pid: int) -> bool:
@@ -359,8 +328,8 @@ def is_alive(pid: int) -> bool:
 
 
 def test_a_cluster_on_this_machine(tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "local")
-    assert not errors(run(engine, tasks_in(tmp_path, *numbered(4))))
+    executor = ClusterExecutor("local", 4)
+    assert not errors(executor, cluster_tasks.write, tmp_path, *numbered(4))
     workers = {int(path.suffix.removeprefix(".by-")) for path in started(tmp_path)}
     assert os.getpid() not in workers
     until(lambda: not any(map(is_alive, workers)))
@@ -389,10 +358,10 @@ def test_strangers_do_not_reach_a_cluster_on_this_machine() -> None:
     other = Security.temporary().get_connection_args("client")["ssl_context"]
     other.check_hostname, other.verify_mode = False, ssl.CERT_NONE
     before = listening()
-    with Connection("local", 2) as connection:
-        client, _ = connection.way()
-        client.wait_for_workers(2, timeout=WATCHDOG_S)
-        assert client.submit(os.getpid).result() != os.getpid()
+    with ClusterExecutor("local", 2) as executor:
+        calls = [executor.submit(time.sleep, 1) for _ in range(2)]  # on one worker each
+        assert executor.submit(os.getpid).result() != os.getpid()
+        wait(calls)
         found = listening() - before
         assert found
         assert {host for host, _ in found} == {"127.0.0.1"}
@@ -458,30 +427,17 @@ def batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Batch]:
     until(lambda: not any(map(is_alive, system.numbers("jobs"))))
 
 
-def test_jobs_of_a_batch_system_run_the_tasks(batch: Batch, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "slurm")
+def test_jobs_of_a_batch_system_make_the_calls(batch: Batch, tmp_path: Path) -> None:
     with dask.config.set({"mp4ds.jobs": 2}):
-        assert not errors(run(engine, tasks_in(tmp_path, *numbered(8))))
+        executor = ClusterExecutor("slurm", 8)
+        assert not errors(executor, cluster_tasks.write, tmp_path, *numbered(8))
     assert len(batch.numbers("jobs")) == 2
 
 
 @pytest.mark.slow
-def test_there_are_not_more_jobs_than_tasks(batch: Batch, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "slurm")
-    assert not errors(run(engine, tasks_in(tmp_path, "a")))
+def test_there_are_not_more_jobs_than_calls(batch: Batch, tmp_path: Path) -> None:
+    assert not errors(ClusterExecutor("slurm", 1), cluster_tasks.write, tmp_path, "a")
     assert len(batch.numbers("jobs")) == 1
-
-
-@pytest.mark.slow
-def test_runs_of_one_connection_share_its_jobs(batch: Batch, tmp_path: Path) -> None:
-    with Connection("slurm", 2) as connection:
-        assert batch.numbers("jobs") == []
-        for folder, names in [("a", numbered(3)), ("b", numbered(2))]:
-            (tmp_path / folder).mkdir()
-            engine = ClusterEngine(cluster_tasks.write, connection)
-            assert not errors(run(engine, tasks_in(tmp_path / folder, *names)))
-        assert len(batch.numbers("jobs")) == 2
-        assert batch.numbers("cancelled") == []
 
 
 @pytest.mark.slow
@@ -489,22 +445,18 @@ def test_a_job_that_ended_is_submitted_again(
     batch: Batch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(access, "_LOOK_SECONDS", 0.5)
-    engine = ClusterEngine(cluster_tasks.write, "slurm")
-    with dask.config.set({"mp4ds.jobs": 1}):
-        outcomes = engine.run(tasks_in(tmp_path, *numbered(6)), lambda *_: None)
-        done = [next(outcomes)]
+    with dask.config.set({"mp4ds.jobs": 1}), ClusterExecutor("slurm", 6) as executor:
+        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in numbered(6)]
+        next(as_completed(calls))
         os.killpg(batch.numbers("jobs")[0], signal.SIGKILL)
-        done += outcomes
-    assert not any(outcome.error for outcome in done)
-    assert sorted(outcome.task[1] for outcome in done) == numbered(6)
+        assert [call.exception() for call in calls] == [None] * 6
     assert len(batch.numbers("jobs")) == 2
 
 
 def test_what_the_batch_system_refuses_is_told(batch: Batch, tmp_path: Path) -> None:
     (batch.folder / "refuse").touch()
-    engine = ClusterEngine(cluster_tasks.write, "slurm")
     with pytest.raises(ClusterError, match=r"could not be submitted.*invalid partition specified"):
-        run(engine, tasks_in(tmp_path, "a", "b"))
+        errors(ClusterExecutor("slurm", 2), cluster_tasks.write, tmp_path, "a")
 
 
 @pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
@@ -517,16 +469,14 @@ def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
         "scheduler-options": {"host": "127.0.0.1", "dashboard_address": ":0"},
     }
     named = {f"jobqueue.{system}.{name}": value for name, value in settings.items()}
-    engine = ClusterEngine(cluster_tasks.write, system)
     with dask.config.set(named), pytest.raises(ClusterError, match="could not be submitted"):
-        run(engine, tasks_in(tmp_path, "a"))
+        errors(ClusterExecutor(system, 1), cluster_tasks.write, tmp_path, "a")
 
 
 @pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
 def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
-    engine = ClusterEngine(cluster_tasks.write, system)
     with pytest.raises(OptionError, match=rf"`cluster` {system}: .*jobqueue.yaml"):
-        run(engine, tasks_in(tmp_path, "a"))
+        errors(ClusterExecutor(system, 1), cluster_tasks.write, tmp_path, "a")
 
 
 @pytest.mark.parametrize(
@@ -537,6 +487,5 @@ def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
 def test_settings_are_checked(
     name: str, value: object, variable: str, batch: Batch, tmp_path: Path
 ) -> None:
-    engine = ClusterEngine(cluster_tasks.write, "slurm")
     with dask.config.set({name: value}), pytest.raises(OptionError, match=variable):
-        run(engine, tasks_in(tmp_path, "a"))
+        errors(ClusterExecutor("slurm", 1), cluster_tasks.write, tmp_path, "a")

@@ -26,18 +26,19 @@ import pytest
 
 import mp4ds
 from commands import NEEDS_ROOT, run, start, tree
-from in_parts import InlineEngine, facts, leftovers
+from in_parts import WORK, InlineExecutor, facts, leftovers, use
 from mp4ds.errors import Mp4dsError, PartsFailedError, SourceError, TargetError, WriteError
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.work import command
+from mp4ds.packing.parts import PartPacker
+from mp4ds.packing.planning import Piece
+from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.plugins.demo import demo
 from round_trips import Compare, unpacked
 from sources import SOURCES, scene
 from waiting import WATCHDOG_S, until
 
 IN_PARTS = PackOptions(window=3, codec="h264")
-PARTS = ["00000-0", "00001-0"]
-WORK = ".dataset.mp4ds-part"
+PARTS = ["00000", "00001"]
 PAGE = 4096
 KINDS = ["bag-none", "mcap-ros2-zstd", "rosbag2-sqlite3-v9", "rosbag2-mcap-v9"]
 AGAIN = "run the same command again to resume"
@@ -73,20 +74,15 @@ def undisturbed(source: Path, folder: Path) -> dict[str, Any]:
     return facts(folder / "undisturbed")
 
 
-def use(monkeypatch: pytest.MonkeyPatch, engine: InlineEngine) -> InlineEngine:
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: engine)
-    return engine
-
-
-def before_task(name: str, action: Callable[[], object]) -> InlineEngine:
-    """An engine that does something before it runs a task."""
+def before_task(name: str, action: Callable[[], object]) -> InlineExecutor:
+    """An executor that does something before it runs a task."""
 
     def meanwhile(task: str) -> bool:
         if task == name:
             action()
         return False
 
-    return InlineEngine(meanwhile)
+    return InlineExecutor(meanwhile)
 
 
 @contextmanager
@@ -119,12 +115,12 @@ def goes_on(
     source: Path, target: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> list[str]:
     """The same command ends well; returns the tasks that it ran."""
-    engine = use(monkeypatch, InlineEngine())
+    executor = use(monkeypatch, InlineExecutor())
     mp4ds.pack(source, target, IN_PARTS)
     assert facts(target) == expected
     assert mp4ds.validate(target, deep=True) == []
     assert leftovers(target.parent) == []
-    return engine.ran
+    return executor.ran
 
 
 # ---------------------------------------------------------------- a disk that is full
@@ -132,14 +128,19 @@ def goes_on(
 
 REACHED = {
     "pages": {("00000", "nothing"), ("00001", "mp4"), ("00001", "yaml"), ("joined", "yaml")},
-    "files": {("00000", "nothing"), ("00001", "yaml"), ("joined", "nothing"), ("joined", "yaml")},
+    "files": {
+        ("00000", "nothing"),
+        ("00001", "part.json"),
+        ("joined", "nothing"),
+        ("joined", "yaml"),
+    },
 }
 """Where packs must have been interrupted for this to be a test: folder, and last file in it."""
 
 
 def _state(work: Path) -> str:
     """The last file, in the order of their making, of which something was written."""
-    order = ["job.json", "mp4", "messages.mcap", "yaml", "part.json", "dataset.yaml"]
+    order = ["plan.json", "mp4", "messages.mcap", "yaml", "part.json", "dataset.yaml"]
     found = {path.name for path in work.rglob("*") if path.is_file() and path.stat().st_size}
     kinds = {name if name in order else name.rpartition(".")[2] for name in found}
     return max((kind for kind in kinds if kind in order), key=order.index, default="nothing")
@@ -152,10 +153,9 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> set[tuple[str, str]]:
     remove = shutil.rmtree
 
     def spy(folder: Path, *args: Any, **options: Any) -> None:
-        if folder.name == "dataset" or folder.name.startswith("."):
-            kind = "joined" if folder.name == "dataset" else folder.name[1:6]
-            if folder.is_dir() and folder.parent.name != "mp4ds":
-                seen.add((kind, _state(folder)))
+        if folder.name.startswith(".") and folder.is_dir():
+            kind = "joined" if folder.name.startswith(".dataset.") else folder.name[1:6]
+            seen.add((kind, _state(folder)))
         remove(folder, *args, **options)
 
     monkeypatch.setattr("shutil.rmtree", spy)
@@ -188,7 +188,7 @@ def test_a_disk_that_is_full_at_any_moment(
             [f"size={number * PAGE}"] if limit == "pages" else ["size=64m", f"nr_inodes={number}"]
         )
         with disk_of(tmp_path / "disk", *options) as disk:
-            use(monkeypatch, InlineEngine())
+            use(monkeypatch, InlineExecutor())
             error = refusal(source, disk / "dataset")
             if error is None:
                 break
@@ -197,7 +197,6 @@ def test_a_disk_that_is_full_at_any_moment(
             assert str(disk) in str(error)
             assert error.exit_code == 1
             assert not (disk / "dataset").exists()
-            assert not (disk / WORK / "dataset").exists()
             assert tree(source.parent) == before
             with_room(disk)
             goes_on(source, disk / "dataset", expected, monkeypatch)
@@ -209,7 +208,7 @@ def test_a_disk_that_is_full_at_any_moment(
 
 
 @pytest.mark.parametrize(
-    "name", ["job.json", "part.json", "messages.mcap", "cam_image_raw.yaml", "dataset.yaml"]
+    "name", ["plan.json", "part.json", "messages.mcap", "cam_image_raw.yaml", "dataset.yaml"]
 )
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS], ids=errno.errorcode.get)
 def test_a_file_that_the_disk_refuses(
@@ -223,7 +222,7 @@ def test_a_file_that_the_disk_refuses(
     """Every file that is written by Python, in a part or in the joining."""
     target = tmp_path / "dataset"
     with failing_open(monkeypatch, lambda path, mode: "w" in mode and name in path, code):
-        use(monkeypatch, InlineEngine())
+        use(monkeypatch, InlineExecutor())
         with pytest.raises((PartsFailedError, WriteError), match=os.strerror(code)) as caught:
             mp4ds.pack(source, target, IN_PARTS)
     assert caught.value.exit_code == 1
@@ -318,12 +317,12 @@ def test_a_bad_sector(
             return io.BufferedReader(Drive(str(file), range(middle, middle + 512)), 512)
         return real(file, mode, buffering, *args, **options)
 
-    engine = use(monkeypatch, before_task(PARTS[0], lambda: setattr(Drive, "broken", True)))
+    executor = use(monkeypatch, before_task(PARTS[0], lambda: setattr(Drive, "broken", True)))
     with monkeypatch.context() as patch:
         instead_of_open(patch, opened)
         with pytest.raises(PartsFailedError, match="Input/output error") as caught:
             mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, keep_going=True))
-    assert engine.ran == ["source-0", *PARTS]
+    assert executor.ran == PARTS
     sentence = str(caught.value)
     assert "could not be written" not in sentence
     assert str(source) in sentence
@@ -375,7 +374,7 @@ def test_a_source_that_goes_before_the_joining(
     expected: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    use(monkeypatch, InlineEngine())
+    use(monkeypatch, InlineExecutor())
     away = source.with_suffix(".away")
 
     def vanish(told: mp4ds.PackProgress) -> None:
@@ -391,22 +390,30 @@ def test_a_source_that_goes_before_the_joining(
 # ---------------------------------------------------------------- processes that die
 
 
-def use_harmed(monkeypatch: pytest.MonkeyPatch, name: str, harm: str) -> None:
-    """Let processes do something before they run a task; Python with what it needs imported."""
-    code = (
-        "import os, signal, sys\n"
-        "from mp4ds.packing import work\n"
-        "run = work.Tasks.run\n"
-        "def harmed(self, folder, name, *rest):\n"
-        f"    if name == {name!r}:\n"
-        f"        {harm}\n"
-        "    return run(self, folder, name, *rest)\n"
-        "work.Tasks.run = harmed\n"
-        "sys.exit(work._main())"
-    )
-    monkeypatch.setattr(
-        "mp4ds.packing.work.command", lambda task: [sys.executable, "-c", code, *task]
-    )
+def harmed(packer: PartPacker, piece: Piece, name: str, harm: str) -> None:
+    """Do something before a piece is packed; in another process."""
+    if piece.name == name:
+        exec(harm)
+    packer(piece)
+
+
+class Harmed(ProcessExecutor):
+    """Whose processes do something before they pack a piece."""
+
+    def __init__(self, jobs: int, name: str, harm: str) -> None:
+        super().__init__(jobs)
+        self._harm = name, f"import os, signal, sys; {harm}"
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
+        if isinstance(fn, PartPacker):
+            return super().submit(harmed, fn, *args, *self._harm)
+        return super().submit(fn, *args, **kwargs)
+
+
+def use_harmed(monkeypatch: pytest.MonkeyPatch, jobs: int, name: str, harm: str) -> None:
+    """Have pieces packed by processes that do something before one of them."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where they find `harmed`
+    use(monkeypatch, Harmed(jobs, name, harm))
 
 
 @pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 3])
@@ -419,7 +426,7 @@ def test_a_process_that_is_killed_again_and_again(
 ) -> None:
     log = tmp_path / "tries"
     kill = "os.kill(os.getpid(), signal.SIGKILL)"
-    use_harmed(monkeypatch, PARTS[0], f"open({str(log)!r}, 'a').write('x'); {kill}")
+    use_harmed(monkeypatch, jobs, PARTS[0], f"open({str(log)!r}, 'a').write('x'); {kill}")
     options = replace(IN_PARTS, keep_going=True, jobs=jobs)
     with pytest.raises(PartsFailedError, match=r"SIGKILL, perhaps for lack of memory") as caught:
         mp4ds.pack(source, tmp_path / "dataset", options)
@@ -434,7 +441,7 @@ def test_a_process_that_finds_its_source_gone(
     tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     away = source.with_suffix(".away")
-    use_harmed(monkeypatch, PARTS[1], f"os.rename({str(source)!r}, {str(away)!r})")
+    use_harmed(monkeypatch, 1, PARTS[1], f"os.rename({str(source)!r}, {str(away)!r})")
     with pytest.raises(PartsFailedError, match=rf"Part {PARTS[1]}: .*drive\.bag: cannot be read"):
         mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, jobs=1))
     away.rename(source)
@@ -460,7 +467,7 @@ def test_a_task_that_ends_its_process(
     expected: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    use_harmed(monkeypatch, PARTS[1], harm)
+    use_harmed(monkeypatch, 1, PARTS[1], harm)
     with pytest.raises(PartsFailedError) as caught:
         mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, keep_going=True, jobs=1))
     assert f"Part {PARTS[1]}: {sentence}" in str(caught.value)
@@ -477,13 +484,16 @@ def test_processes_that_cannot_begin_for_want_of_memory(
     expected: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    limit = ["prlimit", f"--as={megabytes * 2**20}"]
-    monkeypatch.setattr("mp4ds.packing.work.command", lambda task: [*limit, *command(task)])
+    python = tmp_path / "python"
+    limit = f"prlimit --as={megabytes * 2**20}"
+    python.write_text(f'#!/bin/sh\nexec {limit} {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(python))
     with pytest.raises(PartsFailedError, match=r"Part source-0: its process exited") as caught:
         mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, jobs=1))
     assert "\n" not in str(caught.value)
     assert leftovers(tmp_path) == []
-    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == ["source-0", *PARTS]
+    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == PARTS
 
 
 # ---------------------------------------------------------------- folders that are not as they were
@@ -493,22 +503,21 @@ def test_a_work_folder_that_is_removed_meanwhile(
     tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use(monkeypatch, before_task(PARTS[1], lambda: shutil.rmtree(tmp_path / WORK)))
-    with pytest.raises(PartsFailedError, match="holds no pack in progress"):
+    with pytest.raises(PartsFailedError, match="all machines must share"):
         mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
     ran = goes_on(source, tmp_path / "dataset", expected, monkeypatch)
-    assert ran == ["source-0", *PARTS]
+    assert ran == PARTS
 
 
 @pytest.mark.parametrize(
     ("gone", "again"),
     [
-        (".", ["source-0", *PARTS]),
-        ("parts", ["source-0", *PARTS]),
-        (f"parts/{PARTS[0]}", PARTS[:1]),
-        (f"parts/{PARTS[0]}/part.json", PARTS[:1]),
-        (f"parts/{PARTS[1]}/messages.mcap", PARTS[1:]),
-        (f"parts/{PARTS[1]}/cam_image_raw.mp4", PARTS[1:]),
-        ("parts/source-0", ["source-0"]),
+        (".", PARTS),
+        (PARTS[0], PARTS[:1]),
+        (f"{PARTS[0]}/part.json", PARTS[:1]),
+        (f"{PARTS[1]}/dataset.yaml", PARTS[1:]),
+        (f"{PARTS[1]}/messages.mcap", PARTS[1:]),
+        (f"{PARTS[1]}/cam_image_raw.mp4", PARTS[1:]),
     ],
 )
 def test_what_is_removed_before_the_joining(
@@ -519,7 +528,7 @@ def test_what_is_removed_before_the_joining(
     expected: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    use(monkeypatch, InlineEngine())
+    use(monkeypatch, InlineExecutor())
     place = tmp_path / WORK / gone
 
     def vanish(told: mp4ds.PackProgress) -> None:
@@ -540,10 +549,10 @@ def test_what_rots_before_the_joining_is_made_again(
     expected: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    use(monkeypatch, InlineEngine())
+    use(monkeypatch, InlineExecutor())
 
     def rot(told: mp4ds.PackProgress) -> None:
-        path = tmp_path / WORK / "parts" / PARTS[0] / name
+        path = tmp_path / WORK / PARTS[0] / name
         if told.phase == "joining" and not told.note:
             data = bytearray(path.read_bytes())
             data[len(data) // 2] ^= 0x10
@@ -569,7 +578,7 @@ def read_only(folder: Path) -> Iterator[None]:
 def test_a_target_folder_that_is_read_only(
     tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    use(monkeypatch, InlineEngine())
+    use(monkeypatch, InlineExecutor())
     (tmp_path / "out").mkdir()
     with (
         read_only(tmp_path / "out"),
@@ -587,8 +596,7 @@ def test_a_work_folder_that_becomes_read_only(
     expected: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    work = tmp_path / WORK
-    folder = work / "parts" if when == "packing" else work
+    folder = tmp_path / WORK if when == "packing" else tmp_path
 
     def protect(task: str) -> bool:
         if task == PARTS[1] and when == "packing":
@@ -601,13 +609,13 @@ def test_a_work_folder_that_becomes_read_only(
             _mount("--bind", str(folder), str(folder))
             _mount("-o", "remount,bind,ro", str(folder))
 
-    use(monkeypatch, InlineEngine(protect))
+    use(monkeypatch, InlineExecutor(protect))
     try:
-        with pytest.raises(PartsFailedError, match="Read-only file system"):
+        with pytest.raises(Mp4dsError, match="Read-only file system"):
             mp4ds.pack(source, tmp_path / "dataset", IN_PARTS, progress=told)
         if when == "packing":  # now the same command, and --restart, cannot do anything
             for options in (IN_PARTS, replace(IN_PARTS, restart=True)):
-                use(monkeypatch, InlineEngine())
+                use(monkeypatch, InlineExecutor())
                 with pytest.raises(Mp4dsError, match="Read-only file system"):
                     mp4ds.pack(source, tmp_path / "dataset", options)
     finally:
@@ -647,8 +655,8 @@ def long_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _children(pid: int) -> list[int]:
-    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
-    return [int(word) for word in text.split()]
+    threads = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(word) for path in threads for word in path.read_text().split()]
 
 
 def _lives(pid: int) -> bool:
@@ -674,7 +682,7 @@ def test_a_parallel_pack_that_is_interrupted(
     before = tree(long_bag.parent)
     arguments = ("pack", long_bag, "-o", tmp_path / "dataset", "--window", 10, "--codec", "h264")
     process = start(*arguments, "--jobs", 2)
-    until(lambda: list((tmp_path / WORK).glob("parts/0*/part.json")), process)
+    until(lambda: list((tmp_path / WORK).glob("0*/part.json")), process)
     children: list[int] = []
     while not children and process.poll() is None:
         children = _children(process.pid)
@@ -699,10 +707,10 @@ def test_a_parallel_pack_that_is_interrupted(
 
 def test_an_interruption_before_anything_is_finished(long_bag: Path, tmp_path: Path) -> None:
     process = start("pack", long_bag, "-o", tmp_path / "dataset", "--window", 20, "--jobs", 1)
-    until(lambda: list((tmp_path / WORK).glob("parts/.0*")), process)
+    until(lambda: list((tmp_path / WORK).glob(".0*")), process)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=WATCHDOG_S)
     assert (process.returncode, out) == (130, "")
     assert "Traceback" not in err
     # unless the part was just then finished
-    assert list((tmp_path / WORK).glob("parts/0*/part.json")) or tree(tmp_path) == {}
+    assert list((tmp_path / WORK).glob("0*/part.json")) or tree(tmp_path) == {}

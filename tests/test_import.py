@@ -27,7 +27,7 @@ from PIL import Image
 from rosbags.highlevel import AnyReader
 
 import mp4ds
-from in_parts import InlineEngine, facts, leftovers
+from in_parts import InlineExecutor, facts, leftovers, use
 from mp4ds.cli import commands
 from mp4ds.errors import Refused, SourceError
 from mp4ds.format.sidecars import load_manifest
@@ -394,7 +394,7 @@ def test_in_parts_is_as_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     place = euroc(tmp_path)
     options = mp4ds.PackOptions(images=mp4ds.ImageFolder(), codec="ffv1", gop=2)
     mp4ds.pack(place, tmp_path / "whole", options)
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: InlineEngine())
+    use(monkeypatch, InlineExecutor())
     tasks: list[int] = []
     mp4ds.pack(
         place,

@@ -1,4 +1,4 @@
-"""Tasks as processes: what they tell, how they end, and that none outlives its engine."""
+"""Calls in processes and jobs in threads: their order, how they end, and that nothing is left."""
 
 from __future__ import annotations
 
@@ -6,123 +6,254 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from mp4ds.packing.engine import ProcessEngine
-from waiting import until
+from mp4ds.packing.processes import CallError, ProcessExecutor, StreamThreads
+from waiting import WATCHDOG_S, until
 
-DONE = "print(json.dumps({'done': True, 'pid': os.getpid()}), flush=True)"
-TASKS = {
-    "quick": DONE,
-    "talkative": f"[print(json.dumps({{'at': n}}), flush=True) for n in range(5)]; {DONE}",
-    "noisy": f"print('not json'); print('x' * 3_000_000); sys.stderr.write('y' * 300_000); {DONE}",
-    "error": "print(json.dumps({'error': ['SourceError', 'drive.bag: is damaged.']})); sys.exit(1)",
-    "crash": "sys.stderr.write('first\\nlast words\\n'); sys.exit(3)",
-    "quiet": "pass",
-    "killed": "os.kill(os.getpid(), signal.SIGKILL)",
-    "sleep": "print(json.dumps({'pid': os.getpid()}), flush=True); time.sleep(60)",
-}
-EXPECTED: dict[str, tuple[str, str] | None] = {
-    "quick": None,
-    "talkative": None,
-    "noisy": None,
-    "error": ("SourceError", "drive.bag: is damaged."),
-    "crash": ("Failed", "its process exited with code 3: last words"),
-    "quiet": ("Failed", "its process exited with code 0"),
-    "killed": ("Killed", "its process was killed by SIGKILL, perhaps for lack of memory"),
-}
+COUNTS = [0, 1, 2, 5]
 
 
-def command(task: tuple[str, ...]) -> list[str]:
-    imports = "import json, os, signal, sys, time"
-    if task[0] == "once":  # killed at the first try only
-        marker = task[1]
-        code = (
-            f"p = {marker!r}\nif not os.path.exists(p):\n open(p, 'w').close()\n "
-            f"os.kill(os.getpid(), signal.SIGKILL)\n{DONE}"
-        )
-        return [sys.executable, "-c", f"{imports}\n{code}"]
-    return [sys.executable, "-c", f"{imports}\n{TASKS[task[0]]}"]
+class BrokenError(Exception):
+    """A job's own error."""
 
 
-def ignore(_: tuple[str, ...], __: dict[str, Any]) -> None:
-    return None
+def fail(message: str = "broken") -> Callable[[], None]:
+    def job() -> None:
+        raise BrokenError(message)
+
+    return job
 
 
-@pytest.mark.parametrize("slots", [1, 3])
-def test_every_task_has_its_outcome(slots: int) -> None:
-    told: list[tuple[str, Any]] = []
-    engine = ProcessEngine(command, slots)
-    outcomes = engine.run(
-        [(name,) for name in EXPECTED], lambda task, values: told.append((task[0], values))
+def threads() -> int:
+    return threading.active_count()
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_jobs_of_a_stream_run_in_order_and_all_run(count: int) -> None:
+    done: dict[int, list[int]] = defaultdict(list)
+    before = threads()
+    with StreamThreads(count) as workers:
+        for number in range(200):
+            key = number % 7
+
+            def job(key: int = key, number: int = number) -> None:
+                time.sleep(0.0005 * (number % 3))
+                done[key].append(number)
+
+            workers.submit(key, job)
+    assert {key: numbers == sorted(numbers) for key, numbers in done.items()} == dict.fromkeys(
+        range(7), True
     )
-    assert {outcome.task[0]: outcome.error for outcome in outcomes} == EXPECTED
-    assert [values["at"] for name, values in told if "at" in values] == [0, 1, 2, 3, 4]
-    assert sum(name == "noisy" for name, _ in told) == 1
+    assert sum(map(len, done.values())) == 200
+    assert threads() == before
+
+
+def test_a_stream_stays_on_its_thread() -> None:
+    used: dict[int, set[int]] = defaultdict(set)
+    with StreamThreads(3) as workers:
+        for number in range(60):
+            key = number % 5
+            workers.submit(key, lambda key=key: used[key].add(threading.get_ident()))  # type: ignore[misc]
+    assert [len(found) for found in used.values()] == [1] * 5
+    assert threading.get_ident() not in set().union(*used.values())
+
+
+def test_without_threads_a_job_runs_at_once() -> None:
+    seen: list[int] = []
+    with StreamThreads(0) as workers:
+        workers.submit(0, lambda: seen.append(threading.get_ident()))
+        assert seen == [threading.get_ident()]
+        with pytest.raises(BrokenError):
+            workers.submit(0, fail())
+
+
+def test_different_streams_run_side_by_side() -> None:
+    barrier = threading.Barrier(2, timeout=WATCHDOG_S)  # passed only by two at once
+    with StreamThreads(2) as workers:
+        workers.submit(0, lambda: (barrier.wait(), None)[1])
+        workers.submit(1, lambda: (barrier.wait(), None)[1])
+    assert not barrier.broken
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_memory_is_bounded(count: int) -> None:
+    """A source that is faster than the encoders waits for them."""
+    go, submitted = threading.Event(), []
+
+    def feed(workers: StreamThreads) -> None:
+        for number in range(20):
+            workers.submit(0, lambda: (go.wait(WATCHDOG_S), None)[1])
+            submitted.append(number)
+
+    with StreamThreads(count) as workers:
+        feeder = threading.Thread(target=feed, args=(workers,))
+        feeder.start()
+        until(lambda: submitted)
+        time.sleep(0.3)
+        assert len(submitted) <= 4
+        go.set()
+        feeder.join(WATCHDOG_S)
+    assert len(submitted) == 20
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_first_error_reaches_the_caller(count: int) -> None:
+    before, ran = threads(), []
+    with pytest.raises(BrokenError, match="first"), StreamThreads(count) as workers:  # noqa: PT012
+        workers.submit(0, fail("first"))
+        until(lambda: workers.submit(0, lambda: ran.append(1)))
+    assert ran == []
+    assert threads() == before
+
+
+def test_an_error_of_the_last_job_is_raised_at_the_end() -> None:
+    with pytest.raises(BrokenError), StreamThreads(2) as workers:
+        workers.submit(1, fail())
+
+
+def test_even_those_that_are_no_exceptions() -> None:
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), StreamThreads(1) as workers:
+        workers.submit(0, stop)
+
+
+def test_an_error_of_the_caller_drops_what_has_not_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, ran = threads(), []
+    started, go = threading.Event(), threading.Event()
+    end = ThreadPoolExecutor.shutdown
+
+    def shutdown(thread: ThreadPoolExecutor, **options: bool) -> None:
+        end(thread, **{**options, "wait": False})
+        go.set()
+        end(thread)
+
+    monkeypatch.setattr(ThreadPoolExecutor, "shutdown", shutdown)
+
+    def first() -> None:
+        started.set()
+        go.wait(WATCHDOG_S)
+        ran.append("first")
+
+    with pytest.raises(BrokenError, match="the caller's"), StreamThreads(1) as workers:  # noqa: PT012
+        workers.submit(0, first)
+        workers.submit(0, lambda: ran.append("second"))
+        started.wait(WATCHDOG_S)
+        raise BrokenError("the caller's")
+    assert ran == ["first"]
+    assert threads() == before
+
+
+@pytest.mark.parametrize("wait", [0.0, 0.2])
+def test_the_callers_error_is_not_replaced_by_a_jobs(wait: float) -> None:
+    """Also where the job fails while the workers are being ended."""
+    started = threading.Event()
+
+    def late() -> None:
+        started.set()
+        time.sleep(wait)
+        raise BrokenError("the job's")
+
+    with pytest.raises(BrokenError, match="the caller's"), StreamThreads(1) as workers:  # noqa: PT012
+        workers.submit(0, late)
+        started.wait(WATCHDOG_S)
+        raise BrokenError("the caller's")
+
+
+# ---------------------------------------------------------------- processes
+
+CODE = {
+    "quick": "pass",
+    "noisy": "import sys; print('x' * 3_000_000); sys.stderr.write('y' * 300_000)",
+    "error": "from mp4ds.errors import SourceError; raise SourceError('drive.bag', 'is damaged')",
+    "system": "open('/none/such')",
+    "memory": "bytearray(2**60)",
+    "crash": "import sys; sys.stderr.write('first\\nlast words\\n'); sys.exit(3)",
+    "quiet": "import sys; sys.exit()",
+    "odd": "raise ArithmeticError('odd')",
+    "killed": "import os, signal; os.kill(os.getpid(), signal.SIGKILL)",
+}
+SENTENCES = {
+    "error": "drive.bag: is damaged.",
+    "system": "/none/such: No such file or directory",
+    "memory": "out of memory; try fewer `jobs`",
+    "crash": "its process exited with code 3: last words",
+    "quiet": "its process exited with code 0",
+    "odd": "its process exited with code 1: ArithmeticError: odd",
+    "killed": "its process was killed by SIGKILL, perhaps for lack of memory",
+}
+
+
+@pytest.mark.parametrize("processes", [1, 3])
+def test_every_call_has_its_outcome(processes: int) -> None:
+    with ProcessExecutor(processes) as executor:
+        calls = {name: executor.submit(exec, code) for name, code in CODE.items()}
+        errors = {name: call.exception() for name, call in calls.items()}
+    assert {name: str(error) for name, error in errors.items() if error} == SENTENCES
+    assert {error.exit_code for error in errors.values() if isinstance(error, CallError)} == {1, 2}
+
+
+def test_results_and_arguments() -> None:
+    with ProcessExecutor(2) as executor:
+        calls = [executor.submit(int, "11", base=base) for base in range(2, 12)]
+        assert [call.result() for call in calls] == list(range(3, 13))
 
 
 def test_no_more_than_so_many_run_at_a_time(tmp_path: Path) -> None:
     code = (
-        "import os, sys, time, json, pathlib\n"
-        "here = pathlib.Path(sys.argv[1]); mine = here / str(os.getpid()); mine.touch()\n"
-        "there = lambda: len(list(here.iterdir()))\n"
+        "import os, pathlib, time\n"
+        f"here = pathlib.Path({str(tmp_path)!r}); mine = here / str(os.getpid()); mine.touch()\n"
         "met = here.with_name('met')\n"
-        "while not met.exists() and there() < 2: time.sleep(0.01)\n"
-        "met.touch(); time.sleep(0.1); seen = there(); mine.unlink()\n"
-        "print(json.dumps({'done': True, 'seen': seen}))"
+        "while not met.exists() and len(list(here.iterdir())) < 2: time.sleep(0.01)\n"
+        "met.touch(); time.sleep(0.1); seen = len(list(here.iterdir())); mine.unlink()\n"
+        "if seen > 2: raise OSError(f'{seen} at a time')"
     )
-    (here := tmp_path / "here").mkdir()
-    engine = ProcessEngine(lambda _: [sys.executable, "-c", code, str(here)], 2)
-    facts = [outcome.facts["seen"] for outcome in engine.run([(str(n),) for n in range(8)], ignore)]
-    assert len(facts) == 8
-    assert max(facts) == 2
+    with ProcessExecutor(2) as executor:
+        for call in [executor.submit(exec, code, {}) for _ in range(8)]:
+            call.result()
 
 
-def test_a_killed_task_is_tried_once_more(tmp_path: Path) -> None:
-    (outcome,) = ProcessEngine(command, 1).run([("once", str(tmp_path / "mark"))], ignore)
-    assert outcome.error is None
+def test_a_call_whose_process_is_killed_is_made_once_more(tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    once = f"import os\nif not os.path.exists({str(mark)!r}):\n open({str(mark)!r}, 'w')\n "
+    with ProcessExecutor(1) as executor:
+        assert executor.submit(exec, f"{once}os.kill(os.getpid(), 9)").exception() is None
 
 
-def test_a_process_that_is_ready_is_given_the_next_task() -> None:
-    code = (
-        "import json, os, sys\n"
-        "def tasks():\n"
-        " yield sys.argv[1:]\n"
-        " for line in sys.stdin: yield json.loads(line)\n"
-        "for task in tasks():\n"
-        " told = {'done': True, 'ready': True, 'task': task, 'pid': os.getpid()}\n"
-        " print(json.dumps(told), flush=True)"
-    )
-    engine = ProcessEngine(lambda task: [sys.executable, "-c", code, *task], 2)
-    tasks = [(f"task {number}", "ü\n") for number in range(9)]
-    outcomes = list(engine.run(tasks, ignore))
-    assert sorted(outcome.task for outcome in outcomes) == tasks
-    assert all(outcome.error is None for outcome in outcomes)
-    assert all(tuple(outcome.facts["task"]) == outcome.task for outcome in outcomes)
-    assert len({outcome.facts["pid"] for outcome in outcomes}) <= 2
+def test_a_process_makes_many_calls() -> None:
+    with ProcessExecutor(2) as executor:
+        calls = [executor.submit(os.getpid) for _ in range(9)]
+        assert 1 <= len({call.result() for call in calls} - {os.getpid()}) <= 4
 
 
-@pytest.mark.parametrize("end", ["close", "exception"])
-def test_what_still_runs_is_ended_with_the_engine(end: str) -> None:
-    pids: list[int] = []
+class Counter:
+    """Something that a process may keep from call to call; it is counted in the other process."""
 
-    def heard(_: tuple[str, ...], told: dict[str, Any]) -> None:
-        pids.append(told["pid"])
-        if end == "exception" and len(pids) == 2:
-            raise RuntimeError("enough")
+    def __init__(self) -> None:
+        self.calls = 0
 
-    outcomes = ProcessEngine(command, 2).run([("quick",), ("sleep",)], heard)
-    if end == "exception":
-        with pytest.raises(RuntimeError, match="enough"):
-            list(outcomes)
-    else:
-        outcome = next(outcomes)
-        assert (outcome.task, outcome.error) == (("quick",), None)
-        getattr(outcomes, "close")()  # noqa: B009 - a generator, by its protocol an iterator
-    assert not any(map(is_alive, pids))
+    def __call__(self) -> int:
+        self.calls += 1
+        return self.calls
+
+
+def test_what_is_called_stays_in_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that a recording need not be opened again."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    counter = Counter()
+    with ProcessExecutor(1) as executor:
+        calls = [executor.submit(counter) for _ in range(3)]
+        assert [call.result() for call in calls] == [1, 2, 3]
+    assert counter.calls == 0
 
 
 def is_alive(pid: int) -> bool:
@@ -133,21 +264,30 @@ def is_alive(pid: int) -> bool:
     return True
 
 
-def test_a_worker_ends_when_its_coordinator_is_killed(tmp_path: Path) -> None:
-    """It waits for nobody: its standard input is closed then."""
-    worker = (
-        "import os, time\n"
-        "from mp4ds.packing.engine import serve, tell\n"
-        "serve(lambda: (tell({'pid': os.getpid()}), time.sleep(60)))"
+SLEEP = "import os, pathlib, time; pathlib.Path({!r}, str(os.getpid())).touch(); time.sleep(60)"
+
+
+def test_an_error_of_the_caller_ends_what_runs(tmp_path: Path) -> None:
+    calls = []
+    with pytest.raises(BrokenError), ProcessExecutor(2) as executor:  # noqa: PT012
+        calls += [executor.submit(exec, SLEEP.format(str(tmp_path))) for _ in range(4)]
+        until(lambda: len(list(tmp_path.iterdir())) == 2)
+        raise BrokenError
+    assert not any(is_alive(int(path.name)) for path in tmp_path.iterdir())
+    assert [call.cancelled() for call in calls] == [False, False, True, True]
+    with pytest.raises(RuntimeError):
+        executor.submit(os.getpid)
+
+
+def test_a_process_ends_when_its_caller_is_killed(tmp_path: Path) -> None:
+    """It works for nobody: its standard input is closed then."""
+    caller = (
+        "from mp4ds.packing.processes import ProcessExecutor\n"
+        f"ProcessExecutor(1).submit(exec, {SLEEP.format(str(tmp_path))!r}).result()"
     )
-    coordinator = (
-        "import sys\nfrom mp4ds.packing.engine import ProcessEngine\n"
-        f"engine = ProcessEngine(lambda _: [sys.executable, '-c', {worker!r}], 1)\n"
-        "list(engine.run([('x',)], lambda _, told: print(told['pid'], flush=True)))"
-    )
-    with subprocess.Popen([sys.executable, "-c", coordinator], stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        pid = int(process.stdout.readline())
+    with subprocess.Popen([sys.executable, "-c", caller]) as process:
+        until(lambda: list(tmp_path.iterdir()), process)
         process.send_signal(signal.SIGKILL)
         process.wait()
-        until(lambda: not is_alive(pid))
+    (pid,) = (int(path.name) for path in tmp_path.iterdir())
+    until(lambda: not is_alive(pid))

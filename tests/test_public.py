@@ -231,7 +231,7 @@ def test_what_is_used_is_imported(code: str, absent: list[str]) -> None:
 
 
 def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
-    """A short pack is mostly imports: other formats, codecs, folders, scores and parts wait."""
+    """A short pack is mostly imports: those of other formats, codecs and folders wait."""
     source, dataset = tmp_path / "short.bag", tmp_path / "dataset"
     demo(source, seconds=0.1)
     code = f"mp4ds.pack({str(source)!r}, {str(dataset)!r})"
@@ -240,10 +240,9 @@ def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
     assert {"mp4ds.bags.ros1", "mp4ds.packing.writer"} <= set(loaded)
     others = [
         *("click", "rich", "jsonschema", "google.protobuf", "sqlite3", "fsspec", "PIL"),
-        *("rosbags.rosbag2", "mp4ds.bags.rosbag2", "mp4ds.bags.convert"),
-        *("mp4ds.plugins.importing.layouts", "mp4ds.video.scores", "mp4ds.packing.target"),
-        *("mp4ds.dataset.topic", "mp4ds.packing.coordinator", "mp4ds.plugins.importing.ros_mp4"),
-        *("mp4ds.video.vp9", "mp4ds.messages.protobuf"),
+        *("rosbags.rosbag2", "mp4ds.bags.rosbag2", "mp4ds.bags.convert", "mp4ds.video.vp9"),
+        *("mp4ds.plugins.importing.layouts", "mp4ds.plugins.importing.ros_mp4"),
+        "mp4ds.messages.protobuf",
     ]
     assert [name for name in others if name in loaded] == []
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED
 from definitions import IMAGE
-from in_parts import InlineEngine, leftovers
+from in_parts import InlineExecutor, leftovers, use
 from mp4ds import yamlio
 from mp4ds.errors import OptionError, ScoringError
 from mp4ds.format.models import Quality
@@ -42,9 +42,9 @@ needs_vmaf = pytest.mark.skipif(
 
 
 @pytest.fixture(autouse=True)
-def engine(monkeypatch: pytest.MonkeyPatch) -> InlineEngine:
-    inline = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: inline)
+def executor(monkeypatch: pytest.MonkeyPatch) -> InlineExecutor:
+    inline = InlineExecutor()
+    use(monkeypatch, inline)
     monkeypatch.setattr("mp4ds.packing.target._FRAMES", WINDOW)
     return inline
 
@@ -212,22 +212,22 @@ def test_every_window_has_the_score(codec: str, tmp_path: Path) -> None:
     assert set(range(0, WINDOW * len(CHANGING), WINDOW)) <= set(keys)
 
 
-def test_in_parts_too_and_each_time_alike(tmp_path: Path, engine: InlineEngine) -> None:
+def test_in_parts_too_and_each_time_alike(tmp_path: Path, executor: InlineExecutor) -> None:
     """Parts begin with the same crf, and what comes out does not depend on an interruption."""
     noises = [0.0, 8.0, 0.0, 0.0, 4.0, 0.0]
     paths = recording(tmp_path, noises)
     options = PackOptions(quality="psnr=40", window=2 * WINDOW, **QUICK)
     mp4ds.pack(paths, tmp_path / "dataset", options)
-    assert len([name for name in engine.ran if not name.startswith("source")]) == 3
+    assert len([name for name in executor.ran if not name.startswith("source")]) == 3
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     found = check_psnr(tmp_path / "dataset", noises, 40)
 
     def fails(name: str) -> bool:
-        return name == "00001-0"
+        return name == "00001"
 
-    broken = InlineEngine(fails)
+    broken = InlineExecutor(fails)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mp4ds.packing.pack._engine", lambda *_: broken)
+        use(patch, broken)
         with pytest.raises(mp4ds.PartsFailedError):
             mp4ds.pack(paths, tmp_path / "again", options)
     mp4ds.pack(paths, tmp_path / "again", options)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mp4ds
-from in_parts import InlineEngine
+from in_parts import InlineExecutor, use
 from mp4ds import yamlio
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
@@ -269,13 +269,13 @@ def test_lossless_streams_have_nothing_to_tell(encoding: str, tmp_path: Path) ->
 def test_joined_parts_tell_what_the_joined_packets_tell(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    engine = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: engine)
+    executor = InlineExecutor()
+    use(monkeypatch, executor)
     recorded = scene("rgb8", frames=40, width=96, height=64)
     (path,) = SOURCES["mcap-ros2-none"](tmp_path, recorded)
     options = mp4ds.PackOptions(quality="visual", codec="av1", gop=8, window=4)
     mp4ds.pack(path, tmp_path / "d", options)
-    assert len(engine.ran) > 2
+    assert len(executor.ran) > 2
     video = load_stream(stream_of(tmp_path / "d")).video
     assert video.references is not None
     assert video.references == video_facts(tmp_path / "d" / video.file, "av1")["references"]

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mp4ds
-from in_parts import InlineEngine, leftovers
+from in_parts import InlineExecutor, leftovers, use
 from mp4ds.bags.formats import open_sources
 from mp4ds.cli import commands
 from mp4ds.errors import OptionError, PartsFailedError, RemoteError, SourceError
@@ -37,9 +37,9 @@ SECRET = "X-Amz-Signature=4711"
 
 
 @pytest.fixture
-def engine(monkeypatch: pytest.MonkeyPatch) -> InlineEngine:
-    inline = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: inline)
+def executor(monkeypatch: pytest.MonkeyPatch) -> InlineExecutor:
+    inline = InlineExecutor()
+    use(monkeypatch, inline)
     return inline
 
 
@@ -208,7 +208,7 @@ def some(first: int) -> list[Any]:
 
 @pytest.mark.parametrize("source", some(0))
 def test_every_source_in_a_store(
-    source: str, tmp_path: Path, put: Put, compare: Compare, engine: InlineEngine
+    source: str, tmp_path: Path, put: Put, compare: Compare, executor: InlineExecutor
 ) -> None:
     (tmp_path / "source").mkdir()
     paths = SOURCES[source](tmp_path / "source", scene("bayer_rggb8", frames=7))
@@ -217,7 +217,7 @@ def test_every_source_in_a_store(
 
 @pytest.mark.parametrize("source", some(1))
 def test_every_source_on_a_web_server(
-    source: str, tmp_path: Path, web: Server, compare: Compare, engine: InlineEngine
+    source: str, tmp_path: Path, web: Server, compare: Compare, executor: InlineExecutor
 ) -> None:
     paths = SOURCES[source](tmp_path / "web", scene("bayer_rggb8", frames=7))
     urls = [f"{web.url}/{path.name}" for path in paths]
@@ -505,20 +505,20 @@ def test_a_recording_that_changes(
 ) -> None:
     write_bag(tmp_path / "drive.bag", scene("mono8", frames=9))
     url = put(tmp_path / "drive.bag")
-    failing = InlineEngine(lambda task: task == "00001-0")
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: failing)
+    failing = InlineExecutor(lambda task: task == "00001")
+    use(monkeypatch, failing)
     with pytest.raises(PartsFailedError):
         mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
-    going_on = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: going_on)
+    going_on = InlineExecutor()
+    use(monkeypatch, going_on)
     write_bag(tmp_path / "other.bag", scene("mono8", frames=9, seed=1))
     stores.put(str(tmp_path / "other.bag"), url)
     with pytest.raises(SourceError, match=r"has changed since packing began"):
         mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
     put(tmp_path / "drive.bag")
     mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
-    assert "00000-0" not in going_on.ran
-    assert "00001-0" in going_on.ran
+    assert "00000" not in going_on.ran
+    assert "00001" in going_on.ran
 
 
 def test_a_recording_that_changes_while_it_is_packed(tmp_path: Path, put: Put, stores: Any) -> None:
@@ -549,17 +549,17 @@ def test_a_signed_address_goes_on_while_it_is_the_same(
 ) -> None:
     write_bag(tmp_path / "web" / "x.bag", scene("mono8", frames=9))
     url, dataset = f"{web.url}/x.bag?{SECRET}", tmp_path / "dataset"
-    failing = InlineEngine(lambda task: task == "00001-0")
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: failing)
+    failing = InlineExecutor(lambda task: task == "00001")
+    use(monkeypatch, failing)
     with pytest.raises(PartsFailedError):
         mp4ds.pack(url, dataset, PackOptions(window=3))
     with pytest.raises(OptionError, match=r"unfinished pack of http.*/x\.bag\.") as refusal:
         mp4ds.pack(f"{web.url}/x.bag?other", dataset, PackOptions(window=3))
     assert "4711" not in str(refusal.value)
-    going_on = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: going_on)
+    going_on = InlineExecutor()
+    use(monkeypatch, going_on)
     mp4ds.pack(url, dataset, PackOptions(window=3))
-    assert "00000-0" not in going_on.ran
+    assert "00000" not in going_on.ran
 
 
 def test_the_query_goes_with_every_request(tmp_path: Path, web: Server) -> None:

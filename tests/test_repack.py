@@ -16,9 +16,9 @@ from coded_scenes import CODED
 from mp4ds.errors import OptionError, SourceError, TargetExistsError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
-from mp4ds.packing.job import open_recording
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_each
+from mp4ds.packing.planning import open_recording
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message
 from mp4ds.unpacking.options import UnpackOptions

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mp4ds
-from in_parts import InlineEngine
+from in_parts import InlineExecutor, use
 from mp4ds import yamlio
 from mp4ds.bags.formats import open_reader
 from mp4ds.packing.options import PackOptions
@@ -28,8 +28,8 @@ WIDTH, STEP = 32, 36
 
 
 @pytest.fixture(autouse=True)
-def engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: InlineEngine())
+def executor(monkeypatch: pytest.MonkeyPatch) -> None:
+    use(monkeypatch, InlineExecutor())
 
 
 def recording(folder: Path, trait: str, source: str = "mcap-ros2-none", **options: Any) -> Any:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mp4ds.packing.planning import cut_times, share, spans_of
+from mp4ds.packing.planning import cut_times, spans_of
 
 TIMES = st.lists(
     st.lists(st.integers(-(2**62), 2**62) | st.integers(0, 50), min_size=1, max_size=80),
@@ -50,15 +49,3 @@ def test_another_camera_is_cut_where_the_busiest_rests() -> None:
 def test_a_clock_that_jumps_makes_no_endless_row_of_windows() -> None:
     times = np.concatenate([np.arange(0, 600, 10), 1_700_000_000 * 10**9 + np.arange(0, 600, 10)])
     assert len(cut_times([times], 30)) == 3
-
-
-@given(st.integers(1, 20), st.integers(0, 50))
-def test_shares_hold_every_task_once(shares: int, count: int) -> None:
-    tasks = [(str(number),) for number in range(count)]
-    found = [task for n in range(1, shares + 1) for task in share(n, tasks, shares)]
-    assert sorted(found) == sorted(tasks)
-
-
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_a_share_is_every_so_many_th(number: int) -> None:
-    assert share(number, [("a",), ("b",), ("c",), ("d",)], 3)[0] == ("abc"[number - 1],)

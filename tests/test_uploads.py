@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 import mp4ds
-from in_parts import InlineEngine, facts
+from in_parts import InlineExecutor, facts, use
 from mp4ds.cli import commands
 from mp4ds.errors import (
     OptionError,
@@ -98,12 +98,12 @@ def test_a_pack_is_uploaded_the_manifest_last(
     compare: Compare,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    engine = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: engine)
+    executor = InlineExecutor()
+    use(monkeypatch, executor)
     url = f"{folder_url}/drive"
     told: list[PackProgress] = []
     summary = mp4ds.pack(source, url, replace(FAST, window=window), progress=told.append)
-    assert bool(engine.ran) == bool(window)
+    assert bool(executor.ran) == bool(window)
     assert str(summary.dataset) == url
     assert {str(state.dataset) for state in told} == {url}
     assert "uploading" in {state.phase for state in told}
@@ -230,7 +230,7 @@ def test_a_store_that_refuses_is_told_before_the_work(
     staging: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("mp4ds.packing.pack._plan", None)
+    monkeypatch.setattr("mp4ds.packing.pack._planned", None)
     s3.fails = lambda heard: 403 if heard.method == "PUT" else None
     with pytest.raises(TargetError, match=r"cannot be uploaded: access denied"):
         mp4ds.pack(source, f"{folder_url}/drive", FAST)
@@ -266,16 +266,16 @@ def test_a_divided_pack_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     url, options = f"{folder_url}/drive", replace(FAST, window=3)
-    failing = InlineEngine(lambda task: task == "00001-0")
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: failing)
+    failing = InlineExecutor(lambda task: task == "00001")
+    use(monkeypatch, failing)
     with pytest.raises(PartsFailedError):
         mp4ds.pack(source, url, options)
     assert there(stores, url) == set()
-    assert any("00000-0" in name for name in left(staging))
-    going_on = InlineEngine()
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: going_on)
+    assert any("00000" in name for name in left(staging))
+    going_on = InlineExecutor()
+    use(monkeypatch, going_on)
     mp4ds.pack(source, url, options)
-    assert "00000-0" not in going_on.ran
+    assert "00000" not in going_on.ran
     assert left(staging) == []
     assert again(stores, url, tmp_path / "back", compare, source) == []
 
@@ -290,7 +290,7 @@ def test_shares_meet_in_the_temporary_folder(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     url, options = f"{folder_url}/drive", replace(FAST, window=3)
-    monkeypatch.setattr("mp4ds.packing.pack._engine", lambda *_: InlineEngine())
+    use(monkeypatch, InlineExecutor())
     for number in (1, 2):
         pack_share(source, url, (number, 2), options)
     mp4ds.pack(source, url, replace(options, join=True))

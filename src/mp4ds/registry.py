@@ -7,7 +7,7 @@ from typing import Any
 
 _PLUGINS = {
     "images": "importing.layouts:open_images",
-    "cluster": "cluster:ClusterEngine",
+    "cluster": "cluster:ClusterExecutor",
 }
 """What the core asks for -> module of `mp4ds.plugins`, and its name there."""
 

@@ -522,7 +522,10 @@ def is_seen(is_there: Callable[[], bool], *folders: Path) -> bool:
     end = time.monotonic() + _SEEN_SECONDS
     while not (seen := is_there()) and time.monotonic() < end:
         for folder in folders:
-            list(folder.iterdir())  # which asks the server for its names again
+            try:
+                list(folder.iterdir())  # which asks the server for its names again
+            except FileNotFoundError:
+                return False
         time.sleep(_LOOK_SECONDS)
     return seen
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import binascii
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -93,19 +94,9 @@ def document_of(model: BaseModel) -> dict[str, Any]:
     return model.model_dump(mode="json", by_alias=True, exclude_defaults=True)
 
 
-def of_types(kind: type[T], values: Mapping[str, Any]) -> T:
-    """A dataclass from values as JSON has them.
-
-    Raises:
-        ValueError: A value is missing, or not of its field's type.
-    """
-    adapter: TypeAdapter[T] = TypeAdapter(kind)
-    return adapter.validate_python(values)
-
-
 def json_parser(shape: Any) -> Callable[[bytes], Any]:
     """Reads JSON of one shape, such as ``tuple[str, Size]``; raises ValueError for any other."""
-    return TypeAdapter(shape, config=ConfigDict(strict=True)).validate_json
+    return partial(TypeAdapter(shape).validate_json, strict=True)
 
 
 # ---------------------------------------------------------------- columns

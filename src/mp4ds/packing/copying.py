@@ -12,9 +12,9 @@ from mp4ds.errors import FormatError, advising
 from mp4ds.files.outputs import staged
 from mp4ds.format.sidecars import COPY_AGAIN, load_about
 from mp4ds.options import ENCODING
-from mp4ds.packing.job import dataset_at
 from mp4ds.packing.manifest import dataset_files, folder_size
 from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary
+from mp4ds.packing.planning import dataset_at
 
 
 def is_copy(paths: Sequence[Path], options: PackOptions) -> bool:

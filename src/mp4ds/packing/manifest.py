@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import stat
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
-
-import xxhash
 
 from mp4ds._version import __version__
 from mp4ds.bags.combined import bounded
 from mp4ds.bags.protocols import BagReader, BagWriter, Format
 from mp4ds.errors import FormatError, SourceError, advising
-from mp4ds.files.outputs import digest_file, write_synced
-from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME, of_types
+from mp4ds.files.outputs import digest_file
+from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
 from mp4ds.format.manifest import (
     About,
     EarlierDataset,
@@ -43,40 +40,6 @@ from mp4ds.packing.options import PackSummary, TopicSummary
 from mp4ds.plan import LOSSLESS
 from mp4ds.records import EVERYTHING, Channel, Excerpt, Loss
 from mp4ds.video.encoder import tool_versions
-
-_MARK = b',\n"xxh64": "'
-_END = b'"}\n'
-
-
-def dump_kept(values: Mapping[str, Any]) -> bytes:
-    """Serialize values to a file's content.
-
-    Args:
-        values: JSON values, at least one.
-    """
-    text = json.dumps(values, indent=1).encode().removesuffix(b"}").rstrip()
-    return text + _MARK + xxhash.xxh64_hexdigest(text).encode() + _END
-
-
-def load_kept(data: bytes) -> dict[str, Any]:
-    """The values of a file that `dump_kept` made.
-
-    Raises:
-        ValueError: It is damaged, or of another version.
-    """
-    text, mark, rest = data.rpartition(_MARK)
-    if not mark or rest != xxhash.xxh64_hexdigest(text).encode() + _END:
-        raise ValueError("which is damaged, or of another version")
-    try:
-        values: dict[str, Any] = json.loads(text + b"}")
-    except RecursionError:
-        raise ValueError("which is damaged") from None
-    return values
-
-
-# ---------------------------------------------------------------- part
-
-RECORD_NAME = "part.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,65 +97,6 @@ class PartRecord:
         for time in times:
             start, end = self.span or (time, time)
             self.span = (min(start, time), max(end, time))
-
-    def save(self) -> None:
-        """Write what the manifest does not tell, which completes the part."""
-        record = {
-            "topics": [asdict(topic) for topic in self.topics.values()],
-            "skipped": self.skipped,
-            "files": {path.name: path.stat().st_size for path in sorted(self.folder.iterdir())},
-        }
-        write_synced(self.folder / RECORD_NAME, dump_kept(record))
-
-
-@dataclass(frozen=True, slots=True)
-class PartFacts:
-    """What the manifest of a part does not tell.
-
-    Attributes:
-        topics: What became of each topic, in the order of the recording.
-        skipped: What the source holds and no dataset can: a phrase -> how many.
-        files: Size of each file.
-    """
-
-    topics: list[TopicSummary]
-    skipped: dict[str, int]
-    files: dict[str, int]
-
-    @classmethod
-    def load(cls, folder: Path) -> PartFacts:
-        """Read what `PartRecord.save` wrote.
-
-        Raises:
-            FormatError: It is missing or damaged; the part is made again.
-        """
-        try:
-            return of_types(cls, read_record(folder) or {})
-        except ValueError:
-            (folder / RECORD_NAME).unlink(missing_ok=True)
-            raise FormatError(
-                "file-missing", folder, "disappeared or was damaged after it was made"
-            ) from None
-
-
-def read_record(folder: Path) -> dict[str, Any] | None:
-    """The record of a part; None if it is incomplete: a file is missing or cut short."""
-    try:
-        record: dict[str, Any] = load_kept((folder / RECORD_NAME).read_bytes())
-        topics = record.setdefault("topics", [])
-        is_counted = all(
-            isinstance(t["messages"], int) and isinstance(t["raw_bytes"], int) for t in topics
-        )
-        if is_counted and all(_is_whole(folder, *item) for item in record["files"].items()):
-            return record
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        pass
-    return None
-
-
-def _is_whole(folder: Path, name: str, size: int) -> bool:
-    found = (folder / name).lstat()
-    return "/" not in name and stat.S_ISREG(found.st_mode) and found.st_size == size
 
 
 # ---------------------------------------------------------------- manifest
@@ -430,6 +334,14 @@ def summarize(
         losses=part.losses,
         larger=_why_larger(part, source_bytes, dataset_bytes, messages_bytes, origin),
     )
+
+
+def with_latched(summary: PackSummary, reader: BagReader) -> PackSummary:
+    """The summary of what was read, with the latched messages from before a slice."""
+    too_large = [topic for topic in reader.slice.left_out if topic not in summary.left_out]
+    latched = Counter(message.channel.topic for message in reader.slice.latched)
+    packed = {topic: n for topic, n in latched.items() if topic not in summary.left_out}
+    return replace(summary, latched=packed, latched_left_out=too_large)
 
 
 def _why_larger(

@@ -1,25 +1,24 @@
 """Source -> dataset: images into videos, everything else verbatim.
 
-A short recording is packed in one pass. A long one is divided into tasks, which run on every
-core or on other machines, and whose results are kept until all are done.
+A short recording is packed in one pass. A long one is packed in parts, on every core or on other
+machines, which are kept until all are done, and then put together.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from mp4ds import errors
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import (
     FormatError,
     OptionError,
-    PartsFailedError,
     Refused,
     SourceError,
     TargetExistsError,
@@ -31,106 +30,40 @@ from mp4ds.files.sources import (
     SourceHasher,
     is_unfinished,
     salvage_command,
-    source_digest,
     source_size,
     unchanged,
 )
+from mp4ds.files.uploads import local_path, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import MANIFEST_NAME, load_about, load_manifest, load_stream
 from mp4ds.messages.serializations import is_camera
-from mp4ds.packing.job import (
-    Job,
-    Task,
-    absolute,
-    dataset_at,
-    open_recording,
-    outcome_options,
-    with_latched,
-)
+from mp4ds.packing.copying import copy, is_copy
+from mp4ds.packing.long_packs import PartedPack, Report, pack_parts
 from mp4ds.packing.manifest import (
-    Origin,
     PartRecord,
     dataset_files,
     folder_size,
     summarize,
+    with_latched,
     write_manifest,
 )
 from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
-from mp4ds.packing.planning import Resources, plan_job
-from mp4ds.packing.workplace import Workplace
+from mp4ds.packing.parts import PartsFolder, PlanNote, digest_source
+from mp4ds.packing.planning import (
+    Plan,
+    Resources,
+    dataset_at,
+    divide,
+    open_recording,
+    surveyed,
+)
+from mp4ds.packing.processes import ProcessExecutor
+from mp4ds.packing.spool import recover
 from mp4ds.plan import LOSSLESS, Purpose, QualitySetting, parse_quality
 from mp4ds.registry import plugin
 from mp4ds.video.codecs import DEFAULT_LOSSY, check_codec, fastest_preset
-
-if TYPE_CHECKING:
-    from mp4ds.packing.engine import Engine
-
-
-@dataclass
-class PackRun:
-    """One recording being packed by tasks.
-
-    Attributes:
-        job: What is to be done.
-        place: Where its parts are made.
-        paths: What to pack, as given by the user.
-        target: The dataset.
-        force: Replace an existing dataset.
-        is_new: Whether the job has just been planned.
-        failures: Name and sentence of each task that failed.
-        exit_code: That of the first failure.
-    """
-
-    job: Job
-    place: Workplace
-    paths: Sequence[Path]
-    target: Path
-    force: bool
-    is_new: bool
-    failures: list[tuple[str, str]] = field(default_factory=list)
-    exit_code: int = 1
-
-    def begin(self, options: dict[str, object], *, anew: bool, alone: bool) -> None:
-        """Take over the work folder, which is locked.
-
-        Args:
-            options: Those that determine the result.
-            anew: Discard what is there.
-            alone: Nobody else is working there.
-
-        Raises:
-            OptionError: It holds an unfinished pack with other options.
-            SourceError: The recording has changed since.
-        """
-        if anew and alone:
-            self.place.clear()
-        if self.is_new:
-            self.job = self.place.begin(self.job)
-        self.place.check(self.job, options, absolute(self.paths))
-        if alone:
-            self.place.sweep()
-
-    @property
-    def missing(self) -> list[Task]:
-        """The tasks without results."""
-        return [task for task in self.job.tasks if not self.place.is_done(task)]
-
-    def fail(self, name: str, kind: str, sentence: str) -> None:
-        """Note that a task failed."""
-        if not self.failures:
-            self.exit_code = getattr(getattr(errors, kind, None), "exit_code", 1)
-        self.failures.append((name, sentence))
-
-    def raise_failures(self) -> None:
-        """Report the tasks that failed.
-
-        Raises:
-            PartsFailedError: There are some.
-        """
-        if self.failures:
-            raise PartsFailedError(self.target, self.failures, len(self.job.tasks), self.exit_code)
-
+from mp4ds.video.scores import find_ffmpeg
 
 # ---------------------------------------------------------------- in one pass
 
@@ -138,18 +71,13 @@ _REPORT_SECONDS = 0.1
 
 
 def pack_in_one_pass(
-    reader: BagReader,
-    job: Job,
-    folder: Path,
-    target: Path,
-    report: Callable[[PackProgress], None] | None,
-    exact: Exact,
+    reader: BagReader, plan: Plan, folder: Path, target: Path, report: Report | None, exact: Exact
 ) -> PackSummary:
     """Pack a whole recording; its files are hashed while they are read.
 
     Args:
         reader: The recording.
-        job: A job of one task.
+        plan: Of a single piece.
         folder: The folder to fill, empty.
         target: Its final name.
         report: Called with progress several times a second.
@@ -171,7 +99,7 @@ def pack_in_one_pass(
     due = sum(item.count for item in stats.values())
 
     def share(part: PartRecord) -> float:
-        if job.slice:
+        if plan.options.slice:
             return sum(topic.messages for topic in part.topics.values()) / max(1, due)
         hasher.advance(reader.position)
         return reader.position / max(1, total)
@@ -199,26 +127,22 @@ def pack_in_one_pass(
             )
         )
 
-    (task,) = (task for task in job.tasks if task.whole)
-    with unchanged(job.sources), SourceHasher(reader.files) as hasher:
-        part = Packer(reader, folder, job.settings(task, exact), progress).run()
-        digests = job.digests(reader, partial(_digest, reader) if job.slice else hasher.digest)
-    origin = Origin.of(reader.files, digests, job.about, reader.slice.span)
-    write_manifest(part, reader, origin, job.options["quality"])
+    (piece,) = plan.pieces
+    with unchanged(plan.sources), SourceHasher(reader.files) as hasher:
+        part = Packer(reader, folder, plan, piece, exact, progress).run()
+        if plan.options.slice:  # little of it was read
+            digests = [digest_source(source) for source in plan.hashed]
+        else:
+            digests = [hasher.digest(number) for number in range(len(reader.files))]
+    origin = plan.origin(reader, digests)
+    write_manifest(part, reader, origin, str(plan.options.quality))
     progress(part, done=True)
-    return with_latched(summarize(part, target, None if job.slice else total, origin), reader)
-
-
-def _digest(reader: BagReader, number: int) -> tuple[int, str]:
-    return source_digest(reader.files[number])
+    source_bytes = None if plan.options.slice else total
+    return with_latched(summarize(part, target, source_bytes, origin), reader)
 
 
 # ---------------------------------------------------------------- pack
 
-# importing dominates a short pack: what only divided packs, URLs and scores need is imported there
-
-
-Report = Callable[[PackProgress], None]
 _USUAL = PackOptions()
 
 
@@ -266,16 +190,14 @@ def _pack(
         return _recovered(paths, target, options)
     if options.quality is None:
         return _copied(paths, target, options, progress)
-    run = _plan(paths, target, options)
-    if run.is_new and run.job.is_single and not options.cluster:
-        return until_in_reach(partial(_pack_in_one_pass, run, progress))
-    return _pack_runs([run], options, progress)[0]
+    parted = _planned(paths, target, options, progress)
+    if parted.is_new and not parted.plan.is_divided and not options.cluster:
+        return until_in_reach(partial(_pack_in_one_pass, parted))
+    return _pack_all([parted], options)[0]
 
 
 def _recovered(paths: Sequence[Path], target: Path, options: PackOptions) -> PackSummary:
     """The dataset of a recording that was cut off while `mp4ds record` made it."""
-    from mp4ds.packing.spool import recover
-
     folder = next(filter(is_unfinished, paths))
     usual = replace(_USUAL, salvage=True, force=options.force, about=options.about)
     if len(paths) > 1 or replace(options, quality=None) != usual:
@@ -291,8 +213,6 @@ def _copied(
     paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
 ) -> PackSummary:
     """Copy a dataset, or re-encode it if it cannot be copied."""
-    from mp4ds.packing.copying import copy
-
     try:
         return copy(paths[0], target, options)
     except Refused as reason:
@@ -305,8 +225,6 @@ def _pack_to_store(
     paths: Sequence[Path], store: RemotePath, options: PackOptions, progress: Report | None
 ) -> PackSummary:
     """Pack on this machine, then upload."""
-    from mp4ds.files.uploads import uploaded
-
     shown = store
 
     def make(local: Path) -> PackSummary:
@@ -350,11 +268,8 @@ def pack_share(
     target = _target(dataset, paths)
     store = remote(target)
     if store:
-        from mp4ds.files.uploads import local_path
-
         target = local_path(store)
-    run = _plan(paths, target, chosen, is_share=True)
-    _pack_runs([run], chosen, progress, share=share)
+    _pack_all([_planned(paths, target, chosen, progress, is_share=True)], chosen, share)
 
 
 def pack_each(
@@ -401,15 +316,15 @@ def pack_each(
         if asked.force or not _is_packed(source, target, asked)
     }
     made: dict[Path, PackSummary] = {}
-    runs = []
+    parted = []
     for target, source in missing.items():
         # copies, and uploads to URLs, are made one after another
         if source in copied or remote(parent):
             own = _checked(asked, [source])
             made[target] = _pack([source], target, own, progress)
         else:
-            runs.append(_plan([source], target, chosen, recordings=len(targets)))
-    for summary in _pack_runs(runs, chosen, progress) if runs else ():
+            parted.append(_planned([source], target, chosen, progress, recordings=len(targets)))
+    for summary in _pack_all(parted, chosen) if parted else ():
         made[summary.dataset] = summary
     return [made[target] for target in missing if target in made]
 
@@ -443,8 +358,6 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
 def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
     if options.quality is not None or not any(map(dataset_at, paths)):
         return False
-    from mp4ds.packing.copying import is_copy
-
     return is_copy(paths, options)
 
 
@@ -473,8 +386,6 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
         )
     codec = checked_codec(quality, options.codec, options.preset, options.purpose)
     if quality.target and quality.target.metric == "vmaf" and not options.join:
-        from mp4ds.video.scores import find_ffmpeg
-
         find_ffmpeg()  # fails before anything is read, saying how to get one
     transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))
     chosen = replace(options, quality=quality, codec=codec, transcode=transcode, images=images)
@@ -531,87 +442,77 @@ def _has_transcoded(paths: Sequence[Path]) -> bool:
     )
 
 
-def _plan(
+def _planned(
     paths: Sequence[Path],
     target: Path,
     options: PackOptions,
+    progress: Report | None,
     *,
     recordings: int = 1,
     is_share: bool = False,
-) -> PackRun:
-    """The pack of a recording: an unfinished one, or a new one."""
+) -> PartedPack:
+    """The pack of a recording: one that was begun, or a new one."""
     check_target(target, force=options.force, owned=dataset_files, sources=paths)
-    place = Workplace.beside(target)
-    shared = is_share or options.join or options.cluster is not None
-    job = None if options.restart else place.job(shared=shared)
-    if job is not None:
-        return PackRun(job, place, paths, target, options.force, is_new=False)
-    if options.join:
+    folder = PartsFolder(target)
+    is_shared = is_share or options.join or options.cluster is not None
+    note = None if options.restart else folder.note()
+    if note is not None:
+        note.check_sources(paths)
+    elif options.join:
         raise OptionError(
-            f"There is nothing to join: {place.folder} holds no pack in progress. Run the "
-            "shards first."
+            f"There is nothing to join: {folder.path} holds no pack in progress. Run the shards "
+            "first."
         )
     with open_recording(
         paths, salvage=options.salvage, images=options.images, asked=options.slice
     ) as reader:
-        job = plan_job(reader, paths, options, Resources.of(options).for_one_of(recordings))
-    return PackRun(job, place, paths, target, options.force, is_new=True)
+        means = Resources.of(options).for_one_of(recordings)
+        plan = divide(reader, paths, options, means)
+        if note is not None:
+            folder.check(PlanNote.of(plan), shared=is_shared)
+        if not options.join:
+            known = chain.from_iterable(note.decisions) if note else ()
+            plan = surveyed(plan, reader, set(known))
+    return PartedPack(
+        plan, paths, target, options.force, progress, is_new=note is None, is_shared=is_shared
+    )
 
 
-def _pack_in_one_pass(run: PackRun, progress: Report | None, exact: Exact) -> PackSummary:
+def _pack_in_one_pass(parted: PartedPack, exact: Exact) -> PackSummary:
     with (
-        run.job.open() as reader,
-        staged(run.target, force=run.force, owned=dataset_files, sources=run.paths) as folder,
+        parted.plan.open() as reader,
+        staged(
+            parted.target, force=parted.force, owned=dataset_files, sources=parted.paths
+        ) as folder,
     ):
         folder.mkdir()
         try:
-            return pack_in_one_pass(reader, run.job, folder, run.target, progress, exact)
+            return pack_in_one_pass(
+                reader, parted.plan, folder, parted.target, parted.report, exact
+            )
         except OSError as error:
             if isinstance(error, SourceError) or error.errno is None:
                 raise
-            raise WriteError(run.target, error) from error
+            raise WriteError(parted.target, error) from error
 
 
-def _pack_runs(
-    runs: Sequence[PackRun],
-    options: PackOptions,
-    progress: Report | None,
-    *,
-    share: tuple[int, int] | None = None,
+def _pack_all(
+    packs: Sequence[PartedPack], options: PackOptions, share: tuple[int, int] | None = None
 ) -> list[PackSummary]:
-    """Run the tasks of packs, and make their datasets unless only a share of the tasks is run."""
-    from mp4ds.packing.coordinator import Coordinator, claimed
-
-    summaries = {}
-    with claimed(runs, shared=share is not None):
-        for run in runs:
-            run.begin(outcome_options(options), anew=options.restart, alone=share is None)
-        coordinator = Coordinator(
-            runs,
-            _engine(runs, options),
-            keep_going=options.keep_going,
-            share_of=share or (1, 1),
-            report=progress,
-        )
-        if options.join:
-            coordinator.refuse_missing()
-        for run in coordinator.run():
-            if share is None:
-                summaries[run.target] = coordinator.finish(run)
-    return [summaries[run.target] for run in runs if run.target in summaries]
+    """Pack recordings in parts, and make their datasets unless only a share is packed."""
+    results = pack_parts(packs, _executor(packs, options), options, share)
+    made = {summary.dataset: summary for summary in results}
+    return [made[pack.target] for pack in packs if pack.target in made]
 
 
-def _engine(runs: Sequence[PackRun], options: PackOptions) -> Engine:
+def _executor(packs: Sequence[PartedPack], options: PackOptions) -> Executor:
+    """What packs the pieces."""
     if options.cluster:
-        from mp4ds.packing.work import run_task
-
-        engine: Engine = plugin("cluster")(run_task, options.cluster)
-        return engine
-    from mp4ds.packing.engine import ProcessEngine
-    from mp4ds.packing.work import command
-
+        pieces = sum(len(pack.plan.pieces) for pack in packs)
+        executor: Executor = plugin("cluster")(options.cluster, pieces)
+        return executor
     means = Resources.of(options)
-    return ProcessEngine(command, min((means.slots(run.job) for run in runs), default=1))
+    return ProcessExecutor(min(means.slots(pack.plan) for pack in packs))
 
 
 def _paths(sources: Sequence[Path | str] | Path | str) -> list[Path]:

@@ -14,15 +14,16 @@ from mp4ds.errors import OutOfReachError, Refused
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
 from mp4ds.packing.calibrations import Calibrations
-from mp4ds.packing.engine import Workers
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
 from mp4ds.packing.manifest import PartRecord, PartStream, declare_rest
 from mp4ds.packing.options import TopicSummary
+from mp4ds.packing.planning import Piece, Plan
+from mp4ds.packing.processes import StreamThreads
 from mp4ds.packing.survey import MAX_STREAMS_PER_CHANNEL, SAMPLES, Decision, Survey, decide, rate_of
 from mp4ds.packing.tracks import PicturePlan, StreamSettings, TrackPlan, needs_trial
 from mp4ds.packing.writer import StreamWriter
-from mp4ds.plan import FileNames, Selection
-from mp4ds.records import EVERYTHING, Attachment, Channel, Excerpt, Message, Record
+from mp4ds.plan import FileNames
+from mp4ds.records import Attachment, Channel, Message, Record
 
 Exact = Mapping[tuple[int, StreamKey], str]
 """Channel id and key of streams that no longer need to reach a score -> why."""
@@ -113,7 +114,7 @@ class CameraRouter:
         self._streams: list[StreamWriter] = []
         self._renamed: set[str] = set()
 
-    def take(self, message: Message, workers: Workers) -> None:
+    def take(self, message: Message, threads: StreamThreads) -> None:
         """Encode an image, hold it back, or keep it with the reason why no stream accepts it."""
         channel = message.channel
         state = self._state_of(channel)
@@ -122,7 +123,7 @@ class CameraRouter:
         try:
             seen = state.inspector.inspect(message)
         except Refused as reason:
-            self._settle(state, workers)
+            self._settle(state, threads)
             self._keep_verbatim(message, number, str(reason))
             return
         self._calibrations.saw(channel, seen)
@@ -130,13 +131,13 @@ class CameraRouter:
         if state.is_surveyed:
             state.routes.setdefault(seen.key, _Route([], refusal=NOT_SURVEYED))
         if seen.key in state.routes and not state.held:
-            self._write(state, item, workers)
+            self._write(state, item, threads)
             return
         state.held.append(item)
         held = Counter(other.seen.key for other in state.held)
         enough = held[seen.key] == SAMPLES or len(state.held) == 2 * SAMPLES
         if enough or not needs_trial(seen, self._settings):
-            self._settle(state, workers)
+            self._settle(state, threads)
 
     def _state_of(self, channel: Channel) -> _CameraChannel:
         if channel.identity not in self._channels:
@@ -148,12 +149,12 @@ class CameraRouter:
                 state.routes = {item.key: self._route(channel, item) for item in decisions}
         return self._channels[channel.identity]
 
-    def settle(self, workers: Workers) -> None:
+    def settle(self, threads: StreamThreads) -> None:
         """Write everything held back: the recording has ended."""
         for state in self._channels.values():
-            self._settle(state, workers)
+            self._settle(state, threads)
 
-    def _settle(self, state: _CameraChannel, workers: Workers) -> None:
+    def _settle(self, state: _CameraChannel, threads: StreamThreads) -> None:
         """Decide how to encode the held images, and write them in order."""
         held, state.held = state.held, []
         for key in dict.fromkeys(item.seen.key for item in held):
@@ -161,7 +162,7 @@ class CameraRouter:
                 samples = [item.seen for item in held if item.seen.key == key]
                 state.routes[key] = self._plan(samples, held[0].message.channel)
         for item in held:
-            self._write(state, item, workers)
+            self._write(state, item, threads)
 
     def _plan(self, samples: list[CameraMessage], channel: Channel) -> _Route:
         return self._route(channel, decide(samples, self._settings, self._rate(channel)))
@@ -182,7 +183,7 @@ class CameraRouter:
         # measured in each part of a recording by itself, it would make their videos differ
         return None if self._settings.is_fast else rate_of(self._reader, channel)
 
-    def _write(self, state: _CameraChannel, item: _Item, workers: Workers) -> None:
+    def _write(self, state: _CameraChannel, item: _Item, threads: StreamThreads) -> None:
         route = state.routes[item.seen.key]
         reason = route.refusal
         for stream in self._candidates(state, route, item):
@@ -195,7 +196,7 @@ class CameraRouter:
             self._topic_of(item.message.channel).frames += 1
             if stream.frames == 1:
                 self._calibrations.adopt(stream)
-            workers.submit(number, job)
+            threads.submit(number, job)
             return
         state.inspector.leave_out(item.seen)
         self._keep_verbatim(item.message, item.number, route.refusal or reason)
@@ -268,31 +269,6 @@ class CameraRouter:
 _Made = TypeVar("_Made")
 
 
-@dataclass(frozen=True)
-class PartSettings:
-    """How a part is packed.
-
-    Attributes:
-        streams: How its streams are encoded.
-        selected: Whether a topic is packed.
-        excerpt: The part of the recording it covers.
-        survey: What all parts agree on; None if there is only one part.
-        camera_info: Pairs of topics given by the user, ``IMAGE=INFO``.
-        workers: Streams to encode in parallel.
-        compression: Of messages.mcap.
-        exact: Streams made lossless because they cannot reach the score, and why.
-    """
-
-    streams: StreamSettings
-    selected: Selection
-    excerpt: Excerpt = EVERYTHING
-    survey: Survey | None = None
-    camera_info: tuple[str, ...] = ()
-    workers: int = 1
-    compression: str = "zstd"
-    exact: Exact = field(default_factory=dict)
-
-
 def until_in_reach(make: Callable[[Exact], _Made]) -> _Made:
     """Pack, and repeat with more streams lossless while one cannot reach the score.
 
@@ -315,7 +291,9 @@ class Packer:
     Args:
         reader: The recording, open.
         folder: The folder to fill, empty.
-        settings: How.
+        plan: How.
+        piece: What.
+        exact: Streams that must be lossless although a score is asked for, and why.
         progress: Called after each record with what was packed so far.
     """
 
@@ -325,18 +303,24 @@ class Packer:
         self,
         reader: BagReader,
         folder: Path,
-        settings: PartSettings,
-        progress: Callable[[PartRecord], None] | None = None,
+        plan: Plan,
+        piece: Piece,
+        exact: Exact,
+        progress: Callable[[PartRecord], None],
     ) -> None:
         self._reader = reader
-        self._settings = settings
+        self._excerpt = piece.excerpt
+        self._selected = plan.options.selected
+        self._threads = plan.workers if plan.workers > 1 else 0
+        # that of a part is read once more, as parts are put together
+        self._compression = "zstd" if piece.is_all else "lz4"
         self._progress = progress
         self._transforms = TransformCollector()
         self._part = PartRecord(folder)
-        survey = settings.survey
+        survey = plan.survey_for(piece)
         self._calibrations = Calibrations(
-            [channel for channel in reader.channels if settings.selected(channel.topic)],
-            settings.camera_info,
+            [channel for channel in reader.channels if self._selected(channel.topic)],
+            plan.options.camera_info,
             survey.pairs if survey else None,
             topic_of=self._part.topic,
             keep=self._keep,
@@ -344,12 +328,12 @@ class Packer:
         self._cameras = CameraRouter(
             reader,
             folder,
-            settings.streams,
+            plan.streams,
             self._calibrations,
             survey,
             topic_of=self._part.topic,
             keep=self._keep,
-            exact=settings.exact,
+            exact=exact,
         )
 
     def run(self) -> PartRecord:
@@ -365,12 +349,12 @@ class Packer:
             with McapWriter(
                 part.messages_path,
                 profile=self._reader.profile,
-                compression=self._settings.compression,
+                compression=self._compression,
             ) as self._verbatim:
                 self._read()
                 part.streams = self._cameras.finish()
-                if self._settings.excerpt.others:
-                    declare_rest(part, self._reader, self._settings.selected, self._verbatim)
+                if self._excerpt.others:
+                    declare_rest(part, self._reader, self._selected, self._verbatim)
         except BaseException:
             self._cameras.abandon()
             raise
@@ -378,19 +362,17 @@ class Packer:
         return part
 
     def _read(self) -> None:
-        excerpt, count = self._settings.excerpt, self._settings.workers
-        with Workers(count if count > 1 else 0) as workers:
-            for record in self._reader.records(excerpt):
-                self._take(record, workers)
-                if self._progress is not None:
-                    self._progress(self._part)
-            self._cameras.settle(workers)
+        with StreamThreads(self._threads) as threads:
+            for record in self._reader.records(self._excerpt):
+                self._take(record, threads)
+                self._progress(self._part)
+            self._cameras.settle(threads)
         self._calibrations.finish()
-        if excerpt.others:
+        if self._excerpt.others:
             self._part.skipped = dict(self._reader.skipped)
             self._part.losses = list(self._reader.losses)
 
-    def _take(self, record: Record, workers: Workers) -> None:
+    def _take(self, record: Record, threads: StreamThreads) -> None:
         part = self._part
         if isinstance(record, Attachment):
             self._verbatim.add_attachment(record)
@@ -399,7 +381,7 @@ class Packer:
             self._verbatim.add_metadata(record)
             return
         channel = record.channel
-        if not self._settings.selected(channel.topic):
+        if not self._selected(channel.topic):
             part.left_out[channel.topic] = None
             return
         topic = part.topic(channel)
@@ -408,7 +390,7 @@ class Packer:
         part.saw([record.log_time])
         self._transforms.add(channel, record.data)
         if is_camera(channel):
-            self._cameras.take(record, workers)
+            self._cameras.take(record, threads)
         elif is_calibration(channel):
             self._calibrations.take(record)
         else:

@@ -1,9 +1,10 @@
-"""Divides a pack into independent tasks."""
+"""What is decided about a recording before it is packed: its pieces, and what they agree on."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -12,19 +13,269 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds._version import __version__
+from mp4ds.bags.formats import RECORDING_SUFFIXES, open_reader, open_sources
+from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.collections import available_cores
-from mp4ds.files.sources import SourceState
+from mp4ds.dataset.recording import DatasetReader
+from mp4ds.errors import OptionError, SourceError
+from mp4ds.files.sources import SourceState, source_name, source_size
+from mp4ds.files.urls import location, spelled
+from mp4ds.format.manifest import About
+from mp4ds.format.sidecars import MANIFEST_NAME, load_about
 from mp4ds.messages.serializations import is_calibration, is_camera
-from mp4ds.options import Slice
+from mp4ds.options import WHOLE, Slice
 from mp4ds.packing.calibrations import choose_pairs, pair_camera_infos, unpaired_infos
 from mp4ds.packing.inspection import depends_on_others
-from mp4ds.packing.job import Job, Task, absolute, is_hashed, outcome_options, tools
-from mp4ds.packing.options import PackOptions
+from mp4ds.packing.manifest import Origin
+from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.packing.survey import Survey, survey_channel, survey_pairs
 from mp4ds.packing.tracks import PicturePlan, StreamSettings, TrackPlan
-from mp4ds.plan import LOSSLESS, parse_quality
-from mp4ds.records import Channel
+from mp4ds.records import EVERYTHING, Channel, Excerpt
+from mp4ds.registry import plugin
+from mp4ds.video.encoder import tool_versions
+
+PIECE_NAME = r"all|whole-[0-9]{1,9}|[0-9]{5,9}"
+"""Pattern of the names of pieces, which are also folder names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """What is packed at a time, into a dataset.
+
+    Attributes:
+        name: Of the folder of that dataset.
+        excerpt: What is read.
+        is_solo: Whether it takes its topics for the whole recording.
+    """
+
+    name: str
+    excerpt: Excerpt
+    is_solo: bool = False
+
+    @property
+    def is_all(self) -> bool:
+        """Whether it is the whole recording."""
+        return self.excerpt == EVERYTHING
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a recording is packed: by one process at once, or piece by piece, by any.
+
+    Attributes:
+        paths: The recordings, absolute or URLs, as they were given.
+        sources: The state of all their files.
+        options: As completed from the recordings.
+        about: The description of the recording, if there is one.
+        pieces: In the order of their time; a single one for a short recording, or without an index.
+        frames: Messages of each topic of images, if there are several pieces.
+        threads: Of each encoder.
+        workers: Streams that a process encodes in parallel.
+        tools: Versions of what packs: parts made by different ones may not fit together.
+        survey: What all pieces agree on; None before it is made, and for a single piece.
+    """
+
+    paths: Sequence[str]
+    sources: Sequence[SourceState]
+    options: PackOptions
+    about: About | None
+    pieces: Sequence[Piece]
+    frames: Mapping[str, int]
+    threads: int
+    workers: int
+    tools: Mapping[str, str]
+    survey: Survey | None = None
+
+    @property
+    def is_divided(self) -> bool:
+        """Whether there are several pieces."""
+        return not self.pieces[0].is_all
+
+    @property
+    def streams(self) -> StreamSettings:
+        """How streams are encoded."""
+        return StreamSettings.of(self.options, self.threads)
+
+    def open(self) -> BagReader:
+        """The recording, open.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        options = self.options
+        return open_recording(
+            list(map(location, self.paths)),
+            salvage=options.salvage,
+            images=options.images,
+            asked=options.slice,
+        )
+
+    def survey_for(self, piece: Piece) -> Survey | None:
+        """What a piece is told; None if it decides everything itself."""
+        if piece.is_all or self.survey is None:
+            return None
+        return Survey(pairs=self.survey.pairs) if piece.is_solo else self.survey
+
+    @property
+    def hashed(self) -> list[SourceState]:
+        """The files that are hashed: of a slice, not those that are read only in part."""
+        return [source for source in self.sources if self._is_hashed(location(source.path))]
+
+    def _is_hashed(self, path: Path) -> bool:
+        return not self.options.slice or path.name == MANIFEST_NAME
+
+    def origin(self, reader: BagReader, digests: Iterable[tuple[int, str]]) -> Origin:
+        """What a dataset comes from.
+
+        Args:
+            reader: The recording.
+            digests: Size and SHA-256 of the files that are hashed.
+
+        Raises:
+            SourceError: It consists of other files than when it was planned.
+        """
+        if list(map(spelled, reader.files)) != [source.path for source in self.sources]:
+            raise SourceError(
+                reader.path,
+                "consists of different files than when packing began",
+                "Start over with `restart`.",
+            )
+        folder = reader.path if reader.path.is_dir() else None
+        known = iter(digests)
+        listed: list[tuple[str, int, str | None]] = []
+        for path in reader.files:
+            size, sha256 = next(known) if self._is_hashed(path) else (source_size(path), None)
+            listed.append((source_name(path, folder), size, sha256))
+        return Origin.of(reader.files, listed, self.about, reader.slice.span)
+
+
+def tools() -> dict[str, str]:
+    """Versions of the software used."""
+    return {"mp4ds": __version__, **tool_versions()}
+
+
+# ---------------------------------------------------------------- recordings
+
+
+def open_recording(
+    paths: Sequence[Path],
+    *,
+    salvage: bool = False,
+    images: ImageFolder | None = None,
+    asked: Slice = WHOLE,
+) -> BagReader:
+    """Open the source to pack.
+
+    Args:
+        paths: Recordings and datasets that belong together, or a folder of images.
+        salvage: Read what can be read of damaged recordings.
+        images: How to read the folder of images; None for recordings.
+        asked: The slice to pack.
+
+    Raises:
+        SourceError: It cannot be read.
+        OptionError: The options do not apply to it.
+    """
+    reader = _open_whole(paths, salvage, images)
+    if asked:
+        try:
+            take_slice(reader, asked)
+        except BaseException:
+            reader.close()
+            raise
+    return reader
+
+
+def _open_whole(paths: Sequence[Path], salvage: bool, images: ImageFolder | None) -> BagReader:
+    if salvage and any(map(dataset_at, paths)):
+        raise OptionError("`salvage` works with recordings, not with a dataset.")
+    if images is None:
+        return open_sources(paths, salvage=salvage, opener=_open_one)
+    if salvage:
+        raise OptionError("`salvage` works with recordings, not with a folder of images.")
+    if len(paths) != 1:
+        raise OptionError(
+            f"Only one folder of images can be imported at a time, but {len(paths)} were given."
+        )
+    reader: BagReader = plugin("images")(paths[0], images)
+    return reader
+
+
+def dataset_at(path: Path) -> Path | None:
+    """The folder of a dataset that is to be repacked; None for a recording."""
+    folder = path.parent if path.name == MANIFEST_NAME else path
+    if folder.suffix in RECORDING_SUFFIXES:  # saves a request for URLs
+        return None
+    try:
+        return folder if (folder / MANIFEST_NAME).is_file() else None
+    except OSError:
+        return None  # opening it will say why
+
+
+def _open_one(path: Path) -> BagReader:
+    folder = dataset_at(path)
+    if folder is None:
+        return open_reader(path)
+    return DatasetReader(folder)
+
+
+# ---------------------------------------------------------------- resources
+
+
+@dataclass(frozen=True, slots=True)
+class Resources:
+    """Resources of a machine for a pack.
+
+    Attributes:
+        cores: Processors.
+        jobs: Requested number of processes, or None.
+    """
+
+    cores: int
+    jobs: int | None = None
+
+    @classmethod
+    def of(cls, options: PackOptions) -> Resources:
+        """Those of this machine, within the options' limits."""
+        return cls(available_cores(), options.jobs)
+
+    def for_one_of(self, recordings: int) -> Resources:
+        """The share of each of several recordings packed at the same time."""
+        if recordings < 2:
+            return self
+        return replace(self, cores=max(1, self.cores // recordings), jobs=None)
+
+    def slots(self, plan: Plan) -> int:
+        """Number of processes for a job: as requested, or as many as cores and memory serve."""
+        encoders = sum(
+            decision.key.width * decision.key.height * _bytes_a_pixel(track)
+            for decisions in (plan.survey or Survey()).decisions.values()
+            for decision in decisions
+            for track in decision.plans[:1]
+        )
+        busy = self.cores // max(1, plan.threads * plan.workers)
+        return self.jobs or max(1, min(busy, _memory() // 2 // (encoders or 1)))
+
+
+def _bytes_a_pixel(plan: TrackPlan) -> int:
+    """About what an encoder takes; SVT-AV1 looks ahead with many pictures, x264 qp 0 with none."""
+    if not isinstance(plan, PicturePlan):
+        return 0
+    return 60 if plan.recipe.lossless else 300
+
+
+def _memory() -> int:
+    """This machine's memory, or the container's limit if lower, bytes."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with suppress(OSError, ValueError):
+            total = min(total, int(Path(name).read_text()))
+    return total
+
+
+# ---------------------------------------------------------------- cuts
 
 GOPS_PER_WINDOW = 10
 """Groups of pictures of the busiest camera in a window: a cut costs at most one key frame."""
@@ -73,92 +324,13 @@ def spans_of(cuts: Sequence[int]) -> list[tuple[int | None, int | None]]:
     return list(pairwise(edges))
 
 
-def share(number: int, tasks: Sequence[tuple[str, ...]], shares: int) -> list[tuple[str, ...]]:
-    """One machine's share of the tasks: every nth one.
-
-    Args:
-        number: Number of the share, from 1.
-        tasks: All, in an order on which all machines agree.
-        shares: Number of shares.
-    """
-    return list(tasks[number - 1 :: shares])
+# ---------------------------------------------------------------- pieces
 
 
-# ---------------------------------------------------------------- planning
-
-_COPIED, _OTHER_COST = 0.02, 1_000.0  # cost of a message that is not encoded; only for progress
-
-
-@dataclass(frozen=True, slots=True)
-class Resources:
-    """Resources of a machine for a pack.
-
-    Attributes:
-        cores: Processors.
-        jobs: Requested number of processes, or None.
-    """
-
-    cores: int
-    jobs: int | None = None
-
-    @classmethod
-    def of(cls, options: PackOptions) -> Resources:
-        """Those of this machine, within the options' limits."""
-        return cls(available_cores(), options.jobs)
-
-    def for_one_of(self, recordings: int) -> Resources:
-        """The share of each of several recordings packed at the same time."""
-        if recordings < 2:
-            return self
-        return replace(self, cores=max(1, self.cores // recordings), jobs=None)
-
-    def slots(self, job: Job) -> int:
-        """Number of processes for a job: as requested, or as many as cores and memory serve."""
-        encoders = sum(
-            decision.key.width * decision.key.height * _bytes_a_pixel(plan)
-            for decisions in job.survey.decisions.values()
-            for decision in decisions
-            for plan in decision.plans[:1]
-        )
-        busy = self.cores // max(1, job.threads * job.workers)
-        return self.jobs or max(1, min(busy, _memory() // 2 // (encoders or 1)))
-
-
-def _bytes_a_pixel(plan: TrackPlan) -> int:
-    """About what an encoder takes; SVT-AV1 looks ahead with many pictures, x264 qp 0 with none."""
-    if not isinstance(plan, PicturePlan):
-        return 0
-    return 60 if plan.recipe.lossless else 300
-
-
-def _memory() -> int:
-    """This machine's memory, or the container's limit if lower, bytes."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        with suppress(OSError, ValueError):
-            total = min(total, int(Path(name).read_text()))
-    return total
-
-
-@dataclass(frozen=True, slots=True)
-class _Topics:
-    """The camera channels of a recording, by how they can be divided.
-
-    Attributes:
-        free: Their messages are independent, so that they can be cut anywhere.
-        bound: Those that a single task must take as a whole.
-        infos: Topics of calibrations -> the topic of their images.
-    """
-
-    free: list[Channel]
-    bound: list[Channel]
-    infos: dict[str, str]
-
-
-def plan_job(
+def divide(
     reader: BagReader, paths: Sequence[Path], options: PackOptions, means: Resources
-) -> Job:
-    """Plan a pack.
+) -> Plan:
+    """Divide a recording into pieces.
 
     Args:
         reader: The recording.
@@ -167,169 +339,106 @@ def plan_job(
         means: The available resources.
 
     Returns:
-        The job; a single task if the recording is short, or has no index.
+        The plan, without its survey.
 
     Raises:
         OptionError: An option is wrong.
     """
     selected = options.selected
     selected.check(channel.topic for channel in reader.channels)
-    channels = [channel for channel in reader.channels if selected(channel.topic)]
-    if not reader.is_indexed:
-        return _single(reader, paths, options, means)
-    topics, pairs = _topics(reader, channels, options)
-    settings = StreamSettings(
-        quality=options.quality or parse_quality(LOSSLESS),
-        codec=options.codec,
-        preset=options.preset,
-        gop=options.group_frames,
-        threads=_side_by_side(reader, means)[1],
-        transcode=options.transcode,
-        purpose=options.purpose,
+    pieces: list[Piece] = []
+    cameras = [channel for channel in reader.channels if is_camera(channel)]
+    packed = [channel for channel in cameras if selected(channel.topic)]
+    if reader.is_indexed:
+        channels = [channel for channel in reader.channels if selected(channel.topic)]
+        pieces = _pieces(reader, channels, options)
+    if len(pieces) > 1:
+        # at least as many cores as streams, and one for each encoder, make one piece faster
+        spare = max(1, means.cores // len(pieces))
+        workers = min(spare, len(packed))
+        threads = max(1, spare // workers)
+    else:
+        pieces = [Piece("all", EVERYTHING)]
+        cores = means.jobs or means.cores
+        workers = min(cores, len(cameras) or 1)
+        threads = max(1, -(-cores // workers))
+    stats = reader.stats() if len(pieces) > 1 else {}
+    frames = Counter[str]()
+    for channel in packed:
+        frames[channel.topic] += stats[channel.id].count if channel.id in stats else 0
+    return Plan(
+        paths=list(map(spelled, paths)),
+        sources=[SourceState.of(path) for path in reader.files],
+        options=options,
+        about=None if options.about is None else load_about(options.about),
+        pieces=pieces,
+        frames=dict(frames),
+        threads=threads,
+        workers=workers,
+        tools=tools(),
     )
-    if not topics.free:
-        return _single(reader, paths, options, means)
+
+
+def _pieces(reader: BagReader, channels: Sequence[Channel], options: PackOptions) -> list[Piece]:
+    """The pieces of an indexed recording; fewer than two where it is packed at once."""
+    cameras = [channel for channel in channels if is_camera(channel)]
+    free = _independent(reader, channels)
+    pairs = pair_camera_infos(channels, chosen=choose_pairs(options.camera_info, channels))
+    if not free:
+        return []
     window = options.window or GOPS_PER_WINDOW * options.group_frames
     if options.window is None and options.gop is None:
         window = max(window, LEAST_WINDOW)
     times = reader.times()
-    columns = [times[channel.id] for channel in topics.free if len(times.get(channel.id, ()))]
+    columns = [times[channel.id] for channel in free if len(times.get(channel.id, ()))]
     spans = spans_of(cut_times(columns, window))
     if len(spans) == 1:
-        return _single(reader, paths, options, means)
-    survey = _survey(reader, channels, topics, pairs, spans, replace(settings, threads=1))
-    tasks = _tasks(spans, topics, reader, options.slice)
-    spare = max(1, means.cores // len(tasks))
-    workers = min(spare, len(topics.free))
-    threads = max(1, spare // workers)
-    return Job(
-        paths=absolute(paths),
-        sources=[SourceState.of(path) for path in reader.files],
-        options=outcome_options(options),
-        threads=threads,
-        workers=workers,
-        survey=survey,
-        tasks=tasks,
-        work=_work(reader, channels, survey),
-        cameras=list(dict.fromkeys(channel.topic for channel in (*topics.free, *topics.bound))),
-        tools=tools(),
-    )
-
-
-def _single(
-    reader: BagReader, paths: Sequence[Path], options: PackOptions, means: Resources
-) -> Job:
-    """The job of one task that takes everything."""
-    workers, threads = _side_by_side(reader, means)
-    return Job(
-        paths=absolute(paths),
-        sources=[SourceState.of(path) for path in reader.files],
-        options=outcome_options(options),
-        threads=threads,
-        workers=workers,
-        survey=Survey(),
-        tasks=[*_digest_tasks(reader, options.slice), Task("all", others=True, whole=True)],
-        work={},
-        cameras=[],
-        tools=tools(),
-    )
-
-
-def _side_by_side(reader: BagReader, means: Resources) -> tuple[int, int]:
-    """Streams that one process encodes at a time, and the threads of each encoder."""
-    cores = means.jobs or means.cores
-    workers = min(cores, sum(map(is_camera, reader.channels)) or 1)
-    return workers, max(1, -(-cores // workers))
-
-
-def _digest_tasks(reader: BagReader, asked: Slice) -> list[Task]:
-    return [
-        Task(f"source-{number}", source=number)
-        for number, path in enumerate(reader.files)
-        if is_hashed(path, asked)
-    ]
-
-
-def _work(
-    reader: BagReader, channels: Sequence[Channel], survey: Survey
-) -> dict[str, tuple[int, float]]:
-    """Messages of each topic, and the cost of one: its bytes, more if it is encoded."""
-    stats = reader.stats()
-    work: dict[str, tuple[int, float]] = {}
-    for channel in channels:
-        first = reader.first(channel) if channel.id in survey.decisions else None
-        encoded = any(item.plans for item in survey.decisions.get(channel.id, ()))
-        cost = len(first.data) * (1.0 if encoded else _COPIED) if first else _OTHER_COST
-        count, _ = work.get(channel.topic, (0, 0.0))
-        count += stats[channel.id].count if channel.id in stats else 0
-        work[channel.topic] = (count, cost)
-    return work
-
-
-def _topics(
-    reader: BagReader, channels: Sequence[Channel], options: PackOptions
-) -> tuple[_Topics, dict[int, int]]:
-    """How the camera channels can be divided, and the calibrations paired by name."""
-    cameras = [channel for channel in channels if is_camera(channel)]
-    bound = {channel.topic for channel in cameras if _is_bound(reader, channel)}
-    pairs = pair_camera_infos(channels, chosen=choose_pairs(options.camera_info, channels))
+        return []
+    topics = {channel.topic for channel in free}
     by_id = {channel.id: channel.topic for channel in channels}
-    return (
-        _Topics(
-            [channel for channel in cameras if channel.topic not in bound],
-            [channel for channel in cameras if channel.topic in bound],
-            {by_id[info]: by_id[image] for info, image in pairs.items()},
-        ),
-        pairs,
-    )
+    pieces: list[Piece] = []
+    without: set[str] = set()
+    for topic in dict.fromkeys(camera.topic for camera in cameras if camera.topic not in topics):
+        own = {topic, *(by_id[info] for info, image in pairs.items() if by_id[image] == topic)}
+        excerpt = Excerpt(topics=frozenset(own), others=False)
+        pieces.append(Piece(f"whole-{len(pieces)}", excerpt, is_solo=True))
+        without |= own
+    for number, (start, end) in enumerate(spans):
+        excerpt = Excerpt(start, end, without=frozenset(without), others=number == 0)
+        pieces.append(Piece(f"{number:05}", excerpt))
+    return pieces
 
 
-def _is_bound(reader: BagReader, channel: Channel) -> bool:
-    first = reader.first(channel)
-    return first is not None and depends_on_others(channel, first)
+def _independent(reader: BagReader, channels: Sequence[Channel]) -> list[Channel]:
+    """The camera channels that can be cut anywhere."""
+    cameras = [channel for channel in channels if is_camera(channel)]
+    bound = set()
+    for channel in cameras:
+        first = reader.first(channel)
+        if first is not None and depends_on_others(channel, first):
+            bound.add(channel.topic)
+    return [channel for channel in cameras if channel.topic not in bound]
 
 
-def _survey(
-    reader: BagReader,
-    channels: Sequence[Channel],
-    topics: _Topics,
-    pairs: dict[int, int],
-    spans: Sequence[tuple[int | None, int | None]],
-    settings: StreamSettings,
-) -> Survey:
-    infos = [channel for channel in channels if is_calibration(channel)]
+def surveyed(plan: Plan, reader: BagReader, known: Collection[str] = ()) -> Plan:
+    """The plan with what all its pieces agree on.
+
+    Args:
+        plan: Of several pieces.
+        reader: The recording.
+        known: Texts of what existing parts were made by. A choice for fast reading depends on
+            measured times: where one of these is among the candidates, it is chosen again.
+    """
+    if not plan.is_divided:
+        return plan
+    channels = [channel for channel in reader.channels if plan.options.selected(channel.topic)]
+    free = _independent(reader, channels)
+    pairs = pair_camera_infos(channels, chosen=choose_pairs(plan.options.camera_info, channels))
     found: dict[int, int] = {}
     if unpaired_infos(channels, pairs):
-        found = survey_pairs(reader, topics.free, infos, pairs)
-        by_id = {channel.id: channel.topic for channel in channels}
-        topics.infos.update({by_id[info]: by_id[image] for info, image in found.items()})
-    starts = [start for start, _ in spans]
-    decisions = {
-        channel.id: survey_channel(reader, channel, starts, settings) for channel in topics.free
-    }
-    return Survey(decisions, found)
-
-
-def _tasks(
-    spans: Sequence[tuple[int | None, int | None]],
-    topics: _Topics,
-    reader: BagReader,
-    asked: Slice,
-) -> list[Task]:
-    """All tasks: of the topics that are packed as a whole, and of each span of the others."""
-    solo = [
-        _with_infos([topic], topics)
-        for topic in dict.fromkeys(channel.topic for channel in topics.bound)
-    ]
-    without = tuple(sorted(topic for group in solo for topic in group))
-    tasks = _digest_tasks(reader, asked)
-    tasks += [Task(f"whole-{n}", topics=group, solo=True) for n, group in enumerate(solo)]
-    for number, (start, end) in enumerate(spans):
-        tasks.append(Task(f"{number:05}-0", start, end, without=without, others=number == 0))
-    return tasks
-
-
-def _with_infos(group: Sequence[str], topics: _Topics) -> tuple[str, ...]:
-    """Topics of a group, including those of their calibrations."""
-    infos = [info for info, image in topics.infos.items() if image in group]
-    return tuple(sorted({*group, *infos}))
+        infos = [channel for channel in channels if is_calibration(channel)]
+        found = survey_pairs(reader, free, infos, pairs)
+    starts = [piece.excerpt.start for piece in plan.pieces if not piece.is_solo]
+    settings = replace(plan.streams, threads=1, known=frozenset(known))
+    decisions = {channel.id: survey_channel(reader, channel, starts, settings) for channel in free}
+    return replace(plan, survey=Survey(decisions, found))

@@ -1,25 +1,17 @@
-"""Decisions made about a recording before it is packed in parts, so that all parts agree."""
+"""Decisions made about a recording before it is packed in pieces, so that all of them agree."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import Refused
 from mp4ds.messages.serializations import MessageSplitter, is_calibration
 from mp4ds.packing.calibrations import StampPairing
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
-from mp4ds.packing.tracks import (
-    StreamSettings,
-    TrackPlan,
-    needs_trial,
-    plan_from_values,
-    plan_to_values,
-    plan_tracks,
-)
+from mp4ds.packing.tracks import StreamSettings, TrackPlan, needs_trial, plan_tracks
 from mp4ds.records import Channel, Excerpt, Message
 
 SAMPLES = 6
@@ -51,63 +43,26 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What all parts of a recording must agree on.
+    """What all pieces of a recording must agree on.
 
     Attributes:
         decisions: For the keys of each camera channel, by its id; without channels packed by a
-            single task.
+            single piece.
         pairs: Calibration channels paired by stamps: their id -> that of the images.
     """
 
     decisions: Mapping[int, Sequence[Decision]] = field(default_factory=dict)
     pairs: Mapping[int, int] = field(default_factory=dict)
 
-    def to_values(self) -> dict[str, Any]:
-        """As JSON values."""
-        return {
-            "decisions": {
-                str(channel): [
-                    {
-                        "key": asdict(item.key),
-                        "plans": [plan_to_values(plan) for plan in item.plans],
-                        "refusal": item.refusal,
-                    }
-                    for item in items
-                ]
-                for channel, items in self.decisions.items()
-            },
-            "pairs": {str(info): image for info, image in self.pairs.items()},
-        }
-
-    @classmethod
-    def from_values(cls, values: Mapping[str, Any]) -> Survey:
-        """The survey that `to_values` was called on.
-
-        Raises:
-            ValueError: No survey has such values; nor where another error is raised.
-        """
-        return cls(
-            {
-                int(channel): [
-                    Decision(
-                        _key_of(item["key"]),
-                        [plan_from_values(plan) for plan in item["plans"]],
-                        item["refusal"],
-                    )
-                    for item in items
-                ]
-                for channel, items in values["decisions"].items()
-            },
-            {int(info): image for info, image in values["pairs"].items()},
-        )
-
-
-def _key_of(values: Mapping[str, Any]) -> StreamKey:
-    for name, value in values.items():
-        is_number = name in ("width", "height", "step", "is_bigendian")
-        if not isinstance(value, int if is_number else str):
-            raise ValueError(f"{name} {value!r} of a stream's images")
-    return StreamKey(**values)
+    @property
+    def texts(self) -> list[list[str]]:
+        """All of it in words: the same for equal surveys, in every process."""
+        pairs = [[f"{info} belongs to {image}"] for info, image in sorted(self.pairs.items())]
+        return pairs + [
+            [f"{channel}: {item.key}", *(plan.text for plan in item.plans), item.refusal]
+            for channel, items in sorted(self.decisions.items())
+            for item in items
+        ]
 
 
 def rate_of(reader: BagReader, channel: Channel) -> float | None:

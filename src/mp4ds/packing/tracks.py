@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,10 +11,18 @@ from typing import Any, Protocol
 from mp4ds.bags.mcap import compressed_size
 from mp4ds.errors import EncoderRefusedError, OptionError, Refused
 from mp4ds.format.models import Color, LayoutParameters
-from mp4ds.messages.encodings import ENCODINGS, Parameters
+from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import Layout, bind, layout_for
 from mp4ds.packing.inspection import CameraMessage, StreamKey
-from mp4ds.plan import MAX_GOP, Purpose, QualitySetting, QualityTarget, visual_setting
+from mp4ds.packing.options import PackOptions
+from mp4ds.plan import (
+    LOSSLESS,
+    Purpose,
+    QualitySetting,
+    QualityTarget,
+    parse_quality,
+    visual_setting,
+)
 from mp4ds.video.codecs import (
     AV1,
     DEFAULT_LOSSY,
@@ -23,11 +31,10 @@ from mp4ds.video.codecs import (
     fastest_preset,
     lossless_codecs,
     recipe_for,
-    remade,
 )
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketWriter
-from mp4ds.video.trial import choose
+from mp4ds.video.trial import Choice, choose
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +49,7 @@ class StreamSettings:
         threads: Threads of each encoder.
         transcode: Whether JPEG topics are re-encoded.
         purpose: What the dataset is for; None for nothing in particular.
+        known: Texts of plans to prefer, where there is a choice.
     """
 
     quality: QualitySetting
@@ -51,6 +59,24 @@ class StreamSettings:
     threads: int
     transcode: bool = False
     purpose: Purpose | None = None
+    known: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, options: PackOptions, threads: int) -> StreamSettings:
+        """Those of a pack.
+
+        Raises:
+            OptionError: An option is not valid.
+        """
+        return cls(
+            quality=options.quality or parse_quality(LOSSLESS),
+            codec=options.codec,
+            preset=options.preset,
+            gop=options.group_frames,
+            threads=threads,
+            transcode=options.transcode,
+            purpose=options.purpose,
+        )
 
     @property
     def is_fast(self) -> bool:
@@ -120,6 +146,11 @@ class TrackPlan(Protocol):
         """What the user should know about it; empty if nothing."""
         ...
 
+    @property
+    def text(self) -> str:
+        """All that decides about the video, in words."""
+        ...
+
     def open(
         self,
         path: Path,
@@ -157,6 +188,11 @@ class PicturePlan:
     exact: bool
     note: str = ""
     gop: int = 0
+
+    @property
+    def text(self) -> str:
+        """All that decides about the video, in words."""
+        return Choice(self.layout.name, self.layout.parameters, self.recipe, 0.0, self.gop).text
 
     def open(
         self,
@@ -292,6 +328,7 @@ class PacketPlan:
     profile: str = "lossless"
     exact: bool = True
     note: str = ""
+    text: str = "copied"
 
     def open(
         self,
@@ -498,6 +535,7 @@ def _lossless_plans(
         gop=settings.gop,
         threads=settings.threads,
         purpose=settings.purpose,
+        known=settings.known,
     )
     codec = settings.codec if asked else None  # otherwise they were meant for lossy videos
     try:
@@ -563,42 +601,3 @@ def _refuse_few(samples: Sequence[CameraMessage], video_size: float) -> None:
     stored = sum(len(seen.parts.body) for seen in samples)
     if stored < _STREAM_BYTES + len(samples) * video_size:
         raise Refused("so few small files take less than a video with its sidecar")
-
-
-def plan_to_values(plan: TrackPlan) -> dict[str, Any]:
-    """A plan as JSON values."""
-    values = {"profile": plan.profile, "exact": plan.exact, "note": plan.note}
-    if isinstance(plan, PicturePlan):
-        layout = plan.layout
-        values["layout"] = layout.name
-        values["encoding"] = layout.encoding.name
-        values["parameters"] = layout.parameters.to_values()
-        values["recipe"] = asdict(plan.recipe)
-        values["gop"] = plan.gop
-    if isinstance(plan, TargetPlan):
-        values["target"] = asdict(plan.target)
-    return values
-
-
-def plan_from_values(values: Mapping[str, Any]) -> TrackPlan:
-    """The inverse of `plan_to_values`.
-
-    Raises:
-        ValueError: It is not valid, or not one that this version makes.
-    """
-    types = {"profile": str, "exact": bool, "note": str}
-    common = {name: values[name] for name in types}
-    for name, kind in types.items():
-        if not isinstance(common[name], kind):
-            raise ValueError(f"{common[name]!r} as the {name} of a video")
-    if "recipe" not in values:
-        return PacketPlan(**common)
-    parameters = Parameters.from_values(values["parameters"])
-    layout = bind(values["layout"], ENCODINGS[values["encoding"]], parameters)
-    recipe = remade(layout.pixel_format, values["recipe"])
-    common["gop"] = gop = int(values["gop"])
-    if not 0 <= gop <= MAX_GOP:
-        raise ValueError(f"{gop} frames from one key frame to the next")
-    if "target" in values:
-        return TargetPlan(layout, recipe, target=QualityTarget(**values["target"]), **common)
-    return PicturePlan(layout, recipe, **common)

@@ -1,4 +1,4 @@
-"""Runs tasks on Dask workers: an existing cluster, batch jobs, or this machine."""
+"""An executor whose calls run on Dask workers: of a cluster, batch jobs, or this machine."""
 
 from __future__ import annotations
 
@@ -6,60 +6,46 @@ import asyncio
 import importlib
 import logging
 import queue
+import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from urllib.parse import urlsplit
 
 from mp4ds.errors import ClusterError, OptionError
-from mp4ds.packing.engine import Outcome, release_memory
+from mp4ds.packing.processes import CallError, call_error, release_memory
 
 if TYPE_CHECKING:
     from dask_jobqueue import JobQueueCluster
-    from distributed import Client, Future, LocalCluster
+    from distributed import Client, LocalCluster
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
-class TaskFailedError(Exception):
-    """A task's error, as strings: the error itself may not survive pickling.
-
-    Args:
-        kind: Name of its class.
-        sentence: Its message.
-    """
-
-    def __init__(self, kind: str, sentence: str) -> None:
-        self.kind = kind
-        self.sentence = sentence
-        super().__init__(kind, sentence)
-
-
-def attempt(task: tuple[str, ...], *, function: Callable[..., None]) -> None:
-    """Run a task in a thread of this worker.
-
-    Args:
-        task: The function's string arguments.
-        function: What to call.
+def attempt(call: Callable[[], _T]) -> _T:
+    """Make a call in a thread of this worker.
 
     Raises:
-        TaskFailedError: It failed.
+        CallError: It failed.
     """
     from distributed import get_worker
 
-    where = get_worker().address
     try:
-        function(*task)
-    except MemoryError:
-        raise TaskFailedError("MemoryError", f"on worker {where}: out of memory.") from None
+        return call()
     except Exception as error:
-        kind = type(error).__name__
-        raise TaskFailedError(kind, f"on worker {where}: {str(error) or kind}") from None
+        told = call_error(error)
+        sentence = f"on worker {get_worker().address}: {told.sentence}"
+        raise CallError(sentence, told.exit_code) from None
     finally:
-        release_memory()  # a worker using too much is paused and gets no more tasks
+        release_memory()  # a worker using too much is paused and gets no more calls
 
 
 # ---------------------------------------------------------------- batch systems
@@ -224,22 +210,18 @@ class Watch:
         self._next = 0.0
         self._empty_since: float | None = None
 
-    def begin(self) -> None:
-        """Start waiting for tasks; earlier time without tasks does not count.
-
-        Raises:
-            ClusterError: The scheduler is lost.
-        """
-        self._next = 0.0
-        self._empty_since = None
-        self.wait_until_connected()
-
-    def look(self) -> None:
+    def look(self, *, is_waiting: bool) -> None:
         """Check the cluster, unless it was just checked.
+
+        Args:
+            is_waiting: Whether there are calls; time without any does not count.
 
         Raises:
             ClusterError: The scheduler is lost, or there have been no workers for too long.
         """
+        if not is_waiting:
+            self._empty_since = None
+            return
         now = time.monotonic()
         if now < self._next:
             return
@@ -312,48 +294,6 @@ def _is_of_scheduler(address: str) -> bool:
     except ValueError:
         return False
     return bool(complete) and not (parts.path or parts.query or parts.fragment)
-
-
-class Connection:
-    """A connection to a cluster, opened on first use and kept.
-
-    So batch jobs, which may have had to queue, serve more than one run of tasks. A context manager;
-    whatever was started for it ends with it.
-
-    Args:
-        address: As `ClusterEngine` takes it.
-        tasks: Maximum number of parallel tasks.
-
-    Raises:
-        OptionError: The address is not valid, or a package is missing.
-    """
-
-    def __init__(self, address: str, tasks: int) -> None:
-        check_address(address)
-        self._address = address
-        self._tasks = tasks
-        self._stack = ExitStack()
-        self._way: tuple[Client, Watch] | None = None
-
-    def way(self) -> tuple[Client, Watch]:
-        """The client and watch, ready for tasks.
-
-        Raises:
-            ClusterError: No scheduler responds within 15 s, the batch system refuses the jobs, or
-                the scheduler was lost since.
-            OptionError: The configuration lacks something.
-        """
-        if self._way is None:
-            self._way = self._stack.enter_context(_opened(self._address, self._tasks))
-        self._way[1].begin()
-        return self._way
-
-    def __enter__(self) -> Connection:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._way = None
-        self._stack.close()
 
 
 @contextmanager
@@ -487,121 +427,166 @@ def _patience(seconds: float) -> float:
         ) from None
 
 
-# ---------------------------------------------------------------- the engine
+# ---------------------------------------------------------------- the executor
 
 _POLL_SECONDS = 1.0
 _MAX_DROPS = 3
 
 
-class ClusterEngine:
-    """Runs each task on a worker of a Dask cluster. See `Engine`.
+@dataclass
+class _Call:
+    """A call that was handed out.
 
-    A task whose worker dies is rerun on another one, as often as the scheduler's
-    ``distributed.scheduler.allowed-failures`` allows; one that raises is not rerun. Tasks that the
-    scheduler drops, as when the connection breaks, are resubmitted. Reports of running tasks are
-    not received.
+    Attributes:
+        future: Gets its result.
+        function: With all its arguments.
+        theirs: Dask's future; the scheduler forgets results that nobody holds.
+        drops: How often the scheduler dropped it.
+    """
+
+    future: Future[Any]
+    function: Callable[[], Any]
+    theirs: Any = None
+    drops: int = 0
+
+
+class ClusterExecutor(Executor):
+    """Makes each call on a worker of a Dask cluster, which imports what is called by its name.
+
+    It is connected at the first call and stays so: batch jobs, which may have had to queue, serve
+    all calls. A call whose worker dies is made on another one, as often as the scheduler's
+    ``distributed.scheduler.allowed-failures`` allows; one that raises is not. Calls that the
+    scheduler drops, as when the connection breaks, are submitted again. If the cluster is lost, or
+    has no workers for long, all calls fail with a `ClusterError`.
+
+    A context manager: leaving it with an exception drops waiting calls; on a cluster that keeps
+    running, running calls finish, since a worker's thread cannot be stopped from outside. Whatever
+    was started for it ends with it.
 
     Args:
-        function: Called with the strings of a task; workers import it by name.
         address: ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` of a scheduler, which is left as it
             is; ``slurm``, ``pbs``, ``sge``, ``lsf``, ``htcondor`` or ``oar`` for jobs of that
-            batch system, as dask-jobqueue is configured, which are ended after the last task;
-            ``local`` for workers on this machine. Or a connection, shared by several engines and
-            runs.
+            batch system, as dask-jobqueue is configured, which are ended after the last call;
+            ``local`` for workers on this machine.
+        calls: Maximum number of parallel calls.
 
     Raises:
         OptionError: The address has none of these forms, or a package is missing.
     """
 
-    def __init__(self, function: Callable[..., None], address: str | Connection) -> None:
-        if isinstance(address, str):
-            check_address(address)
-        self._function = function
+    def __init__(self, address: str, calls: int) -> None:
+        check_address(address)
         self._address = address
+        self._most = calls
+        self._stack = ExitStack()
+        self._client: Client | None = None
+        self._thread: threading.Thread | None = None
+        self._ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._calls: dict[str, _Call] = {}  # by Dask's key
+        self._lost: ClusterError | None = None
 
-    def run(
-        self,
-        tasks: Sequence[tuple[str, ...]],
-        on_progress: Callable[[tuple[str, ...], dict[str, Any]], None],
-    ) -> Generator[Outcome, None, None]:
-        """See `Engine.run`.
-
-        Closing the generator drops waiting tasks; on a cluster that keeps running, running tasks
-        finish, since a worker's thread cannot be stopped from outside.
+    def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
+        """Make a call on a worker.
 
         Raises:
-            ClusterError: No scheduler answers, it was lost, or there are no workers.
+            ClusterError: No scheduler responds within 15 s, the batch system refuses the jobs, or
+                the cluster was lost.
             OptionError: The configuration of Dask lacks something.
         """
-        if not tasks:
-            return
-        with ExitStack() as stack:
-            connection = self._address
-            if isinstance(connection, str):
-                connection = stack.enter_context(Connection(connection, len(tasks)))
-            yield from self._run(*connection.way(), tasks)
-
-    def _run(
-        self, client: Client, watch: Watch, tasks: Sequence[tuple[str, ...]]
-    ) -> Generator[Outcome, None, None]:
-        waiting: dict[str, tuple[tuple[str, ...], Future]] = {}
-        heard: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        drops: Counter[tuple[str, ...]] = Counter()
-
-        def hand_out(some: Sequence[tuple[str, ...]]) -> None:
-            futures = client.map(
-                attempt,
-                list(some),
-                function=self._function,
-                key=f"mp4ds-{self._function.__name__}",
-                pure=False,  # another run of the same tasks shares nothing with this one
+        if self._client is None:
+            self._client, watch = self._stack.enter_context(_opened(self._address, self._most))
+            self._thread = threading.Thread(
+                target=self._follow, args=(self._client, watch), daemon=True
             )
-            for task, future in zip(some, futures, strict=True):
-                waiting[future.key] = (task, future)
-                future.add_done_callback(heard.put)
+            self._thread.start()
+        if self._lost is not None:
+            raise self._lost
+        call = _Call(Future(), partial(fn, *args, **kwargs))
+        self._hand_out(self._client, call)
+        return call.future
 
-        hand_out(tasks)
+    def _hand_out(self, client: Client, call: _Call) -> None:
+        # not pure: another call with the same arguments shares nothing with this one
+        call.theirs = client.submit(attempt, call.function, pure=False)
+        self._calls[call.theirs.key] = call
+        call.theirs.add_done_callback(self._ended.put)
+
+    def _follow(self, client: Client, watch: Watch) -> None:
+        """Hand on what becomes of calls, until the executor is shut down; in a thread."""
         try:
-            while waiting:
-                watch.look()
+            while True:
+                watch.look(is_waiting=bool(self._calls))
                 try:
-                    ended = heard.get(timeout=_POLL_SECONDS)
+                    ended = self._ended.get(timeout=_POLL_SECONDS)
                 except queue.Empty:
                     continue
-                task, _ = waiting.pop(ended.key)
-                outcome = self._outcome(task, ended)
-                del ended, _  # the scheduler forgets results that nobody holds
-                if outcome is not None:
-                    yield outcome
+                if ended is None:
+                    return
+                call = self._calls.pop(ended.key)
+                if call.future.cancelled() or _settle(call.future, ended):
                     continue
-                drops[task] += 1
-                if drops[task] > _MAX_DROPS:
+                call.drops += 1
+                if call.drops > _MAX_DROPS:
+                    self._calls[ended.key] = call
                     raise watch.lost()
                 watch.wait_until_connected()
-                hand_out([task])
-        finally:
-            if waiting and client.status == "running":
-                with suppress(OSError):
-                    client.cancel([future for _, future in waiting.values()])
+                self._hand_out(client, call)
+        except ClusterError as error:
+            self._lost = error
+            for call in list(self._calls.values()):
+                if not call.future.cancelled():
+                    call.future.set_exception(error)
 
-    def _outcome(self, task: tuple[str, ...], future: Future) -> Outcome | None:
-        """The outcome of a task; None if the scheduler has dropped it."""
-        if future.status == "finished":
-            return Outcome(task)
-        if future.status != "error":
-            return None
-        error = future.exception()
-        if isinstance(error, TaskFailedError):
-            return Outcome(task, (error.kind, error.sentence))
-        if type(error).__name__ == "KilledWorker":
-            said = (
-                f"{error.allowed_failures + 1} workers died on it, perhaps for lack of memory. See "
-                "their logs."
-            )
-            return Outcome(task, ("Killed", said))
-        lines = str(error.__cause__ or error).strip().splitlines() or [""]
-        said = (
-            f"the cluster could not run it ({type(error).__name__}: {lines[0]}). The same version "
-            "of mp4ds must be installed where the scheduler and its workers run."
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Take no more calls.
+
+        Args:
+            wait: Wait for those that were taken.
+            cancel_futures: Drop them.
+        """
+        calls = list(self._calls.values())
+        if cancel_futures:
+            for call in calls:
+                call.future.cancel()
+            if calls and self._client is not None and self._client.status == "running":
+                with suppress(OSError):
+                    self._client.cancel([call.theirs for call in calls])
+        elif wait and self._lost is None:
+            wait_for([call.future for call in calls])
+        if self._thread is not None:
+            self._ended.put(None)
+            self._thread.join()
+        self._client = self._thread = None
+        self._stack.close()
+
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
+        self.shutdown(cancel_futures=exc_type is not None)
+
+
+def _settle(future: Future[Any], theirs: Any) -> bool:
+    """Give a call what Dask's future has; false if the scheduler has dropped the call."""
+    try:
+        if theirs.status == "finished":
+            future.set_result(theirs.result())
+            return True
+        if theirs.status == "error":
+            future.set_exception(_call_error(theirs.exception()))
+            return True
+    except Exception:  # of many kinds: the worker that has it died just then
+        return False
+    return False
+
+
+def _call_error(error: Any) -> CallError:
+    if isinstance(error, CallError):
+        return error
+    if type(error).__name__ == "KilledWorker":
+        return CallError(
+            f"{error.allowed_failures + 1} workers died on it, perhaps for lack of memory. See "
+            "their logs."
         )
-        return Outcome(task, ("Failed", said))
+    lines = str(error.__cause__ or error).strip().splitlines() or [""]
+    return CallError(
+        f"the cluster could not run it ({type(error).__name__}: {lines[0]}). The same version of "
+        "mp4ds must be installed where the scheduler and its workers run."
+    )

@@ -27,7 +27,7 @@ from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, names_dataset
 from mp4ds.messages.serializations import MessageSplitter, kind_of
 from mp4ds.messages.wire import CodedFields, ImageFields
 from mp4ds.options import WHOLE, Slice
-from mp4ds.packing.job import open_recording
+from mp4ds.packing.planning import open_recording
 from mp4ds.records import Channel, latched_text
 from mp4ds.times import intervals, lost_frames
 

@@ -6,9 +6,8 @@ To add a codec, add an entry to `CODECS`, and to the tables of encodings below i
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib import import_module
-from itertools import product
 from types import MappingProxyType
 from typing import Any
 
@@ -396,37 +395,6 @@ def recipe_for(
         matrix="smpte170m" if is_yuv else "gbr" if is_rgb else "bt709",
         full_range=not is_yuv,
     )
-
-
-def remade(pixel_format: str, values: Mapping[str, Any]) -> Recipe:
-    """Rebuild the recipe stated in a file, rather than trust it: encoder options may write files.
-
-    Args:
-        pixel_format: Of the pictures.
-        values: The fields of a `Recipe`.
-
-    Raises:
-        ValueError: This version makes no such recipe.
-    """
-    lossless = bool(values["lossless"])
-    preset, crf = (values["options"].get(name) for name in ("preset", "crf"))
-    for name in _LOSSLESS[pixel_format] if lossless else _LOSSY:
-        fast = (False, True) if lossless and _LOSSLESS[pixel_format][name].fast else (False,)
-        varied = (False,) if lossless else (False, True)
-        known = preset if preset in _PRESETS[name] else None
-        for choice in product({known, None}, varied, fast):
-            recipe = recipe_for(
-                pixel_format,
-                lossless=lossless,
-                codec=name,
-                crf=None if crf is None else int(crf),
-                preset=choice[0],
-                varied=choice[1],
-                fast=choice[2],
-            )
-            if asdict(recipe) == values:
-                return recipe
-    raise ValueError(f"{values['encoder']!r} does not take such options")
 
 
 def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:

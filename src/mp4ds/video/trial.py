@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
@@ -46,6 +46,12 @@ class Choice:
     recipe: Recipe
     bytes_per_frame: float
     gop: int
+
+    @property
+    def text(self) -> str:
+        """The choice in words: the same for the same choice, in every process."""
+        recipe, parameters = self.recipe, self.parameters.to_values()
+        return f"{self.layout} {parameters} {recipe.encoder} {dict(recipe.options)} gop {self.gop}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +169,7 @@ def choose(
     gop: int,
     threads: int,
     purpose: Purpose | None = None,
+    known: Collection[str] = (),
 ) -> Choice:
     """The best lossless layout, recipe and distance of key frames, found by trying each.
 
@@ -174,6 +181,8 @@ def choose(
         gop: Frames from one key frame to the next, unless the purpose sets it.
         threads: Threads of the encoder.
         purpose: What the video is for.
+        known: Texts of choices made before, for ``training``, for which times are measured: one of
+            these that is allowed is chosen again.
 
     Returns:
         The first, in the order of the encoding's layouts and their codecs, within 2 % of the
@@ -214,18 +223,21 @@ def choose(
         raise next((e for e in refusals if isinstance(e, EncoderRefusedError)), refusals[0])
     smallest = min(choice.bytes_per_frame for choice, _ in tried)
     if purpose is not None and purpose.is_training:
-        return _fastest(tried, share, most=(1 + purpose.larger / 100) * smallest)
+        return _fastest(tried, share, (1 + purpose.larger / 100) * smallest, known)
     near = NEAR if purpose is None else 1.0
     return next(choice for choice, _ in tried if choice.bytes_per_frame <= near * smallest)
 
 
-def _fastest(tried: Sequence[tuple[Choice, Coded]], share: float, most: float) -> Choice:
+def _fastest(
+    tried: Sequence[tuple[Choice, Coded]], share: float, most: float, known: Collection[str]
+) -> Choice:
     """The choice, with its best distance of key frames, whose random frames decode fastest.
 
     Args:
         tried: All candidates, with their cost.
         share: Share of the images' pixels that were tried.
         most: Maximum bytes per frame; at least one candidate meets it.
+        known: Texts of choices to make again.
     """
     found = [
         (coded.random_seconds(gop), replace(choice, bytes_per_frame=size, gop=gop))
@@ -233,7 +245,8 @@ def _fastest(tried: Sequence[tuple[Choice, Coded]], share: float, most: float) -
         for gop in {*_DISTANCES, choice.gop}
         if (size := coded.bytes_per_frame(gop) / share) <= most
     ]
-    return min(found, key=lambda pair: (pair[0], pair[1].bytes_per_frame))[1]
+    again = [pair for pair in found if pair[1].text in known]
+    return min(again or found, key=lambda pair: (pair[0], pair[1].bytes_per_frame))[1]
 
 
 def _candidates(samples: Sequence[Pixels], encoding: Encoding) -> list[Layout]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import as_completed
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +16,8 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from mp4ds._version import __version__
-from mp4ds.errors import Mp4dsError
 from mp4ds.files.outputs import write_synced
-from mp4ds.packing.engine import ProcessEngine, serve
+from mp4ds.packing.processes import ProcessExecutor, call_error
 from mp4ds.video.codecs import LOSSY_GOP, Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import png_file
@@ -224,20 +223,17 @@ def try_out(
         OSError: A result cannot be written.
     """
     known = {trial.name: cell for trial in trials if (cell := trial.known())}
-    tasks: dict[tuple[str, ...], Trial] = {
-        (_TRIAL.dump_json(trial).decode(),): trial for trial in trials if trial.name not in known
-    }
     new: dict[str, Cell | str] = {}
     on_done(len(known))
-    with closing(ProcessEngine(_command, jobs).run(list(tasks), lambda *_: None)) as outcomes:
-        for outcome in outcomes:
-            trial = tasks[outcome.task]
-            if outcome.error is not None:
-                new[trial.name] = outcome.error[1]
+    with ProcessExecutor(jobs) as executor:
+        calls = {executor.submit(run, it): it for it in trials if it.name not in known}
+        for call in as_completed(calls):
+            trial, error = calls[call], call.exception()
+            if error is not None:
+                new[trial.name] = call_error(error).sentence
             else:
-                cell = _CELL.validate_python(outcome.facts["cell"])
+                new[trial.name] = cell = call.result()
                 write_synced(trial.path, _CELL.dump_json(cell, indent=1))
-                new[trial.name] = cell
             on_done(len(known) + len(new))
     for trial in trials:
         yield trial, (known | new)[trial.name], trial.name in known
@@ -254,10 +250,6 @@ def versions_of(ffmpeg: Ffmpeg | None) -> dict[str, str]:
 
 
 # ---------------------------------------------------------------- in a process
-
-
-def _command(task: tuple[str, ...]) -> list[str]:
-    return [sys.executable, "-m", "mp4ds.plugins.evaluating.trials", *task]
 
 
 def run(trial: Trial) -> Cell:
@@ -328,16 +320,3 @@ def _encoded(trial: Trial, frames: PlaneSpool, recipe: Recipe, video: Path) -> d
         "whole_bytes": frame_bytes * clip.source_frames,
         "whole_seconds": seconds / clip.frames * clip.source_frames,
     }
-
-
-def _outcome(task: str) -> dict[str, Any]:
-    try:
-        return {"done": True, "cell": _CELL.dump_python(run(_TRIAL.validate_json(task)))}
-    except MemoryError:
-        return {"error": ("MemoryError", "out of memory; try fewer `jobs` or `frames`")}
-    except (Mp4dsError, OSError) as error:
-        return {"error": (type(error).__name__, str(error))}
-
-
-if __name__ == "__main__":
-    serve(_outcome)

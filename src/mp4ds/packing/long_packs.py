@@ -1,0 +1,455 @@
+"""Recordings that are packed in parts: their pieces on an executor, and what becomes of them."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.concat import concat
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.errors import (
+    ClusterError,
+    FormatError,
+    OptionError,
+    PartsFailedError,
+    SourceError,
+    TargetError,
+    WriteError,
+    interrupted,
+    path_text,
+)
+from mp4ds.files.outputs import is_seen, staged
+from mp4ds.format.manifest import Manifest
+from mp4ds.format.models import StreamSidecar
+from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.packing.manifest import (
+    PartRecord,
+    PartStream,
+    dataset_files,
+    folder_size,
+    summarize,
+    with_latched,
+)
+from mp4ds.packing.options import PackOptions, PackProgress, PackSummary, TopicSummary
+from mp4ds.packing.parts import (
+    FACTS_NAME,
+    PROGRESS_NAME,
+    SHARED,
+    Digest,
+    PartFacts,
+    PartPacker,
+    PartsFolder,
+    PlanNote,
+    Topics,
+    digest_source,
+    parse_topics,
+    part_facts,
+)
+from mp4ds.packing.planning import Piece, Plan
+from mp4ds.packing.processes import CallError, call_error
+from mp4ds.plan import FileNames
+
+Report = Callable[[PackProgress], None]
+
+_POLL_SECONDS = 0.5
+_REPORT_SECONDS = 0.1
+_LISTED = 10
+_KEPT = "finished parts are kept: run the same command again to resume"
+
+
+@dataclass
+class PartedPack:
+    """A recording that is packed in parts.
+
+    Attributes:
+        plan: How.
+        paths: What to pack, as given by the user.
+        target: The dataset.
+        force: Replace an existing one.
+        report: Called with progress.
+        is_new: Whether no part was begun before.
+        is_shared: Other machines may work in the same folder, or have begun it.
+        failures: Name and error of each piece that failed.
+    """
+
+    plan: Plan
+    paths: Sequence[Path]
+    target: Path
+    force: bool
+    report: Report | None
+    is_new: bool
+    is_shared: bool
+    failures: list[tuple[str, CallError]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.folder = PartsFolder(self.target)
+        self._done: dict[str, Topics] = {}
+        self._before = 0
+        self._written = 0
+        self._next_report = 0.0
+
+    def begin(self, *, anew: bool, alone: bool) -> None:
+        """Take over the folder, which is locked.
+
+        Args:
+            anew: Discard what is there.
+            alone: Nobody else is working there.
+
+        Raises:
+            Mp4dsError: It holds the parts of another pack.
+        """
+        if anew and alone:
+            self.folder.clear()
+        note = PlanNote.of(self.plan)
+        if self.folder.note() is None:
+            self.folder.keep(note)
+        self.folder.check(note, shared=self.is_shared)
+        if alone:
+            self.folder.sweep()
+        for piece in self.plan.pieces:
+            if facts := part_facts(self.folder.part(piece)):
+                self._note_part(piece, facts)
+        self._before = len(self._done)
+
+    @property
+    def missing(self) -> list[Piece]:
+        """The pieces without parts."""
+        return [piece for piece in self.plan.pieces if piece.name not in self._done]
+
+    def ended(self, piece: Piece, error: BaseException | None) -> None:
+        """Note that the call that packs a piece has ended."""
+        place = self.folder.part(piece)
+        if error is None and is_seen(lambda: part_facts(place) is not None, self.folder.path):
+            self._note_part(piece, part_facts(place))
+        elif error is None:
+            gone = f"its part did not appear in {self.folder.path}; {SHARED}"
+            self.failures.append((piece.name, CallError(gone)))
+        else:
+            self.failures.append((piece.name, call_error(error)))
+        self.tell(now=error is not None)
+
+    def _note_part(self, piece: Piece, facts: PartFacts | None) -> None:
+        place = self.folder.part(piece)
+        self._done[piece.name] = facts.messages() if facts else {}
+        self._written += folder_size(place)
+
+    def refuse_failures(self) -> None:
+        """Report the pieces that failed.
+
+        Raises:
+            PartsFailedError: There are some.
+        """
+        if self.failures:
+            failures = sorted(self.failures, key=lambda failure: failure[0])
+            raise PartsFailedError(
+                self.target,
+                [(name, error.sentence) for name, error in failures],
+                len(self.plan.pieces),
+                failures[0][1].exit_code,
+            )
+
+    def refuse_missing(self) -> None:
+        """Refuse to put parts together of which some are missing.
+
+        Raises:
+            OptionError: Names them.
+        """
+        names = [piece.name for piece in self.missing]
+        if names:
+            listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
+            raise OptionError(
+                f"{path_text(self.target)}: {len(names)} of {len(self.plan.pieces)} parts are "
+                f"missing: {listed}. Run their shards, or pack without `join` to pack them here."
+            )
+
+    def tell(self, phase: str = "packing", note: str = "", *, now: bool = False) -> None:
+        """Report progress, unless it was just reported."""
+        clock = time.monotonic()
+        if self.report is None or (clock < self._next_report and not now):
+            return
+        self._next_report = clock + _REPORT_SECONDS
+        messages, size = Counter[str](), 0
+        for topics in (*self._done.values(), *self._begun()):
+            for topic, (count, length) in topics.items():
+                messages[topic] += count
+                size += length
+        frames = self.plan.frames
+        packed = sum(min(messages[topic], count) for topic, count in frames.items())
+        total = sum(frames.values())
+        self.report(
+            PackProgress(
+                dataset=self.target,
+                phase=phase,
+                done=packed / total if total else None,
+                bytes_read=size,
+                bytes_total=sum(source.size for source in self.plan.sources),
+                bytes_written=self._written,
+                topics={topic: (messages[topic], count) for topic, count in frames.items()},
+                tasks_done=len(self._done),
+                tasks_total=len(self.plan.pieces),
+                tasks_before=self._before,
+                failed=len(self.failures),
+                note=note,
+            )
+        )
+
+    def _begun(self) -> Iterator[Topics]:
+        """What is packed of parts that are not done."""
+        for path in self.folder.path.glob(f".*/{PROGRESS_NAME}"):
+            with suppress(OSError, ValueError):  # it may be just then written, or removed
+                yield parse_topics(path.read_bytes())
+
+    def finish(self, digests: Sequence[Digest]) -> PackSummary:
+        """Put the parts together, and remove them.
+
+        Args:
+            digests: Size and SHA-256 of each file that is hashed.
+
+        Raises:
+            PartsFailedError: The dataset could not be written; the parts are kept.
+            FormatError: A part was damaged after it was made; it will be made again.
+            SourceError: The recording is damaged, or has changed.
+        """
+        self.tell("joining", now=True)
+        try:
+            with staged(self.target, force=self.force, owned=dataset_files) as made:
+                made.mkdir()
+                summary = self._join(made, digests)
+        except OSError as error:
+            if isinstance(error, (SourceError, TargetError)):
+                raise
+            refused = error if isinstance(error, WriteError) else WriteError(self.target, error)
+            raise PartsFailedError(
+                self.target, [("joining", str(refused))], len(self.plan.pieces), 1
+            ) from None
+        self.folder.remove()
+        return summary
+
+    def _join(self, made: Path, digests: Sequence[Digest]) -> PackSummary:
+        plan = self.plan
+        places = [self.folder.part(piece) for piece in plan.pieces]
+        with ExitStack() as stack:
+            reader = stack.enter_context(plan.open())
+            with _redone_if_damaged(places):
+                facts = list(map(_whole_facts, places))
+                parts = [stack.enter_context(Dataset(place)) for place in places]
+                _check_facts(parts, facts)
+                for source in plan.sources:
+                    source.check()
+                origin = plan.origin(reader, digests)
+                manifests = [part.manifest for part in parts if part.manifest]
+                losses = [item.to_record() for one in manifests for item in one.losses]
+                left_out = [topic for one in manifests for topic in one.topics_left_out]
+                manifest, sidecars = concat(
+                    parts,
+                    made,
+                    changes=origin.fields(reader, losses, left_out),
+                    report=lambda name: self.tell("joining", name, now=True),
+                )
+                # last, since damage of a part would be taken for that of the index
+                _check_index(reader, parts, plan.options.selected)
+            whole = _joined(made, manifest, sidecars, facts)
+            whole.losses, whole.left_out = losses, dict.fromkeys(left_out)
+            size = sum(source.size for source in plan.sources)
+            source_bytes = None if plan.options.slice else size
+            return with_latched(summarize(whole, self.target, source_bytes, origin), reader)
+
+
+@contextmanager
+def _redone_if_damaged(places: Sequence[Path]) -> Iterator[None]:
+    """Where parts cannot be joined, see to it that damaged ones are made again.
+
+    Raises:
+        FormatError: Names a damaged file.
+    """
+    try:
+        yield
+    except FormatError as error:
+        for place in places:
+            if str(error.place).startswith(f"{place}{os.sep}"):
+                (place / FACTS_NAME).unlink(missing_ok=True)
+                raise FormatError(
+                    "checksum-mismatch",
+                    error.place,
+                    "was damaged after it was written; run the same command again to redo this "
+                    "part",
+                ) from None
+        raise
+
+
+def _check_facts(parts: Sequence[Dataset], facts: Sequence[PartFacts]) -> None:
+    """Refuse parts whose facts are not those of their datasets.
+
+    Raises:
+        FormatError: Names one; it is made again.
+    """
+    for part, told in zip(parts, facts, strict=True):
+        found = Counter[str]()
+        counts = part.counts()
+        for channel in part.channels:
+            found[channel.topic] += counts.get(channel.id, 0)
+        if +found != +Counter({topic.topic: topic.messages for topic in told.topics}):
+            (part.path / FACTS_NAME).unlink()
+            raise FormatError("file-missing", part.path, "was damaged after it was made")
+
+
+def _check_index(
+    reader: BagReader, parts: Sequence[Dataset], selected: Callable[[str], bool]
+) -> None:
+    """Refuse parts that together lack messages: those of other channels do not make up for it.
+
+    Args:
+        reader: The recording.
+        parts: All of them, undamaged.
+        selected: Whether a topic is packed.
+
+    Raises:
+        SourceError: The recording's index is wrong.
+    """
+    found = Counter[tuple[object, ...]]()  # by channel; equal ones of a recording are one in a part
+    for part in parts:
+        counts = part.counts()
+        for channel in part.channels:
+            found[channel.identity] += counts.get(channel.id, 0)
+    stats = reader.stats()
+    due = Counter[tuple[object, ...]]()
+    for channel in reader.channels:
+        if selected(channel.topic) and channel.id in stats:
+            due[channel.identity] += stats[channel.id].count
+    for channel in reader.channels:
+        key = channel.identity
+        if key in due and found[key] != due[key]:
+            raise SourceError(
+                reader.path,
+                f"is damaged: its index lists {due[key]} messages on {channel.topic}, but "
+                f"{found[key]} were found",
+            )
+
+
+def _joined(
+    folder: Path, manifest: Manifest, sidecars: Sequence[StreamSidecar], facts: Sequence[PartFacts]
+) -> PartRecord:
+    """What became of each topic in all parts together."""
+    topics: dict[str, TopicSummary] = {}
+    skipped: dict[str, int] = {}
+    for part in facts:
+        skipped |= part.skipped
+        for topic in part.topics:
+            if topic.topic in topics:
+                topics[topic.topic].extend(topic, topics[topic.topic].messages)
+            else:
+                topics[topic.topic] = topic
+    names = FileNames()
+    streams = [
+        PartStream(Path(entry.sidecar).stem, sidecar, names.name_for(entry.topic)[1])
+        for entry, sidecar in zip(manifest.streams, sidecars, strict=True)
+    ]
+    return PartRecord(folder, topics, streams, skipped=skipped)
+
+
+def _whole_facts(place: Path) -> PartFacts:
+    """What became of a part.
+
+    Raises:
+        FormatError: It is damaged, or gone.
+    """
+    facts = part_facts(place)
+    if facts is None:
+        raise FormatError("file-missing", place / MANIFEST_NAME, "or another file is gone")
+    return facts
+
+
+@contextmanager
+def _claimed(packs: Sequence[PartedPack], *, alone: bool) -> Iterator[None]:
+    """Lock the folders of packs; those without any parts are removed at the end."""
+    with ExitStack() as stack:
+        for pack in packs:
+            stack.enter_context(pack.folder.claimed(shared=not alone))
+        try:
+            yield
+        except BaseException as error:
+            kept = not alone
+            for pack in packs:
+                if pack.folder.has_parts():
+                    kept = True
+                elif alone:
+                    pack.folder.remove()
+            if kept and isinstance(error, (KeyboardInterrupt, SystemExit)):
+                raise interrupted(error, _KEPT) from None
+            raise
+
+
+def pack_parts(
+    packs: Sequence[PartedPack],
+    executor: Executor,
+    options: PackOptions,
+    share: tuple[int, int] | None = None,
+) -> Iterator[PackSummary]:
+    """Pack recordings in parts, as one job.
+
+    Args:
+        packs: The recordings.
+        executor: Packs the pieces; is shut down.
+        options: How.
+        share: Which share of the pieces to pack, from 1, and the number of shares; None to pack
+            all, and to make the datasets.
+
+    Yields:
+        The result for each dataset that is made, as it is done.
+
+    Raises:
+        PartsFailedError: Pieces failed.
+        ClusterError: The cluster was lost.
+    """
+    number, shares = share or (1, 1)
+    with _claimed(packs, alone=share is None), executor, ExitStack() as stack:
+        for pack in packs:
+            pack.begin(anew=options.restart, alone=share is None)
+            if options.join:
+                pack.refuse_missing()
+        digests: dict[Path, list[Future[Digest]]] = {}
+        calls: dict[Future[Any], tuple[PartedPack, Piece | None]] = {}
+        for pack in packs:
+            sources = pack.plan.hashed if share is None else []
+            digests[pack.target] = [executor.submit(digest_source, source) for source in sources]
+            calls.update((call, (pack, None)) for call in digests[pack.target])
+            packer = stack.enter_context(closing(PartPacker(pack.plan, pack.folder.path)))
+            missing = pack.missing
+            for piece in pack.plan.pieces[number - 1 :: shares]:
+                if piece in missing:
+                    calls[executor.submit(packer, piece)] = pack, piece
+            pack.tell(now=True)  # so that all work is known from the beginning
+        left = Counter(pack.target for pack, _ in calls.values())
+        ready = [pack for pack in packs if not left[pack.target]]
+        while ready or calls:
+            for pack in ready if share is None else ():
+                if not pack.failures:
+                    yield pack.finish([call.result() for call in digests[pack.target]])
+            ready = []
+            for call in wait(calls, _POLL_SECONDS, FIRST_COMPLETED).done:
+                pack, ended = calls.pop(call)
+                if isinstance(error := call.exception(), ClusterError):
+                    raise error
+                if ended is not None:
+                    pack.ended(ended, error)
+                elif error is not None:
+                    name = f"source-{digests[pack.target].index(call)}"
+                    pack.failures.append((name, call_error(error)))
+                if not options.keep_going:
+                    pack.refuse_failures()
+                left[pack.target] -= 1
+                if not left[pack.target]:
+                    ready.append(pack)
+            for pack in packs:
+                if left[pack.target]:
+                    pack.tell()
+        for pack in packs:
+            pack.refuse_failures()

@@ -1,0 +1,390 @@
+"""An executor whose calls run in processes of this machine, and threads that keep streams in order.
+
+``python -m mp4ds.packing.processes`` is such a process: it takes calls from its standard input, and
+answers each on its standard output.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from mp4ds.errors import Mp4dsError, sentence_of
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+class CallError(Exception):
+    """A call failed elsewhere. Its own error, which may not survive pickling, stays there.
+
+    Args:
+        sentence: What happened.
+        exit_code: That of the command line.
+    """
+
+    def __init__(self, sentence: str, exit_code: int = 1) -> None:
+        super().__init__(sentence, exit_code)
+        self.sentence = sentence
+        self.exit_code = exit_code
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
+def call_error(error: BaseException) -> CallError:
+    """What is told of the error of a call, wherever it ran."""
+    if isinstance(error, CallError):
+        return error
+    if isinstance(error, Mp4dsError):
+        return CallError(str(error), error.exit_code)
+    if isinstance(error, MemoryError):
+        return CallError("out of memory")
+    said = sentence_of(error) if isinstance(error, OSError) else str(error)
+    return CallError(said or type(error).__name__)
+
+
+def release_memory() -> None:
+    """Release the memory that a call took.
+
+    Encoders in reference cycles wait for a collector that does not know how large they are, and the
+    C library keeps freed memory.
+    """
+    gc.collect()
+    with suppress(OSError, AttributeError):  # not the GNU C library
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+# ---------------------------------------------------------------- threads
+
+_AHEAD = 2  # jobs of a thread that may wait: each holds an image
+
+
+class StreamThreads:
+    """A few threads; jobs of one stream run in order on one of them.
+
+    A context manager: leaving it normally waits for all jobs, leaving it with an exception drops
+    those not started. After the first error of a job no other is run; the next call raises it.
+
+    Args:
+        count: Threads; 0 runs each job at once in the calling thread.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._error: BaseException | None = None
+        self._threads = [ThreadPoolExecutor(1) for _ in range(count)]
+        self._jobs: list[deque[Future[None]]] = [deque() for _ in range(count)]
+
+    def submit(self, stream: int, job: Callable[[], None]) -> None:
+        """Run a job after all earlier ones of its stream; waits while too many are waiting.
+
+        Raises:
+            BaseException: An earlier job's error.
+        """
+        if not self._threads:
+            job()
+            return
+        number = stream % len(self._threads)
+        jobs = self._jobs[number]
+        if len(jobs) > _AHEAD:
+            jobs.popleft().result()
+        if self._error is not None:
+            raise self._error
+        jobs.append(self._threads[number].submit(self._run, job))
+
+    def _run(self, job: Callable[[], None]) -> None:
+        if self._error is None:
+            try:
+                job()
+            except BaseException as error:
+                self._error = error
+
+    def __enter__(self) -> StreamThreads:
+        return self
+
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
+        for thread in self._threads:
+            thread.shutdown(cancel_futures=exc_type is not None)
+        if exc_type is None and self._error is not None:
+            raise self._error
+
+
+# ---------------------------------------------------------------- processes
+
+_STDERR_BYTES = 2_000
+_TERMINATE_SECONDS = 5.0
+_TRIES = 2
+_KEPT_BYTES = 400 * 2**20
+
+
+@dataclass
+class _Call:
+    """A call to be made.
+
+    Attributes:
+        future: Gets its result.
+        function: Pickled; a process keeps the one that it was given last, with all that this holds.
+        arguments: Pickled.
+        tries: How often it was begun.
+    """
+
+    future: Future[Any]
+    function: bytes
+    arguments: bytes
+    tries: int = 0
+
+
+class ProcessExecutor(Executor):
+    """Runs calls in processes of its own, each of them one call at a time.
+
+    Other than of a `ProcessPoolExecutor`, its processes do not import the caller's main module,
+    which would have to be guarded; and where one of them is killed, its call alone is made once
+    more, after all others. Errors that a user can meet arrive as `CallError`.
+
+    A context manager: leaving it with an exception ends running calls.
+
+    Args:
+        processes: How many there are at most.
+        nice: Added to their niceness.
+    """
+
+    def __init__(self, processes: int, *, nice: int = 0) -> None:
+        self._most = processes
+        self._nice = nice
+        self._waiting: deque[_Call] = deque()
+        self._threads: list[threading.Thread] = []
+        self._running: set[_Process] = set()
+        self._changed = threading.Condition()
+        self._is_closed = self._is_ended = False
+
+    def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
+        """Make a call in a process, of a function that can be pickled."""
+        call = _Call(Future(), pickle.dumps(fn), pickle.dumps((args, kwargs)))
+        with self._changed:
+            if self._is_closed:
+                raise RuntimeError("no more calls after shutdown")
+            self._waiting.append(call)
+            if len(self._threads) < self._most:
+                # a daemon: as this process is killed, nobody waits for a call
+                thread = threading.Thread(target=self._work, daemon=True)
+                self._threads.append(thread)
+                thread.start()
+            self._changed.notify()
+        return call.future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Take no more calls.
+
+        Args:
+            wait: Wait for those that were taken.
+            cancel_futures: Drop those that are waiting, and end those that are running.
+        """
+        with self._changed:
+            self._is_closed = True
+            if cancel_futures:
+                self._is_ended = True
+                while self._waiting:
+                    self._waiting.pop().future.cancel()
+            ended = list(self._running) if cancel_futures else []
+            self._changed.notify_all()
+        for process in ended:
+            process.terminate()
+        for process in ended:
+            process.wait_or_kill()
+        for thread in self._threads if wait else ():
+            thread.join()
+
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
+        self.shutdown(cancel_futures=exc_type is not None)
+
+    def _work(self) -> None:
+        """Make calls, one after another; in a thread for each process."""
+        process: _Process | None = None
+        while (call := self._next(process)) is not None:
+            try:
+                if process is None or not process.is_ready:
+                    process = self._begun()
+            except OSError as error:
+                call.future.set_exception(error)
+                continue
+            answer = process.make(call)
+            if not isinstance(answer, BaseException):
+                call.future.set_result(answer)
+            elif not (process.was_killed and self._is_tried_again(call)):
+                call.future.set_exception(answer)
+
+    def _next(self, process: _Process | None) -> _Call | None:
+        """The next call, waited for; None after the last one."""
+        if process is not None and not (self._waiting and process.is_ready):
+            with self._changed:
+                self._running.discard(process)
+            process.close()  # an idle one need not hold its memory
+        with self._changed:
+            while True:
+                while not self._waiting:
+                    if self._is_closed:
+                        return None
+                    self._changed.wait()
+                call = self._waiting.popleft()
+                call.tries += 1
+                if call.tries > 1 or call.future.set_running_or_notify_cancel():
+                    return call
+
+    def _begun(self) -> _Process:
+        process = _Process(self._nice)
+        with self._changed:
+            self._running.add(process)
+            if self._is_ended:
+                process.terminate()
+        return process
+
+    def _is_tried_again(self, call: _Call) -> bool:
+        with self._changed:
+            if call.tries == _TRIES or self._is_ended:
+                return False
+            self._waiting.append(call)
+            return True
+
+
+class _Process:
+    """A process of a `ProcessExecutor`.
+
+    Attributes:
+        is_ready: Whether it can be given another call.
+        was_killed: Whether a signal ended it.
+    """
+
+    def __init__(self, nice: int) -> None:
+        self.is_ready = True
+        self.was_killed = False
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __spec__.name, str(nice)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._stderr,
+            bufsize=0,
+            # the terminal's Ctrl-C is for this process, which ends the others
+            start_new_session=True,
+        )
+        pipes = self._process.stdin, self._process.stdout
+        fds = [os.dup(pipe.fileno()) for pipe in pipes if pipe is not None]
+        for pipe in pipes:
+            if pipe is not None:
+                pipe.close()
+        self._calls = Connection(fds[0], readable=False)
+        self._answers = Connection(fds[1], writable=False)
+
+    def make(self, call: _Call) -> Any:
+        """Make a call; returns its result, or the error to raise."""
+        try:
+            self._calls.send((call.function, call.arguments))
+            result, error, self.is_ready = self._answers.recv()
+        except (OSError, EOFError):
+            self.is_ready = False
+            return self._death()
+        except Exception as unpickled:
+            return unpickled
+        return result if error is None else CallError(*error)
+
+    def _death(self) -> CallError:
+        code = self._process.wait()
+        self._stderr.seek(max(0, self._stderr.seek(0, os.SEEK_END) - _STDERR_BYTES))
+        lines = self._stderr.read().decode(errors="replace").strip().splitlines()
+        said = f": {lines[-1]}" if lines else ""
+        if code >= 0:
+            return CallError(f"its process exited with code {code}{said}")
+        self.was_killed = True
+        name = signal.Signals(-code).name if -code in list(signal.Signals) else str(-code)
+        hint = ", perhaps for lack of memory" if -code == signal.SIGKILL else ""
+        return CallError(f"its process was killed by {name}{hint}{said}")
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+        self._process.terminate()
+
+    def wait_or_kill(self) -> None:
+        """Wait until it has ended, for a while."""
+        try:
+            self._process.wait(_TERMINATE_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+
+    def close(self) -> None:
+        """Let it end: there is nothing more to do."""
+        self.is_ready = False
+        self._calls.close()
+        self._answers.close()
+        self._process.wait()
+        self._stderr.close()
+
+
+# ---------------------------------------------------------------- in such a process
+
+
+def _serve() -> None:
+    """Make calls until there are no more."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    os.nice(int(sys.argv[1]))
+    answers = Connection(os.dup(1), readable=False)
+    os.dup2(2, 1)  # what libraries print is no answer
+    calls: queue.SimpleQueue[tuple[bytes, bytes] | None] = queue.SimpleQueue()
+    is_busy = threading.Event()
+    threading.Thread(target=_listen, args=(calls, is_busy), daemon=True).start()
+    function: Callable[..., Any] | None = None
+    pickled = b""
+    with suppress(BrokenPipeError):
+        while (call := calls.get()) is not None:
+            is_busy.set()
+            if function is None or pickled != call[0]:
+                function, pickled = pickle.loads(call[0]), call[0]
+            args, kwargs = pickle.loads(call[1])
+            result, error = None, None
+            try:
+                result = function(*args, **kwargs)
+            except MemoryError:
+                error = ("out of memory; try fewer `jobs`", 1)
+            except (Mp4dsError, OSError, CallError) as caught:
+                error = call_error(caught).args
+            release_memory()
+            # memory fragmented by large encoders is only released by exiting
+            answers.send((result, error, error is None and _resident_bytes() < _KEPT_BYTES))
+            is_busy.clear()
+
+
+def _listen(calls: queue.SimpleQueue[tuple[bytes, bytes] | None], is_busy: threading.Event) -> None:
+    """Take calls; when the last has come, this process ends, and at once if nobody waits."""
+    source = Connection(os.dup(0), writable=False)
+    with suppress(EOFError, OSError):
+        while True:
+            calls.put(source.recv())
+    calls.put(None)
+    if is_busy.is_set():
+        os._exit(1)
+
+
+def _resident_bytes() -> int:
+    """This process's memory; 0 if unknown."""
+    with suppress(OSError, ValueError, IndexError):
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0
+
+
+if __name__ == "__main__":
+    _serve()
