@@ -412,8 +412,11 @@ def test_a_packing_process_that_dies(
     tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = write(tmp_path)
-    monkeypatch.setattr(PackingProcess, "_ARGUMENTS", ("-c", "raise SystemExit(7)"))
-    with pytest.raises(RecordError, match="ended with code 7"):
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\nexit 7\n")
+    python.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(python))
+    with pytest.raises(RecordError, match="exited with code 7"):
         recorded(PlayedSource(paths), tmp_path / "live")
     mp4ds.pack(tmp_path / "live.recording", tmp_path / "live", SALVAGE)
     assert compare(paths, again(tmp_path / "live", tmp_path)) == []

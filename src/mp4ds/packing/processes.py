@@ -131,6 +131,7 @@ _STDERR_BYTES = 2_000
 _TERMINATE_SECONDS = 5.0
 _TRIES = 2
 _KEPT_BYTES = 400 * 2**20
+_IDLE_SECONDS = 60.0  # a process without calls for so long ends; starting one takes a second
 
 
 @dataclass
@@ -231,20 +232,23 @@ class ProcessExecutor(Executor):
 
     def _next(self, process: _Process | None) -> _Call | None:
         """The next call, waited for; None after the last one."""
-        if process is not None and not (self._waiting and process.is_ready):
-            with self._changed:
-                self._running.discard(process)
-            process.close()  # an idle one need not hold its memory
         with self._changed:
             while True:
-                while not self._waiting:
-                    if self._is_closed:
-                        return None
-                    self._changed.wait()
-                call = self._waiting.popleft()
-                call.tries += 1
-                if call.tries > 1 or call.future.set_running_or_notify_cancel():
-                    return call
+                while not self._waiting and not self._is_closed:
+                    if not self._changed.wait(_IDLE_SECONDS):
+                        break
+                is_idle = not self._waiting or (process is not None and not process.is_ready)
+                if process is not None and is_idle:
+                    self._running.discard(process)
+                    process.close()
+                    process = None
+                if self._waiting:
+                    call = self._waiting.popleft()
+                    call.tries += 1
+                    if call.tries > 1 or call.future.set_running_or_notify_cancel():
+                        return call
+                elif self._is_closed:
+                    return None
 
     def _begun(self) -> _Process:
         process = _Process(self._nice)
@@ -293,6 +297,8 @@ class _Process:
 
     def make(self, call: _Call) -> Any:
         """Make a call; returns its result, or the error to raise."""
+        self._stderr.seek(0)
+        self._stderr.truncate()  # earlier calls told nothing of this one
         try:
             self._calls.send((call.function, call.arguments))
             result, error, self.is_ready = self._answers.recv()

@@ -1,25 +1,16 @@
-"""A process of low priority that packs what is recorded while the recording goes on.
-
-``python -m mp4ds.plugins.recording.packing`` takes an order from each line of its standard input,
-and answers with a line. If the input ends in the middle of an order, its recorder was killed.
-"""
+"""A process of low priority that packs what is recorded while the recording goes on."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import suppress
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-from mp4ds.errors import Mp4dsError, sentence_of
+from mp4ds.errors import Mp4dsError
 from mp4ds.format.sidecars import load_about
-from mp4ds.packing.engine import Orders, release_memory, tell
 from mp4ds.packing.pack import pack
+from mp4ds.packing.processes import CallError, ProcessExecutor
 from mp4ds.packing.spool import SpoolFolder
 
 _NICE = 10
@@ -30,17 +21,15 @@ class PackingError(Mp4dsError):
 
 
 class PackingProcess:
-    """Carries out orders, one at a time, in a process of low priority. A context manager."""
-
-    _ARGUMENTS = ("-m", "mp4ds.plugins.recording.packing")
+    """Packs one piece at a time, in a process of low priority. A context manager."""
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[str] | None = None
+        self._executor = ProcessExecutor(1, nice=_NICE)
         self._thread = ThreadPoolExecutor(1, "packing")
         self._jobs: list[Future[None]] = []
 
     def submit(self, job: Callable[[], None]) -> None:
-        """Run a job that gives orders after all earlier ones, in another thread."""
+        """Run a job that packs or joins, after all earlier ones, in another thread."""
         self._jobs.append(self._thread.submit(job))
 
     def wait(self, seconds: float) -> bool:
@@ -53,10 +42,9 @@ class PackingProcess:
     def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
         if exc_type is not None:
             self._thread.shutdown(wait=False, cancel_futures=True)
-            if self._process is not None:
-                self._process.kill()  # in the middle of an order
+            self._executor.shutdown(cancel_futures=True)  # in the middle of a piece
         self._thread.shutdown()
-        self._close()
+        self._executor.shutdown()
 
     def pack(self, folder: Path, number: int) -> None:
         """Make the part of a piece, which is then removed.
@@ -64,7 +52,7 @@ class PackingProcess:
         Raises:
             PackingError: It failed.
         """
-        self._order("pack", str(folder), number)
+        self._call(_pack, folder, number)
 
     def join(
         self, folder: Path, count: int, target: Path, *, force: bool, about: str | None
@@ -81,74 +69,26 @@ class PackingProcess:
         Raises:
             PackingError: It failed.
         """
-        self._order("join", str(folder), count, str(target), force, about)
+        self._call(_join, folder, count, target, force, about)
 
-    def _order(self, *order: Any) -> None:
-        if self._process is None:
-            self._process = subprocess.Popen(
-                [sys.executable, *self._ARGUMENTS],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                text=True,
-                start_new_session=True,  # Ctrl-C is for the recorder
-            )
-        answer = ""
-        with suppress(OSError):  # it has died, as its answer shows
-            _pipe(self._process.stdin).write(json.dumps(order) + "\n")
-            _pipe(self._process.stdin).flush()
-            answer = _pipe(self._process.stdout).readline()
-        if not answer:
-            raise PackingError(f"the process that packs ended with code {self._close()}")
-        if problem := json.loads(answer):
-            raise PackingError(problem)
-
-    def _close(self) -> int:
-        """End it; returns its exit code."""
-        process, self._process = self._process, None
-        if process is None:
-            return 0
-        with suppress(OSError):  # where it has died before it read all
-            _pipe(process.stdin).close()
-        _pipe(process.stdout).close()
-        return process.wait()
+    def _call(self, function: Callable[..., None], *args: Any) -> None:
+        try:
+            self._executor.submit(function, *args).result()
+        except (CallError, CancelledError, OSError) as error:
+            raise PackingError(str(error)) from None
 
 
-def _pipe(pipe: IO[str] | None) -> IO[str]:
-    if pipe is None:
-        raise OSError("no pipe")
-    return pipe
+# ---------------------------------------------------------------- in the process
 
 
-# ---------------------------------------------------------------- the process
+def _pack(folder: Path, number: int) -> None:
+    spool = SpoolFolder(folder)
+    with spool.locked(shared=True):
+        spool.pack(number, pack)
 
 
-def _carry_out(kind: str, folder: str, number: int, *rest: Any) -> str:
-    """Carry out an order; returns the sentence of its error, empty if there is none."""
-    spool = SpoolFolder(Path(folder))
-    try:
-        with spool.locked(shared=True):
-            if kind == "pack":
-                spool.pack(number, pack)
-            else:
-                target, force, about = rest
-                told = load_about(about) if about is not None else None
-                spool.join(number, Path(target), force=force, about=told)
-    except Mp4dsError as error:
-        return str(error)
-    except OSError as error:
-        return sentence_of(error)
-    return ""
-
-
-def _main() -> None:
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
-    for order in Orders():
-        problem = _carry_out(*order)
-        release_memory()
-        tell(problem)
-
-
-if __name__ == "__main__":
-    with suppress(BrokenPipeError):
-        _main()
+def _join(folder: Path, count: int, target: Path, force: bool, about: str | None) -> None:
+    spool = SpoolFolder(folder)
+    told = load_about(about) if about is not None else None
+    with spool.locked(shared=True):
+        spool.join(count, target, force=force, about=told)
