@@ -74,7 +74,7 @@ def values(item: Any) -> Any:
     return struct.pack("<d", item) if isinstance(item, float) else item
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", REAL_BAGS)
 def test_real_bags_to_ros2_and_back(name: str) -> None:
     to_ros2, to_ros1 = Converter("ros2"), Converter("ros1")

@@ -108,6 +108,7 @@ def test_source_is_valid_and_equals_itself(name: str, written: Any) -> None:
             assert sum(1 for _ in reader.messages()) == 64
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(("a", "b"), EQUAL)
 def test_equal_across_compression_and_format(a: str, b: str, written: Any) -> None:
     report = witness.examine(written(a), written(b))
@@ -115,6 +116,7 @@ def test_equal_across_compression_and_format(a: str, b: str, written: Any) -> No
     assert all(row.equal == row.a == row.b for row in report.rows.values())
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("trait", TRAITS)
 def test_trait_can_be_written(trait: str, tmp_path: Path) -> None:
     what = odd_scene(trait)

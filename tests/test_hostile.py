@@ -211,6 +211,7 @@ def test_a_video_outside_of_the_folder_is_refused(name: str, pair: Path, jail: J
     refused(jail, pair, *BAD_DOCUMENT)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     "name", ["parent", "absolute", "empty", "dot", "line-feed", "fullwidth-dots"]
 )
@@ -330,6 +331,7 @@ TEXTS: dict[str, bytes] = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", TEXTS)
 @pytest.mark.parametrize("to", ["sidecar", "manifest"])
 def test_yaml_beyond_the_subset(to: str, name: str, dataset: Path, jail: Jail) -> None:
@@ -606,6 +608,7 @@ RESIDUALS: dict[str, str] = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", RESIDUALS)
 def test_columns_that_do_not_decode(name: str, pair: Path, jail: Jail) -> None:
     changed(pair, put("columns", "stamp", "values", value=RESIDUALS[name]))

@@ -71,12 +71,23 @@ with mp4ds.open("{HOME}/first") as dataset:
 
 
 def test_commands_take_it(hub: Hub, drives: Path, tmp_path: Path) -> None:
-    told = json.loads(run(hub, "-m", "mp4ds", "info", HOME, "--json", folder=tmp_path))
-    assert [Path(item["path"]).name for item in told] == ["first", "second"]
-    said = run(hub, "-m", "mp4ds", "validate", f"{HOME}@main/first", "--deep", folder=tmp_path)
+    commands = [
+        ["info", HOME, "--json"],
+        ["validate", f"{HOME}@main/first", "--deep"],
+        ["unpack", f"{HOME}/first", "--to", "bag", "-o", "again.bag"],
+    ]
+    code = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from commands import call
+for words in {commands!r}:
+    done = call(*words)
+    assert done.code == 0, done
+    print(done.out, end="\\0")
+"""
+    listed, said, _ = run(hub, "-c", code, folder=tmp_path).split("\0")[:3]
+    assert [Path(item["path"]).name for item in json.loads(listed)] == ["first", "second"]
     assert "no problem" in said
-    words = ("unpack", f"{HOME}/first", "--to", "bag", "-o", "again.bag")
-    run(hub, "-m", "mp4ds", *words, folder=tmp_path)
     local = mp4ds.unpack(drives / "first", "bag", tmp_path / "local.bag")
     assert (tmp_path / "again.bag").read_bytes() == Path(local.output).read_bytes()
 

@@ -148,7 +148,7 @@ def jobs(draw: st.DrawFn) -> list[tuple[float, PackProgress]]:
     return found
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(jobs(), st.integers(20, 200), st.integers(1, 60))
 def test_whatever_is_told_nothing_silly_is_shown(
     reports: list[tuple[float, PackProgress]], width: int, height: int

@@ -346,6 +346,7 @@ def test_what_is_no_structure(text: str, packed: Path, tmp_path: Path) -> None:
         Stream(path)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("structures", "code"),
     [

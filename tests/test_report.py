@@ -450,6 +450,7 @@ def test_no_code_of_the_page_makes_elements_of_text() -> None:
 SOME = {*COMMON, "rgb16", "yuyv", "nv12", "8UC2", "32FC1", "64FC3", "bgra8", "bayer_gbrg16"}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     "encoding",
     [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in ENCODINGS],

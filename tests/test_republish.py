@@ -506,6 +506,7 @@ def test_the_encoding_in_a_format_tells_a_mosaic(extension: str, tmp_path: Path)
 # ---------------------------------------------------------------- files stay as they are
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("to", ["bag", "mcap"])
 @pytest.mark.parametrize(
     ("name", "source", "kind"),
@@ -547,6 +548,7 @@ JPEG_KINDS = [
 ]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", JPEG_KINDS)
 def test_jpeg_pixels_are_those_of_opencv(packed: Pack, name: str) -> None:
     """By number, in order, as raw messages and as PNG: what cv2.imdecode gives."""

@@ -201,7 +201,7 @@ def served(site: Path) -> Iterator[str]:
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("width", [1400, 390])
+@pytest.mark.parametrize("width", [pytest.param(1400, marks=pytest.mark.slow), 390])
 def test_no_page_is_wider_than_the_window(width: int, served: str, tmp_path: Path) -> None:
     """And none asks another server, or has an error."""
     with chromium(tmp_path, width=width, height=900) as tab:

@@ -49,7 +49,7 @@ def hidden(dataset: Path) -> list[int]:
 # ---------------------------------------------------------------- of recordings and datasets
 
 
-@pytest.mark.one_in(5)
+@pytest.mark.one_in(10)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("way", ["one-pass", "parts", "dataset", "dataset-anew", "unpack"])
 def test_what_is_taken(source: str, way: str, tmp_path: Path, compare: Compare) -> None:

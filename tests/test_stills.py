@@ -135,6 +135,7 @@ def test_a_frame_of_a_topic_that_changes_its_size(tmp_path: Path) -> None:
 SOME = {*COMMON, "rgb16", "yuyv", "8UC2", "32FC1", "bgra8", "bayer_gbrg16"}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     "encoding",
     [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in ENCODINGS],

@@ -753,6 +753,7 @@ def torchcodec() -> None:
         pytest.skip(f"torchcodec cannot be used: {error}")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("torchcodec")
 def test_torchcodec_with_the_ffmpeg_of_pyav(drives: list[Path], tmp_path: Path) -> None:
     if not list((Path(av.__file__).parents[1] / "av.libs").glob("libavcodec*")):

@@ -224,6 +224,7 @@ def test_large_pictures_have_more_slices(
     assert int(encoder.options["slices"]) > 4
 
 
+@pytest.mark.slow
 def test_a_large_picture_is_exact(tmp_path: Path) -> None:
     large = np.zeros((3648, 4096, 4), np.uint8)
     large[::7, ::5] = np.arange(4096 // 5 + 1, dtype=np.uint8)[:, None]
