@@ -277,7 +277,7 @@ def test_tied_filters_of_libpng(data: st.DataObject) -> None:
 
 
 def test_a_tall_picture_is_unfiltered_in_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mp4ds.messages.png._FRONT_BYTES", 1)
+    monkeypatch.setattr("mp4ds.messages.png.BAND_BYTES", 1)
     data = by_opencv(picture(200, 9, 3, np.uint8), cv2.IMWRITE_PNG_COMPRESSION, 6)
     assert max(zlib.decompress(idat(data))[:: 9 * 3 + 1]) > 2
     check(data)

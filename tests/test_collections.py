@@ -124,7 +124,7 @@ def stubborn(place: Path, number: int) -> int:
 
 
 def test_a_process_that_does_not_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collections, "_TIDY_S", 0.1)
+    monkeypatch.setattr(collections, "TIDY_S", 0.1)
     with pytest.raises(OptionError, match="two"):
         for _ in each(partial(stubborn, tmp_path), [1, 0], 2):
             pass

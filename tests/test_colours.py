@@ -44,13 +44,13 @@ def smooth(width: int, height: int, pixel_format: str) -> av.VideoFrame:
 
 def as_numpy(monkeypatch: pytest.MonkeyPatch, *arguments: Any, **options: Any) -> NDArray[np.uint8]:
     with monkeypatch.context() as patch:
-        patch.setattr(colour, "_compiled", lambda: None)
+        patch.setattr(colour, "compiled", lambda: None)
         return rgb(*arguments, **options)
 
 
 @pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv420p10le"])
 def test_compiled_or_not(pixel_format: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if colour._compiled() is None:
+    if colour.compiled() is None:
         pytest.skip("it was not compiled here")
     options = itertools.product(SIZES, MATRICES, (False, True), (False, True))
     for (width, height), matrix, full_range, is_bgr in options:

@@ -601,7 +601,7 @@ def test_the_limit_is_yours_to_set(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_what_is_written_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also a large black picture, whose chunk would look like a bomb."""
-    monkeypatch.setattr(files, "_ALWAYS", 2**20)
+    monkeypatch.setattr(files, "ALWAYS_ALLOWED", 2**20)
     channel = Channel(1, "/a", "cdr", None)
     payloads = [b"small", bytes(2**21), b"x" * 2**18, bytes(2**19 + 1), b"last"]
     path = tmp_path / "a.mcap"

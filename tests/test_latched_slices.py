@@ -10,15 +10,14 @@ from click.testing import CliRunner
 
 import mp4ds
 from mp4ds.bags import latched
-from mp4ds.bags.formats import open_reader, open_writer
+from mp4ds.bags.formats import open_writer
 from mp4ds.cli import commands
 from mp4ds.format.sidecars import load_manifest
-from mp4ds.options import Slice, parse_time
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.info import info
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.play import open_player
-from mp4ds.records import Excerpt, Message, Record
+from mp4ds.records import Message
 from mp4ds.unpacking.options import UnpackOptions
 from player_scenes import (
     MS,
@@ -147,27 +146,6 @@ def test_static_transforms_count_as_latched(tmp_path: Path) -> None:
     _, output = sliced("one-pass", tmp_path / "a.mcap", tmp_path, start=str(START + STEP))
     assert [row[2] - START for row in recorded(output)[:2]] == [MS, 2 * MS]
     assert len(recorded(output)) == 2 + 3
-
-
-def test_only_latched_topics_are_read_before_the_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = made("bag", tmp_path)
-    with open_reader(source) as reader:
-        asked: list[Excerpt] = []
-        records = reader._records
-
-        def noted(excerpt: Excerpt) -> Any:
-            asked.append(excerpt)
-            return records(excerpt)
-
-        monkeypatch.setattr(reader, "_records", noted)
-        latched.take_slice(reader, Slice(parse_time(str(FIRST)), latched=True))
-        found: list[Record] = [*reader.records()]
-    assert len(found) > 2
-    before, after = asked
-    assert (before.topics, before.end, before.others) == ({"/tf_static"}, FIRST, False)
-    assert after.start == FIRST
 
 
 def test_what_is_too_large_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

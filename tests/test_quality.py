@@ -398,7 +398,8 @@ def test_without_libvmaf_it_is_said_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = recording(tmp_path, [0.0])
-    monkeypatch.setattr("mp4ds.video.scores._can_score", lambda path: False)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setenv("PATH", "")
     with pytest.raises(ScoringError, match=r"pip install 'mp4ds\[vmaf\]'"):
         mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="vmaf=95"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]

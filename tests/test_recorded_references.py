@@ -102,7 +102,7 @@ def test_groups_that_were_not_asked_for_long_are_forgotten(
     path = written(tmp_path, recipe)
     table, data = index(path), path.read_bytes()
     most = max(np.diff(np.append(np.flatnonzero(table.sync), len(table.sizes))))
-    monkeypatch.setattr(structure, "_KEPT_FRAMES", 2 * most)
+    monkeypatch.setattr(structure, "KEPT_FRAMES", 2 * most)
 
     def read(sample: int) -> bytes:
         return data[table.places[sample] :][: table.sizes[sample]]

@@ -44,7 +44,7 @@ from republished import (
     subscribed,
     truth,
 )
-from scenes import Record, Scene, instant, scene, together, typestore
+from scenes import Record, Scene, instant, scene, together
 from sources import SOURCES
 
 TARGETS = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap"}
@@ -440,19 +440,6 @@ def test_formats_are_those_of_the_transport(
         assert {message.value.format for message in found} == {told}
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-@pytest.mark.parametrize("codec", ["png", "rvl"])
-def test_coded_depths_in_metres(packed: Pack, encoding: str, codec: str) -> None:
-    name = f"depth-{encoding}-{codec}"
-    made = packed(name, "mcap-ros2-zstd")
-    with mp4ds.open(made.folder / "dataset") as dataset:
-        found = dataset[made.topic].read(range(len(made.cameras)), format="depth_m")
-    for image, original in zip(found, truth(rvl_as_png(name, made.cameras)), strict=True):
-        metres = original if encoding == "32FC1" else original / 1000
-        assert image.dtype == np.float32
-        np.testing.assert_allclose(image, metres, rtol=1e-5)
-
-
 def test_quantised_depths_without_their_parameters(packed: Pack, tmp_path: Path) -> None:
     made = packed("depth-32FC1-png", "mcap-ros2-zstd")
     folder = tmp_path / "dataset"
@@ -668,17 +655,6 @@ def test_parameters_sent_once_are_repeated(tmp_path: Path) -> None:
     check_stand_alone("h264", found)
 
 
-def test_nothing_is_decoded_for_video(packed: Pack, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = packed("raw-mono8", "mcap-ros2-zstd")
-
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("a video was decoded")
-
-    monkeypatch.setattr("mp4ds.dataset.stream.Stream.open_video", refuse)
-    summary, _ = made.unpack("mcap", "compressed-video")
-    assert summary.messages["/cam/image_raw/compressed_video"] == len(made.cameras)
-
-
 # ---------------------------------------------------------------- what stays
 
 
@@ -695,14 +671,6 @@ def test_verbatim_messages_stay_and_are_counted(packed: Pack) -> None:
     assert stayed.payload == made.cameras[3].payload("cdr")
     order = [m.stamp for m in messages if m.topic in (made.topic, "/cam/image_raw")]
     assert order == [record.values["header"]["stamp"] for record in made.cameras]
-
-
-def test_a_topic_on_which_messages_stay_is_taken(packed: Pack) -> None:
-    made = packed("jpeg-cut-one", "mcap-ros2-zstd")
-    summary, messages = made.unpack("mcap", "png")
-    now = Republished("/cam/image_raw/compressed_png", COMPRESSED, made.topic)
-    assert summary.republished == {made.topic: now}
-    assert len(kept(made, messages)) == 1
 
 
 def test_a_recorded_topic_is_taken(tmp_path: Path) -> None:
@@ -850,29 +818,6 @@ def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> No
             assert [message.value.header.seq for message in found] == expected
 
 
-@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
-@pytest.mark.parametrize(("name", "kind"), CHANGES)
-def test_channels_of_ros2(packed: Pack, name: str, kind: str, source: str) -> None:
-    made = packed(name, source)
-    to = "rosbag2" if source == "bag-none" else "mcap"
-    summary, messages = made.unpack(to, kind)
-    found = [message for message in messages if message.type_name == TYPES[kind]]
-    digest = typestore("cdr").hash_rihs01(TYPES[kind])
-    metadata = found[0].metadata
-    assert digest in (metadata.get("digest"), metadata.get("topic_type_hash"))
-    if source == "mcap-ros2-zstd":
-        plain = made.unpack("mcap", None)[1]
-        (before,) = {m.metadata["offered_qos_profiles"] for m in plain if m.topic == made.topic}
-        assert metadata["offered_qos_profiles"] == before != ""
-        times = [(m.log_time, m.publish_time, m.sequence) for m in found]
-        old = [(m.log_time, m.publish_time, m.sequence) for m in plain if m.topic == made.topic]
-        assert times == old
-    else:
-        lost = "messages with a header sequence number, which ROS 2 does not have"
-        # of all cameras, and what else has a header
-        assert summary.omitted[lost] >= len(made.cameras)
-
-
 def latched(encoding: str) -> Scene:
     made = scene(encoding, frames=3)
     return Scene(
@@ -911,19 +856,6 @@ def test_two_publishers_of_a_topic(tmp_path: Path) -> None:
     check_times(made, found, "bag")
     assert {m.metadata["callerid"] for m in found} == {"/first", "/second"}
     assert {m.topic for m in found} == {"/cam/image_raw/compressed"}
-
-
-def test_a_profile_of_neither_ros(packed: Pack) -> None:
-    made = packed("raw-mono8", "mcap-none-profile")
-    _, messages = made.unpack("mcap", "compressed-video")
-    found = [message for message in messages if message.type_name == CODED_VIDEO]
-    check_times(made, found, "mcap")
-
-
-def test_other_protobuf_topics_have_no_place_in_a_bag(packed: Pack) -> None:
-    made = packed("foxglove-raw-mono8", "mcap-protobuf")
-    with pytest.raises(ConversionError, match="protobuf, which has no equivalent in ROS"):
-        made.unpack("bag", "raw")
 
 
 def test_stamps_beyond_32_bits_have_no_place_in_ros(tmp_path: Path) -> None:
@@ -997,8 +929,6 @@ def test_no_topic_is_taken_twice() -> None:
     [
         ("mcap", {"images": "bmp"}, "`images` 'bmp' is not known. Use raw, jpeg, png, compressed"),
         ("images", {"images": "raw"}, "`images` is for recordings"),
-        ("mcap", {"jpeg_quality": 0}, "`jpeg_quality` 0 is not from 1 to 100"),
-        ("mcap", {"jpeg_quality": 101}, "`jpeg_quality` 101 is not from 1 to 100"),
     ],
 )
 def test_options_that_contradict(

@@ -13,7 +13,6 @@ import pytest
 
 import mp4ds
 from commands import call, refused, unchanged
-from mp4ds.cli import commands, progress
 from mp4ds.cli.output import Column, print_table
 from scenes import START, Record, Scene
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
@@ -75,22 +74,6 @@ def test_one_of_a_kind_is_singular(tmp_path: Path) -> None:
     done = call("unpack", tmp_path / "drive", "--to", "bag", "-o", tmp_path / "drive.bag")
     assert "drive.bag: 1 message of 1 topic\n" in done.out
     assert "not supported by this format: attachments (2)\n" in done.out
-
-
-def test_progress_of_a_single_video(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its frames are its messages."""
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.setattr(progress, "_LEAST_PAUSE", 0)
-    err = io.StringIO()
-    words = ["unpack", dataset / SIDECAR, "--to", "mcap", "-o", dataset.parent / "again.mcap"]
-    with (
-        contextlib.redirect_stdout(io.StringIO()),
-        contextlib.redirect_stderr(err),
-        pytest.raises(SystemExit),
-    ):
-        commands.main(list(map(str, words)))
-    assert re.search(r"unpacking: \d+ % \| \d+ of \d+ messages", err.getvalue())
-    assert "?" not in err.getvalue()
 
 
 def test_paths_are_as_users_write_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -113,7 +113,7 @@ def test_a_compiled_wheel_is_for_its_platform(unpacked: Path, tmp_path: Path) ->
         assert "mp4ds/video/colour.c" not in wheel.namelist()
         assert re.fullmatch(r"py3-none-(linux|macosx)_\w+", metadata_of(wheel, "WHEEL")["Tag"])
         wheel.extractall(tmp_path / "installed")
-    code = "import mp4ds.video.colour as c; assert c._compiled() is not None; print(c.__file__)"
+    code = "import mp4ds.video.colour as c; assert c.compiled() is not None; print(c.__file__)"
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=tmp_path,
@@ -170,7 +170,7 @@ def test_the_shell_completes(tmp_path: Path) -> None:
     if not bash:
         pytest.skip("there is no bash")
     code = """
-    eval "$(_MP4DS_COMPLETE=source_bash mp4ds)"
+    eval "$(_MP4DS_COMPLETE=bash_source mp4ds)"
     COMP_WORDS=(mp4ds vali) COMP_CWORD=1
     $(complete -p mp4ds | sed 's/.*-F \\([^ ]*\\).*/\\1/') mp4ds
     echo "${COMPREPLY[@]}"

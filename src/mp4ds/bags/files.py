@@ -108,7 +108,7 @@ DECOMPRESSED = "MP4DS_MAX_DECOMPRESSED"
 ZSTD_PIECE = 2**11
 """Bytes of zstd decompressed at a time, which give 64 MiB at most."""
 
-_ALWAYS = 128 * 2**20
+ALWAYS_ALLOWED = 128 * 2**20
 _CHUNK_RATIO = 256  # of lz4 it is 255
 _FILE_RATIO = 1024
 _MOST = 512 * 2**20  # recorders make chunks of 1 to 4 MiB unless told otherwise
@@ -119,12 +119,12 @@ def most_unpacked(packed: int) -> int:
 
     Small ones are not limited by their ratio: they may hold a black picture.
     """
-    return min(max(_ALWAYS, _CHUNK_RATIO * packed), _MOST)
+    return min(max(ALWAYS_ALLOWED, _CHUNK_RATIO * packed), _MOST)
 
 
 def most_in_file(packed: int) -> int:
     """Maximum decompressed size of a file of so many bytes, which is not held in memory."""
-    return max(_ALWAYS, _FILE_RATIO * packed)
+    return max(ALWAYS_ALLOWED, _FILE_RATIO * packed)
 
 
 def most_held(packed: int | None = None) -> int:

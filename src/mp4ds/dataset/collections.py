@@ -22,7 +22,7 @@ from mp4ds.format.sidecars import MANIFEST_NAME
 _Item = TypeVar("_Item")
 _Made = TypeVar("_Made")
 
-_TIDY_S = 20.0
+TIDY_S = 20.0
 """Seconds that a process has to end, on its parent's word."""
 
 Paths = str | Path | Sequence[str | Path]
@@ -123,7 +123,7 @@ def each(
             for process in processes:
                 process.terminate()
             for process in processes:
-                process.join(_TIDY_S)
+                process.join(TIDY_S)
                 process.kill()  # one that has not ended would be waited for without end
             pool.shutdown(cancel_futures=True)
             raise

@@ -22,7 +22,7 @@ _Wide = NDArray[np.int16]
 
 _NONE, _SUB, _UP, _AVERAGE, _PAETH = range(5)
 _BAND_BYTES = 2**17  # of pixels filtered at once, to stay in the cache
-_FRONT_BYTES = 2**26  # of pixels unfiltered at once
+BAND_BYTES = 2**26  # of pixels unfiltered at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def unfilter(rows: Bytes, pixel_bytes: int) -> Bytes:
         return _unfilter_simple(rows, pixel_bytes)
     out = np.empty((rows.shape[0], rows.shape[1] - 1), np.uint8)
     above = np.zeros(out.shape[1], np.uint8)
-    band = max(64, _FRONT_BYTES // (4 * out.shape[1]))
+    band = max(64, BAND_BYTES // (4 * out.shape[1]))
     for start in range(0, len(rows), band):
         part = out[start : start + band]
         _unfilter_front(rows[start : start + band], above, pixel_bytes, part)

@@ -92,7 +92,7 @@ def rgb(
     used = factors(matrix, full_range, bits)
     if out is None:
         out = np.empty((frame.height, frame.width, 3), np.uint8)
-    library = _compiled()
+    library = compiled()
     if library is None or out.strides[1:] != (3, 1):
         _by_numpy(frame, bits, used, out[:, :, ::-1] if is_bgr else out)
         return out
@@ -114,7 +114,8 @@ def rgb(
 
 
 @cache
-def _compiled() -> ctypes.CDLL | None:
+def compiled() -> ctypes.CDLL | None:
+    """The compiled loops; None where the package was installed without them."""
     path = Path(__file__).with_name("_colour.so")
     try:
         return ctypes.CDLL(str(path))

@@ -421,7 +421,7 @@ def frame_bytes(codec: str, packet: bytes, *, part: int, parts: int, key: bool) 
 
 # ---------------------------------------------------------------- chains
 
-_KEPT_FRAMES = 50_000  # coded frames whose references are kept in memory
+KEPT_FRAMES = 50_000  # coded frames whose references are kept in memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -515,7 +515,7 @@ class Chains:
             self._kept -= len(group.pieces)
         if group.parser is not None:
             self._parse(group, group.parser, last)
-        while self._groups and self._kept + len(group.pieces) > _KEPT_FRAMES:
+        while self._groups and self._kept + len(group.pieces) > KEPT_FRAMES:
             _, forgotten = self._groups.popitem(last=False)
             self._kept -= len(forgotten.pieces)
         self._groups[place] = group
