@@ -430,6 +430,7 @@ def sequence(
     *,
     points: Sequence[int] = (0,),
     timing: Bits = (0, 1),
+    after_point: tuple[Bits, ...] = (),
     ids: tuple[int, int] | None = None,
     tools: tuple[Bits, ...] = ((1, 1), (1, 1)),
     order: int = 7,
@@ -439,13 +440,14 @@ def sequence(
     Args:
         points: `operating_point_idc` of each.
         timing: `timing_info_present_flag` and what follows it.
+        after_point: What follows each of the points.
         ids: `delta_frame_id_length_minus_2` and `additional_frame_id_length_minus_1`.
         tools: From `seq_choose_screen_content_tools` to before the bits of order hints.
         order: `OrderHintBits`, or 0.
     """
     fields: list[Bits] = [(0, 3), (0, 1), (0, 1), timing, (0, 1), (len(points) - 1, 5)]
     for point in points:
-        fields += [(point, 12), (8, 5), (0, 1)]
+        fields += [(point, 12), (8, 5), (0, 1), *after_point]
     fields += [(3, 4), (3, 4), (15, 4), (15, 4)]
     fields += [(0, 1)] if ids is None else [(1, 1), (ids[0], 4), (ids[1], 3)]
     fields += [(0, 3), (0, 4), (order > 0, 1)]
@@ -552,7 +554,11 @@ def test_av1_slots_chosen_by_order() -> None:
     ("head", "body", "reason"),
     [
         (sequence(points=(0x303,)), b"", "spatial layers"),
-        (sequence(timing=((1 << 66 | 1) << 0, 67)), b"", "times of a decoder"),
+        (
+            sequence(timing=((1 << 66 | 1) << 47, 114), after_point=((0, 1),)),
+            b"",
+            "times of a decoder",
+        ),
         (sequence(), unit(6, b"\x30" + bytes(20), 0x08), "layers"),
         (sequence(points=(0x103, 0x101)), unit(6, b"\x30" + bytes(20), 0x40), "layers"),
         (sequence(), sequence(order=6) + inter([0] * 7, 0), "changes"),

@@ -31,7 +31,6 @@ _DROPPED = {
     15: "padding",
 }
 _MAX_OBUS = 4096
-_HEADER_BYTES = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,101 +116,7 @@ def sequence_header(data: bytes | memoryview) -> bytes:
     return b""
 
 
-class Av1Pictures:
-    """The pictures of one stream, temporal unit by temporal unit."""
-
-    def __init__(self) -> None:
-        self._parameters = b""
-        self._size = (0, 0)
-        self._still = False
-
-    @property
-    def parameters(self) -> bytes:
-        """The sequence header OBU seen last."""
-        return self._parameters
-
-    def parse(self, body: memoryview) -> CodedPicture:
-        """The picture in a temporal unit.
-
-        Raises:
-            NoPicture: There is none.
-            Refused: There are several, an mp4 would lose a part of it, or it needs a sequence
-                header that was not sent.
-        """
-        data, framing = strip(body)
-        shown = frames = 0
-        keyframe = has_header = False
-        for obu in obus(data):
-            if obu.kind in _DROPPED:
-                raise Refused(f"it has {_DROPPED[obu.kind]}, which no mp4 keeps")
-            if obu.kind not in _KEPT:
-                raise Refused(f"it has an AV1 unit of the unknown kind {obu.kind}")
-            payload = bytes(data[obu.payload : min(obu.end, obu.payload + _HEADER_BYTES)])
-            if obu.kind == _SEQUENCE_HEADER:
-                self._take_sequence_header(payload)
-                self._parameters = bytes(data[obu.start : obu.end])
-                has_header = True
-            elif obu.kind in (_FRAME_HEADER, _FRAME):
-                if not self._parameters:
-                    raise Refused("its sequence header was not sent before it")
-                is_shown, is_key = self._frame(payload)
-                # decoders begin only where the header is too (AV1 in ISOBMFF, 2.4)
-                keyframe |= is_key and has_header and not frames
-                frames += 1
-                shown += is_shown
-        if not frames:
-            raise NoPicture("it holds no picture, only parameters or remarks")
-        if shown != 1:
-            raise Refused("it shows no picture" if not shown else "it holds more than one picture")
-        return CodedPicture(*self._size, keyframe, framing)
-
-    def _frame(self, payload: bytes) -> tuple[bool, bool]:
-        """Whether a frame is shown, and a key frame (5.9.2)."""
-        if self._still:
-            return True, True
-        reader = BitReader(payload)
-        if reader.flag():
-            return True, False
-        key = reader.bits(2) == 0
-        shown = reader.flag()
-        return shown, key and shown
-
-    def _take_sequence_header(self, payload: bytes) -> None:
-        """Read up to the picture size (5.5.1)."""
-        reader = BitReader(payload)
-        reader.bits(4)
-        still = reader.flag()
-        if still:
-            reader.bits(5)
-        else:
-            _skip_operating_points(reader)
-        width_bits, height_bits = reader.bits(4) + 1, reader.bits(4) + 1
-        width, height = reader.bits(width_bits) + 1, reader.bits(height_bits) + 1
-        check_size(width, height)
-        self._size, self._still = (width, height), still
-
-
-def _skip_operating_points(reader: BitReader) -> None:
-    delay_bits = 0
-    if reader.flag():
-        reader.bits(64)
-        if reader.flag():
-            reader.ue()
-        if reader.flag():
-            delay_bits = reader.bits(5) + 1
-            reader.bits(42)
-    display_delay = reader.flag()
-    for _ in range(reader.bits(5) + 1):
-        reader.bits(12)
-        if reader.bits(5) > 7:
-            reader.flag()
-        if delay_bits and reader.flag():
-            reader.bits(2 * delay_bits + 1)
-        if display_delay and reader.flag():
-            reader.bits(4)
-
-
-# ---------------------------------------------------------------- references
+# ---------------------------------------------------------------- headers
 
 _PADDING = 15
 _KEY, _INTER, _INTRA_ONLY, _SWITCH = range(4)
@@ -225,8 +130,15 @@ _SEQUENCE_BYTES = 512
 
 @dataclass(frozen=True, slots=True)
 class _Sequence:
-    """The part of a sequence header that determines how frame headers are read (5.5.1)."""
+    """The part of a sequence header that determines how frame headers are read (5.5.1).
 
+    Attributes:
+        unfit: Why what its frames refer to is not understood; empty if it is.
+        size: Width and height.
+    """
+
+    unfit: str
+    size: tuple[int, int]
     still: bool
     layers: int
     id_bits: int
@@ -237,16 +149,17 @@ class _Sequence:
 
 
 def _parse_sequence(payload: bytes) -> _Sequence:
-    reader = BitReader(payload)
+    reader = BitReader(payload[:_SEQUENCE_BYTES])
     reader.bits(4)
     still = reader.flag()
-    layers = 0
+    layers, unfit = 0, ""
     if still:
         reader.bits(5)
     else:
-        layers = _parse_operating_points(reader)
-    side_bits = reader.bits(4) + reader.bits(4) + 2
-    reader.bits(side_bits)
+        layers, unfit = _parse_operating_points(reader)
+    width_bits, height_bits = reader.bits(4) + 1, reader.bits(4) + 1
+    size = reader.bits(width_bits) + 1, reader.bits(height_bits) + 1
+    check_size(*size)
     id_bits = delta_id_bits = 0
     if not still and reader.flag():
         delta_id_bits = reader.bits(4) + 2
@@ -265,32 +178,37 @@ def _parse_sequence(payload: bytes) -> _Sequence:
             integer_mv = reader.bits(1)
         if ordered:
             order_bits = reader.bits(3) + 1
-    return _Sequence(still, layers, id_bits, delta_id_bits, screen_content, integer_mv, order_bits)
+    return _Sequence(
+        *(unfit, size, still, layers),
+        *(id_bits, delta_id_bits, screen_content, integer_mv, order_bits),
+    )
 
 
-def _parse_operating_points(reader: BitReader) -> int:
-    """The layers that decoders use, those of the first operating point; 0: all.
-
-    Raises:
-        UnknownStructure: There is a model of the decoder, or several pictures at one time.
-    """
+def _parse_operating_points(reader: BitReader) -> tuple[int, str]:
+    """The layers that decoders use, those of the first operating point; 0: all. And see `unfit`."""
+    unfit = ""
+    delay_bits = 0
     if reader.flag():
         reader.bits(64)
         if reader.flag():
             reader.ue()
         if reader.flag():
-            raise UnknownStructure("its AV1 tells the times of a decoder")
+            delay_bits = reader.bits(5) + 1
+            reader.bits(42)
+            unfit = "its AV1 tells the times of a decoder"
     display_delay = reader.flag()
     layers: list[int] = []
     for _ in range(reader.bits(5) + 1):
         layers.append(reader.bits(12))
         if reader.bits(5) > 7:
             reader.flag()
+        if delay_bits and reader.flag():
+            reader.bits(2 * delay_bits + 1)
         if display_delay and reader.flag():
             reader.bits(4)
     if layers[0] and layers[0] >> 8 != 1:
-        raise UnknownStructure("its AV1 has spatial layers")
-    return layers[0]
+        unfit = unfit or "its AV1 has spatial layers"
+    return layers[0], unfit
 
 
 class _Header(NamedTuple):
@@ -308,12 +226,18 @@ class _Header(NamedTuple):
     used: Iterable[int]
     filled: int
 
+    @property
+    def is_key(self) -> bool:
+        """Whether decoding can begin here."""
+        return self.kind == _KEY and self.shown
 
-def _parse_header(payload: bytes, sequence: _Sequence) -> _Header:
-    """Read an uncompressed header up to the slots that it uses (5.9.2)."""
+
+def _parse_header(data: memoryview, obu: Obu, sequence: _Sequence) -> _Header:
+    """Read the uncompressed header of a frame up to the slots that it uses (5.9.2)."""
     if sequence.still:
         return _Header(_KEY, shown=True, used=(), filled=_ALL_SLOTS)
-    reader = BitReader(payload)
+    end = min(obu.end, obu.payload + _FRAME_HEADER_BYTES)
+    reader = BitReader(bytes(data[obu.payload : end]))
     if reader.flag():
         return _Header(None, shown=True, used=(reader.bits(3),), filled=0)
     kind = reader.bits(2)
@@ -347,6 +271,59 @@ def _parse_header(payload: bytes, sequence: _Sequence) -> _Header:
         used.add(reader.bits(3))
         reader.bits(sequence.delta_id_bits)
     return _Header(kind, shown, used, filled)
+
+
+# ---------------------------------------------------------------- pictures
+
+
+class Av1Pictures:
+    """The pictures of one stream, temporal unit by temporal unit."""
+
+    def __init__(self) -> None:
+        self._parameters = b""
+        self._sequence: _Sequence | None = None
+
+    @property
+    def parameters(self) -> bytes:
+        """The sequence header OBU seen last."""
+        return self._parameters
+
+    def parse(self, body: memoryview) -> CodedPicture:
+        """The picture in a temporal unit.
+
+        Raises:
+            NoPicture: There is none.
+            Refused: There are several, an mp4 would lose a part of it, or it needs a sequence
+                header that was not sent.
+        """
+        data, framing = strip(body)
+        shown = frames = 0
+        keyframe = has_header = False
+        for obu in obus(data):
+            if obu.kind in _DROPPED:
+                raise Refused(f"it has {_DROPPED[obu.kind]}, which no mp4 keeps")
+            if obu.kind not in _KEPT:
+                raise Refused(f"it has an AV1 unit of the unknown kind {obu.kind}")
+            if obu.kind == _SEQUENCE_HEADER:
+                self._sequence = _parse_sequence(bytes(data[obu.payload : obu.end]))
+                self._parameters = bytes(data[obu.start : obu.end])
+                has_header = True
+            elif obu.kind in (_FRAME_HEADER, _FRAME):
+                if self._sequence is None:
+                    raise Refused("its sequence header was not sent before it")
+                header = _parse_header(data, obu, self._sequence)
+                # decoders begin only where the header is too (AV1 in ISOBMFF, 2.4)
+                keyframe |= header.is_key and has_header and not frames
+                frames += 1
+                shown += header.shown
+        if not frames or self._sequence is None:
+            raise NoPicture("it holds no picture, only parameters or remarks")
+        if shown != 1:
+            raise Refused("it shows no picture" if not shown else "it holds more than one picture")
+        return CodedPicture(*self._sequence.size, keyframe, framing)
+
+
+# ---------------------------------------------------------------- references
 
 
 class Av1References:
@@ -403,7 +380,10 @@ class Av1References:
     def _take_sequence(self, payload: bytes) -> None:
         if payload != self._sequence_bytes:
             self._sequence, self._sequence_bytes = None, b""
-            self._sequence = _parse_sequence(payload[:_SEQUENCE_BYTES])
+            sequence = _parse_sequence(payload)
+            if sequence.unfit:
+                raise UnknownStructure(sequence.unfit)
+            self._sequence = sequence
             self._sequence_bytes = payload
             self._changed = True
 
@@ -413,10 +393,9 @@ class Av1References:
             raise UnknownStructure("its sequence header was not sent before it")
         if data[obu.start] & 4:
             _check_layer(data[obu.start + 1], sequence.layers)
-        payload = bytes(data[obu.payload : min(obu.end, obu.payload + _FRAME_HEADER_BYTES)])
-        header = _parse_header(payload, sequence)
+        header = _parse_header(data, obu, sequence)
         number = self._number
-        begins = header.kind == _KEY and header.shown
+        begins = header.is_key
         if begins:
             self._start = number
             self._changed = False
