@@ -137,13 +137,15 @@ NAMES = [f"/vehicle/sensor_{n:02}/camera/image_rect_color/compressed" for n in r
 ROWS = [[name, "sensor_msgs/Image", "123", "", "0.5", "rgb8 " * 9] for name in NAMES]
 
 
-def printed(monkeypatch: pytest.MonkeyPatch, columns: int | None) -> list[str]:
+def printed(
+    monkeypatch: pytest.MonkeyPatch, columns: int | None, rows: list[list[str]] = ROWS
+) -> list[str]:
     """The lines of a table, on a terminal that is so wide, or in a pipe."""
     screen = Screen() if columns else io.StringIO()
     monkeypatch.setenv("COLUMNS", str(columns or 80))
     with contextlib.redirect_stdout(screen):
-        is_cut = print_table(TABLE, ROWS)
-    assert is_cut == (columns is not None and columns < 300)
+        is_cut = print_table(TABLE, rows, first=4)
+    assert is_cut == bool(columns)
     return re.sub(r"\x1b\[[0-9;]*m", "", screen.getvalue()).splitlines()
 
 
@@ -163,16 +165,21 @@ def test_a_table_fits_a_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) 
     assert ("jitter" in heading) == (columns >= 80)
     assert ("sensor_msgs/Image" in lines[0]) == (columns == 300)
     assert ("  Image  " in lines[0]) == (80 <= columns < 300)
-    assert all(line.startswith("/vehi") for line in lines)
+    assert all(line.startswith("/vehi") for line in lines[:4])
     assert lines[0].split()[0].endswith("compressed")
-    assert len(lines) == len(ROWS)
+    assert lines[4] == "66 other topics:"
+    assert len(lines) == 8
+    assert lines[-1].endswith(" ...")
+
+
+def test_a_table_of_few_rows_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(printed(monkeypatch, 80, ROWS[:20])) == 21
 
 
 def test_wide_letters_stay_in_their_columns(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [["/\u8eca" * 30, "a/B", "1", "", "", "x"], ["/b", "a/B", "2", "", "", "x"]]
-    monkeypatch.setitem(globals(), "ROWS", rows)
     for columns in (80, 40):
-        _, wide, plain = printed(monkeypatch, columns)
+        _, wide, plain = printed(monkeypatch, columns, rows)
         start = plain.index("2")
         assert len(wide[: wide.index("1")].encode("utf-16-le")) // 2 < start
         taken = sum(2 if letter == "\u8eca" else 1 for letter in wide[: wide.index("1")])

@@ -227,7 +227,7 @@ def _print_info(result: facts.Info) -> None:
     cameras = [topic for topic in result.topics if topic.content or topic.stored]
     others = [topic for topic in result.topics if not topic.content and not topic.stored]
     rows = [_info_row(topic) for topic in (*cameras, *others)]
-    if print_table(_INFO_COLUMNS, rows):
+    if print_table(_INFO_COLUMNS, rows, first=len(cameras)):
         say("shortened to fit; in full: --json, or `| less -S`")
     for note in result.notes:
         say(note)

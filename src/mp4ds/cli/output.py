@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, is_dataclass
@@ -14,7 +15,7 @@ from unicodedata import east_asian_width
 
 import click
 
-from mp4ds.errors import Mp4dsError
+from mp4ds.errors import Mp4dsError, counted
 
 _QUIET, _JSON = "mp4ds.quiet", "mp4ds.json"  # keys in click's context
 
@@ -106,6 +107,8 @@ def complain(value: object) -> None:
         print(f"mp4ds: {shown(value)}", file=sys.stderr, flush=True)
 
 
+_MOST_ROWS = 20  # of a table on a terminal
+_MOST_LINES = 3  # of the names of other rows
 _SHORTEST = {"topic": 24, "type": 12, "text": 20}
 
 
@@ -126,14 +129,18 @@ class Column:
     spare: int = 0
 
 
-def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> bool:
+def print_table(
+    columns: Sequence[Column], rows: Sequence[Sequence[str]], *, first: int = 0
+) -> bool:
     """Print a table with a line for each row, without the columns that are empty.
 
-    A terminal shows what fits: short names of types, fewer columns. Other programs get all.
+    A terminal shows what fits: few rows, short names of types, fewer columns. Other programs get
+    all.
 
     Args:
         columns: Its columns.
         rows: A text for each of them.
+        first: How many rows a terminal shows if there are too many for it, the others by name.
 
     Returns:
         Whether anything was shortened or left out.
@@ -141,10 +148,12 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> boo
     if is_quiet():
         return False
     cells = [[shown(cell) for cell in row] for row in rows]
+    is_terminal = sys.stdout.isatty()
+    most = (first or _MOST_ROWS) if is_terminal and len(cells) > _MOST_ROWS else len(cells)
+    cells, folded = cells[:most], [row[0] for row in cells[most:]]
     used = [n for n in range(len(columns)) if any(row[n] for row in cells)]
     table = [[column.name for column in columns], *cells]
     widths = {n: max(_width(row[n]) for row in table) for n in used}
-    is_terminal = sys.stdout.isatty()
     width = shutil.get_terminal_size().columns if is_terminal else sys.maxsize
     is_cut = _total(widths) > width
     if is_cut:
@@ -154,7 +163,12 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> boo
             line = "  ".join(_cell(row[n], size, columns[n].kind) for n, size in widths.items())
             is_heading = is_terminal and not number
             print(click.style(line.rstrip(), bold=True) if is_heading else line.rstrip())
-    return is_cut
+    if folded:
+        say(f"{counted(len(folded), f'other {columns[0].name}')}:")
+        names = ", ".join(folded)
+        for line in textwrap.wrap(names, width - 2, max_lines=_MOST_LINES, placeholder=" ..."):
+            say(f"  {line}")
+    return is_cut or bool(folded)
 
 
 def _fitted(

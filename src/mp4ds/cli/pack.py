@@ -76,7 +76,7 @@ def print_pack(summary: PackSummary) -> None:
     cameras = [topic for topic in summary.topics if topic.frames]
     others = [topic for topic in summary.topics if not topic.frames]
     rows = [_pack_row(topic) for topic in (*cameras, *others)]
-    print_table(_COLUMNS, rows)
+    print_table(_COLUMNS, rows, first=len(cameras))
     for topic in summary.topics:
         for reason, (count, first) in topic.verbatim.items():
             share = f"{count} of {counted(topic.messages, 'message')}"
