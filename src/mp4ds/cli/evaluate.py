@@ -53,7 +53,7 @@ def print_evaluation(result: Evaluation) -> None:
 
 
 @command()
-@argument("source", "SOURCE", "A .bag, rosbag2 folder, .mcap, dataset, video or folder of images.")
+@argument("source", "SOURCE", "A .bag, rosbag2 folder, .mcap, dataset or video.")
 @option(
     "--output",
     "-o",

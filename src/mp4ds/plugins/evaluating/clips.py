@@ -18,18 +18,15 @@ from mp4ds.bags.formats import open_reader
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import open_dataset
 from mp4ds.dataset.topic import Topic
-from mp4ds.errors import Refused, SourceNotFoundError
-from mp4ds.files.urls import remote
-from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.errors import Refused
+from mp4ds.format.sidecars import names_dataset
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.layouts import Layout, layout_for
 from mp4ds.messages.serializations import is_camera, kind_of
 from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.inspection import MessageInspector, depends_on_others
-from mp4ds.packing.options import ImageFolder
 from mp4ds.plan import LOSSLESS
 from mp4ds.plugins.evaluating.trials import FRAMES, TICKS, Clip
-from mp4ds.plugins.importing.layouts import images_in, open_images
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import TIMESCALE, PresentationClock
 from mp4ds.video.planes import PlaneMaker, PlaneSpool
@@ -37,7 +34,6 @@ from mp4ds.video.scores import SMALLEST
 
 _JPEG = "JPEG files, which `mp4ds pack` re-encodes only with --transcode"
 
-_VIDEOS = (".mp4", ".m4v", ".mov", ".yaml", ".yml")
 _AT_ONCE = 8  # frames of a dataset in memory at once
 _SECOND = 1_000_000_000
 _DETAIL = (96, 128)  # rows and columns shown side by side
@@ -83,38 +79,24 @@ class Camera:
 
 
 @contextmanager
-def open_cameras(place: Path, fps: float) -> Iterator[tuple[list[Camera], dict[str, str]]]:
-    """Open a recording, a dataset, a video, or a folder of images.
-
-    Args:
-        place: Where it is; a folder of images is on this machine.
-        fps: Frames per second of a folder of images.
+def open_cameras(place: Path) -> Iterator[tuple[list[Camera], dict[str, str]]]:
+    """Open a recording, a dataset, or a video.
 
     Yields:
         Its cameras, and the topics of those whose images no encoder takes, with the reason.
 
     Raises:
-        SourceError: It is not a recording, a dataset or such a folder.
+        SourceError: It is none of these.
         FormatError: It is a dataset, and breaks a rule of the format.
     """
-    if not place.exists():
-        raise SourceNotFoundError(place)
-    if (place / MANIFEST_NAME).exists() or place.suffix.lower() in _VIDEOS:
+    if names_dataset(place):
         with open_dataset(place) as dataset, ExitStack() as topics:
             # stream by stream: an encoder takes images of one size
             opened = [topics.enter_context(closing(Topic([part]))) for part in dataset.parts]
             yield list(map(_of_topic, opened)), {}
-        return
-    with _reader_of(place, fps) as reader:
-        yield _of_recording(reader)
-
-
-def _reader_of(place: Path, fps: float) -> BagReader:
-    # a rosbag2 folder may hold pictures, too
-    is_plain = place.is_dir() and not (place / "metadata.yaml").exists()
-    if is_plain and not remote(place) and images_in(place):
-        return open_images(place, ImageFolder(layout="plain", rate=str(fps)))
-    return open_reader(place)
+    else:
+        with open_reader(place) as reader:
+            yield _of_recording(reader)
 
 
 def _of_recording(reader: BagReader) -> tuple[list[Camera], dict[str, str]]:

@@ -124,7 +124,6 @@ class EvaluateOptions(TopicOptions):
         most=_MOST,
     )
     frames: int = option("Frames per clip.", 150, panel=WHAT, least=1)
-    fps: float = option("Frame rate of a folder of images.", 30.0, least=_LEAST, most=_MOST)
     target: Parsed[ScoreGoal] = option(
         "Score to reach, such as vmaf=99.5, psnr_y=42 or ssim=0.98.",
         "vmaf=99.5",
@@ -211,7 +210,7 @@ def evaluate(
     """Compare a grid of encoder settings on clips of a recording's cameras.
 
     Args:
-        source: A bag, rosbag2 folder, MCAP, dataset, video, or folder of images; or a URL.
+        source: A bag, rosbag2 folder, MCAP, dataset, or video; or a URL.
         options: How.
         output: Folder of the results; None: ``NAME_evaluation`` in the current folder. Existing
             results are reused.
@@ -232,7 +231,7 @@ def evaluate(
     asked = options or EvaluateOptions()
     goal, settings, place = asked.target, settings_of(asked), location(source)
     ffmpeg = _ffmpeg(goal)
-    with open_cameras(place, asked.fps) as (found, left_out):
+    with open_cameras(place) as (found, left_out):
         cameras = _selected(found, left_out, asked)
         origin = min((int(camera.times[0]) for camera in found), default=0)
         result = Evaluation(place, _folder(place, output), [], left_out, versions_of(ffmpeg))

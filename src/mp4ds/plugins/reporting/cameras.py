@@ -34,45 +34,8 @@ _DAY_NS = 86_400 * 10**9
 _NO_STAMPS, _OTHER_CLOCK = "no header stamps", "stamps from another clock"
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Timing statistics of one camera, in milliseconds; None if there are too few frames.
-
-    Attributes:
-        frames: Number of frames.
-        rate_hz: Mean rate by the median interval.
-        median_ms: Median of the positive intervals between stamps.
-        jitter_ms: Standard deviation of the intervals.
-        p99_ms: 99th percentile of the intervals' distance from the median.
-        longest_ms: Longest interval.
-        lost: Frames missing by the stamps: see `lost_frames`.
-        gaps: Places where they are missing.
-        repeated: Frames with the same stamp as the previous one.
-        backward: Frames with an earlier stamp than the previous one.
-        seq_missing: Numbers missing in the header's `seq`; None if there is no `seq`.
-        delay_median_ms: Median of log time minus stamp.
-        delay_least_ms: Their minimum.
-        delay_most_ms: Their maximum.
-    """
-
-    frames: int
-    rate_hz: float | None
-    median_ms: float | None
-    jitter_ms: float | None
-    p99_ms: float | None
-    longest_ms: float | None
-    lost: int
-    gaps: int
-    repeated: int
-    backward: int
-    seq_missing: int | None
-    delay_median_ms: float
-    delay_least_ms: float
-    delay_most_ms: float
-
-
-def timing_of(stamps: Integers, log_times: Integers, seq: Integers | None) -> Timing:
-    """The timing statistics of one camera.
+def timing_of(stamps: Integers, log_times: Integers, seq: Integers | None) -> dict[str, Any]:
+    """The timing of one camera, in milliseconds; None where there are too few frames.
 
     Args:
         stamps: Header stamps, nanoseconds, at least one.
@@ -83,22 +46,24 @@ def timing_of(stamps: Integers, log_times: Integers, seq: Integers | None) -> Ti
     usual = usual_interval(steps)
     lost = lost_frames(steps)
     delays = differences(log_times, stamps) / _MS
-    return Timing(
-        frames=len(stamps),
-        rate_hz=1e9 / usual if usual else None,
-        median_ms=usual / _MS if usual else None,
-        jitter_ms=float(steps.std()) / _MS if len(steps) else None,
-        p99_ms=float(np.percentile(np.abs(steps - usual), 99)) / _MS if usual else None,
-        longest_ms=float(steps.max()) / _MS if len(steps) else None,
-        lost=sum(lost[lost > 0].tolist()),
-        gaps=int((lost > 0).sum()),
-        repeated=int((steps == 0).sum()),
-        backward=int((steps < 0).sum()),
-        seq_missing=None if seq is None else _missing_numbers(seq),
-        delay_median_ms=float(np.median(delays)),
-        delay_least_ms=float(delays.min()),
-        delay_most_ms=float(delays.max()),
-    )
+    return {
+        "frames": len(stamps),
+        # rate and median of the positive intervals, and how far the others are from it
+        "rate_hz": 1e9 / usual if usual else None,
+        "median_ms": usual / _MS if usual else None,
+        "jitter_ms": float(steps.std()) / _MS if len(steps) else None,
+        "p99_ms": float(np.percentile(np.abs(steps - usual), 99)) / _MS if usual else None,
+        "longest_ms": float(steps.max()) / _MS if len(steps) else None,
+        # see `lost_frames`
+        "lost": sum(lost[lost > 0].tolist()),
+        "gaps": int((lost > 0).sum()),
+        "repeated": int((steps == 0).sum()),
+        "backward": int((steps < 0).sum()),
+        "seq_missing": None if seq is None else _missing_numbers(seq),
+        "delay_median_ms": float(np.median(delays)),
+        "delay_least_ms": float(delays.min()),
+        "delay_most_ms": float(delays.max()),
+    }
 
 
 def _missing_numbers(seq: Integers) -> int:
@@ -298,7 +263,7 @@ class ReportedCamera:
             "note": self.note,
             "caption": self.caption,
             "shown": self._shown(),
-            "timing": asdict(timing_of(stream.stamps, stream.log_times, stream.columns.seq)),
+            "timing": timing_of(stream.stamps, stream.log_times, stream.columns.seq),
             "untimed": untimed,
             "offset": None if reference is None else _offset(stream, reference.stream),
             **self._calibrations(),

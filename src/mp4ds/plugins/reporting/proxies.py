@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -129,16 +129,6 @@ class Look:
             scaled = (values.astype(np.float64) - self._low) * (255 / (self._high - self._low))
         places: NDArray[np.float64] = np.nan_to_num(np.clip(np.rint(scaled), 0, 255))
         return places
-
-
-def pictures_in_order(stream: Stream) -> Iterator[tuple[int, Pixels | None]]:
-    """The pixels of all frames; None for a packet that cannot be decoded by what was recorded.
-
-    Raises:
-        VideoError: The video is damaged.
-    """
-    for index, picture in stream.recorded_pictures():
-        yield index, None if picture is None else stream.rebuilder.pixels(picture)
 
 
 def _sampled(topic: Topic) -> list[Pixels]:
@@ -285,9 +275,9 @@ def make_proxy(
     picture: Bytes = np.zeros((size[1], size[0], 3), np.uint8)
     try:
         with encoder:
-            for number, pixels in pictures_in_order(stream):
-                if pixels is not None:  # otherwise the previous one stays
-                    picture = look.picture(pixels)
+            for number, found in stream.recorded_pictures():
+                if found is not None:  # otherwise the previous one stays
+                    picture = look.picture(stream.rebuilder.pixels(found))
                 encoder.write((picture,), int(times[number]))
                 if number % _TELL_EVERY == 0:
                     progress(f"{stream.topic}: frame {number} of {len(stream)} for the page")
