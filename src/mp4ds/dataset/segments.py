@@ -206,8 +206,7 @@ class JoinedStream:
             copy_file(part.stream.video_path, path)
         else:
             frames = range(int(part.images[0]), int(part.images[-1]) + 1)
-            codec = part.stream.sidecar.video.codec
-            cut_segment(part.stream.video_path, codec, frames, self._ticks(), path)
+            cut_segment(part.stream.video_path, frames, self._ticks(), path)
 
     def _ticks(self) -> list[int]:
         """When each frame is shown."""

@@ -93,13 +93,8 @@ class PacketWriter:
             self.begin(body)
         if not self._ticks:
             self._first = plain
-        packet = av.Packet(len(plain))  # padded, since parsers read on
-        packet.update(plain)
-        packet.stream = self._stream
-        packet.time_base = _TIME_BASE
-        packet.pts = packet.dts = tick
-        packet.duration = round(TIMESCALE / self._rate)
-        packet.is_keyframe = keyframe
+        duration = round(TIMESCALE / self._rate)
+        packet = _packet_at(plain, self._stream, tick, duration, is_key=keyframe)
         self._container.mux(packet)
         self._ticks.append(tick)
         self._sizes.append(len(plain))
@@ -214,6 +209,7 @@ class PacketReader:
         coded_size: Expected width and height, if known.
 
     Attributes:
+        path: The video.
         hidden: How many packets are hidden, to which the first that are shown refer.
         ticks: Decoding times of the shown packets in ticks of the track.
         sizes: Bytes of each shown packet.
@@ -234,7 +230,7 @@ class PacketReader:
         frames: int | None = None,
         coded_size: tuple[int, int] | None = None,
     ) -> None:
-        self._path = path
+        self.path = path
         with closing(Media(path)) as media:
             media.check(codec, coded_size)
             context = media.track.codec_context
@@ -266,7 +262,7 @@ class PacketReader:
             total += size
             if place < 0 or size < 0 or place + size > length or total > length:
                 self._file.close()
-                raise VideoError("video-unreadable", self._path, "has an index that is damaged")
+                raise VideoError("video-unreadable", self.path, "has an index that is damaged")
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -276,6 +272,10 @@ class PacketReader:
         """Numbers of the packets at which decoding can begin, increasing."""
         return [number for number, is_key in enumerate(self.keyframes) if is_key]
 
+    def is_key(self, index: int) -> bool:
+        """Whether decoding can begin at a packet, which may be hidden."""
+        return bool(self._keyframes[self.hidden + index])
+
     def key_before(self, index: int) -> int:
         """Number of the packet at which decoding must begin to get a shown one.
 
@@ -284,7 +284,7 @@ class PacketReader:
         """
         key = self._keyframes.rfind(1, 0, self.hidden + index + 1)
         if key < 0:
-            raise VideoError("video-unreadable", self._path, "does not start with a key frame")
+            raise VideoError("video-unreadable", self.path, "does not start with a key frame")
         return key - self.hidden
 
     def packet(self, index: int) -> bytes:
@@ -300,7 +300,7 @@ class PacketReader:
         self._file.seek(self._places[self.hidden + index])
         packet = self._file.read(size)
         if len(packet) != size:
-            raise VideoError("decode-failed", self._path, "is cut off", frame=index)
+            raise VideoError("decode-failed", self.path, "is cut off", frame=index)
         return packet
 
     def packets(self) -> Iterator[bytes]:
@@ -325,9 +325,7 @@ class PacketReader:
 # ---------------------------------------------------------------- cut, join
 
 
-def cut_segment(
-    source: Path, codec: str, numbers: range, ticks: Sequence[int], target: Path
-) -> None:
+def cut_segment(source: Path, numbers: range, ticks: Sequence[int], target: Path) -> None:
     """Write consecutive frames of a video to a separate file.
 
     The frames from the preceding key frame on are included, since they are referred to; an edit
@@ -335,7 +333,6 @@ def cut_segment(
 
     Args:
         source: A file of `VideoEncoder` or `PacketWriter`, of which frames may be cut off already.
-        codec: Name in the registry.
         numbers: Numbers of the frames, at least one.
         ticks: Their presentation times, in ticks of 1 / `TIMESCALE` s, strictly increasing from 0.
         target: The file to make. It is removed if it cannot be finished.
@@ -344,36 +341,8 @@ def cut_segment(
         VideoError: The source cannot be read, or the result does not hold every packet as it was.
         OSError: It cannot be written.
     """
-    entry = read_sample_entry(source)
-    try:
-        with (
-            closing(Media(source)) as media,
-            PacketReader(source, codec=codec) as reader,
-            closing(new_mp4(target)) as container,
-        ):
-            written = _Written(codec)
-            stream = _new_stream(container, media.track, entry)
-            first = numbers[0]
-            duration = max(1, ticks[-1] - ticks[-2]) if len(ticks) > 1 else _last_duration(source)
-            for number in range(reader.key_before(first), numbers[-1] + 1):
-                is_shown = number >= first
-                tick = (
-                    ticks[number - first]
-                    if is_shown
-                    else number - first  # of what nobody sees, any that increases does
-                )
-                is_key = number == reader.key_before(number)
-                data = reader.packet(number)
-                packet = _packet_at(data, stream, tick, duration, is_key=is_key)
-                with _damage_told(source, f"packet {number} is damaged"):
-                    container.mux(packet)
-                if is_shown:
-                    written.add(tick, len(data), is_key=is_key)
-            _finish(container, target)
-        written.check(target, entry)
-    except BaseException:
-        target.unlink(missing_ok=True)
-        raise
+    duration = max(1, ticks[-1] - ticks[-2]) if len(ticks) > 1 else _last_duration(source)
+    _write([source], iter(ticks), target, duration, numbers)
 
 
 def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> int:
@@ -404,9 +373,48 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
     """
     if not segments:
         raise ValueError("there are no segments to join")
+    return _write(segments, iter(ticks), target, _last_duration(segments[-1]))
+
+
+def _write(
+    segments: Sequence[Path],
+    ticks: Iterator[int],
+    target: Path,
+    duration: int,
+    numbers: range | None = None,
+) -> int:
+    """Write frames of videos to a new file, which is removed if it cannot be finished.
+
+    Args:
+        segments: The videos.
+        ticks: Presentation times of the frames.
+        target: The file.
+        duration: Of the last frame, in ticks.
+        numbers: Those of the frames of the only video; None: all.
+
+    Returns:
+        The number of frames.
+    """
     entry = _common_entry(segments)
     try:
-        written = _copy(segments, iter(ticks), target, entry)
+        with closing(Media(segments[0])) as source, closing(new_mp4(target)) as container:
+            written = _Written(source.track.codec_context.codec.canonical_name)
+            stream = _new_stream(container, source.track, entry)
+            try:
+                for segment in segments:
+                    with PacketReader(segment, codec=written.codec) as reader:
+                        _copy(reader, numbers, ticks, container, stream, duration, written)
+                if next(ticks, None) is not None:
+                    raise VideoError(
+                        "frame-count", target, f"would have only {len(written.ticks)} frames"
+                    )
+            except BaseException:
+                # closing completes the file, which may fail, too; the first error tells more
+                with suppress(FFmpegError, OSError):
+                    container.close()
+                raise
+            with _damage_told(target, "cannot be completed"):
+                container.close()
         written.check(target, entry)
     except BaseException:
         target.unlink(missing_ok=True)
@@ -452,29 +460,6 @@ class _Written:
             return False  # the muxer continues after some damages, and the index is wrong then
 
 
-def _copy(
-    segments: Sequence[Path], ticks: Iterator[int], target: Path, entry: SampleEntry
-) -> _Written:
-    duration = _last_duration(segments[-1])
-    with closing(Media(segments[0])) as source, closing(new_mp4(target)) as container:
-        written = _Written(source.track.codec_context.codec.canonical_name)
-        stream = _new_stream(container, source.track, entry)
-        try:
-            for segment in segments:
-                _copy_segment(segment, ticks, container, stream, duration, written)
-            if next(ticks, None) is not None:
-                raise VideoError(
-                    "frame-count", target, f"would have only {len(written.ticks)} frames"
-                )
-        except BaseException:
-            # closing completes the file, which may fail, too; the first error tells more
-            with suppress(FFmpegError, OSError):
-                container.close()
-            raise
-        _finish(container, target)
-    return written
-
-
 def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
     """A track described as the segments' tracks are.
 
@@ -498,44 +483,43 @@ def _last_duration(path: Path) -> int:
         return max(int(source.track.duration or 0) - int(elapsed), 1)
 
 
-def _copy_segment(
-    path: Path,
+def _copy(
+    reader: PacketReader,
+    numbers: range | None,
     ticks: Iterator[int],
     container: Any,
     stream: Any,
     duration: int,
     written: _Written,
 ) -> None:
-    with PacketReader(path, codec=written.codec) as reader:
-        for index, data in enumerate(reader.packets()):
-            tick = next(ticks, None)
-            if tick is None:
-                raise VideoError(
-                    "frame-count", path, f"has {len(reader)} frames, but {index} are needed"
-                )
+    first, end = (numbers[0], numbers[-1] + 1) if numbers else (0, len(reader))
+    for number in range(reader.key_before(first) if numbers else 0, end):
+        data, is_key = reader.packet(number), reader.is_key(number)
+        # of what nobody sees, any time that increases does
+        tick = next(ticks, None) if number >= first else number - first
+        if tick is None:
+            raise VideoError(
+                "frame-count", reader.path, f"has {len(reader)} frames, but {number} are needed"
+            )
+        if number >= first:
             if written.ticks and tick <= written.ticks[-1]:
                 raise ValueError(f"tick {tick} does not follow {written.ticks[-1]}")
-            is_key = bool(reader.keyframes[index])
-            packet = _packet_at(data, stream, tick, duration, is_key=is_key)
-            with _damage_told(path, f"packet {index} is damaged"):
-                container.mux(packet)
             written.add(tick, len(data), is_key=is_key)
+        packet = _packet_at(data, stream, tick, duration, is_key=is_key)
+        with _damage_told(reader.path, f"packet {number} is damaged"):
+            container.mux(packet)
 
 
 def _packet_at(data: bytes, stream: Any, tick: int, duration: int, *, is_key: bool) -> Any:
     """A packet to mux, shown from a tick on."""
-    packet = av.Packet(data)
+    packet = av.Packet(len(data))  # padded, since parsers read on
+    packet.update(data)
     packet.stream = stream
     packet.time_base = _TIME_BASE
     packet.pts = packet.dts = tick
     packet.duration = duration
     packet.is_keyframe = is_key
     return packet
-
-
-def _finish(container: Any, target: Path) -> None:
-    with _damage_told(target, "cannot be completed"):
-        container.close()
 
 
 @contextmanager
@@ -586,7 +570,7 @@ class StandAlonePackets(PacketReader):
             raise self._damage(error) from None
 
     def _damage(self, error: Refused) -> VideoError:
-        return VideoError("decode-failed", self._path, f"has a damaged packet: {error}")
+        return VideoError("decode-failed", self.path, f"has a damaged packet: {error}")
 
     def packet(self, index: int) -> bytes:
         """One packet; see `PacketReader.packet`."""
