@@ -681,9 +681,17 @@ BAD: dict[str, tuple[Callable[[Path], Any], list[str], str]] = {
     ),
     "other-layout": (lambda root: None, ["--layout", "tum"], "does not have the layout tum"),
     "no-layout": (lambda root: None, ["--layout", "x"], "euroc, tum, plain"),
-    "stamps": (lambda root: None, ["--stamps", "x"], "--stamps is for plain folders"),
-    "frame-id": (lambda root: None, ["--frame-id", "x"], "--frame-id is for plain folders"),
-    "own-calibration": (lambda root: None, ["--calibration", "x"], "has its own"),
+    "stamps": (lambda root: None, ["--stamps", "x"], "--stamps works with plain, not with euroc"),
+    "frame-id": (
+        lambda root: None,
+        ["--frame-id", "x"],
+        "--frame-id works with plain, not with euroc",
+    ),
+    "own-calibration": (
+        lambda root: None,
+        ["--calibration", "x"],
+        "--calibration works with plain, tum",
+    ),
     "no-images": (lambda root: None, ["--layout", "plain"], "holds no images"),
     "quality": (lambda root: None, ["--quality", "x"], "x"),
 }

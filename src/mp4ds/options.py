@@ -41,6 +41,7 @@ class Declared:
         most: The maximum; None for any value.
         parse: Makes the value of text; passes on what is a value.
         changes: `CONTENT`, `ENCODING`, or empty.
+        only: The formats, layouts or ROS versions that it works with; empty for all.
     """
 
     help: str
@@ -51,6 +52,7 @@ class Declared:
     most: float | None = None
     parse: Callable[[Any], Any] | None = None
     changes: str = ""
+    only: tuple[str, ...] = ()
 
 
 class Parsed(Generic[_T]):
@@ -72,9 +74,10 @@ def option(
     most: float | None = None,
     parse: Callable[[Any], Any] | None = None,
     changes: str = "",
+    only: tuple[str, ...] = (),
 ) -> Any:
     """A field of `Options`; see `Declared`."""
-    declared = Declared(help, flags, panel, metavar, least, most, parse, changes)
+    declared = Declared(help, flags, panel, metavar, least, most, parse, changes, only)
     return field(default=default, metadata={"declared": declared})
 
 
@@ -112,6 +115,19 @@ class Options:
                 _check_bounds(value, declared)
             except OptionError as error:
                 raise OptionError(f"`{name}` {error}") from None
+
+    def check_for(self, kind: str) -> None:
+        """Refuse options that do not work with a format, layout or ROS version.
+
+        Raises:
+            OptionError: Names one.
+        """
+        usual = type(self)()
+        for name, declared in declared_in(type(self)):
+            is_given = getattr(self, name) != getattr(usual, name)
+            if is_given and declared.only and kind not in declared.only:
+                works = ", ".join(declared.only)
+                raise OptionError(f"`{name}` works with {works}, not with {kind}.")
 
     def changing(self, *what: str) -> dict[str, Any]:
         """The options that change this of a result, by name."""

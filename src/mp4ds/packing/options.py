@@ -28,6 +28,8 @@ from mp4ds.plan import MAX_GOP, Purpose, QualitySetting, parse_purpose, parse_qu
 from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
 from mp4ds.video.codecs import ARCHIVE_GOP, LOSSLESS_GOP, LOSSY_GOP, LOSSY_TRAINING_GOP
 
+_PLAIN = ("plain",)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImageFolder(Options):
@@ -35,21 +37,27 @@ class ImageFolder(Options):
 
     layout: str | None = option("euroc, tum or plain; default: detected.")
     stamps: str | None = option(
-        "Text file with a time per line, or a time and a file name.", metavar="FILE"
+        "Text file with a time per line, or a time and a file name.", metavar="FILE", only=_PLAIN
     )
     rate: str | None = option(
-        "Frame rate of images without times, such as 20 or 30000/1001.", metavar="HZ"
+        "Frame rate of images without times, such as 20 or 30000/1001.", metavar="HZ", only=_PLAIN
     )
     unit: str | None = option(
-        "Unit of integer times: s, ms, us or ns; default: ns, if they have enough digits."
+        "Unit of integer times: s, ms, us or ns; default: ns, if they have enough digits.",
+        only=_PLAIN,
     )
     calibration: str | None = option(
-        "Calibration as saved by ROS's camera_calibration.", metavar="YAML"
+        "Calibration as saved by ROS's camera_calibration.",
+        metavar="YAML",
+        only=("plain", "tum"),
     )
-    topic: str | None = option("Topic of plain images; default: /camera/image_raw.", panel=WHAT)
-    frame_id: str | None = option("Frame id of plain images; default: camera.")
+    topic: str | None = option(
+        "Topic of plain images; default: /camera/image_raw.", panel=WHAT, only=_PLAIN
+    )
+    frame_id: str | None = option("Frame id of plain images; default: camera.", only=_PLAIN)
     encoding: str | None = option(
-        "Encoding of plain images, such as bayer_rggb8 or 16UC1; default: as in the files."
+        "Encoding of plain images, such as bayer_rggb8 or 16UC1; default: as in the files.",
+        only=_PLAIN,
     )
 
     def absolute(self) -> ImageFolder:

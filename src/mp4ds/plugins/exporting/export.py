@@ -30,7 +30,6 @@ FORMATS = {"euroc": "EuRoC", "tum": "TUM", "colmap": "COLMAP", "lerobot": "LeRob
 """Formats -> display name."""
 
 _WRITERS = {"euroc": write_euroc, "tum": write_tum, "colmap": write_colmap}
-_OF_LEROBOT = ("fps", "state", "action", "task", "codec", "crf")
 
 
 def export(
@@ -130,11 +129,7 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
             f"{FORMATS[to]} holds a single dataset, but {len(paths)} were given: export them "
             "one by one."
         )
-    usual = ExportOptions()
-    for name in ("poses", *_OF_LEROBOT):
-        formats = ("lerobot",) if name in _OF_LEROBOT else tuple(_WRITERS)
-        if getattr(options, name) != getattr(usual, name) and to not in formats:
-            raise OptionError(f"`{name}` works with {', '.join(formats)}, not with {to}.")
+    options.check_for(to)
     if to == "lerobot" and options.pixels not in ("seen", "rgb"):
         raise OptionError(
             f"LeRobot's videos are in colour: `pixels` {options.pixels} does not apply."

@@ -26,6 +26,7 @@ from mp4ds.unpacking.pictures import ReductionOptions, is_inverse_depth, times_o
 from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
 
+_LEROBOT = ("lerobot",)
 PIXELS = ("seen", "native", "rgb", "gray")
 _CODECS = ("av1", "h264", "h265")
 _NS_PER_MS = 1_000_000
@@ -60,18 +61,30 @@ class ExportOptions(SliceOptions, ReductionOptions):
         parse=_nanoseconds,
     )
     poses: str | None = option(
-        "Topic with poses, for euroc, tum and colmap.", panel=WHAT, metavar="TOPIC"
+        "Topic with poses, for euroc, tum and colmap.",
+        panel=WHAT,
+        metavar="TOPIC",
+        only=("euroc", "tum", "colmap"),
     )
     fps: int | None = option(
-        "Frame rate for lerobot; default: that of the first camera.", least=1, most=1000
+        "Frame rate for lerobot; default: that of the first camera.",
+        least=1,
+        most=1000,
+        only=_LEROBOT,
     )
     state: str | None = option(
-        "Topic for lerobot's observation.state.", panel=WHAT, metavar="TOPIC"
+        "Topic for lerobot's observation.state.", panel=WHAT, metavar="TOPIC", only=_LEROBOT
     )
-    action: str | None = option("Topic for lerobot's action.", panel=WHAT, metavar="TOPIC")
-    task: str = option("Task description, for lerobot.", "", panel=WHAT, metavar="TEXT")
-    codec: str = option("Video codec for lerobot: av1, h264 or h265.", "av1")
-    crf: int = option("Quality of lerobot's videos; lower is better.", 30, least=0, most=63)
+    action: str | None = option(
+        "Topic for lerobot's action.", panel=WHAT, metavar="TOPIC", only=_LEROBOT
+    )
+    task: str = option(
+        "Task description, for lerobot.", "", panel=WHAT, metavar="TEXT", only=_LEROBOT
+    )
+    codec: str = option("Video codec for lerobot: av1, h264 or h265.", "av1", only=_LEROBOT)
+    crf: int = option(
+        "Quality of lerobot's videos; lower is better.", 30, least=0, most=63, only=_LEROBOT
+    )
     force: bool = force()
 
     def __post_init__(self) -> None:

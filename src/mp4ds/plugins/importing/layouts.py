@@ -36,8 +36,6 @@ from mp4ds.plugins.importing.parsing import (
 from mp4ds.plugins.importing.reader import ImagesReader
 from mp4ds.video.images import STILL_SUFFIXES, image_size
 
-_PLAIN_ONLY = ("stamps", "rate", "unit", "topic", "frame_id", "encoding")
-
 
 def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
     """Open a folder of images as a recording.
@@ -60,7 +58,7 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
     try:
         name = options.layout or next(key for key in _LAYOUTS if _LAYOUTS[key][0](folder))
         matches, add_all = _LAYOUTS[name]
-        _check_for(name, options)
+        options.check_for(name)
         if not matches(folder):
             raise SourceError(folder, f"does not have the layout {name}", "Omit `layout`.")
         reader = ImagesReader(folder)
@@ -82,18 +80,6 @@ def _check(options: ImageFolder) -> None:
             raise OptionError(f"`{name}` {value!r} is not one of {', '.join(known)}.")
     if options.topic is not None and not options.topic.strip("/"):
         raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
-
-
-def _check_for(name: str, options: ImageFolder) -> None:
-    """Refuse options for other layouts."""
-    given = [key for key in _PLAIN_ONLY if getattr(options, key) is not None]
-    if name != "plain" and given:
-        raise OptionError(
-            f"`{given[0]}` is for plain folders of images, but this one has the layout {name}, "
-            f"which already defines it. Give `layout` plain, or omit `{given[0]}`."
-        )
-    if name == "euroc" and options.calibration:
-        raise OptionError("`calibration` cannot be used with the layout euroc, which has its own.")
 
 
 def _calibration(

@@ -154,6 +154,7 @@ class PlayOptions(ReductionOptions):
         "Wait when playback gets too far ahead of the header stamps on this topic (ROS 1).",
         "",
         metavar="TOPIC",
+        only=("ros1",),
     )
     rate_control_max_delay: Parsed[float] = option(
         "Seconds that playback may be ahead of `rate_control_topic`.",
@@ -168,12 +169,20 @@ class PlayOptions(ReductionOptions):
         None,
         metavar="MS",
         least=0,
+        only=("ros2",),
     )
     queue: int = option(
-        "Outgoing queue per subscriber, in messages; 0: no limit but 128 MiB (ROS 1).", 0, least=0
+        "Outgoing queue per subscriber, in messages; 0: no limit but 128 MiB (ROS 1).",
+        0,
+        least=0,
+        only=("ros1",),
     )
     qos_overrides: Path | None = option(
-        "QoS profiles by topic (ROS 2).", None, "--qos-profile-overrides-path", metavar="YAML"
+        "QoS profiles by topic (ROS 2).",
+        None,
+        "--qos-profile-overrides-path",
+        metavar="YAML",
+        only=("ros2",),
     )
     publish_as: str | None = option(
         "Publish cameras as raw, compressed (JPEG) or ffmpeg (video packets); default: as recorded."

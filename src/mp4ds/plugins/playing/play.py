@@ -11,7 +11,7 @@ from pathlib import Path
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.salvage import HOW_TO_SALVAGE
-from mp4ds.errors import OptionError, advising
+from mp4ds.errors import advising
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary
 from mp4ds.plugins.playing.timeline import Timeline
@@ -85,14 +85,7 @@ def open_player(
 
 
 def _opened(kind: str, chosen: PlayOptions) -> Node:
-    for name, needed, is_given in (
-        ("wait_for_all_acked", "ros2", chosen.wait_for_all_acked is not None),
-        ("qos_overrides", "ros2", chosen.qos_overrides is not None),
-        ("queue", "ros1", chosen.queue > 0),
-        ("rate_control_topic", "ros1", bool(chosen.rate_control_topic)),
-    ):
-        if is_given and kind != needed:
-            raise OptionError(f"`{name}` needs `{needed}`.")
+    chosen.check_for(kind)
     patience = chosen.wait_for_all_acked
     options = NodeOptions(
         _NODES.get(kind, ""),
