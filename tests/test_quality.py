@@ -22,7 +22,7 @@ from mp4ds import yamlio
 from mp4ds.errors import OptionError, ScoringError
 from mp4ds.format.models import Quality
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.target import CrfControl, window_frames
+from mp4ds.packing.tracks import CrfControl, window_frames
 from mp4ds.plan import QualityTarget, parse_quality
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
@@ -45,7 +45,7 @@ needs_vmaf = pytest.mark.skipif(
 def executor(monkeypatch: pytest.MonkeyPatch) -> InlineExecutor:
     inline = InlineExecutor()
     use(monkeypatch, inline)
-    monkeypatch.setattr("mp4ds.packing.target._FRAMES", WINDOW)
+    monkeypatch.setattr("mp4ds.packing.tracks._FRAMES", WINDOW)
     return inline
 
 

@@ -19,8 +19,17 @@ from mp4ds.packing.manifest import PartRecord, PartStream, declare_rest
 from mp4ds.packing.options import TopicSummary
 from mp4ds.packing.planning import Piece, Plan
 from mp4ds.packing.processes import StreamThreads
-from mp4ds.packing.survey import MAX_STREAMS_PER_CHANNEL, SAMPLES, Decision, Survey, decide, rate_of
-from mp4ds.packing.tracks import PicturePlan, StreamSettings, TrackPlan, needs_trial
+from mp4ds.packing.survey import (
+    MAX_STREAMS_PER_CHANNEL,
+    SAMPLES,
+    Decision,
+    StreamSettings,
+    Survey,
+    decide,
+    needs_trial,
+    rate_of,
+)
+from mp4ds.packing.tracks import TrackPlan
 from mp4ds.packing.writer import StreamWriter
 from mp4ds.plan import FileNames
 from mp4ds.records import Attachment, Channel, Message, Record
@@ -172,10 +181,10 @@ class CameraRouter:
         if reason is None:
             return _Route(list(decision.plans), refusal=decision.refusal)
         kept = "partly kept lossless" if self._survey else "kept lossless"
-        plans: list[TrackPlan] = [
+        plans = [
             replace(plan, note=f"{kept}: {reason}")
             for plan in decision.plans
-            if isinstance(plan, PicturePlan) and plan.exact
+            if plan.coding is not None and plan.is_exact
         ]
         return _Route(plans, refusal="" if plans else reason)
 
@@ -232,7 +241,7 @@ class CameraRouter:
             channel=channel,
             seen=item.seen,
             plan=plan,
-            settings=self._settings,
+            threads=self._settings.threads,
             rate=self._rate(channel),
         )
         self._streams.append(stream)

@@ -30,8 +30,8 @@ from mp4ds.packing.calibrations import choose_pairs, pair_camera_infos, unpaired
 from mp4ds.packing.inspection import depends_on_others
 from mp4ds.packing.manifest import Origin
 from mp4ds.packing.options import ImageFolder, PackOptions
-from mp4ds.packing.survey import Survey, survey_channel, survey_pairs
-from mp4ds.packing.tracks import PicturePlan, StreamSettings, TrackPlan
+from mp4ds.packing.survey import StreamSettings, Survey, survey_channel, survey_pairs
+from mp4ds.packing.tracks import TrackPlan
 from mp4ds.records import EVERYTHING, Channel, Excerpt
 from mp4ds.registry import plugin
 from mp4ds.video.encoder import tool_versions
@@ -261,9 +261,9 @@ class Resources:
 
 def _bytes_a_pixel(plan: TrackPlan) -> int:
     """About what an encoder takes; SVT-AV1 looks ahead with many pictures, x264 qp 0 with none."""
-    if not isinstance(plan, PicturePlan):
+    if plan.coding is None:
         return 0
-    return 60 if plan.recipe.lossless else 300
+    return 60 if plan.coding.recipe.lossless else 300
 
 
 def _memory() -> int:

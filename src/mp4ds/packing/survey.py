@@ -1,18 +1,354 @@
-"""Decisions made about a recording before it is packed in pieces, so that all of them agree."""
+"""Decisions made before a recording is packed: how images are stored, whose calibrations are whose.
+
+All pieces of a long recording agree on them.
+"""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 
+import numpy as np
+
+from mp4ds.bags.mcap import compressed_size
 from mp4ds.bags.protocols import BagReader
-from mp4ds.errors import Refused
+from mp4ds.errors import EncoderRefusedError, OptionError, Refused
+from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.layouts import bind, layout_for
 from mp4ds.messages.serializations import MessageSplitter, is_calibration
 from mp4ds.packing.calibrations import StampPairing
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
-from mp4ds.packing.tracks import StreamSettings, TrackPlan, needs_trial, plan_tracks
+from mp4ds.packing.options import PackOptions
+from mp4ds.packing.tracks import FALLS, Coding, TrackPlan, WindowCoder, out_of_reach
+from mp4ds.plan import (
+    LOSSLESS,
+    Purpose,
+    QualitySetting,
+    QualityTarget,
+    parse_quality,
+    visual_setting,
+)
 from mp4ds.records import Channel, Excerpt, Message
+from mp4ds.times import TIMESCALE
+from mp4ds.video.codecs import (
+    AV1,
+    DEFAULT_LOSSY,
+    LEAST_CRF,
+    MAX_CRF,
+    PURPOSE_PRESET,
+    fastest_preset,
+    lossless_codecs,
+    recipe_for,
+)
+from mp4ds.video.scores import SMALLEST, largest_crf
+from mp4ds.video.trial import choose
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSettings:
+    """How to encode streams.
+
+    Attributes:
+        quality: The requested quality.
+        codec: Name of the codec, or None for the default.
+        preset: Preset of the encoder, or None for the default.
+        gop: Most frames between key frames.
+        threads: Threads of each encoder.
+        transcode: Whether JPEG topics are re-encoded.
+        purpose: What the dataset is for; None for nothing in particular.
+        known: Texts of plans to prefer, where there is a choice.
+    """
+
+    quality: QualitySetting
+    codec: str | None
+    preset: str | None
+    gop: int
+    threads: int
+    transcode: bool = False
+    purpose: Purpose | None = None
+    known: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, options: PackOptions, threads: int) -> StreamSettings:
+        """Those of a pack.
+
+        Raises:
+            OptionError: An option is not valid.
+        """
+        return cls(
+            quality=options.quality or parse_quality(LOSSLESS),
+            codec=options.codec,
+            preset=options.preset,
+            gop=options.group_frames,
+            threads=threads,
+            transcode=options.transcode,
+            purpose=options.purpose,
+        )
+
+    @property
+    def is_fast(self) -> bool:
+        """Whether to encode in the least time, with nothing tried."""
+        return self.purpose is not None and self.purpose.is_speed
+
+
+# ---------------------------------------------------------------- one key
+
+_KEPT_JPEG = "JPEG files are kept as they are; --transcode re-encodes them"
+_MANY = 6  # files, after which any number may follow
+_STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
+_NEGLIGIBLE = 1 / 50
+"""Share of the raw size below which a video is kept even if zstd would be smaller."""
+
+
+def needs_trial(seen: CameraMessage, settings: StreamSettings) -> bool:
+    """Whether `plan_tracks` benefits from having several messages."""
+    if seen.pixels is None or settings.is_fast:
+        return False
+    if settings.quality.target is not None:
+        return True
+    return seen.key.body != "jpeg" and _is_lossless(seen.key.encoding, settings)
+
+
+def _is_lossless(encoding: str, settings: StreamSettings) -> bool:
+    return settings.quality.lossless or ENCODINGS[encoding].lossy is None
+
+
+def plan_tracks(
+    samples: Sequence[CameraMessage],
+    settings: StreamSettings,
+    rate: float | None,
+    runs: Iterable[Iterable[CameraMessage]] | None = None,
+) -> list[TrackPlan]:
+    """How the messages of one key are stored in videos.
+
+    Args:
+        samples: The first messages, at least one.
+        settings: The requested settings.
+        rate: Frames per second, where known.
+        runs: Runs of messages of the same key from several places of the recording, to choose the
+            crf for a score. None: the samples.
+
+    Returns:
+        The best plan first; the last one accepts every message of the key.
+
+    Raises:
+        Refused: A video would be larger than the messages compressed by zstd, or cannot reach the
+            requested score.
+        ScoringError: VMAF cannot be computed.
+    """
+    first = samples[0]
+    if first.pixels is None:
+        can_shrink = first.key.codec == "mjpeg" and not settings.quality.lossless
+        return [TrackPlan(note=_KEPT_JPEG if can_shrink else "")]
+    if not _is_lossless(first.key.encoding, settings):
+        plan = _lossy_plan(first.key, settings, rate)
+        if plan.coding is None or plan.target is None:
+            return [plan]
+        return _scored_plans(plan.coding, plan.target, samples, runs, settings, rate)
+    if settings.is_fast:
+        return _fast_plans(samples[0], settings)
+    return _lossless_plans(samples, settings)
+
+
+_SCORE_PRESET = "8"
+"""SVT-AV1's preset for a score: a window is encoded several times, and preset 7 at its lowest crf
+gets less close to a noisy original."""
+
+
+def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) -> TrackPlan:
+    quality = settings.quality
+    layout = layout_for(ENCODINGS[key.encoding], lossless=False)
+    crf, preset = quality.crf, settings.preset
+    if settings.is_fast and quality.target is None:
+        preset = preset or fastest_preset(settings.codec or DEFAULT_LOSSY)
+    if crf is None:  # the search for a score starts there
+        crf, table_preset = visual_setting(rate)
+        if settings.codec in (None, *AV1):
+            usual = PURPOSE_PRESET if settings.purpose else str(table_preset)
+            preset = preset or (_SCORE_PRESET if quality.target else usual)
+    recipe = recipe_for(
+        layout.pixel_format,
+        lossless=False,
+        codec=settings.codec,
+        crf=crf,
+        preset=preset,
+        varied=quality.target is not None,
+    )
+    return TrackPlan(Coding(layout, recipe, settings.gop), str(quality), quality.target)
+
+
+def _scored_plans(
+    coding: Coding,
+    target: QualityTarget,
+    samples: Sequence[CameraMessage],
+    runs: Iterable[Iterable[CameraMessage]] | None,
+    settings: StreamSettings,
+    rate: float | None,
+) -> list[TrackPlan]:
+    """A plan that reaches a score, and one for images that cannot."""
+    key = samples[0].key
+    is_jpeg = key.body == "jpeg"
+    coder = WindowCoder(coding, (key.width, key.height), target, settings.threads, rate)
+    try:
+        if min(coder.coded_size) < SMALLEST:
+            raise Refused(f"images with less than {SMALLEST} rows or columns have no {target}")
+        with tempfile.TemporaryDirectory(prefix="mp4ds-") as folder:
+            crf = _start_crf(coder, runs or [samples], Path(folder))
+    except EncoderRefusedError as error:
+        raise Refused(str(error)) from None
+    except Refused as reason:
+        if is_jpeg:  # which is smaller than any lossless video of its pixels
+            raise
+        return _lossless_plans(samples, settings, f"kept lossless: {reason}")
+    found = TrackPlan(coding.with_crf(crf), str(target), target)
+    return [found] if is_jpeg else [found, _general_plan(key.encoding, settings.gop)]
+
+
+_MOST_SEARCHED = 5  # encodings of the samples
+_USUAL_RATE = 30.0
+
+
+def _start_crf(coder: WindowCoder, runs: Iterable[Iterable[CameraMessage]], folder: Path) -> int:
+    """The crf at which samples of a stream reach the score.
+
+    Raises:
+        Refused: No crf reaches it.
+    """
+    maker, target = coder.maker(), coder.target
+    least = LEAST_CRF[coder.coding.recipe.codec]
+    spools = []
+    try:
+        for number, run in enumerate(runs):
+            spools.append(coder.spool(folder / f"{number}.yuv"))
+            for seen in run:
+                if seen.pixels is not None:
+                    spools[-1].append(maker.make(coder.coding.layout.to_picture(seen.pixels)))
+        filled = [spool for spool in spools if len(spool)]
+        due = float(np.mean([coder.reachable(spool) for spool in filled]))
+
+        known: dict[int, float] = {}
+
+        def score(crf: int) -> float:
+            video = folder / "sample.mp4"
+            step = round(TIMESCALE / (coder.rate or _USUAL_RATE)) or 1
+            found = []
+            for spool in filled:
+                ticks = range(0, len(spool) * step, step)
+                found.append(coder.mean(coder.encode(spool, ticks, crf, video)))
+            known[crf] = float(np.mean(found))
+            return known[crf]
+
+        crf, reached, _ = largest_crf(
+            score,
+            due,
+            guess=coder.coding.crf,
+            largest=MAX_CRF[coder.coding.recipe.codec],
+            smallest=least,
+            fall=FALLS[target.metric],
+            most=_MOST_SEARCHED,
+        )
+        # a few frames have less VMAF than many, compared with their originals too: where they fall
+        # a little short, the first window tells
+        if not reached and crf == least and known[crf] < due - target.tolerance:
+            raise out_of_reach(target, due, f"crf {crf} gives {known[crf]:.2f}")
+        return crf
+    finally:
+        for spool in spools:
+            spool.close()
+
+
+def _general_plan(encoding: str, gop: int) -> TrackPlan:
+    """Without loss, for every image of an encoding."""
+    layout = layout_for(ENCODINGS[encoding], lossless=True)
+    return TrackPlan(Coding(layout, recipe_for(layout.pixel_format, lossless=True), gop))
+
+
+def _lossless_plans(
+    samples: Sequence[CameraMessage], settings: StreamSettings, note: str = ""
+) -> list[TrackPlan]:
+    encoding = ENCODINGS[samples[0].key.encoding]
+    pixels = [seen.pixels for seen in samples if seen.pixels is not None]
+    asked = settings.quality.lossless
+    if not (asked or note):
+        note = f"{encoding.name} is kept lossless"
+    tried = partial(
+        choose,
+        pixels,
+        encoding,
+        gop=settings.gop,
+        threads=settings.threads,
+        purpose=settings.purpose,
+        known=settings.known,
+    )
+    codec = settings.codec if asked else None  # otherwise they were meant for lossy videos
+    try:
+        try:
+            best = tried(codec=codec, preset=settings.preset if asked else None)
+        except (OptionError, EncoderRefusedError) as error:
+            if codec is None:
+                raise
+            best = tried(codec=None, preset=None)
+            note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
+    except EncoderRefusedError as error:
+        raise Refused(str(error)) from None
+    _refuse_noise(samples, best.bytes_per_frame)
+    if codec is None:
+        _refuse_few(samples, best.bytes_per_frame)
+    layout = bind(best.layout, encoding, best.parameters)
+    plan = TrackPlan(Coding(layout, best.recipe, best.gop), note=note)
+    if layout.name == encoding.general:
+        return [plan]
+    return [plan, _general_plan(encoding.name, settings.gop)]
+
+
+def _fast_plans(seen: CameraMessage, settings: StreamSettings) -> list[TrackPlan]:
+    """Without loss, by what encodes in the least time (spec/notes.md)."""
+    layout = layout_for(ENCODINGS[seen.key.encoding], lossless=True)
+    able = lossless_codecs(layout.pixel_format)
+    codec, preset = settings.codec, settings.preset
+    if codec is None or codec not in able:  # of those that are, H.264 has the fastest presets
+        codec, preset = ("h264" if "h264" in able else able[0]), None
+    preset = preset or fastest_preset(codec)
+    recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset)
+    return [TrackPlan(Coding(layout, recipe, settings.gop))]
+
+
+def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
+    """Refuse images that a video would not make smaller.
+
+    Raises:
+        Refused: Gives both sizes.
+    """
+    bodies = [seen.parts.body for seen in samples]
+    raw = sum(map(len, bodies)) / len(bodies)
+    if video_size <= raw * _NEGLIGIBLE:
+        return
+    verbatim = compressed_size(bodies) / len(bodies)
+    if video_size > verbatim:
+        raise Refused(
+            f"a video would not be smaller: about {video_size / verbatim:.2f} times as large"
+        )
+
+
+def _refuse_few(samples: Sequence[CameraMessage], video_size: float) -> None:
+    """Refuse a few files that are smaller than their video with its index and sidecar.
+
+    Raises:
+        Refused: They are.
+    """
+    is_file = samples[0].key.body in ("png", "rvl")
+    if not is_file or len(samples) >= _MANY:
+        return
+    stored = sum(len(seen.parts.body) for seen in samples)
+    if stored < _STREAM_BYTES + len(samples) * video_size:
+        raise Refused("so few small files take less than a video with its sidecar")
+
+
+# ---------------------------------------------------------------- the recording
 
 SAMPLES = 6
 """Images of a stream that show how it is best encoded."""

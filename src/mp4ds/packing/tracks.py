@@ -1,90 +1,116 @@
-"""What a stream's video is made from: pictures encoded here, or copied packets."""
+"""What a stream's video is made from: pictures encoded here, or copied packets.
+
+Pictures may have to reach a score. Then a window of them is kept on disk as planes, encoded,
+decoded and scored, and encoded again with a lower crf until it is good enough.
+"""
 
 from __future__ import annotations
 
+import shutil
+from abc import ABC, abstractmethod
+from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
+from math import ceil
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from mp4ds.bags.mcap import compressed_size
-from mp4ds.errors import EncoderRefusedError, OptionError, Refused
-from mp4ds.format.models import Color, LayoutParameters
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.errors import EncoderRefusedError, Refused
+from mp4ds.format.models import SCORE_STEPS, Color, LayoutParameters
+from mp4ds.format.models import Quality as Measured
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.messages.layouts import Layout, bind, layout_for
-from mp4ds.packing.inspection import CameraMessage, StreamKey
-from mp4ds.packing.options import PackOptions
-from mp4ds.plan import (
-    LOSSLESS,
-    Purpose,
-    QualitySetting,
-    QualityTarget,
-    parse_quality,
-    visual_setting,
-)
-from mp4ds.video.codecs import (
-    AV1,
-    DEFAULT_LOSSY,
-    PURPOSE_PRESET,
-    Recipe,
-    fastest_preset,
-    lossless_codecs,
-    recipe_for,
-)
-from mp4ds.video.encoder import VideoEncoder
-from mp4ds.video.packets import PacketWriter
-from mp4ds.video.trial import Choice, choose
+from mp4ds.messages.layouts import Layout, layout_for
+from mp4ds.packing.inspection import CameraMessage
+from mp4ds.plan import LOSSLESS, QualityTarget
+from mp4ds.video.codecs import LEAST_CRF, MAX_CRF, Recipe, lossless_codecs, recipe_for
+from mp4ds.video.encoder import VideoEncoder, coded_size
+from mp4ds.video.packets import PacketWriter, join_segments
+from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
+from mp4ds.video.scores import Ffmpeg, find_ffmpeg, scores_of
+from mp4ds.video.trial import Choice
 
 
 @dataclass(frozen=True, slots=True)
-class StreamSettings:
-    """How to encode streams.
+class Coding:
+    """How pixels are encoded.
 
     Attributes:
-        quality: The requested quality.
-        codec: Name of the codec, or None for the default.
-        preset: Preset of the encoder, or None for the default.
+        layout: How they become pictures.
+        recipe: Codec and options.
         gop: Most frames between key frames.
-        threads: Threads of each encoder.
-        transcode: Whether JPEG topics are re-encoded.
-        purpose: What the dataset is for; None for nothing in particular.
-        known: Texts of plans to prefer, where there is a choice.
     """
 
-    quality: QualitySetting
-    codec: str | None
-    preset: str | None
+    layout: Layout
+    recipe: Recipe
     gop: int
-    threads: int
-    transcode: bool = False
-    purpose: Purpose | None = None
-    known: frozenset[str] = frozenset()
 
-    @classmethod
-    def of(cls, options: PackOptions, threads: int) -> StreamSettings:
-        """Those of a pack.
-
-        Raises:
-            OptionError: An option is not valid.
-        """
-        return cls(
-            quality=options.quality or parse_quality(LOSSLESS),
-            codec=options.codec,
-            preset=options.preset,
-            gop=options.group_frames,
-            threads=threads,
-            transcode=options.transcode,
-            purpose=options.purpose,
-        )
+    def with_crf(self, crf: int) -> Coding:
+        """The same at another crf."""
+        options = {**self.recipe.options, "crf": str(crf)}
+        return replace(self, recipe=replace(self.recipe, options=options))
 
     @property
-    def is_fast(self) -> bool:
-        """Whether to encode in the least time, with nothing tried."""
-        return self.purpose is not None and self.purpose.is_speed
+    def crf(self) -> int:
+        """The constant rate factor of a lossy one."""
+        return int(self.recipe.options["crf"])
+
+    def facts(self, size: tuple[int, int], options: Mapping[str, str]) -> dict[str, Any]:
+        """The fields of `mp4ds.format.models.Video`, except for the file.
+
+        Args:
+            size: Columns and rows of the coded pictures.
+            options: Of the encoder.
+        """
+        layout, recipe = self.layout, self.recipe
+        values = layout.parameters.to_values()
+        return {
+            "layout": layout.name,
+            "parameters": LayoutParameters.model_validate(values) if values else None,
+            "codec": recipe.codec,
+            "pixel_format": recipe.pixel_format,
+            "width": size[0],
+            "height": size[1],
+            "color": _color(recipe) if layout.is_shown else None,
+            "encoder": recipe.encoder,
+            "options": dict(options),
+        }
 
 
-class Track(Protocol):
+@dataclass(frozen=True, slots=True)
+class TrackPlan:
+    """How a stream's video is made.
+
+    Attributes:
+        coding: How its pictures are encoded; None to copy packets.
+        profile: The profile in its sidecar.
+        target: The score that its pictures have to reach, if there is one.
+        note: What the user should know about it; empty if nothing.
+    """
+
+    coding: Coding | None = None
+    profile: str = LOSSLESS
+    target: QualityTarget | None = None
+    note: str = ""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether messages are restored byte for byte."""
+        return self.profile == LOSSLESS
+
+    @property
+    def text(self) -> str:
+        """All that decides about the video, in words."""
+        if self.coding is None:
+            return "copied"
+        layout, recipe, gop = self.coding.layout, self.coding.recipe, self.coding.gop
+        return Choice(layout.name, layout.parameters, recipe, 0.0, gop).text
+
+
+class Track(ABC):
     """A video being written.
 
     Attributes:
@@ -93,10 +119,11 @@ class Track(Protocol):
 
     note: str
 
+    @abstractmethod
     def refuses(self, seen: CameraMessage) -> str | None:
         """Why the track cannot carry a message exactly, or None if it can."""
-        ...
 
+    @abstractmethod
     def write(self, seen: CameraMessage, tick: int) -> None:
         """Write a message's frame.
 
@@ -108,8 +135,8 @@ class Track(Protocol):
             Refused: The video cannot reach the requested score.
             OSError: It cannot be written.
         """
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Finish the file.
 
@@ -117,240 +144,45 @@ class Track(Protocol):
             Refused: The video cannot reach the requested score.
             OSError: It cannot be written.
         """
-        ...
 
+    @abstractmethod
     def abandon(self) -> None:
         """Close the file as it is; the caller removes it."""
-        ...
 
+    @abstractmethod
     def describe(self) -> dict[str, Any]:
         """The fields of `mp4ds.format.models.Video`, except for the file."""
-        ...
 
 
-class TrackPlan(Protocol):
-    """A way to make a track."""
-
-    @property
-    def profile(self) -> str:
-        """The profile in the stream's sidecar."""
-        ...
-
-    @property
-    def exact(self) -> bool:
-        """Whether messages are restored byte for byte."""
-        ...
-
-    @property
-    def note(self) -> str:
-        """What the user should know about it; empty if nothing."""
-        ...
-
-    @property
-    def text(self) -> str:
-        """All that decides about the video, in words."""
-        ...
-
-    def open(
-        self,
-        path: Path,
-        seen: CameraMessage,
-        settings: StreamSettings,
-        rate: float | None,
-    ) -> Track:
-        """Begin the file.
-
-        Args:
-            path: The video to make.
-            seen: The first message.
-            settings: How to encode.
-            rate: Frames per second, where known.
-
-        Raises:
-            Refused: The encoder does not support such pictures.
-        """
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class PicturePlan:
-    """Pictures, encoded here. See `TrackPlan`.
-
-    Attributes:
-        layout: How pixels become the picture.
-        recipe: Codec and options.
-        gop: Most frames between key frames; 0 for those of the settings.
-    """
-
-    layout: Layout
-    recipe: Recipe
-    profile: str
-    exact: bool
-    note: str = ""
-    gop: int = 0
-
-    @property
-    def text(self) -> str:
-        """All that decides about the video, in words."""
-        return Choice(self.layout.name, self.layout.parameters, self.recipe, 0.0, self.gop).text
-
-    def open(
-        self,
-        path: Path,
-        seen: CameraMessage,
-        settings: StreamSettings,
-        rate: float | None,
-    ) -> Track:
-        """See `TrackPlan.open`."""
-        return _PictureTrack(self, path, seen.key, settings, rate)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TargetPlan(PicturePlan):
-    """Pictures, encoded here until they reach a score. See `TrackPlan`."""
-
-    target: QualityTarget
-
-    def open(
-        self,
-        path: Path,
-        seen: CameraMessage,
-        settings: StreamSettings,
-        rate: float | None,
-    ) -> Track:
-        """See `TrackPlan.open`."""
-        from mp4ds.packing.target import TargetTrack
-
-        return TargetTrack(self, path, seen.key, settings, rate)
-
-
-def _recipes(plan: PicturePlan) -> Iterator[Recipe]:
-    """The recipe of a plan, then those of other codecs that can hold its pictures exactly."""
-    yield plan.recipe
-    pixel_format = plan.layout.pixel_format
-    for codec in lossless_codecs(pixel_format) if plan.recipe.lossless else ():
-        if codec != plan.recipe.codec:
-            yield recipe_for(pixel_format, lossless=True, codec=codec)
-
-
-class _PictureTrack:
-    """See `Track`."""
-
-    def __init__(
-        self,
-        plan: PicturePlan,
-        path: Path,
-        key: StreamKey,
-        settings: StreamSettings,
-        rate: float | None,
-    ) -> None:
-        self._layout = layout = plan.layout
-        self.note = plan.note
-        width, height = layout.picture_size(key.width, key.height)
-        refusals: list[str] = []
-        for recipe in _recipes(plan):
-            try:
-                self._encoder = VideoEncoder(
-                    path,
-                    recipe,
-                    picture_format=layout.pixel_format,
-                    width=width,
-                    height=height,
-                    gop=plan.gop or settings.gop,
-                    threads=settings.threads,
-                    rate=rate,
-                )
-            except EncoderRefusedError as error:
-                path.unlink(missing_ok=True)
-                refusals.append(str(error))
-                continue
-            self._plan = replace(plan, recipe=recipe)
-            if refusals:
-                coded = f"coded as {recipe.codec}: {refusals[0]}"
-                self.note = "; ".join(filter(None, (plan.note, coded)))
-            return
-        raise Refused(refusals[0])
-
-    def refuses(self, seen: CameraMessage) -> str | None:
-        """See `Track.refuses`."""
-        if seen.pixels is None:
-            return "it has no pixels"
-        return self._layout.refuses(seen.pixels)
-
-    def write(self, seen: CameraMessage, tick: int) -> None:
-        """See `Track.write`."""
-        if seen.pixels is not None:
-            self._encoder.write(self._layout.to_picture(seen.pixels), tick)
-
-    def close(self) -> None:
-        """See `Track.close`."""
-        self._encoder.close()
-
-    def abandon(self) -> None:
-        """See `Track.abandon`."""
-        self._encoder.abandon()
-
-    def describe(self) -> dict[str, Any]:
-        """See `Track.describe`."""
-        encoder = self._encoder
-        return picture_facts(self._plan, (encoder.width, encoder.height), encoder.options)
-
-
-def picture_facts(
-    plan: PicturePlan, size: tuple[int, int], options: Mapping[str, str]
-) -> dict[str, Any]:
-    """`Track.describe` for a video that is encoded here.
+def open_track(
+    plan: TrackPlan, path: Path, seen: CameraMessage, threads: int, rate: float | None
+) -> Track:
+    """Begin a video.
 
     Args:
-        plan: How it was made.
-        size: Columns and rows of its pictures.
-        options: Of the encoder.
+        plan: How to make it.
+        path: The file.
+        seen: The first message.
+        threads: Of an encoder.
+        rate: Frames per second, where known.
+
+    Raises:
+        Refused: The encoder does not support such pictures.
     """
-    layout, recipe = plan.layout, plan.recipe
-    values = layout.parameters.to_values()
-    return {
-        "layout": layout.name,
-        "parameters": LayoutParameters.model_validate(values) if values else None,
-        "codec": recipe.codec,
-        "pixel_format": recipe.pixel_format,
-        "width": size[0],
-        "height": size[1],
-        "color": _color(recipe) if layout.is_shown else None,
-        "encoder": recipe.encoder,
-        "options": dict(options),
-    }
+    if plan.coding is None:
+        return _CopiedTrack(path, seen, rate, plan.note)
+    size = seen.key.width, seen.key.height
+    if plan.target is None:
+        return _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
+    coder = WindowCoder(plan.coding, size, plan.target, threads, rate)
+    return _ScoredTrack(path, coder, plan.note)
 
 
-@dataclass(frozen=True, slots=True)
-class PacketPlan:
-    """Packets, copied. See `TrackPlan`."""
-
-    profile: str = "lossless"
-    exact: bool = True
-    note: str = ""
-    text: str = "copied"
-
-    def open(
-        self,
-        path: Path,
-        seen: CameraMessage,
-        settings: StreamSettings,
-        rate: float | None,
-    ) -> Track:
-        """See `TrackPlan.open`."""
-        return _PacketTrack(path, seen, rate, self.note)
+# ---------------------------------------------------------------- copied
 
 
-class _PacketTrack:
-    """See `Track`."""
-
-    def __init__(
-        self,
-        path: Path,
-        seen: CameraMessage,
-        rate: float | None,
-        note: str,
-    ) -> None:
+class _CopiedTrack(Track):
+    def __init__(self, path: Path, seen: CameraMessage, rate: float | None, note: str) -> None:
         self.note = note
         self._key = seen.key
         self._begun = False
@@ -364,7 +196,6 @@ class _PacketTrack:
         )
 
     def refuses(self, seen: CameraMessage) -> str | None:
-        """See `Track.refuses`."""
         if not self._begun:
             try:
                 self._writer.begin(seen.parts.body)
@@ -374,19 +205,15 @@ class _PacketTrack:
         return None
 
     def write(self, seen: CameraMessage, tick: int) -> None:
-        """See `Track.write`."""
         self._writer.write(seen.parts.body, tick, keyframe=seen.keyframe)
 
     def close(self) -> None:
-        """See `Track.close`."""
         self._writer.close()
 
     def abandon(self) -> None:
-        """See `Track.abandon`."""
         self._writer.abandon()
 
     def describe(self) -> dict[str, Any]:
-        """See `Track.describe`."""
         key = self._key
         return {
             "layout": layout_for(ENCODINGS[key.encoding], lossless=False).name,
@@ -394,6 +221,75 @@ class _PacketTrack:
             "width": key.width,
             "height": key.height,
         }
+
+
+# ---------------------------------------------------------------- encoded
+
+
+class _EncodedTrack(Track):
+    def __init__(
+        self,
+        path: Path,
+        coding: Coding,
+        size: tuple[int, int],
+        threads: int,
+        rate: float | None,
+        note: str,
+    ) -> None:
+        layout = coding.layout
+        width, height = layout.picture_size(*size)
+        refusals: list[str] = []
+        for recipe in _recipes(coding):
+            try:
+                self._encoder = VideoEncoder(
+                    path,
+                    recipe,
+                    picture_format=layout.pixel_format,
+                    width=width,
+                    height=height,
+                    gop=coding.gop,
+                    threads=threads,
+                    rate=rate,
+                )
+            except EncoderRefusedError as error:
+                path.unlink(missing_ok=True)
+                refusals.append(str(error))
+                continue
+            self._coding = replace(coding, recipe=recipe)
+            coded = f"coded as {recipe.codec}: {refusals[0]}" if refusals else ""
+            self.note = "; ".join(filter(None, (note, coded)))
+            return
+        raise Refused(refusals[0])
+
+    def refuses(self, seen: CameraMessage) -> str | None:
+        return _refuses(self._coding, seen)
+
+    def write(self, seen: CameraMessage, tick: int) -> None:
+        if seen.pixels is not None:
+            self._encoder.write(self._coding.layout.to_picture(seen.pixels), tick)
+
+    def close(self) -> None:
+        self._encoder.close()
+
+    def abandon(self) -> None:
+        self._encoder.abandon()
+
+    def describe(self) -> dict[str, Any]:
+        encoder = self._encoder
+        return self._coding.facts((encoder.width, encoder.height), encoder.options)
+
+
+def _refuses(coding: Coding, seen: CameraMessage) -> str | None:
+    return "it has no pixels" if seen.pixels is None else coding.layout.refuses(seen.pixels)
+
+
+def _recipes(coding: Coding) -> Iterator[Recipe]:
+    """The recipe, then those of other codecs that can hold its pictures exactly."""
+    yield coding.recipe
+    pixel_format = coding.layout.pixel_format
+    for codec in lossless_codecs(pixel_format) if coding.recipe.lossless else ():
+        if codec != coding.recipe.codec:
+            yield recipe_for(pixel_format, lossless=True, codec=codec)
 
 
 def _color(recipe: Recipe) -> Color:
@@ -405,199 +301,330 @@ def _color(recipe: Recipe) -> Color:
     )
 
 
-# ---------------------------------------------------------------- planning
+# ---------------------------------------------------------------- aimed at a score
 
-_KEPT_JPEG = "JPEG files are kept as they are; --transcode re-encodes them"
-_MANY = 6  # files, after which any number may follow
-_STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
-_NEGLIGIBLE = 1 / 50
-"""Share of the raw size below which a video is kept even if zstd would be smaller."""
+FALLS = {"vmaf": 0.3, "psnr": 0.4, "ssim": 0.001}
+"""Metric -> about how much it drops per crf step, near typical targets."""
 
-
-def needs_trial(seen: CameraMessage, settings: StreamSettings) -> bool:
-    """Whether `plan_tracks` benefits from having several messages."""
-    if seen.pixels is None or settings.is_fast:
-        return False
-    if settings.quality.target is not None:
-        return True
-    return seen.key.body != "jpeg" and _is_lossless(seen.key.encoding, settings)
+_MOST_UP = 8  # maximum crf increase from one window to the next
+_RANGE = 4  # factor by which the fall of scores may differ from the assumed one
+# of the tolerance: a window that exceeds the target by more is re-encoded with fewer bits
+_LAVISH = 0.5
+_MOST_TRIMS = 2  # times
+_NOISE = 1e-9  # of sums of floats
 
 
-def _is_lossless(encoding: str, settings: StreamSettings) -> bool:
-    return settings.quality.lossless or ENCODINGS[encoding].lossy is None
+class CrfControl:
+    """Chooses the crf of each window in turn.
 
-
-def plan_tracks(
-    samples: Sequence[CameraMessage],
-    settings: StreamSettings,
-    rate: float | None,
-    runs: Iterable[Iterable[CameraMessage]] | None = None,
-) -> list[TrackPlan]:
-    """How the messages of one key are stored in videos.
+    The mean of all frames never falls below the target, nor that of a window by more than the
+    tolerance: the surplus of earlier windows can be used by later ones. Nor is a window much better
+    than required, if a second try with fewer bits can avoid it.
 
     Args:
-        samples: The first messages, at least one.
-        settings: The requested settings.
-        rate: Frames per second, where known.
-        runs: Runs of messages of the same key from several places of the recording, to choose the
-            crf for a score. None: the samples.
-
-    Returns:
-        The best plan first; the last one accepts every message of the key.
-
-    Raises:
-        Refused: A video would be larger than the messages compressed by zstd, or cannot reach the
-            requested score.
-        ScoringError: VMAF cannot be computed.
+        start: The crf of the first window.
+        smallest: The smallest allowed.
+        largest: The largest allowed.
+        tolerance: How far below the target the mean of a window may be.
+        fall: About how much a score drops per crf step.
     """
-    first = samples[0]
-    if first.pixels is None:
-        can_shrink = first.key.codec == "mjpeg" and not settings.quality.lossless
-        return [PacketPlan(note=_KEPT_JPEG if can_shrink else "")]
-    if not _is_lossless(first.key.encoding, settings):
-        plan = _lossy_plan(first.key, settings, rate)
-        target = settings.quality.target
-        if target is None:
-            return [plan]
-        return _target_plans(plan, target, samples, runs, settings, rate)
-    if settings.is_fast:
-        return _fast_plans(samples[0], settings)
-    return _lossless_plans(samples, settings)
+
+    def __init__(
+        self, start: int, smallest: int, largest: int, tolerance: float, fall: float
+    ) -> None:
+        self.crf = start
+        self._smallest, self._largest = smallest, largest
+        self._tolerance = tolerance
+        self._assumed = self._fall = fall
+        self._surplus = 0.0  # over all frames
+
+    def accepted(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
+        """The largest crf of those tried that is good enough; None if none is.
+
+        Args:
+            tried: Crf -> the mean score of the window's frames.
+            due: The required score.
+            frames: Number of its frames.
+        """
+        least = self._least(due, frames) - _NOISE
+        return max((crf for crf, mean in tried.items() if mean >= least), default=None)
+
+    def next(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
+        """The crf to re-encode a window with; None if no further try is needed.
+
+        Args:
+            tried: Crf -> the mean score of the window, in the order they were tried.
+            due: The required score.
+            frames: Number of its frames.
+        """
+        self._learn(tried)
+        best = self.accepted(tried, due, frames)
+        if best is None:
+            return self._better(tried, due, frames)
+        is_lavish = tried[best] - due > _LAVISH * self._tolerance
+        return self._smaller(tried, best, due) if is_lavish else None
+
+    def keep(self, tried: Mapping[int, float], crf: int, due: float, frames: int) -> None:
+        """Accept a window as encoded with a crf, and choose the crf of the next one.
+
+        Args:
+            tried: Crf -> the mean score of the window.
+            crf: The one accepted.
+            due: The required score.
+            frames: Number of its frames.
+        """
+        mean = tried[crf]
+        self._surplus = max(0.0, self._surplus + (mean - due) * frames)
+        room = (due - self._least(due, frames)) / 2  # keep half in reserve
+        up = int((mean - due + room) / self._fall)
+        self.crf = min(crf + min(max(up, 0), _MOST_UP), self._largest)
+
+    def _least(self, due: float, frames: int) -> float:
+        return due - min(self._tolerance, self._surplus / frames)
+
+    def _better(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
+        crf, mean = min(tried.items())
+        if crf == self._smallest:
+            return None
+        short = self._least(due, frames) - mean
+        # doubled each time: a scene whose scores do not rise comes to an end soon; but a half
+        # at the most, as small crf differ more
+        step = max(ceil(short / self._fall), 1 << (len(tried) - 1))
+        return max(self._smallest, crf // 2, crf - step)
+
+    def _smaller(self, tried: Mapping[int, float], best: int, due: float) -> int | None:
+        if len(tried) > _MOST_TRIMS:
+            return None
+        refused = min((crf for crf in tried if crf > best), default=self._largest + 1)
+        crf = min(best + int((tried[best] - due) / self._fall), refused - 1)
+        return crf if crf > best else None
+
+    def _learn(self, tried: Mapping[int, float]) -> None:
+        if len(tried) > 1:
+            (crf, mean), (other, its_mean) = list(tried.items())[-2:]
+            found = (its_mean - mean) / (crf - other)
+            self._fall = min(max(found, self._assumed / _RANGE), self._assumed * _RANGE)
 
 
-_SCORE_PRESET = "8"
-"""SVT-AV1's preset for a score: a window is encoded several times, and preset 7 at its lowest crf
-gets less close to a noisy original."""
+# ---------------------------------------------------------------- windows
+
+_FRAMES = 60  # of a window, or one group of pictures if that is longer
+_MOST_FRAMES = 240
 
 
-def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) -> PicturePlan:
-    quality = settings.quality
-    layout = layout_for(ENCODINGS[key.encoding], lossless=False)
-    crf, preset = quality.crf, settings.preset
-    if settings.is_fast and quality.target is None:
-        preset = preset or fastest_preset(settings.codec or DEFAULT_LOSSY)
-    if crf is None:  # the search for a score starts there
-        crf, table_preset = visual_setting(rate)
-        if settings.codec in (None, *AV1):
-            usual = PURPOSE_PRESET if settings.purpose else str(table_preset)
-            preset = preset or (_SCORE_PRESET if quality.target else usual)
-    recipe = recipe_for(
-        layout.pixel_format,
-        lossless=False,
-        codec=settings.codec,
-        crf=crf,
-        preset=preset,
-        varied=quality.target is not None,
-    )
-    return PicturePlan(layout, recipe, str(quality), exact=False)
+def window_frames(gop: int) -> int:
+    """Frames of a window: whole groups of pictures, so that windows cost no more key frames.
 
-
-def _target_plans(
-    plan: PicturePlan,
-    target: QualityTarget,
-    samples: Sequence[CameraMessage],
-    runs: Iterable[Iterable[CameraMessage]] | None,
-    settings: StreamSettings,
-    rate: float | None,
-) -> list[TrackPlan]:
-    """A plan that reaches a score, and one for images that cannot."""
-    from mp4ds.packing.target import target_plan
-
-    key = samples[0].key
-    is_jpeg = key.body == "jpeg"
-    try:
-        found = target_plan(plan, target, key, runs or [samples], settings, rate)
-    except EncoderRefusedError as error:
-        raise Refused(str(error)) from None
-    except Refused as reason:
-        if is_jpeg:  # which is smaller than any lossless video of its pixels
-            raise
-        return _lossless_plans(samples, settings, f"kept lossless: {reason}")
-    if is_jpeg:
-        return [found]
-    general = layout_for(plan.layout.encoding, lossless=True)
-    recipe = recipe_for(general.pixel_format, lossless=True)
-    return [found, PicturePlan(general, recipe, "lossless", exact=True)]
-
-
-def _lossless_plans(
-    samples: Sequence[CameraMessage], settings: StreamSettings, note: str = ""
-) -> list[TrackPlan]:
-    encoding = ENCODINGS[samples[0].key.encoding]
-    pixels = [seen.pixels for seen in samples if seen.pixels is not None]
-    asked = settings.quality.lossless
-    if not (asked or note):
-        note = f"{encoding.name} is kept lossless"
-    tried = partial(
-        choose,
-        pixels,
-        encoding,
-        gop=settings.gop,
-        threads=settings.threads,
-        purpose=settings.purpose,
-        known=settings.known,
-    )
-    codec = settings.codec if asked else None  # otherwise they were meant for lossy videos
-    try:
-        try:
-            best = tried(codec=codec, preset=settings.preset if asked else None)
-        except (OptionError, EncoderRefusedError) as error:
-            if codec is None:
-                raise
-            best = tried(codec=None, preset=None)
-            note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
-    except EncoderRefusedError as error:
-        raise Refused(str(error)) from None
-    _refuse_noise(samples, best.bytes_per_frame)
-    if codec is None:
-        _refuse_few(samples, best.bytes_per_frame)
-    layout = bind(best.layout, encoding, best.parameters)
-    plan = PicturePlan(layout, best.recipe, "lossless", exact=True, note=note, gop=best.gop)
-    general = layout_for(encoding, lossless=True)
-    if general.name == layout.name:
-        return [plan]
-    recipe = recipe_for(general.pixel_format, lossless=True)
-    return [plan, PicturePlan(general, recipe, "lossless", exact=True)]
-
-
-def _fast_plans(seen: CameraMessage, settings: StreamSettings) -> list[TrackPlan]:
-    """Without loss, by what encodes in the least time (spec/notes.md)."""
-    layout = layout_for(ENCODINGS[seen.key.encoding], lossless=True)
-    able = lossless_codecs(layout.pixel_format)
-    codec, preset = settings.codec, settings.preset
-    if codec is None or codec not in able:  # of those that are, H.264 has the fastest presets
-        codec, preset = ("h264" if "h264" in able else able[0]), None
-    preset = preset or fastest_preset(codec)
-    recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset)
-    return [PicturePlan(layout, recipe, "lossless", exact=True)]
-
-
-def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
-    """Refuse images that a video would not make smaller.
-
-    Raises:
-        Refused: Gives both sizes.
+    Args:
+        gop: Maximum key frame interval, frames.
     """
-    bodies = [seen.parts.body for seen in samples]
-    raw = sum(map(len, bodies)) / len(bodies)
-    if video_size <= raw * _NEGLIGIBLE:
-        return
-    verbatim = compressed_size(bodies) / len(bodies)
-    if video_size > verbatim:
-        raise Refused(
-            f"a video would not be smaller: about {video_size / verbatim:.2f} times as large"
+    return min(max(1, _FRAMES // gop) * gop, _MOST_FRAMES)
+
+
+@dataclass(frozen=True)
+class WindowCoder:
+    """Encodes and scores windows.
+
+    Attributes:
+        coding: How images are encoded; the crf varies.
+        size: Columns and rows of an image.
+        target: The target, whose metric is measured.
+        threads: Of the encoder, and of libvmaf.
+        rate: Frames per second, if known.
+    """
+
+    coding: Coding
+    size: tuple[int, int]
+    target: QualityTarget
+    threads: int
+    rate: float | None
+
+    @cached_property
+    def coded_size(self) -> tuple[int, int]:
+        """Columns and rows of a coded picture."""
+        return coded_size(self.coding.recipe, *self.coding.layout.picture_size(*self.size))
+
+    @cached_property
+    def ffmpeg(self) -> Ffmpeg | None:
+        """The ffmpeg that computes VMAF, if that is the metric.
+
+        Raises:
+            ScoringError: There is none; says how to get one.
+        """
+        return find_ffmpeg() if self.target.metric == "vmaf" else None
+
+    def maker(self) -> PlaneMaker:
+        """Makes planes of pictures."""
+        return PlaneMaker(self.coding.layout.pixel_format)
+
+    def spool(self, path: Path) -> PlaneSpool:
+        """Keeps planes in a file."""
+        return PlaneSpool(path, *self.coded_size)
+
+    def encode(
+        self, frames: PlaneSpool, ticks: Sequence[int], crf: int, path: Path
+    ) -> NDArray[np.int64]:
+        """Encode a window.
+
+        Args:
+            frames: The window's frames, at least one.
+            ticks: When each is shown, increasing.
+            crf: Constant rate factor.
+            path: The video to make.
+
+        Returns:
+            The scores of its frames, in steps of the metric (`SCORE_STEPS`).
+
+        Raises:
+            EncoderRefusedError: The encoder does not support such pictures.
+            ScoringError: libvmaf failed.
+            OSError: It cannot be written.
+        """
+        width, height = self.coded_size
+        with VideoEncoder(
+            path,
+            self.coding.with_crf(crf).recipe,
+            picture_format=PLANES_FORMAT,
+            width=width,
+            height=height,
+            gop=self.coding.gop,
+            threads=self.threads,
+            rate=self.rate,
+        ) as encoder:
+            for planes, tick in zip(frames, ticks, strict=True):
+                encoder.write(planes, tick - ticks[0])
+        return self._scores(frames, decoded_planes(path))
+
+    def reachable(self, frames: PlaneSpool) -> float:
+        """The score required of a window: the target, or less if it is out of reach.
+
+        VMAF underrates still scenes, even compared with themselves.
+
+        Raises:
+            ScoringError: libvmaf failed.
+        """
+        target = self.target
+        if target.metric != "vmaf":
+            return target.score
+        ceiling = self.mean(self._scores(frames, frames))
+        return min(target.score, ceiling - target.tolerance)
+
+    def mean(self, scores: NDArray[np.int64]) -> float:
+        """The mean of scores given in steps."""
+        return float(np.mean(scores)) / SCORE_STEPS[self.target.metric]
+
+    def _scores(self, frames: PlaneSpool, decoded: Iterable[Planes]) -> NDArray[np.int64]:
+        metric = "psnr_y" if self.target.metric == "psnr" else self.target.metric
+        # motion in the first frame is measured with the second
+        before = frames.frame(1) if self.ffmpeg is not None and len(frames) > 1 else None
+        found = scores_of(
+            frames, decoded, [metric], ffmpeg=self.ffmpeg, threads=self.threads, before=before
+        )[metric]
+        return np.rint(found * SCORE_STEPS[self.target.metric]).astype(np.int64)
+
+
+def out_of_reach(target: QualityTarget, due: float, made: str) -> Refused:
+    """Why a stream is lossless: the target, the required score, and the one reached."""
+    limit = f" of the {due:.2f} that the originals allow" if due < target.score else ""
+    return Refused(f"{target} is out of reach: {made}{limit}")
+
+
+class _ScoredTrack(Track):
+    """The videos of its windows are joined at the end."""
+
+    def __init__(self, path: Path, coder: WindowCoder, note: str) -> None:
+        self.note = note
+        self._path = path
+        self._coder = coder
+        self._maker = coder.maker()
+        self._most = window_frames(coder.coding.gop)
+        codec, target = coder.coding.recipe.codec, coder.target
+        self._control = CrfControl(
+            coder.coding.crf,
+            LEAST_CRF[codec],
+            MAX_CRF[codec],
+            target.tolerance,
+            FALLS[target.metric],
         )
+        self._folder = path.with_name(f".{path.stem}.windows")
+        self._folder.mkdir()
+        self._spool = coder.spool(self._folder / "frames.yuv")
+        self._ticks = array("q")
+        self._segments: list[Path] = []
+        self._scores: list[NDArray[np.int64]] = []
+        self._reencoded = self._limited = 0
 
+    def refuses(self, seen: CameraMessage) -> str | None:
+        return _refuses(self._coder.coding, seen)
 
-def _refuse_few(samples: Sequence[CameraMessage], video_size: float) -> None:
-    """Refuse a few files that are smaller than their video with its index and sidecar.
+    def write(self, seen: CameraMessage, tick: int) -> None:
+        if seen.pixels is not None:
+            picture = self._coder.coding.layout.to_picture(seen.pixels)
+            self._spool.append(self._maker.make(picture))
+            self._ticks.append(tick)
+        if len(self._spool) == self._most:
+            self._finish_window()
 
-    Raises:
-        Refused: They are.
-    """
-    is_file = samples[0].key.body in ("png", "rvl")
-    if not is_file or len(samples) >= _MANY:
-        return
-    stored = sum(len(seen.parts.body) for seen in samples)
-    if stored < _STREAM_BYTES + len(samples) * video_size:
-        raise Refused("so few small files take less than a video with its sidecar")
+    def _finish_window(self) -> None:
+        """Encode the window until it is good enough.
+
+        Raises:
+            Refused: No crf is good enough.
+        """
+        coder, control, target = self._coder, self._control, self._coder.target
+        spool, due = self._spool, target.score
+        frames = len(spool)
+        ticks = self._ticks[-frames:]
+        number = len(self._segments)
+        found: dict[int, NDArray[np.int64]] = {}
+        tried: dict[int, float] = {}
+        crf: int | None = control.crf
+        while crf is not None:
+            found[crf] = coder.encode(spool, ticks, crf, self._segment(number, crf))
+            tried[crf] = coder.mean(found[crf])
+            if len(tried) == 1 and control.accepted(tried, due, frames) is None:
+                due = coder.reachable(spool)
+            crf = control.next(tried, due, frames)
+        kept = control.accepted(tried, due, frames)
+        if kept is None:
+            first, least = len(self._ticks) - frames, min(tried)
+            made = f"crf {least} gives frames {first} to {first + frames - 1} of a part "
+            raise out_of_reach(target, due, f"{made}{tried[least]:.2f}")
+        control.keep(tried, kept, due, frames)
+        for crf in tried.keys() - {kept}:
+            self._segment(number, crf).unlink()
+        self._segments.append(self._segment(number, kept))
+        self._scores.append(found[kept])
+        self._reencoded += len(tried) > 1
+        self._limited += due < target.score
+        spool.clear()
+
+    def _segment(self, number: int, crf: int) -> Path:
+        return self._folder / f"{number:06}-{crf}.mp4"
+
+    def close(self) -> None:
+        try:
+            if len(self._spool):
+                self._finish_window()
+            join_segments(self._segments, self._ticks, self._path)
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        self._spool.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def describe(self) -> dict[str, Any]:
+        coder = self._coder
+        options = {**coder.coding.recipe.options, "g": str(coder.coding.gop)}
+        return {
+            **coder.coding.facts(coder.coded_size, options),
+            "quality": Measured.from_scores(
+                coder.target,
+                np.concatenate(self._scores),
+                worst_window=min(map(coder.mean, self._scores)),
+                windows=len(self._scores),
+                reencoded=self._reencoded,
+                limited=self._limited,
+            ),
+        }

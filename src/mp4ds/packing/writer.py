@@ -28,7 +28,7 @@ from mp4ds.format.sidecars import dump_document
 from mp4ds.messages.png import PngRecipe, zlib_fingerprint
 from mp4ds.messages.wire import CodedFields, Form, Parts, Template, WireError, prove
 from mp4ds.packing.inspection import CameraMessage
-from mp4ds.packing.tracks import StreamSettings, TrackPlan
+from mp4ds.packing.tracks import TrackPlan, open_track
 from mp4ds.records import Channel, Message
 from mp4ds.times import INT64_MAX, INT64_MIN, Int64Column, PresentationClock
 
@@ -144,7 +144,7 @@ class StreamWriter:
         channel: The channel of all messages.
         seen: What the first of them holds.
         plan: How the video is made.
-        settings: How to encode.
+        threads: Of an encoder.
         rate: Frames per second, where known.
 
     Raises:
@@ -159,7 +159,7 @@ class StreamWriter:
         channel: Channel,
         seen: CameraMessage,
         plan: TrackPlan,
-        settings: StreamSettings,
+        threads: int,
         rate: float | None,
     ) -> None:
         self.channel = channel
@@ -171,7 +171,7 @@ class StreamWriter:
         self._heads = HeaderTable[Header](seen.form)
         self._digests = array("Q")
         self._clock = PresentationClock()
-        self._track = plan.open(self.video_path, seen, settings, rate)
+        self._track = open_track(plan, self.video_path, seen, threads, rate)
         self._key = seen.key
 
     @property
@@ -214,7 +214,7 @@ class StreamWriter:
         tick = self._clock.tick(parts.stamp, message.log_time)
 
         def write() -> None:
-            if self._plan.exact:
+            if self._plan.is_exact:
                 self._digests.append(xxhash.xxh64_intdigest(message.data))
             try:
                 self._track.write(seen, tick)
@@ -258,7 +258,7 @@ class StreamWriter:
             video=VideoModel.model_validate(video),
             camera_info=self.camera_info,
             columns=self._columns.to_model(),
-            digests=digests_model(self._digests) if self._plan.exact else None,
+            digests=digests_model(self._digests) if self._plan.is_exact else None,
         )
         self.sidecar_path.write_bytes(dump_document(sidecar))
         return sidecar
