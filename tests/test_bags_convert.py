@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from rosbags.convert.converter import default_message
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
@@ -226,19 +225,6 @@ def test_types_that_differ_keep_their_own_definition() -> None:
     assert b"uv_coordinates" in back.data
 
 
-@pytest.mark.parametrize("target", ["ros1", "ros2", None])
-def test_what_is_there_already_stays(target: str | None) -> None:
-    converter = Converter(target)
-    for encoding in (
-        ("ros1", "cdr") if target is None else ("ros1",) if target == "ros1" else ("cdr",)
-    ):
-        channel = Channel(0, "/a", encoding, None, {})
-        data = memoryview(b"anything")
-        assert converter.channel(channel) is channel
-        assert converter.payload(channel, data) is data
-    assert not converter.omitted
-
-
 def test_definitions_as_they_are_found() -> None:
     """Line ends, rulers, bounds, defaults, old headers, and types defined elsewhere."""
     old_header = (
@@ -398,17 +384,6 @@ def test_payloads_that_do_not_parse(target: str) -> None:
     assert not converter.omitted
 
 
-def test_compressed_payloads_do_not_parse() -> None:
-    """Real CDR that is compressed message by message, without the file saying so."""
-    path = real("rosbag2/amber_soccer_goal_msgzstd_v0/soccer_goal_12.mcap")
-    with path.open("rb") as stream:
-        schema, channel, message = next(make_reader(stream).iter_messages())
-    assert schema
-    own = Schema(schema.name, schema.encoding, schema.data)
-    with pytest.raises(ConversionError, match="cannot be parsed as sensor_msgs"):
-        Converter("ros1").payload(Channel(0, channel.topic, "cdr", own, {}), message.data)
-
-
 @pytest.mark.slow
 def test_every_standard_type_converts() -> None:
     """All of Noetic's types, with default values, against rosbags' own serialisation."""
@@ -473,18 +448,3 @@ def test_times_that_the_target_cannot_hold(
     converter.payload(*stamped(kind, good, encoding))
     with pytest.raises(ConversionError, match=f"topic /a: a message has a time of {bad} s, and"):
         converter.payload(*stamped(kind, bad, encoding))
-
-
-@pytest.mark.parametrize(
-    ("encoding", "target", "name"),
-    [
-        ("cdr", "ros1", "tf2_msgs/msg/TFMessage"),
-        ("ros1", "ros2", "tf2_msgs/TFMessage"),
-        ("cdr", "ros1", "geometry_msgs/msg/VelocityStamped"),
-    ],
-)
-def test_standard_types_need_no_definition(encoding: str, target: str, name: str) -> None:
-    """sqlite3 recordings have none."""
-    made = Converter(target).channel(Channel(0, "/a", encoding, Schema(name, "", b""), {}))
-    assert made.schema is not None
-    assert b"header" in made.schema.data

@@ -160,15 +160,6 @@ def test_one_recipe_for_a_topic(name: str, monkeypatch: pytest.MonkeyPatch) -> N
         assert check(small, recipe) == recipe  # its one chunk is no exception
 
 
-def test_a_hint_of_another_encoder_does_no_harm() -> None:
-    files = [make(picture(90, 120, 3, np.uint8)) for make in ENCODERS.values()]
-    recipes = [check(data) for data in files]
-    assert len(set(recipes)) == len(files)
-    for data, recipe in zip(files, recipes, strict=True):
-        for hint in recipes:
-            assert check(data, hint) == recipe
-
-
 def test_other_chunks_are_kept() -> None:
     text = PillowText()
     text.add_text("Comment", "in front " * 20)
@@ -451,17 +442,3 @@ def test_forged_recipes(change: dict[str, Any]) -> None:
 )
 def test_pixels_that_no_png_has(pixels: Pixels) -> None:
     assert refusal(png.rebuild, pixels, png.decode(BASE)[1])
-
-
-def test_pixels_in_any_order_of_bytes() -> None:
-    data = by_opencv(picture(9, 9, 1, np.uint16))
-    pixels, recipe = png.decode(data)
-    assert png.rebuild(pixels.astype(">u2"), recipe) == data
-    assert png.rebuild(np.asfortranarray(pixels), recipe) == data
-
-
-def test_the_compressor_is_told() -> None:
-    assert png.zlib_build() == zlib.ZLIB_RUNTIME_VERSION
-    assert png.zlib_fingerprint() == png.zlib_fingerprint()
-    if "ng" not in png.zlib_build():
-        assert png.zlib_fingerprint() == "c1f62ae5"

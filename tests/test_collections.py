@@ -16,7 +16,6 @@ from pathlib import Path
 
 import pytest
 
-import mp4ds
 from commands import call
 from mp4ds.dataset import collections
 from mp4ds.dataset.collections import datasets_in, each
@@ -238,17 +237,3 @@ def test_the_page_of_all(drives: Path, tmp_path: Path) -> None:
     (tmp_path / "mine" / "index.html").write_text("mine")
     with pytest.raises(TargetExistsError):
         reports(drives, tmp_path / "mine")
-
-
-def test_loaders_take_folders(drives: Path) -> None:
-    pytest.importorskip("torch")
-    from mp4ds import torch
-
-    one = torch.FrameDataset(drives / "a")
-    assert len(torch.FrameDataset(drives)) == 3 * len(one)
-    assert len(torch.FrameDataset(str(drives / "[ab]"))) == 2 * len(one)
-
-
-def test_work_that_is_a_method_of_the_library(drives: Path) -> None:
-    found = list(each(partial(mp4ds.validate, deep=True), datasets_in(drives), 2))
-    assert [problems for _, problems in found] == [[], [], []]

@@ -9,7 +9,6 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg, superframe
 from coded_tools import encode as encode_packets
 from coded_tools import scene as packet_scene
 from mp4ds.errors import Mp4dsError, SegmentsDifferError, VideoError
-from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video.codecs import Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.mp4 import read_sample_entry
@@ -355,26 +353,6 @@ def test_a_vp9_superframe(tmp_path: Path) -> None:
         assert list(reader.packets()) == bodies * 2
 
 
-def test_pictures_that_are_not_square_stay_so(tmp_path: Path) -> None:
-    """H.264 may say it of its pixels; what a JPEG says of them no track repeats."""
-    picture = next(packet_scene(1))
-    told = [jpeg(picture, dpi=(72, 144)), jpeg(picture, dpi=(300, 300)), jpeg(picture[..., 0])]
-    for number, body in enumerate(told):
-        write_packets(tmp_path / f"{number}.mp4", "mjpeg", [body])
-    write_packets(tmp_path / "uncut.mp4", "mjpeg", told)
-    join_segments(
-        [tmp_path / f"{n}.mp4" for n in range(3)], [0, STEP, 2 * STEP], tmp_path / "joined.mp4"
-    )
-    assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
-    wide = with_options("h264", {"x264-params": "sar=4/3"})
-    write_packets(tmp_path / "wide.mp4", "h264", wide)
-    write_packets(tmp_path / "twice.mp4", "h264", wide * 2)
-    assert read_sample_entry(tmp_path / "wide.mp4").aspect_ratio == Fraction(4, 3)
-    ticks = [number * STEP for number in range(2 * len(wide))]
-    join_segments([tmp_path / "wide.mp4"] * 2, ticks, tmp_path / "joined.mp4")
-    assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "twice.mp4").read_bytes()
-
-
 def with_options(name: str, options: dict[str, str], **more: int) -> list[bytes]:
     base = ENCODINGS[name]
     encoding = type(base)(base.codec, base.encoder, {**base.options, **options}, base.pixel_format)
@@ -382,21 +360,6 @@ def with_options(name: str, options: dict[str, str], **more: int) -> list[bytes]
 
 
 # ---------------------------------------------------------------- times
-
-
-def test_times_with_gaps(tmp_path: Path) -> None:
-    """A tick, and the longest gap, several times over: beyond 32 bits."""
-    longest = MAX_GAP_NS // NS_PER_TICK
-    ticks = [0, 1, 2, longest, 2 * longest, 3 * longest, 4 * longest, 5 * longest, 5 * longest + 1]
-    bodies = [jpeg(picture) for picture in packet_scene(len(ticks))]
-    assert ticks[-1] > 2**32
-    segments = []
-    for begin in range(0, len(ticks), 4):
-        segments.append(tmp_path / f"{begin}.mp4")
-        write_packets(segments[-1], "mjpeg", bodies[begin : begin + 4])
-    write_packets(tmp_path / "uncut.mp4", "mjpeg", bodies, ticks)
-    join_segments(segments, ticks, tmp_path / "joined.mp4")
-    assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
 
 
 @pytest.mark.parametrize("rate", [0.5, 10.0, 30.0, 120.0, None])
@@ -533,11 +496,6 @@ def test_ticks_that_do_not_increase(ticks: list[int], tmp_path: Path) -> None:
     assert not (tmp_path / "j.mp4").exists()
 
 
-def test_no_segments(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no segments"):
-        join_segments([], [], tmp_path / "j.mp4")
-
-
 def renamed(data: bytes, name: bytes, new: bytes) -> bytes:
     assert data.count(name) == 1
     return data.replace(name, new)
@@ -633,18 +591,6 @@ def test_packets_that_the_muxer_joins(tmp_path: Path) -> None:
     rewrite(path, "vp9", 1, hide(bodies[1]))
     with pytest.raises(VideoError, match="one is damaged"):
         join_segments([path], range(4), tmp_path / "j.mp4")
-
-
-def test_a_folder_that_is_missing(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="No such file"):
-        join_segments([small(tmp_path / "a.mp4")], range(5), tmp_path / "none" / "j.mp4")
-
-
-def test_names_that_look_like_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    small(Path("http:a.mp4"))
-    assert join_segments([Path("http:a.mp4")], range(5), Path("pipe:1.mp4")) == 5
-    assert (tmp_path / "pipe:1.mp4").exists()
 
 
 # ---------------------------------------------------------------- large files

@@ -15,7 +15,6 @@ import pytest
 from mp4ds.errors import Mp4dsError, TargetError, TargetExistsError, WriteError
 from mp4ds.files.outputs import (
     PAGE_SIGN,
-    as_write_error,
     check_target,
     csv_cell,
     digest_file,
@@ -242,13 +241,6 @@ def test_a_folder_that_may_not_be_written(target: Path, monkeypatch: pytest.Monk
         pytest.fail("nothing can be made there")
 
 
-@pytest.mark.parametrize("name", ["x" * 250, "\U0001f916" * 61 + ".bag", "a b", ".hidden", "-x"])
-def test_any_name_that_the_disk_takes(name: str, tmp_path: Path) -> None:
-    with staged(tmp_path / name, force=False, owned=nothing) as path:
-        make(path, "folder")
-    assert only(tmp_path, name)
-
-
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS])
 def test_a_disk_that_refuses(code: int, target: Path) -> None:
     with (  # noqa: PT012 - the body is what is tested
@@ -260,16 +252,6 @@ def test_a_disk_that_refuses(code: int, target: Path) -> None:
     assert os.strerror(code) in str(caught.value)
     assert caught.value.path == target
     assert only(target.parent)
-
-
-def test_other_errors_keep_their_class(target: Path) -> None:
-    for error in (
-        FileNotFoundError(errno.ENOENT, "x"),
-        WriteError(target, OSError("x")),
-        OSError(),
-    ):
-        assert as_write_error(error, target) is error
-    assert isinstance(as_write_error(OSError(errno.ENOSPC, "full"), target), WriteError)
 
 
 @pytest.mark.parametrize("old", [None, "file", "folder"])

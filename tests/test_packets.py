@@ -28,16 +28,13 @@ from coded_tools import (
     scene,
     superframe,
 )
-from conftest import real
 from mp4ds.errors import Refused, VideoError
 from mp4ds.messages.coded import CodedPicture
-from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video import av1, h264, h265, nal
 from mp4ds.video.codecs import recipe_for
 from mp4ds.video.coded_messages import PictureParser, body_of
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketReader, PacketWriter, StandAlonePackets
-from test_coded_pictures import packets_of
 
 STEP = 33_333
 SIZE = (WIDTH, HEIGHT)
@@ -132,24 +129,6 @@ def test_sizes_that_are_cropped(name: str, width: int, height: int, tmp_path: Pa
         pass
 
 
-def test_times_with_gaps(tmp_path: Path) -> None:
-    """As the presentation clock gives them: a tick, and the longest gap, several times over."""
-    longest = MAX_GAP_NS // NS_PER_TICK
-    ticks = [0, 1, 2, longest, 2 * longest, 3 * longest, 3 * longest + 1]
-    for name in ("mjpeg", "h264"):
-        path = tmp_path / f"{name}.mp4"
-        bodies = [packet.data for packet in encode(ENCODINGS[name], frames=len(ticks))]
-        pictures = write(path, name, bodies, ticks)
-        assert read(path, name, pictures) == bodies
-        with av.open(str(path)) as container:
-            assert [frame.pts for frame in container.decode(video=0)] == ticks
-
-
-@pytest.mark.parametrize("codec", ["mjpeg", "h264"])
-def test_one_packet(codec: str, tmp_path: Path) -> None:
-    check(tmp_path / "a.mp4", codec, [encode(ENCODINGS[codec], frames=1)[0].data])
-
-
 # ---------------------------------------------------------------- framing
 
 
@@ -209,12 +188,6 @@ def test_jpeg_of_all_kinds(tmp_path: Path) -> None:
     check(tmp_path / "a.mp4", "mjpeg", bodies)
 
 
-def test_jpeg_of_several_sizes(tmp_path: Path) -> None:
-    bodies = [jpeg(next(scene(1, width, height))) for width, height in ((64, 48), (32, 16), (8, 8))]
-    pictures = write(tmp_path / "a.mp4", "mjpeg", bodies)
-    assert read(tmp_path / "a.mp4", "mjpeg", pictures) == bodies
-
-
 def test_jpeg_whose_coded_data_are_damaged(tmp_path: Path) -> None:
     """What does not decode comes back all the same."""
     body = bytearray(jpeg(next(scene(1))))
@@ -265,11 +238,6 @@ def test_a_first_picture_that_cannot_be_used(codec: str, tmp_path: Path) -> None
         assert "cannot be decoded" in refusal(lambda: writer.begin(second))
     writer.close()
     assert not path.exists()
-
-
-def test_unknown_codecs(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"ffv1.*mjpeg"):
-        PacketWriter(tmp_path / "a.mp4", "ffv1", width=1, height=1)
 
 
 def test_a_writer_that_was_given_nothing(tmp_path: Path) -> None:
@@ -385,34 +353,12 @@ def test_sizes_beyond_the_file(video: Path, size: int) -> None:
     assert caught.value.code == ("video-unreadable" if size == 2**28 else "frame-count")
 
 
-def test_packets_that_share_their_bytes(video: Path) -> None:
-    """A short file could otherwise promise any amount of data."""
-    length = video.stat().st_size
-    forged = patched(video, b"stsz", 8, length // 3)  # one size for all five
-    with pytest.raises(VideoError):
-        PacketReader(forged, codec="mjpeg", frames=5)
-
-
-def test_a_place_beyond_the_file(video: Path) -> None:
-    with pytest.raises(VideoError):
-        PacketReader(patched(video, b"stco", 12, 2**31), codec="mjpeg", frames=5)
-
-
 def test_a_file_that_shrinks_while_it_is_read(video: Path) -> None:
     with PacketReader(video, codec="mjpeg") as reader:
         video.write_bytes(video.read_bytes()[:500])
         with pytest.raises(VideoError) as caught:
             reader.packet(4)
     assert caught.value.code == "decode-failed"
-
-
-def test_files_are_closed(video: Path, recwarn: pytest.WarningsRecorder) -> None:
-    reader = PacketReader(video, codec="mjpeg")
-    reader.close()
-    with pytest.raises(ValueError, match="closed"):
-        reader.packet(0)
-    del reader
-    assert not list(recwarn)
 
 
 # ---------------------------------------------------------------- standing alone
@@ -499,23 +445,6 @@ def test_damaged_parameters(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- real videos
-
-REAL = {
-    "carnd_solidWhiteRight.mp4": "h264",
-    "intel_car-detection.mp4": "h264",
-    "lerobot_aloha_insertion_human_yuv444.mp4": "h264",
-    "var_fps_video.mp4": "h264",
-    "av1_video.mkv": "av1",
-}
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_real_videos(name: str, tmp_path: Path) -> None:
-    packets, size = packets_of(real(f"video/{name}"), REAL[name])
-    bodies = [packet.data for packet in packets[:120]]
-    check(tmp_path / "a.mp4", REAL[name], bodies)
-    with PacketReader(tmp_path / "a.mp4", codec=REAL[name], coded_size=size) as reader:
-        assert len(reader) == len(bodies)
 
 
 def test_a_refusal_is_a_reason() -> None:

@@ -14,7 +14,6 @@ from pydantic import TypeAdapter
 from mp4ds.errors import OptionError
 from mp4ds.format.fields import FileName
 from mp4ds.plan import (
-    VISUAL_TABLE,
     FileNames,
     QualitySetting,
     QualityTarget,
@@ -67,11 +66,6 @@ def test_other_qualities_are_refused(text: str) -> None:
 )  # fmt: skip
 def test_the_visual_table(rate: float | None, setting: tuple[int, int]) -> None:
     assert visual_setting(rate) == setting
-
-
-def test_the_table_is_ordered_by_rate() -> None:
-    rates = [row[0] for row in VISUAL_TABLE]
-    assert rates == sorted(rates)
 
 
 # ---------------------------------------------------------------- selection
@@ -163,11 +157,3 @@ def test_names_are_plain_and_never_collide(topics: list[str]) -> None:
             pattern.validate_python(file)
             assert file.casefold() not in files
             files.add(file.casefold())
-
-
-def test_ordinary_names() -> None:
-    names = FileNames()
-    assert names.name_for("/left/image_raw") == ("left_image_raw", False)
-    assert names.name_for("/left/image_raw") == ("left_image_raw-2", True)
-    assert names.name_for("left//image_raw/") == ("left_image_raw-3", True)
-    assert names.name_for("/cam/Bild \u00e4") == ("cam_Bild", False)

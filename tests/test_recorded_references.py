@@ -26,7 +26,6 @@ from mp4ds.video.codecs import CODECS
 from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.references import (
     Chains,
-    StructureRecorder,
     Structures,
     digest_video,
     frame_bytes,
@@ -39,7 +38,6 @@ from sources import SOURCES, scene
 from test_access import Counting, Samples, written
 from test_references import FRAMES, RECIPES, REFUSED, svt
 
-TOPIC = "/cam/image_raw"
 HIERARCHICAL = svt(10, gop=20)
 
 Pieces = list[tuple[int, bytes]]
@@ -166,18 +164,6 @@ def test_a_packet(frames: list[CodedFrame], text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "frames", [[], [frame(shown=False)], [frame(), frame(1)], [frame(), frame(1, shown=False)]]
-)
-def test_a_packet_shows_its_last_frame(frames: list[CodedFrame]) -> None:
-    with pytest.raises(UnknownStructure):
-        write_packet(frames)
-
-
-def test_needs_are_counted_from_the_key_frame() -> None:
-    assert read_structure("k 1+2+1,3 1 k+2,4") == [[()], [(0,), (0,), (2, 0)], [(3,)], [(), (4, 2)]]
-
-
-@pytest.mark.parametrize(
     ("text", "problem"),
     [
         ("k 2", "packet 1 refers to 2 frames back, before the key frame"),
@@ -210,13 +196,6 @@ def test_too_many_structures_are_not_recorded(
     assert digest_video(path, "av1").structures is not None
     monkeypatch.setattr(structure, bound, most)
     assert digest_video(path, "av1").structures is None
-
-
-def test_recording_begins_at_a_key_frame() -> None:
-    recorder = StructureRecorder("h264", b"")
-    assert recorder.finish() is None
-    recorder.add(b"", key=False)
-    assert recorder.finish() is None
 
 
 def test_a_packet_with_other_frames_than_told(tmp_path: Path) -> None:

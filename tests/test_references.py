@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import av
@@ -20,7 +19,6 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from coded_tools import mutations, refusal, scene
-from conftest import real
 from mp4ds.messages.coded import CodedFrame
 from mp4ds.video import av1
 from mp4ds.video.nal import parameter_units
@@ -129,13 +127,6 @@ REFUSED = {
     "x265-open-gop": x265("bframes=4:open-gop=1:b-adapt=0:scenecut=0"),
 }
 KINDS = {"avc1": "h264", "h264": "h264", "hevc": "h265", "av1": "av1"}
-FILES = (
-    *("av1_video.mkv", "lerobot_follower_wrist_ep4_1frame_av1.mp4", "h265_video.mp4"),
-    *("bt709_full_range.mp4", "carnd_solidWhiteRight.mp4", "decord_rotated90.mov"),
-    *("h264_10bits.mp4", "intel_car-detection.mp4", "lerobot_aloha_insertion_human_yuv444.mp4"),
-    *("nasa_13013.mp4", "sam2_02_cups.mp4", "var_fps_video.mp4"),
-)
-OPEN_GOP = ("h265_video.mp4",)
 
 
 def pictures() -> list[NDArray[np.uint8]]:
@@ -310,17 +301,6 @@ def test_what_reaches_across_key_packets_is_refused(name: str) -> None:
     keys = [number for number, packet in enumerate(clip.packets) if packet.key]
     following = next((number for number in keys if number > first), FRAMES)
     assert all(reasons[first:following])
-
-
-@pytest.mark.one_in(2)
-@pytest.mark.parametrize("name", FILES)
-def test_real_videos(name: str) -> None:
-    path: Path = real(f"video/{name}")
-    clip = read(str(path), most=60)
-    if name in OPEN_GOP:
-        assert "refer to what is before" in refusal(parsed, clip)
-    else:
-        check(clip, range(0, len(clip.packets), 7))
 
 
 # ---------------------------------------------------------------- NAL units
@@ -699,11 +679,3 @@ def test_noise_is_refused_or_read(codec: str) -> None:
             continue
         parser = ReferenceParser(codec, b"")
         refusal(partial(parser.packet, noise, key=rng.random() < 0.5))
-
-
-def test_codecs_that_nothing_is_known_of() -> None:
-    for codec in ("mp4v", "vvc1", "", "h263"):
-        assert "not known" in refusal(ReferenceParser, codec, b"")
-    for names in (("h264", "avc1"), ("h265", "hvc1", "hev1", "hevc")):
-        for name in names:
-            assert "cut short" in refusal(ReferenceParser, name, b"")

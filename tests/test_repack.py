@@ -13,11 +13,10 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
-from mp4ds.errors import OptionError, SourceError, TargetExistsError
+from mp4ds.errors import OptionError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.pack import pack_each
 from mp4ds.packing.planning import open_recording
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message
@@ -249,27 +248,6 @@ def test_what_was_lost_stays_told(recording: Path, tmp_path: Path) -> None:
     assert manifest(tmp_path / "again").losses == manifest(tmp_path / "saved").losses != []
 
 
-def test_several_datasets_and_a_recording(
-    recording: Path, tmp_path: Path, compare: Compare
-) -> None:
-    write_bag(tmp_path / "later.bag", scene("mono8", frames=5))
-    mp4ds.pack(recording, tmp_path / "whole")
-    mp4ds.pack([tmp_path / "whole", tmp_path / "later.bag"], tmp_path / "dataset")
-    assert compare([recording, tmp_path / "later.bag"], unpacked(tmp_path, "bag")) == []
-    told = manifest(tmp_path / "dataset")
-    assert {item.name for item in told.sources} == {"drive.bag", "later.bag"}
-
-
-def test_one_dataset_each(recording: Path, tmp_path: Path) -> None:
-    mp4ds.pack(recording, tmp_path / "drive")
-    assert len(pack_each([tmp_path / "drive"], tmp_path / "out")) == 1
-    assert pack_each([tmp_path / "drive"], tmp_path / "out") == []
-    shutil.rmtree(tmp_path / "drive")
-    mp4ds.pack(recording, tmp_path / "drive", PackOptions(exclude=["/imu"]))
-    with pytest.raises(TargetExistsError):
-        pack_each([tmp_path / "drive"], tmp_path / "out")
-
-
 def test_no_dataset_is_salvaged(recording: Path, tmp_path: Path) -> None:
     mp4ds.pack(recording, tmp_path / "whole")
     with pytest.raises(OptionError, match="`salvage` works with recordings"):
@@ -290,23 +268,6 @@ def test_who_made_it(recording: Path, tmp_path: Path) -> None:
         assert {"title: A drive", "authors: A lab"} <= set(info(tmp_path / dataset).notes)
     mp4ds.pack([tmp_path / "whole", recording], tmp_path / "more")
     assert manifest(tmp_path / "more").about == manifest(tmp_path / "whole").about
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("author: me", "at author"),
-        ("title: [", "is not valid YAML"),
-        ("doi: https://doi.org/10.5281/zenodo.1", "at doi"),
-        ("- title", "at the top"),
-        ("title:", "at title"),
-    ],
-)
-def test_what_has_no_place(text: str, problem: str, recording: Path, tmp_path: Path) -> None:
-    (tmp_path / "about.yaml").write_text(text)
-    with pytest.raises(SourceError, match=f"about.yaml: {problem}"):
-        mp4ds.pack(recording, tmp_path / "no", PackOptions(about=str(tmp_path / "about.yaml")))
-    assert not (tmp_path / "no").exists()
 
 
 def test_excerpts_add_up(recording: Path, tmp_path: Path) -> None:

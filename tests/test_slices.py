@@ -16,8 +16,6 @@ from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_each, pack_share
-from mp4ds.plugins.exporting.export import export
-from mp4ds.plugins.exporting.job import ExportOptions
 from mp4ds.unpacking.options import UnpackOptions
 from round_trips import TARGETS, Compare, output_of, own_target
 from sources import PERIOD, SOURCES, START, TRAITS, Scene, odd_scene, scene, write_bag
@@ -263,23 +261,6 @@ def test_a_slice_is_unpacked_as_images_and_packets(visual: Path, tmp_path: Path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "video.mcap"]
 
 
-def test_a_slice_is_exported(visual: Path, tmp_path: Path) -> None:
-    export(visual, "euroc", tmp_path / "euroc", ExportOptions(**SPAN))
-    assert len(list((tmp_path / "euroc").rglob("*.png"))) == 9
-    assert [path.name for path in tmp_path.iterdir()] == ["euroc"]
-
-
-def test_torchcodec_is_not_asked(visual: Path, tmp_path: Path) -> None:
-    """It was seen to show another frame than the first."""
-    pytest.importorskip("torch")
-    from mp4ds import torch
-
-    mp4ds.pack(visual, tmp_path / "part", PackOptions(**SPAN))
-    assert len(torch.FrameDataset(tmp_path / "part")) == 9
-    with pytest.raises(OptionError, match="cut out of another"):
-        torch.FrameDataset(tmp_path / "part", backend="torchcodec", format="rgb")[0]
-
-
 def test_one_slice_each(recording: Path, tmp_path: Path) -> None:
     assert len(pack_each([recording], tmp_path / "out", PackOptions(duration=0.5))) == 1
     assert pack_each([recording], tmp_path / "out", PackOptions(duration=0.5)) == []
@@ -352,17 +333,6 @@ def test_of_nothing_there_is_no_slice(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="no messages"):
         mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(start="1"))
     assert not (tmp_path / "part").exists()
-
-
-def test_datasets_and_recordings_each(recording: Path, visual: Path, tmp_path: Path) -> None:
-    """Datasets are copied, whatever else is packed in the same run."""
-    summaries = pack_each([visual, recording], tmp_path / "out", PackOptions(**SPAN))
-    assert [(item.dataset.name, item.is_copy) for item in summaries] == [
-        ("visual", True),
-        ("drive", False),
-    ]
-    assert manifest(tmp_path / "out" / "visual").profile == "visual"
-    assert pack_each([visual, recording], tmp_path / "out", PackOptions(**SPAN)) == []
 
 
 def test_a_share_of_a_dataset_is_encoded(recording: Path, tmp_path: Path) -> None:

@@ -106,17 +106,6 @@ def test_what_others_write_is_read(values: list[int], data: st.DataObject) -> No
     assert decode_column(values[0], step, text, len(values)).tolist() == values
 
 
-def test_numpy_arrays_and_runs() -> None:
-    encoded = encode_column(np.arange(1000, dtype=np.int64) * 5 + 3)
-    assert encoded == {"start": 3, "step": 5, "values": "0*999\n"}
-    assert encode_column([7]) == {"start": 7, "step": 0, "values": ""}
-
-
-@pytest.mark.parametrize("text", ["1 2", "1 2\n", " 1\n2 ", "1\n\n2", "1*1 2", "1 2*1", "01 2*01"])
-def test_texts_of_three_values(text: str) -> None:
-    assert decode_column(10, 0, text, 3).tolist() == [10, 11, 13]
-
-
 @pytest.mark.parametrize(
     ("text", "count"),
     [
@@ -210,25 +199,6 @@ def test_ticks_increase_whatever_the_clocks_do(times: list[tuple[int, int]]) -> 
     # 2,147 s is where FFmpeg's mp4 muxer breaks at this timescale
     assert (steps <= 1000 * TIMESCALE + 1).all()
     assert found == ticks_by_the_spec(stamps, log_times)
-
-
-@steady
-@given(st.lists(st.tuples(Gaps, Gaps), min_size=1, max_size=40))
-def test_sums_of_gaps(gaps: list[tuple[int, int]]) -> None:
-    stamps = np.cumsum([s for s, _ in gaps]).tolist()
-    log_times = np.cumsum([t for _, t in gaps]).tolist()
-    found = ticks(stamps, log_times)
-    assert (np.diff(found) > 0).all()
-    assert found == ticks_by_the_spec(stamps, log_times)
-
-
-@steady
-@given(st.lists(st.integers(1000, MAX_GAP_NS), min_size=1, max_size=50), Int64)
-def test_an_ordinary_clock_is_shown_as_it_is(gaps: list[int], first: int) -> None:
-    """To the microsecond, without rounding errors that add up."""
-    stamps = [first + sum(gaps[:i]) for i in range(len(gaps) + 1)]
-    found = ticks(stamps, [0] * len(stamps))
-    assert found == [(stamp - first) // 1000 for stamp in stamps]
 
 
 def test_what_replaces_a_clock() -> None:

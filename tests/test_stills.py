@@ -160,26 +160,11 @@ def test_every_encoding_can_be_looked_at(encoding: str, tmp_path: Path) -> None:
     assert png.dtype == (np.uint16 if is_wide else np.uint8)
 
 
-@pytest.mark.parametrize("encoding", ["bayer_rggb8", "mono16", "16UC1", "rgb8"])
-def test_exact_samples(encoding: str, tmp_path: Path) -> None:
-    dataset = pack_cameras(tmp_path, scene(encoding, frames=4), quality="lossless")
-    frames(dataset, tmp_path / "out.png", StillOptions(at="#3", exact=True))
-    with mp4ds.open(dataset) as opened:
-        assert np.array_equal(read(tmp_path / "out.png"), next(iter(opened))[3].data)
-
-
 def test_exact_floats_have_no_image(tmp_path: Path) -> None:
     dataset = pack_cameras(tmp_path, scene("32FC1", frames=4), quality="lossless")
     with pytest.raises(OptionError, match="cannot hold 32FC1"):
         frames(dataset, tmp_path / "out.png", StillOptions(at="#3", exact=True))
     assert not (tmp_path / "out.png").exists()
-
-
-def test_another_size(drive: Path, tmp_path: Path) -> None:
-    for topic in (COLOUR, DEPTH):
-        options = StillOptions(topic=topic, at="#1", resize=0.5, force=True)
-        assert frames(drive, tmp_path / "out.png", options).size == (48, 33)
-        assert read(tmp_path / "out.png").shape == (33, 48, 3)
 
 
 # ---------------------------------------------------------------- sheets
@@ -217,13 +202,6 @@ def test_a_sheet_shows_its_frames(drive: Path, tmp_path: Path) -> None:
             found.append((y, x))
     assert found == sorted(found)
     assert len({y for y, _ in found}) == 2
-
-
-def test_a_sheet_of_more_than_there_is(drive: Path, tmp_path: Path) -> None:
-    out = tmp_path / "sheet.jpg"
-    summary = frames(drive, out, StillOptions(topic=DEPTH, sheet=(8, 50), resize=(48, 33)))
-    assert len(summary.frames) == FRAMES - 1
-    assert read(out).shape[0] < 5 * 70
 
 
 def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:

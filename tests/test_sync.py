@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 import mp4ds
 from mp4ds.times import match, synchronize
@@ -106,35 +105,6 @@ def test_any_topics(topics: list[list[int]], chosen: int | None, tolerance: int)
         every = [*sync.indices[:, column].tolist(), *sync.unmatched[topic].tolist()]
         assert sorted(every) == list(range(len(times)))
         assert sync.unmatched[topic].tolist() == sorted(sync.unmatched[topic].tolist())
-
-
-def test_cameras_half_a_period_apart() -> None:
-    """All as near as each other: the earlier pair is taken, and so each frame has its own."""
-    left, right = np.arange(1000) * 20, np.arange(1000) * 20 + 10
-    found = match(left, right, tolerance_ns=10)
-    assert found.tolist() == list(range(1000))
-
-
-def test_gaps_that_grow() -> None:
-    """A chain in which every pair waits for the one before."""
-    times = np.cumsum(np.arange(1, 2001))
-    found = match(times[::2], times[1::2], tolerance_ns=10**6)
-    assert found.tolist() == list(range(1000))
-
-
-def test_eleven_cameras_for_two_hours() -> None:
-    """432,000 frames each; few of them are missing."""
-    rng = np.random.default_rng(0)
-    frames = 432_000
-    stamps: dict[str, NDArray[np.int64]] = {}
-    kept = []
-    for camera in range(11):
-        times = START + np.arange(frames) * 16_666_667 + rng.integers(-(10**6), 10**6, frames)
-        kept.append(rng.random(frames) > 0.001)
-        stamps[f"/camera{camera}"] = times[kept[-1]]
-    sync = synchronize(stamps, tolerance_ns=8_000_000)
-    assert len(sync) == np.logical_and.reduce(kept).sum()
-    assert (np.abs(sync.stamps - sync.stamps[:, :1]) <= 2 * 10**6).all()
 
 
 # ---------------------------------------------------------------- datasets

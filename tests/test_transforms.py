@@ -19,9 +19,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from conftest import real
-from mp4ds import yamlio
 from mp4ds.bags.formats import open_reader
-from mp4ds.format.manifest import StaticTransform
 from mp4ds.messages.transforms import (
     MAX_TRANSFORMS,
     Transform,
@@ -318,30 +316,6 @@ def test_json_of_another_shape(text: str) -> None:
         parse_transforms(channel("json", MANY), text.encode("utf-8", "surrogatepass"))
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"parent_frame_id": 5},
-        {"child_frame_id": None},
-        {"translation": 1},
-        {"rotation": None},
-    ],
-)
-def test_descriptors_of_another_shape(fields: dict[str, int | None]) -> None:
-    """Fields that are absent or of another type than they should."""
-    files = descriptor_pb2.FileDescriptorSet.FromString(ONE_SCHEMA)
-    (kind,) = (m for f in files.file for m in f.message_type if m.name == "FrameTransform")
-    for field in list(kind.field):
-        if field.name in fields:
-            if fields[field.name] is None:
-                kind.field.remove(field)
-            else:
-                field.type = fields[field.name] or 0
-                field.ClearField("type_name")
-    with pytest.raises(WireError, match="fields are not those"):
-        parse_transforms(channel("protobuf", ONE, files.SerializeToString()), b"")
-
-
 def test_a_message_beyond_all_measure() -> None:
     for own, write in MANY_KINDS.values():
         parse = transform_parser(own)
@@ -467,25 +441,6 @@ def test_the_number_of_children_is_bounded() -> None:
 # ---------------------------------------------------------------- between cameras
 
 
-@pytest.mark.parametrize(
-    ("frames", "children"),
-    [
-        (["left", "right \u00e4"], ["head", "left", "right \u00e4"]),
-        (["/left", "right \u00e4"], ["head", "left", "right \u00e4"]),
-        (["left"], ["head", "left"]),
-        (["head", "left"], ["head", "left"]),
-        (["lidar", "left"], ["head", "left", "lidar"]),
-        (["base"], []),
-        (["nowhere", ""], []),
-        ([], []),
-    ],
-)
-def test_paths_between_cameras(frames: list[str], children: list[str]) -> None:
-    found = collected(TREE).between(frames)
-    assert [item.child for item in found] == children
-    assert all(item in TREE for item in found)
-
-
 @settings(deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=20),
@@ -505,18 +460,6 @@ def test_any_graph_gives_the_ancestors(edges: list[tuple[int, int]], frames: lis
     found = collector.between(f"f{n}" for n in frames)
     assert {item.child for item in found} == above
     assert found == [item for item in collector.transforms if item.child in above]
-
-
-# ---------------------------------------------------------------- in a manifest
-
-
-def test_a_manifest_holds_them_bit_for_bit() -> None:
-    models = [StaticTransform.from_record(item) for item in TREE]
-    text = yamlio.dump({"transforms": [model.model_dump() for model in models]})
-    (loaded,) = yamlio.load(text, "here").values()
-    assert [StaticTransform.model_validate(item) for item in loaded] == models
-    assert [tuple(item["translation"]) for item in loaded] == [item.translation for item in TREE]
-    assert [tuple(item["rotation"]) for item in loaded] == [item.rotation for item in TREE]
 
 
 # ---------------------------------------------------------------- real recordings
