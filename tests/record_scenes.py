@@ -21,6 +21,7 @@ from mp4ds.bags.protocols import Format
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.record import RecordSummary, open_recorder
 from mp4ds.plugins.recording.source import Source
+from mp4ds.plugins.ros.node import Service
 from mp4ds.records import Message
 
 
@@ -30,6 +31,7 @@ class PlayedSource(Source):
     Args:
         paths: The recording.
         rate: Times the recorded speed; None for as fast as they are read.
+        is_endless: Whether the recorder goes on after the end.
         before: Called before each message, by its number.
         altered: What messages of a topic become, by their number in the topic.
     """
@@ -41,13 +43,15 @@ class PlayedSource(Source):
         paths: Sequence[Path],
         *,
         rate: float | None = None,
+        is_endless: bool = False,
         before: Callable[[int], object] = lambda number: None,
         altered: Mapping[str, Callable[[Message, int], Message]] = {},
     ) -> None:
         self.warnings, self.topics, self.waiting_for = {}, {}, ""
-        self.stop: Callable[[], None] = lambda: None
+        self._stop: Callable[[object], object] = lambda _: None
         self._paths = list(paths)
         self._rate = rate
+        self._is_endless = is_endless
         self._before = before
         self._altered = altered
         with open_sources(self._paths) as reader:
@@ -74,14 +78,15 @@ class PlayedSource(Source):
                 alter = self._altered.get(topic, lambda message, number: message)
                 take(alter(replace(record, data=bytes(record.data)), counts[topic]))
                 counts[topic] += 1
-        self.stop()
+        if not self._is_endless:
+            self._stop(None)
 
     @property
     def lost(self) -> Counter[str]:
         return Counter()
 
-    def serve(self, services: object) -> None:
-        pass
+    def serve(self, services: Sequence[Service]) -> None:
+        (self._stop,) = (one.answer for one in services if one.name == "stop")
 
     def close(self) -> None:
         pass
@@ -91,12 +96,11 @@ def recorded(source: PlayedSource, target: Path, **options: Any) -> RecordSummar
     with open_recorder(
         (), target, RecordOptions(**{"all": True, **options}), source=source
     ) as recorder:
-        source.stop = recorder.stop
         return recorder.run()
 
 
 def _main(recording: str, dataset: str, rate: str) -> None:
-    source = PlayedSource([Path(recording)], rate=float(rate))
+    source = PlayedSource([Path(recording)], rate=float(rate), is_endless=True)
     with open_recorder((), dataset, RecordOptions(all=True), source=source) as recorder:
         recorder.run()
 

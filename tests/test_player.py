@@ -120,13 +120,6 @@ def test_a_part_of_it(drive: tuple[Path, list[Recorded]]) -> None:
     assert [item[0] for item in published(publisher)[:2]] == ["/tf_static"] * 2
 
 
-def test_what_begins_at_the_beginning_has_nothing_twice(
-    drive: tuple[Path, list[Recorded]],
-) -> None:
-    publisher, _ = run(drive[0], immediate=True)
-    assert sum(item[0] == "/tf_static" for item in published(publisher)) == 2
-
-
 @pytest.mark.parametrize(
     ("options", "topics"),
     [
@@ -225,8 +218,10 @@ def test_a_damaged_video_ends_it(drive: tuple[Path, list[Recorded]], tmp_path: P
 def test_nothing_runs_after_the_end(drive: tuple[Path, list[Recorded]]) -> None:
     before = threading.active_count()
     run(drive[0], immediate=True)
-    with running(drive[0]) as (_, publisher):
-        until(lambda: len(publisher.sent) > 3)
+    with running(drive[0], rate=0.01) as (player, publisher):
+        until(lambda: publisher.sent)
+        player.stop()
+    assert len(publisher.sent) < len(drive[1])
     assert threading.active_count() == before
 
 
@@ -444,13 +439,6 @@ def test_rate_changes(drive: tuple[Path, list[Recorded]]) -> None:
         assert player.set_rate(100.0)
         until(lambda: len(publisher.sent) == len(drive[1]))
     assert published(publisher) == drive[1]
-
-
-def test_stop(drive: tuple[Path, list[Recorded]]) -> None:
-    with running(drive[0], rate=0.01) as (player, publisher):
-        until(lambda: publisher.sent)
-        player.stop()
-    assert len(publisher.sent) < len(drive[1])
 
 
 def test_controls_are_served(drive: tuple[Path, list[Recorded]]) -> None:

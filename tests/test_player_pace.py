@@ -14,12 +14,14 @@ import pytest
 
 import mp4ds
 from mp4ds.bags.formats import open_writer
+from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import PublishError
-from mp4ds.plugins.playing import pace, timeline
+from mp4ds.plugins.playing import pace
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import Lateness, Pace, Ticks
 from mp4ds.plugins.playing.play import open_player
 from mp4ds.plugins.playing.player import Player, PlaySummary
+from mp4ds.plugins.playing.timeline import Timeline
 from mp4ds.records import Message
 from player_scenes import MS, START, STEP, RecordingPublisher, make_ros2, ros2_channel, text
 from waiting import WATCHDOG_S, until
@@ -192,8 +194,9 @@ def stalled(drive: Path, seconds: float) -> tuple[list[int], PlaySummary]:
             machine.now += round(seconds * NS) if len(late) == 5 else 0
 
     publisher.on_sent = on_sent
-    with open_player(drive, PlayOptions(), node=publisher) as made:
-        player = Player(made._timeline, publisher, steady=machine)
+    with Dataset(drive) as dataset:
+        timeline = Timeline([dataset], PlayOptions(), None)
+        player = Player(timeline, publisher, steady=machine)
         machine.drive(player)
         summary = player.run()
     return [one - late[0] for one in late], summary
@@ -217,13 +220,14 @@ def test_a_suspended_player_goes_on_where_it_was(drive: Path) -> None:
 @pytest.fixture
 def slow_reading(monkeypatch: pytest.MonkeyPatch) -> None:
     """Strings that take 40 ms to read."""
-    due = timeline._Part._due
+    records = Dataset.records
 
-    def slow(part: Any, message: Any) -> Any:
-        time.sleep(0.04)
-        return due(part, message)
+    def slow(dataset: Dataset, *arguments: Any, **options: Any) -> Iterator[Any]:
+        for record in records(dataset, *arguments, **options):
+            time.sleep(0.04)
+            yield record
 
-    monkeypatch.setattr(timeline._Part, "_due", slow)
+    monkeypatch.setattr(Dataset, "records", slow)
 
 
 def test_the_clock_waits_for_what_is_not_read_in_time(drive: Path, slow_reading: None) -> None:

@@ -15,7 +15,6 @@ import pytest
 pytest.importorskip("cyclonedds")
 
 from mp4ds.bags.convert import Converter
-from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.errors import ConversionError, OptionError, PublishError
 from mp4ds.plugins.ros.dds_types import dds_name, dds_topic, message_type
 from mp4ds.plugins.ros.node import NodeOptions, open_node
@@ -295,14 +294,6 @@ def test_a_quality_of_service_that_makes_no_sense_is_told(side: Side) -> None:
         pytest.raises(ConversionError, match="or its QoS"),
     ):
         publisher.advertise(channel("/a", STRING))
-
-
-def test_a_latched_topic_of_ros1_stays_latched(side: Side) -> None:
-    recorded = channel("/map", STRING, qos=LATCHED_QOS)
-    with side.open() as publisher:
-        publisher.advertise(recorded)
-        (told,) = side.peer.ask("publications", "rt/map")
-    assert told["latched"]
 
 
 @pytest.mark.parametrize("told", ["x", "-1", "1.5", "²", "233", "1000000000"])

@@ -31,7 +31,6 @@ from mp4ds.plugins.recording import spool
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.packing import PackingError, PackingProcess
 from mp4ds.plugins.recording.record import (
-    Recorder,
     RecordProgress,
     open_recorder,
 )
@@ -216,13 +215,6 @@ class Opened:
         self.kind, self.options = "", RecordOptions()
         self._source = source
         monkeypatch.setattr("mp4ds.plugins.recording.record.open_source", self)
-        make = Recorder.__init__
-
-        def made(recorder: Recorder, *arguments: Any) -> None:
-            make(recorder, *arguments)
-            source.stop = recorder.stop
-
-        monkeypatch.setattr(Recorder, "__init__", made)
 
     def __call__(self, kind: str, options: RecordOptions) -> PlayedSource:
         self.kind, self.options = kind, options
@@ -250,10 +242,10 @@ def test_one_that_may_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     """The second signal says where the rest is."""
     opened = Opened(PlayedSource(write(tmp_path)), monkeypatch)
 
-    def drain(*_: object) -> None:
+    def wait(*_: object) -> bool:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Recorder, "_drain", drain)
+    monkeypatch.setattr(PackingProcess, "wait", wait)
     monkeypatch.chdir(tmp_path)
     told = call("record", "--ros1", "-o", "", "-a", "--no-progress")
     assert opened.kind == "ros1"
@@ -328,7 +320,6 @@ def test_pauses_and_splits_on_demand(tmp_path: Path) -> None:
         total = sum(isinstance(record, Message) for record in reader.records())
     source = PlayedSource(paths, before=lambda number: controls(number))
     with open_recorder((), tmp_path / "live", RecordOptions(all=True), source=source) as recorder:
-        source.stop = recorder.stop
 
         def controls(number: int) -> None:
             if number == total // 4:
@@ -368,16 +359,10 @@ def test_packing_that_is_too_slow(
 
     seen: list[RecordProgress] = []
     monkeypatch.setattr(PackingProcess, "pack", slow)
-    # as fast as the spool takes it
-    source = PlayedSource(paths, before=lambda number: until(lambda: room(recorder)))
-
-    def room(recorder: Recorder) -> bool:
-        return recorder._buffer.bytes < 500_000
-
+    source = PlayedSource(paths, rate=4.0)
     options = RecordOptions(all=True, buffer=1)
     opened = open_recorder((), tmp_path / "live", options, source=source, progress=watch)
     with opened as recorder:
-        source.stop = recorder.stop
         summary = recorder.run()
     assert max(progress.spool_bytes for progress in seen) > 3_000_000
     assert not summary.dropped

@@ -98,7 +98,7 @@ class Node(ABC):
 
     world: str | None
     discovery_s = 0.0
-    poll_s = 0.0
+    poll_s = 0.01
 
     def __init__(self) -> None:
         self.lost: Counter[str] = Counter()
