@@ -498,7 +498,7 @@ def assert_proxy_shows(dataset: Path, width: int) -> None:
             look = Look(opened[stream.topic], size)
             for index, picture in stream.recorded_pictures():
                 if picture is not None:
-                    expected = blocks(look.picture(stream.rebuilder.pixels(picture)))
+                    expected = blocks(look.picture(stream.recorded_pixels(picture)))
                     assert np.abs(blocks(shown[index].data) - expected).mean() < 8
 
 

@@ -182,13 +182,11 @@ def _decoded(stream: Stream) -> Values:
 
 def _of_pictures(stream: Stream) -> Iterator[tuple[str, str]]:
     """SHA-256 of the pixels and of the payload of each frame."""
-    rebuilder = stream.rebuilder
-    with stream.open_video(sequential=True) as decoder:
-        for index, picture in enumerate(decoder.pictures()):
-            pixels = rebuilder.pixels(picture)
-            little_endian = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
-            payload = rebuilder.payload(index, picture)
-            yield _sha256(little_endian.tobytes()), _sha256(payload)
+    for index, picture in stream.pictures_at():
+        pixels = stream.recorded_pixels(picture)
+        little_endian = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
+        payload = stream.rebuilder.payload(index, picture)
+        yield _sha256(little_endian.tobytes()), _sha256(payload)
 
 
 def _of_packets(stream: Stream) -> Iterator[tuple[str, str]]:

@@ -105,6 +105,13 @@ class Images(ABC):
         """Write the pixels of a picture, as recorded."""
         np.copyto(out, picture[0])
 
+    def recorded_pixels(self, picture: Picture) -> Pixels:
+        """A new array of the pixels of a picture, as recorded."""
+        encoding = ENCODINGS[self.encoding]
+        pixels: Pixels = np.empty(encoding.shape(*self.image_size), encoding.dtype)
+        self.write_pixels(picture, pixels)
+        return pixels
+
     def depth_header(self, index: int) -> bytes:
         """What gives the quantised depths of a frame in metres; empty for all others.
 
@@ -164,9 +171,7 @@ class Images(ABC):
         if view.is_plain:
             self.write_pixels(picture, made)
             return made
-        encoding = ENCODINGS[self.encoding]
-        pixels: Pixels = np.empty(encoding.shape(*self.image_size), encoding.dtype)
-        self.write_pixels(picture, pixels)
+        pixels = self.recorded_pixels(picture)
         view.give(metres_of(pixels, self.depth_header(index)) if view.in_metres else pixels, made)
         return made
 

@@ -152,28 +152,6 @@ class MessageRebuilder:
         )
         check_slots(self.columns, self._templates, place)
 
-    @property
-    def picture_format(self) -> str:
-        """Pixel format of the pictures for `pixels`."""
-        return self._layout.pixel_format
-
-    @property
-    def picture_size(self) -> tuple[int, int]:
-        """Width and height of the pictures for `pixels`."""
-        return self._layout.picture_size(self._sidecar.image.width, self._sidecar.image.height)
-
-    def pixels(self, picture: Picture) -> Pixels:
-        """A new array of the image's pixels, shape `Encoding.shape`, native byte order."""
-        image = self._sidecar.image
-        shape = self._encoding.shape(image.width, image.height)
-        out: Pixels = np.empty(shape, self._encoding.dtype)
-        self.write_pixels(picture, out)
-        return out
-
-    def write_pixels(self, picture: Picture, out: Pixels) -> None:
-        """Write the image's pixels into an array with the shape and type returned by `pixels`."""
-        self._layout.to_pixels(picture, out)
-
     def payload(self, index: int, picture: Picture) -> bytes | bytearray:
         """The message of a frame, verified against its digest if there is one.
 
@@ -187,7 +165,10 @@ class MessageRebuilder:
         if self._sidecar.body == "pixels":
             return self._verified(index, self._with_pixels(index, picture))
         variant = int(self.columns.variant[index])
-        pixels, recipe = self.pixels(picture), self._recipes[variant]
+        image, recipe = self._sidecar.image, self._recipes[variant]
+        shape = self._encoding.shape(image.width, image.height)
+        pixels: Pixels = np.empty(shape, self._encoding.dtype)
+        self._layout.to_pixels(picture, pixels)
         prefix = bytes.fromhex(self._sidecar.headers[variant].prefix)
         try:
             if self._jpeg is not None:

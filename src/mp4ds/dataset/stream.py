@@ -20,6 +20,7 @@ from mp4ds.format.sidecars import load_stream
 from mp4ds.messages import depth
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.encodings import Pixels
+from mp4ds.messages.layouts import Layout
 from mp4ds.records import Channel, Message
 from mp4ds.video.access import FrameAccess, FrameReader
 from mp4ds.video.decoder import VideoDecoder
@@ -100,6 +101,11 @@ class Stream(Images):
         return CalibrationMessages(info, str(self.path)) if info and info.messages else None
 
     @cached_property
+    def layout(self) -> Layout:
+        """How the video's pictures hold the images."""
+        return self.sidecar.layout
+
+    @cached_property
     def rebuilder(self) -> MessageRebuilder:
         """Makes the stream's messages."""
         return MessageRebuilder(
@@ -164,12 +170,13 @@ class Stream(Images):
 
     def _told(self) -> dict[str, Any]:
         """What the sidecar tells a decoder about the video; a maker serves one decoder."""
-        video = self.sidecar.video
+        _ = self.columns  # which checks that the video is there, and long enough
+        image, video = self.sidecar.image, self.sidecar.video
         maker = PictureMaker(
             self.video_path,
             coded_size=(video.width, video.height),
-            picture_format=self.rebuilder.picture_format,
-            picture_size=self.rebuilder.picture_size,
+            picture_format=self.layout.pixel_format,
+            picture_size=self.layout.picture_size(image.width, image.height),
             matrix=video.matrix,
             full_range=video.full_range,
         )
@@ -194,7 +201,7 @@ class Stream(Images):
 
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
         """Write the pixels of a picture, as recorded."""
-        self.rebuilder.write_pixels(picture, out)
+        self.layout.to_pixels(picture, out)
 
     def depth_header(self, index: int) -> bytes:
         """What gives the quantised depths of a frame in metres; empty for all others.

@@ -350,15 +350,3 @@ def output(out: Pixels | None, shape: tuple[int, ...], dtype: np.dtype[np.generi
     if not out.flags.writeable:
         raise OptionError("out is not writeable")
     return out
-
-
-def check_outputs(outs: Sequence[Pixels], count: int, view: View) -> None:
-    """Refuse arrays that cannot take the frames, one each.
-
-    Raises:
-        OptionError: Says why.
-    """
-    if len(outs) != count:
-        raise OptionError(f"outs has {len(outs)} arrays for {count} frames")
-    for out in outs:
-        output(out, view.shape, view.dtype)

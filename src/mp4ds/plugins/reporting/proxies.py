@@ -277,7 +277,7 @@ def make_proxy(
         with encoder:
             for number, found in stream.recorded_pictures():
                 if found is not None:  # otherwise the previous one stays
-                    picture = look.picture(stream.rebuilder.pixels(found))
+                    picture = look.picture(stream.recorded_pixels(found))
                 encoder.write((picture,), int(times[number]))
                 if number % _TELL_EVERY == 0:
                     progress(f"{stream.topic}: frame {number} of {len(stream)} for the page")
