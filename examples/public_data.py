@@ -43,8 +43,7 @@ def steps(options: argparse.Namespace) -> Iterator[tuple[str, str]]:
     """What is done, and what it came to."""
     images = None
     if options.kind != "mcap":
-        layout = "plain" if options.kind == "images" else options.kind
-        images = mp4ds.ImageFolder(layout=layout, rate=options.rate)
+        images = mp4ds.ImageFolder(rate=options.rate)
     sizes = {}
     for quality in ("lossless", "visual"):
         target = options.out / quality

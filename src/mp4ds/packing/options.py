@@ -35,7 +35,6 @@ _PLAIN = ("plain",)
 class ImageFolder(Options):
     """How a folder of images is read as a recording."""
 
-    layout: str | None = option("euroc, tum or plain; default: detected.")
     stamps: str | None = option(
         "Text file with a time per line, or a time and a file name.", metavar="FILE", only=_PLAIN
     )

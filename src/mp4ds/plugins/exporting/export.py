@@ -7,7 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 
@@ -83,9 +83,8 @@ def export(
             stack.enter_context(sliced(one, chosen.slice, path.parent / str(number), chosen.uses))
             for number, one in enumerate(opened)
         ]
-        if to == "lerobot":  # whose videos are in colour
-            chosen = replace(chosen, pixels="rgb")
-        sources = [ExportSource(dataset, chosen) for dataset in opened]
+        # LeRobot's videos are in colour
+        sources = [ExportSource(one, chosen, in_colour=to == "lerobot") for one in opened]
         job = ExportJob(path, chosen, sources, progress or (lambda *_: None))
         write(job)
         summary = _summary(job, target, to)
@@ -130,10 +129,6 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
             "one by one."
         )
     options.check_for(to)
-    if to == "lerobot" and options.pixels not in ("seen", "rgb"):
-        raise OptionError(
-            f"LeRobot's videos are in colour: `pixels` {options.pixels} does not apply."
-        )
     _ = options.reduction  # refuses invalid ones
 
 

@@ -26,8 +26,7 @@ from mp4ds.unpacking.pictures import ReductionOptions, is_inverse_depth, times_o
 from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
 
-_LEROBOT = ("lerobot",)
-PIXELS = ("seen", "native", "rgb", "gray")
+_FOLDERS, _LEROBOT = ("euroc", "tum", "colmap"), ("lerobot",)
 _CODECS = ("av1", "h264", "h265")
 _NS_PER_MS = 1_000_000
 
@@ -46,10 +45,8 @@ def _nanoseconds(value: str | int) -> int:
 class ExportOptions(SliceOptions, ReductionOptions):
     """How to export."""
 
-    pixels: str = option(
-        "seen: as recorded, but Bayer and YUV as RGB; native: keep Bayer mosaics; rgb; gray.",
-        "seen",
-        metavar="KIND",
+    native: bool = option(
+        "Keep Bayer mosaics, as grey images, instead of interpolating.", False, only=_FOLDERS
     )
     tolerance_ns: Parsed[int | None] = option(
         "Keep only frames that all cameras have within this time of each other.",
@@ -64,7 +61,7 @@ class ExportOptions(SliceOptions, ReductionOptions):
         "Topic with poses, for euroc, tum and colmap.",
         panel=WHAT,
         metavar="TOPIC",
-        only=("euroc", "tum", "colmap"),
+        only=_FOLDERS,
     )
     fps: int | None = option(
         "Frame rate for lerobot; default: that of the first camera.",
@@ -89,8 +86,6 @@ class ExportOptions(SliceOptions, ReductionOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.pixels not in PIXELS:
-            raise OptionError(f"`pixels` {self.pixels!r} is not known. Use {', '.join(PIXELS)}.")
         if self.codec not in _CODECS:
             raise OptionError(f"`codec` {self.codec!r} is not known. Use {', '.join(_CODECS)}.")
         most = MAX_CRF[self.codec]
@@ -211,19 +206,15 @@ class ExportedCamera:
             yield int(place_of[index]), self.stream.pixels(picture, self.view, index)
 
 
-def _view(stream: Stream, options: ExportOptions, notes: list[str]) -> View:
+def _view(stream: Stream, options: ExportOptions, in_colour: bool, notes: list[str]) -> View:
     known = ENCODINGS[stream.encoding]
-    colours = options.pixels if options.pixels in ("rgb", "gray") else "native"
-    if options.pixels == "seen" and not known.is_plain:
-        colours = "rgb"
-    if colours != "native" and not known.is_plain:
-        kind = "a Bayer mosaic" if known.mosaic else "YUV"
-        keeps = (
-            ", which --pixels native keeps" if known.mosaic and colours != options.pixels else ""
-        )
-        notes.append(f"{stream.topic}: its pixels are converted from {kind}{keeps}")
-    if encoding_as(known, "rgb") is None:
-        colours = "native"  # depths and other measurements have no colours
+    is_converted = not known.is_plain and (in_colour or not (known.mosaic and options.native))
+    if is_converted:
+        kind = "a Bayer mosaic, which --native keeps" if known.mosaic else "YUV"
+        notes.append(f"{stream.topic}: its pixels are converted from {kind}")
+    # depths and other measurements have no colours
+    has_colours = encoding_as(known, "rgb") is not None
+    colours = "rgb" if has_colours and (in_colour or is_converted) else "native"
     return stream.view(colours, options.reduction.resize)
 
 
@@ -236,6 +227,7 @@ class ExportSource:
     Args:
         dataset: The dataset.
         options: How.
+        in_colour: Whether all images with colours become RGB.
 
     Attributes:
         dataset: The dataset.
@@ -249,14 +241,14 @@ class ExportSource:
         FormatError: The dataset is damaged.
     """
 
-    def __init__(self, dataset: Dataset, options: ExportOptions) -> None:
+    def __init__(self, dataset: Dataset, options: ExportOptions, *, in_colour: bool) -> None:
         dataset.verify_messages()
         self.dataset = dataset
         self.exported: Counter[str] = Counter()
         self.left_out: dict[str, Counter[str]] = {}
         self.notes: list[str] = []
         options.selected.check(dataset.all_topics)
-        self._options = options
+        self._options, self._in_colour = options, in_colour
         dataset.verify_sidecars(options.chosen)
         streams = [stream for stream in dataset.streams if options.selected(stream.topic)]
         found = [camera for stream in streams for camera in self._camera(stream)]
@@ -319,7 +311,8 @@ class ExportSource:
         if times is not columns.stamp:
             self.note(f"{stream.topic}: its stamps do not increase, so log times are used instead")
         kept = kept[np.argsort(times[kept], kind="stable")]
-        yield ExportedCamera(stream, kept, times[kept], _view(stream, self._options, self.notes))
+        view = _view(stream, self._options, self._in_colour, self.notes)
+        yield ExportedCamera(stream, kept, times[kept], view)
 
     def _matched(self, cameras: list[ExportedCamera], tolerance_ns: int) -> list[ExportedCamera]:
         """The frames that every camera has, frame n of each taken at the same time."""

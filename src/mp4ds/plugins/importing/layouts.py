@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +56,15 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
         raise SourceError(folder, "is not a folder of images")
     _check(options)
     try:
-        name = options.layout or next(key for key in _LAYOUTS if _LAYOUTS[key][0](folder))
-        matches, add_all = _LAYOUTS[name]
-        options.check_for(name)
-        if not matches(folder):
-            raise SourceError(folder, f"does not have the layout {name}", "Omit `layout`.")
         reader = ImagesReader(folder)
-        add_all(reader, options)
+        if _is_euroc(folder):
+            options.check_for("euroc")
+            _add_euroc(reader)
+        elif _is_tum(folder):
+            options.check_for("tum")
+            _add_tum(reader, options)
+        else:
+            _add_plain(reader, options)
     except OSError as error:
         if isinstance(error, SourceError):
             raise
@@ -74,7 +76,7 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
 
 
 def _check(options: ImageFolder) -> None:
-    for name, known in (("layout", _LAYOUTS), ("unit", UNITS), ("encoding", ENCODINGS)):
+    for name, known in (("unit", UNITS), ("encoding", ENCODINGS)):
         value = getattr(options, name)
         if value is not None and value not in known:
             raise OptionError(f"`{name}` {value!r} is not one of {', '.join(known)}.")
@@ -123,7 +125,7 @@ def _is_euroc(folder: Path) -> bool:
     return any((sensor / "data").is_dir() for sensor in _sensors(folder))
 
 
-def _add_euroc(reader: ImagesReader, _: ImageFolder) -> None:
+def _add_euroc(reader: ImagesReader) -> None:
     """Add cameras, IMUs and poses."""
     sensors = _sensors(reader.path)
     for sensor in sensors:
@@ -393,13 +395,3 @@ def _by_name(reader: ImagesReader, images: list[Path], unit: str | None) -> NDAr
         except Refused as error:
             raise SourceError(path, f"has a name that is not a time: {error}") from None
     return stamps
-
-
-# name -> whether a folder has the layout, and what adds all that is in it; in the order of trial
-_LAYOUTS: Mapping[
-    str, tuple[Callable[[Path], bool], Callable[[ImagesReader, ImageFolder], None]]
-] = {
-    "euroc": (_is_euroc, _add_euroc),
-    "tum": (_is_tum, _add_tum),
-    "plain": (lambda _: True, _add_plain),
-}
