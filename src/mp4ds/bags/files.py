@@ -170,7 +170,7 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
 
 
 def _unpacked(compression: str, data: bytes | memoryview, size: int) -> tuple[bytes, int]:
-    """See `unpack`; also how many bytes of the data were used."""
+    """The content of a compressed chunk, and how many bytes of the data it took."""
     if compression not in _MACHINES:
         raise DamageError(f"it is compressed with {compression!r}, which is not supported")
     if size > (most := most_held(len(data))):

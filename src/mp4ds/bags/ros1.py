@@ -116,17 +116,15 @@ class Ros1Reader(BagReader):
         """Messages in log-time order, from the chunks that hold them."""
         self.position = 0
         visited: set[int] = set()
-        for channel, time, chunk, offset, is_last in self._entries(excerpt):
+        for channel, time, chunk, offset in self._entries(excerpt):
             if chunk not in visited:
                 visited.add(chunk)
                 self.position += self._bag.chunks[chunk].packed
             yield self._message(channel, time, chunk, offset)
-            if is_last:
-                self._chunks.pop(chunk, None)
         self.position = self._size
 
-    def _entries(self, excerpt: Excerpt) -> Iterator[tuple[Channel, int, int, int, bool]]:
-        """Per message: channel, log time, chunk number, offset, whether it is the chunk's last."""
+    def _entries(self, excerpt: Excerpt) -> Iterator[tuple[Channel, int, int, int]]:
+        """Per message: channel, log time, chunk number, offset."""
         channels = [channel for channel in self.channels if excerpt.has_topic(channel.topic)]
         parts = [self._index[channel.id].within(excerpt) for channel in channels]
         if not parts:
@@ -135,14 +133,11 @@ class Ros1Reader(BagReader):
         owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.times) for p in parts])
         order = np.lexsort((offsets, chunks, times))
         self._bag.expect(_first_seen(chunks[order]))
-        last = np.full(len(self._bag.chunks), -1)
-        last[chunks[order]] = np.arange(len(order))
         for start in range(0, len(order), 4096):
             rows = order[start : start + 4096]
-            ends = last[chunks[rows]] == np.arange(start, start + len(rows))
             columns = (column[rows].tolist() for column in (owners, times, chunks, offsets))
-            for owner, time, chunk, offset, is_last in zip(*columns, ends.tolist(), strict=True):
-                yield channels[owner], time, chunk, offset, is_last
+            for owner, time, chunk, offset in zip(*columns, strict=True):
+                yield channels[owner], time, chunk, offset
 
     def _message(self, channel: Channel, time: int, chunk: int, offset: int) -> Message:
         try:

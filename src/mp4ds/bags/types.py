@@ -146,7 +146,7 @@ class BoundedStore(Typestore):
         self._empty_left = 0
 
     def get_msgdef(self, typename: str) -> Msgdef[object]:
-        """See rosbags."""
+        """The functions for a type, compiled when first asked for."""
         found = self.cache.get(typename)
         if found is None:
             found = by_library(incomprehensible(typename), super().get_msgdef, typename)

@@ -159,19 +159,6 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         SourceError: It is not an image.
     """
-    return _header(path)[:2]
-
-
-def image_kind(path: Path) -> str:
-    """Size and pixel type of an image file, in words, from its header.
-
-    Raises:
-        SourceError: It is not an image.
-    """
-    return "{}x{} {}".format(*_header(path))
-
-
-def _header(path: Path) -> tuple[int, int, str]:
     from PIL import Image
 
     try:
@@ -179,7 +166,7 @@ def _header(path: Path) -> tuple[int, int, str]:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path, formats=STILL_FORMATS) as image:
                 width, height = image.size
-                return int(width), int(height), _ENCODINGS.get(image.mode, image.mode)
+                return int(width), int(height)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         reason = getattr(error, "strerror", None) or error
         raise SourceError(path, f"cannot be read as an image: {reason}") from None

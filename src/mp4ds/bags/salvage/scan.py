@@ -44,7 +44,6 @@ class Window:
         self._data = b""
         self._at = 0
         self._ended = False
-        self._probe: io.FileIO | None = None
         self.offset = offset
         self.size = size
 
@@ -112,18 +111,17 @@ class Window:
         if self._ended or distance + length <= len(self._data) - self._at:
             return bytes(self.peek(distance + length)[distance:])
         try:
-            if self._probe is None:
-                self._probe = io.FileIO(self._path)
-            self._probe.seek(self.offset + distance)
-            return self._probe.read(length) or b""
+            place = self._source.tell()
+            self._source.seek(self.offset + distance)
+            ahead = self._source.read(length)
+            self._source.seek(place)
         except OSError as error:
             raise SourceError(self._path, f"cannot be read: {error.strerror}") from None
+        return ahead
 
     def close(self) -> None:
         """Close the file."""
         self._source.close()
-        if self._probe:
-            self._probe.close()
 
     def __enter__(self) -> Window:
         return self
