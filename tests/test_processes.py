@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from mp4ds.packing.processes import CallError, ProcessExecutor, StreamThreads
+from mp4ds.packing.packer import StreamThreads
+from mp4ds.packing.processes import CallError, ProcessExecutor
 from waiting import WATCHDOG_S, until
 
 COUNTS = [0, 1, 2, 5]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.fields import MAX_CAMERA_INFOS
@@ -366,18 +365,6 @@ _MAX_PENDING = 1000
 """Calibrations of a topic that may wait for their stream; with more, all are kept verbatim."""
 
 
-class CalibratedStream(Protocol):
-    """A stream that takes the calibrations of its camera.
-
-    Attributes:
-        channel: Of its messages.
-        camera_info: The calibrations, when all are there.
-    """
-
-    channel: Channel
-    camera_info: CameraInfo | None
-
-
 class CameraInfoWriter:
     """The calibration messages of one channel."""
 
@@ -428,12 +415,16 @@ class CameraInfoWriter:
         )
 
 
+Identity = tuple[object, ...]
+"""Of a channel of images, whose first stream takes its calibrations."""
+
+
 @dataclass
 class _InfoChannel:
-    """A calibration channel whose stream exists, or may still come."""
+    """A calibration channel whose images have a stream, or may still have one."""
 
     writer: CameraInfoWriter
-    owner: CalibratedStream | None = None
+    owner: Identity | None = None
     pending: list[tuple[Message, int]] = field(default_factory=list)
 
 
@@ -478,8 +469,8 @@ class Calibrations:
             self._by_stamp = StampPairing()
         self._forms: dict[int, MessageSplitter] = {}
         self._infos: dict[int, _InfoChannel | None] = {}
-        self._counts: Counter[tuple[object, ...]] = Counter()
-        self._streams: dict[tuple[object, ...], CalibratedStream] = {}
+        self._counts: Counter[Identity] = Counter()
+        self._streams: set[Identity] = set()
 
     def take(self, message: Message) -> None:
         """Add a calibration to its stream, or keep it if it belongs to none."""
@@ -516,37 +507,39 @@ class Calibrations:
             self._channels[channel.id] = channel
             self._pairs = pair_camera_infos(list(self._channels.values()), chosen=self._pairs)
 
-    def adopt(self, stream: CalibratedStream) -> None:
-        """Give a channel's first stream the calibrations that waited for it."""
-        self._streams.setdefault(stream.channel.identity, stream)
+    def adopt(self, images: Identity) -> None:
+        """Take the calibrations that waited for the first stream of a channel of images."""
+        self._streams.add(images)
         self._settle()
 
-    def finish(self) -> None:
-        """Hand each stream its calibrations, and keep those whose stream never came."""
+    def finish(self) -> dict[Identity, CameraInfo]:
+        """The calibrations of each stream; those whose stream never came are kept."""
         if self._by_stamp is not None:
             self._pairs.update(self._by_stamp.decide(self._pairs))
             self._settle()
+        found: dict[Identity, CameraInfo] = {}
         for info_id, state in list(self._infos.items()):
             if state is None:
                 continue
             if state.owner is None:
                 self._give_up(info_id, state)
-            else:
-                state.owner.camera_info = state.writer.to_model()
+            elif model := state.writer.to_model():
+                found[state.owner] = model
+        return found
 
     def _new(self, channel: Channel) -> _InfoChannel | None:
         if channel.id not in self._pairs and self._by_stamp is None:
             return None
         return _InfoChannel(CameraInfoWriter(channel), self._owner_of(channel.id))
 
-    def _owner_of(self, info_id: int) -> CalibratedStream | None:
+    def _owner_of(self, info_id: int) -> Identity | None:
         image_id = self._pairs.get(info_id)
         if image_id is None:
             return None
-        stream = self._streams.get(self._channels[image_id].identity)
+        images = self._channels[image_id].identity
         # a stream has the calibrations of one channel
-        owned = any(state and state.owner is stream for state in self._infos.values())
-        return None if owned else stream
+        owned = any(state and state.owner == images for state in self._infos.values())
+        return images if images in self._streams and not owned else None
 
     def _pair_by_stamp(self, message: Message, state: _InfoChannel) -> None:
         channel = message.channel

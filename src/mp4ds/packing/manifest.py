@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from mp4ds._version import __version__
 from mp4ds.bags.combined import bounded
 from mp4ds.bags.protocols import BagReader, BagWriter, Format
+from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, SourceError, advising
 from mp4ds.files.outputs import digest_file
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
@@ -383,3 +384,43 @@ def dataset_files(path: Path) -> set[str] | None:
         return None
     streams = {name for entry in manifest.streams for name in (entry.sidecar, entry.video)}
     return {MANIFEST_NAME, *streams, *(entry.name for entry in manifest.files)}
+
+
+# ---------------------------------------------------------------- of datasets
+
+
+def topic_summaries(dataset: Dataset) -> list[TopicSummary]:
+    """What is in a dataset, by topic; the bytes of the recorded messages are not known."""
+    times = dataset.times()
+    found: dict[str, TopicSummary] = {}
+    for channel in dataset.channels:
+        topic = found.setdefault(channel.topic, TopicSummary(channel.topic, channel.type_name))
+        topic.messages += len(times.get(channel.id, ()))
+    for stream in dataset.streams:
+        topic = found[stream.topic]
+        topic.frames += len(stream)
+        topic.files.append(stream.video_path.name)
+        topic.packed_bytes += stream.video_path.stat().st_size + stream.path.stat().st_size
+        if stream.infos:
+            found[stream.infos.channel.topic].frames += len(stream.infos)
+    return list(found.values())
+
+
+def summary_of(path: Path) -> PackSummary:
+    """What is in the dataset of a recording; the bytes of what was recorded are not known."""
+    with Dataset(path) as dataset:
+        topics = {topic.topic: topic for topic in topic_summaries(dataset)}
+        manifest = dataset.manifest
+    for item in manifest.verbatim if manifest else ():
+        topics[item.topic].verbatim[item.reason] = (item.messages, item.first)
+    return PackSummary(
+        dataset=path,
+        topics=list(topics.values()),
+        source_bytes=0,
+        dataset_bytes=folder_size(path),
+        messages_bytes=(path / MESSAGES_NAME).stat().st_size,
+        left_out=[],
+        skipped={},
+        losses=[entry.to_record() for entry in manifest.losses] if manifest else [],
+        is_copy=True,
+    )

@@ -16,6 +16,9 @@ from itertools import chain
 from pathlib import Path
 
 from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.checks import validate
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.slicing import copy_part, latched_at, span_in
 from mp4ds.errors import (
     FormatError,
     OptionError,
@@ -23,6 +26,7 @@ from mp4ds.errors import (
     SourceError,
     TargetExistsError,
     WriteError,
+    advising,
     path_text,
 )
 from mp4ds.files.outputs import check_target, digest_file, staged
@@ -35,15 +39,16 @@ from mp4ds.files.sources import (
 )
 from mp4ds.files.uploads import local_path, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
-from mp4ds.format.sidecars import MANIFEST_NAME, load_about, load_manifest, load_stream
+from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest, load_stream
 from mp4ds.messages.serializations import is_camera
-from mp4ds.packing.copying import copy, is_copy
+from mp4ds.options import ENCODING
 from mp4ds.packing.long_packs import PartedPack, Report, pack_parts
 from mp4ds.packing.manifest import (
     PartRecord,
     dataset_files,
     folder_size,
     summarize,
+    topic_summaries,
     with_latched,
     write_manifest,
 )
@@ -214,11 +219,66 @@ def _copied(
 ) -> PackSummary:
     """Copy a dataset, or re-encode it if it cannot be copied."""
     try:
-        return copy(paths[0], target, options)
+        return _copy(paths[0], target, options)
     except Refused as reason:
         encoded = replace(options, quality=_quality_of(paths), transcode=_has_transcoded(paths))
         summary = _pack(paths, target, _checked(encoded, paths), progress)
         return replace(summary, not_copied=str(reason))
+
+
+def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
+    """Copy a dataset or a part of it.
+
+    Args:
+        path: The dataset.
+        target: The folder to make.
+        options: Which part, and its description.
+
+    Raises:
+        Refused: It cannot be copied; says why. Nothing is left behind.
+        FormatError: It is damaged.
+        TargetError: The dataset may not be written there.
+        WriteError: The disk refused.
+        OptionError: There is no such topic or time.
+    """
+    about = load_about(options.about) if options.about is not None else None
+    with (
+        advising(COPY_AGAIN),
+        Dataset(path) as dataset,
+        staged(target, force=options.force, owned=dataset_files, sources=[path]) as folder,
+    ):
+        selected = options.selected
+        selected.check(channel.topic for channel in dataset.channels)
+        folder.mkdir()
+        span = span_in(dataset, options.slice)
+        if options.slice or options.topics or options.exclude:  # whole files are checked as copied
+            dataset.verify_messages()
+        for stream in dataset.streams:
+            is_cut = options.slice and selected(stream.topic)
+            if is_cut and stream.sidecar.digests is None:  # nothing else shows that it is damaged
+                stream.verify_video()
+        latched, too_large = latched_at(dataset, span, options.slice, selected)
+        manifest = copy_part(
+            dataset, folder, span=span, latched=latched, selected=selected, about=about
+        )
+        if options.slice:
+            for problem in validate(folder, deep=True):
+                raise FormatError(problem.code, dataset.path, f"is damaged: {problem}")
+        with Dataset(folder) as made:
+            topics = topic_summaries(made)
+            early = dict(made.latched_before) if options.slice else {}
+        return PackSummary(
+            dataset=target,
+            topics=topics,
+            source_bytes=folder_size(dataset.path),
+            dataset_bytes=folder_size(folder),
+            messages_bytes=sum(item.size for item in manifest.files if item.name[-5:] == ".mcap"),
+            left_out=[item.topic for item in dataset.channels if not selected(item.topic)],
+            skipped={},
+            is_copy=True,
+            latched=early,
+            latched_left_out=list(too_large),
+        )
 
 
 def _pack_to_store(
@@ -356,9 +416,11 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
 
 
 def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
-    if options.quality is not None or not any(map(dataset_at, paths)):
+    """Whether it is one dataset, and no option asks for encoding its videos."""
+    if options.changing(ENCODING) != PackOptions().changing(ENCODING):
         return False
-    return is_copy(paths, options)
+    is_divided = options.join or options.cluster is not None
+    return not is_divided and len(paths) == 1 and dataset_at(paths[0]) is not None
 
 
 def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = True) -> PackOptions:

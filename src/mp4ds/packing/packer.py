@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -11,14 +12,14 @@ from typing import TypeVar
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import OutOfReachError, Refused
+from mp4ds.format.models import CameraInfo
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
-from mp4ds.packing.calibrations import Calibrations
+from mp4ds.packing.calibrations import Calibrations, Identity
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
 from mp4ds.packing.manifest import PartRecord, PartStream, declare_rest
 from mp4ds.packing.options import TopicSummary
 from mp4ds.packing.planning import Piece, Plan
-from mp4ds.packing.processes import StreamThreads
 from mp4ds.packing.survey import (
     MAX_STREAMS_PER_CHANNEL,
     SAMPLES,
@@ -40,6 +41,63 @@ Exact = Mapping[tuple[int, StreamKey], str]
 NOT_SURVEYED = (
     "images of its size or encoding were not in the parts of the recording that were surveyed"
 )
+
+
+# ---------------------------------------------------------------- threads
+
+_AHEAD = 2  # jobs of a thread that may wait: each holds an image
+
+
+class StreamThreads:
+    """A few threads; jobs of one stream run in order on one of them.
+
+    A context manager: leaving it normally waits for all jobs, leaving it with an exception drops
+    those not started. After the first error of a job no other is run; the next call raises it.
+
+    Args:
+        count: Threads; 0 runs each job at once in the calling thread.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._error: BaseException | None = None
+        self._threads = [ThreadPoolExecutor(1) for _ in range(count)]
+        self._jobs: list[deque[Future[None]]] = [deque() for _ in range(count)]
+
+    def submit(self, stream: int, job: Callable[[], None]) -> None:
+        """Run a job after all earlier ones of its stream; waits while too many are waiting.
+
+        Raises:
+            BaseException: An earlier job's error.
+        """
+        if not self._threads:
+            job()
+            return
+        number = stream % len(self._threads)
+        jobs = self._jobs[number]
+        if len(jobs) > _AHEAD:
+            jobs.popleft().result()
+        if self._error is not None:
+            raise self._error
+        jobs.append(self._threads[number].submit(self._run, job))
+
+    def _run(self, job: Callable[[], None]) -> None:
+        if self._error is None:
+            try:
+                job()
+            except BaseException as error:
+                self._error = error
+
+    def __enter__(self) -> StreamThreads:
+        return self
+
+    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
+        for thread in self._threads:
+            thread.shutdown(cancel_futures=exc_type is not None)
+        if exc_type is None and self._error is not None:
+            raise self._error
+
+
+# ---------------------------------------------------------------- cameras
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +179,7 @@ class CameraRouter:
         self._names = FileNames()
         self._channels: dict[tuple[object, ...], _CameraChannel] = {}
         self._streams: list[StreamWriter] = []
+        self._firsts: dict[Identity, StreamWriter] = {}  # of each channel
         self._renamed: set[str] = set()
 
     def take(self, message: Message, threads: StreamThreads) -> None:
@@ -204,7 +263,8 @@ class CameraRouter:
                 continue
             self._topic_of(item.message.channel).frames += 1
             if stream.frames == 1:
-                self._calibrations.adopt(stream)
+                self._firsts.setdefault(stream.channel.identity, stream)
+                self._calibrations.adopt(stream.channel.identity)
             threads.submit(number, job)
             return
         state.inspector.leave_out(item.seen)
@@ -255,8 +315,14 @@ class CameraRouter:
         self._topic_of(message.channel).count_verbatim(reason, number)
         self._keep(message)
 
-    def finish(self) -> list[PartStream]:
-        """Complete all videos and write their sidecars; all jobs must have run."""
+    def finish(self, infos: Mapping[Identity, CameraInfo]) -> list[PartStream]:
+        """Complete all videos and write their sidecars; all jobs must have run.
+
+        Args:
+            infos: The calibrations of each channel, for its first stream.
+        """
+        for identity, info in infos.items():
+            self._firsts[identity].camera_info = info
         finished = []
         for stream in self._streams:
             if not stream.frames:
@@ -361,7 +427,7 @@ class Packer:
                 compression=self._compression,
             ) as self._verbatim:
                 self._read()
-                part.streams = self._cameras.finish()
+                part.streams = self._cameras.finish(self._calibrations.finish())
                 if self._excerpt.others:
                     declare_rest(part, self._reader, self._selected, self._verbatim)
         except BaseException:
@@ -376,7 +442,6 @@ class Packer:
                 self._take(record, threads)
                 self._progress(self._part)
             self._cameras.settle(threads)
-        self._calibrations.finish()
         if self._excerpt.others:
             self._part.skipped = dict(self._reader.skipped)
             self._part.losses = list(self._reader.losses)

@@ -1,4 +1,4 @@
-"""An executor whose calls run in processes of this machine, and threads that keep streams in order.
+"""An executor whose calls run in processes of this machine.
 
 ``python -m mp4ds.packing.processes`` is such a process: it takes calls from its standard input, and
 answers each on its standard output.
@@ -18,7 +18,7 @@ import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -69,60 +69,6 @@ def release_memory() -> None:
     gc.collect()
     with suppress(OSError, AttributeError):  # not the GNU C library
         ctypes.CDLL("libc.so.6").malloc_trim(0)
-
-
-# ---------------------------------------------------------------- threads
-
-_AHEAD = 2  # jobs of a thread that may wait: each holds an image
-
-
-class StreamThreads:
-    """A few threads; jobs of one stream run in order on one of them.
-
-    A context manager: leaving it normally waits for all jobs, leaving it with an exception drops
-    those not started. After the first error of a job no other is run; the next call raises it.
-
-    Args:
-        count: Threads; 0 runs each job at once in the calling thread.
-    """
-
-    def __init__(self, count: int) -> None:
-        self._error: BaseException | None = None
-        self._threads = [ThreadPoolExecutor(1) for _ in range(count)]
-        self._jobs: list[deque[Future[None]]] = [deque() for _ in range(count)]
-
-    def submit(self, stream: int, job: Callable[[], None]) -> None:
-        """Run a job after all earlier ones of its stream; waits while too many are waiting.
-
-        Raises:
-            BaseException: An earlier job's error.
-        """
-        if not self._threads:
-            job()
-            return
-        number = stream % len(self._threads)
-        jobs = self._jobs[number]
-        if len(jobs) > _AHEAD:
-            jobs.popleft().result()
-        if self._error is not None:
-            raise self._error
-        jobs.append(self._threads[number].submit(self._run, job))
-
-    def _run(self, job: Callable[[], None]) -> None:
-        if self._error is None:
-            try:
-                job()
-            except BaseException as error:
-                self._error = error
-
-    def __enter__(self) -> StreamThreads:
-        return self
-
-    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
-        for thread in self._threads:
-            thread.shutdown(cancel_futures=exc_type is not None)
-        if exc_type is None and self._error is not None:
-            raise self._error
 
 
 # ---------------------------------------------------------------- processes

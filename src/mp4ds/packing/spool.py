@@ -25,10 +25,9 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, Refused, SourceError
 from mp4ds.files.outputs import check_target, is_mine, lock, staged, work_folder
 from mp4ds.files.sources import RECORDING_NAME
-from mp4ds.format.fields import MESSAGES_NAME, Model, Profile
+from mp4ds.format.fields import Model, Profile
 from mp4ds.format.manifest import About, LossEntry
-from mp4ds.packing.copying import topic_summaries
-from mp4ds.packing.manifest import dataset_files, folder_size
+from mp4ds.packing.manifest import dataset_files, summary_of
 from mp4ds.packing.options import PackOptions, PackSummary
 from mp4ds.plan import MAX_GOP, SPEED
 from mp4ds.records import Loss
@@ -210,26 +209,6 @@ def _joined(
         for problem in validate(made) if is_foreign else ():
             raise FormatError(problem.code, parts[0].parent, str(problem))
         return replace(summary_of(made), dataset=target)
-
-
-def summary_of(path: Path) -> PackSummary:
-    """What is in the dataset of a recording; the bytes of what was recorded are not known."""
-    with Dataset(path) as dataset:
-        topics = {topic.topic: topic for topic in topic_summaries(dataset)}
-        manifest = dataset.manifest
-    for item in manifest.verbatim if manifest else ():
-        topics[item.topic].verbatim[item.reason] = (item.messages, item.first)
-    return PackSummary(
-        dataset=path,
-        topics=list(topics.values()),
-        source_bytes=0,
-        dataset_bytes=folder_size(path),
-        messages_bytes=(path / MESSAGES_NAME).stat().st_size,
-        left_out=[],
-        skipped={},
-        losses=[entry.to_record() for entry in manifest.losses] if manifest else [],
-        is_copy=True,
-    )
 
 
 # ---------------------------------------------------------------- recovery

@@ -18,10 +18,10 @@ from mp4ds.errors import Mp4dsError, OptionError, RecordError, TargetError, Writ
 from mp4ds.files.outputs import check_target, sync
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
-from mp4ds.packing.manifest import dataset_files, folder_size
+from mp4ds.packing.manifest import dataset_files, folder_size, summary_of
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.pack import checked_codec
-from mp4ds.packing.spool import SpoolFolder, SpoolSettings, summary_of
+from mp4ds.packing.spool import SpoolFolder, SpoolSettings
 from mp4ds.plan import SPEED, Purpose
 from mp4ds.plugins.playing.timeline import quick_switches
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
