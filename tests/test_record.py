@@ -26,10 +26,11 @@ from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.packing.options import PackOptions
+from mp4ds.packing.processes import CallError
 from mp4ds.packing.spool import SpoolFolder
 from mp4ds.plugins.recording import spool
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.recording.packing import PackingError, PackingProcess
+from mp4ds.plugins.recording.packing import PackingProcess
 from mp4ds.plugins.recording.record import (
     RecordProgress,
     open_recorder,
@@ -379,7 +380,7 @@ def test_packing_that_fails(
 
     def fail(self: PackingProcess, folder: Path, number: int) -> None:
         if number == 1:
-            raise PackingError("the encoder is out of order")
+            raise CallError("the encoder is out of order")
         pack(self, folder, number)
 
     monkeypatch.setattr(PackingProcess, "pack", fail)

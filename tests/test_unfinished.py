@@ -16,8 +16,9 @@ import mp4ds
 from commands import Result, call, tree
 from mp4ds.errors import RecordError
 from mp4ds.files.sources import RECORDING_NAME
+from mp4ds.packing.processes import CallError
 from mp4ds.plugins.recording import spool
-from mp4ds.plugins.recording.packing import PackingError, PackingProcess
+from mp4ds.plugins.recording.packing import PackingProcess
 from record_scenes import PlayedSource, recorded
 from scenes import scene
 from sources import SOURCES
@@ -39,7 +40,7 @@ def left(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def fail(self: PackingProcess, folder: Path, number: int) -> None:
         if number == 2:
-            raise PackingError("the disk is tired")
+            raise CallError("the disk is tired")
         pack(self, folder, number)
 
     with pytest.MonkeyPatch.context() as tired:

@@ -16,8 +16,8 @@ from mp4ds.errors import OptionError, PublishError, Refused
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Lateness, Pace, Ticks
 from mp4ds.plugins.playing.stamps import Restamper
-from mp4ds.plugins.playing.timeline import Due, Playback, Timeline, quick_switches
-from mp4ds.plugins.ros.node import Node, Service, action
+from mp4ds.plugins.playing.timeline import Due, Playback, Timeline
+from mp4ds.plugins.ros.node import Node, Service, action, quick_switches
 from mp4ds.records import Channel
 
 

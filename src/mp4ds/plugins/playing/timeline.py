@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import heapq
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Generic, TypeVar
@@ -27,8 +25,6 @@ from mp4ds.unpacking.republish import Republisher
 # ---------------------------------------------------------------- read ahead
 
 T = TypeVar("T")
-
-_SWITCH_S = 0.001
 
 
 class ReadAhead(Generic[T]):
@@ -143,17 +139,6 @@ class ReadAhead(Generic[T]):
     def join(self) -> None:
         """Wait until the thread has ended and closed its source."""
         self._thread.join()
-
-
-@contextmanager
-def quick_switches() -> Iterator[None]:
-    """Lets waiting threads have the interpreter sooner than Python does by default."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(_SWITCH_S)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
 
 
 # ---------------------------------------------------------------- timeline
