@@ -17,9 +17,8 @@ from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE
 from mp4ds.messages.layouts import bind, fit
 from mp4ds.packing.options import PackOptions
 from mp4ds.plan import Purpose
-from mp4ds.video.codecs import Recipe, lossless_codecs, recipe_for
-from mp4ds.video.encoder import VideoEncoder, open_encoder
-from mp4ds.video.trial import NEAR, Choice, choose, encode_on_trial
+from mp4ds.video.codecs import lossless_codecs, recipe_for
+from mp4ds.video.encoder import NEAR, Choice, VideoEncoder, choose, encode_on_trial
 from pictures import picture
 from pixel_kinds import as_message, rounded
 from round_trips import unpacked
@@ -276,13 +275,15 @@ def test_the_next_codec_where_one_refuses(
     """The encoder may refuse, by its size, what it took of the middle of an image."""
     asked: list[str] = []
 
-    def refuses(context: Any, recipe: Recipe, *rest: Any, **options: Any) -> None:
-        asked.append(recipe.codec)
-        if recipe.codec == asked[0]:
-            raise ValueError
-        open_encoder(context, recipe, *rest, **options)
+    plain = VideoEncoder._open_stream
 
-    monkeypatch.setattr("mp4ds.video.encoder.open_encoder", refuses)
+    def refuses(self: VideoEncoder, *given: Any) -> None:
+        asked.append(self.recipe.codec)
+        if self.recipe.codec == asked[0]:
+            raise ValueError
+        plain(self, *given)
+
+    monkeypatch.setattr(VideoEncoder, "_open_stream", refuses)
     paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("rgb8", frames=3))
     summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(codec=codec))
     (topic,) = (topic for topic in summary.topics if topic.topic == "/cam/image_raw")

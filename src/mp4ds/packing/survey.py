@@ -44,8 +44,8 @@ from mp4ds.video.codecs import (
     lossless_codecs,
     recipe_for,
 )
+from mp4ds.video.encoder import choose
 from mp4ds.video.scores import SMALLEST, largest_crf
-from mp4ds.video.trial import choose
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,11 +27,10 @@ from mp4ds.messages.layouts import Layout, layout_for
 from mp4ds.packing.inspection import CameraMessage
 from mp4ds.plan import LOSSLESS, QualityTarget
 from mp4ds.video.codecs import LEAST_CRF, MAX_CRF, Recipe, lossless_codecs, recipe_for
-from mp4ds.video.encoder import VideoEncoder, coded_size
+from mp4ds.video.encoder import Choice, VideoEncoder, coded_size
 from mp4ds.video.packets import PacketWriter, join_segments
 from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
 from mp4ds.video.scores import Ffmpeg, find_ffmpeg, scores_of
-from mp4ds.video.trial import Choice
 
 
 @dataclass(frozen=True, slots=True)

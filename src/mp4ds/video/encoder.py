@@ -1,21 +1,28 @@
-"""Encoding a stream's pictures to one mp4."""
+"""Encoding a stream's pictures to one mp4, and trying which layout and codec is the best."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import av
+import numpy as np
 from av.error import FFmpegError
 
-from mp4ds.errors import EncoderRefusedError
+from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.encodings import MAX_SIDE, Encoding, Parameters, Pixels
+from mp4ds.messages.layouts import Layout, fit
+from mp4ds.plan import Purpose
 from mp4ds.times import TIMESCALE
-from mp4ds.video.codecs import Recipe
+from mp4ds.video.codecs import CODECS, Recipe, codecs_to_try, recipe_for
 from mp4ds.video.media import new_mp4, raise_if_scarce
 from mp4ds.video.pixels import PictureConverter, picture_to_frame
 
@@ -262,3 +269,259 @@ def tool_versions() -> Mapping[str, str]:
         "av": av.__version__,
         "libavcodec": ".".join(map(str, av.library_versions["libavcodec"])),
     }
+
+
+# ---------------------------------------------------------------- trials
+
+NEAR = 1.02
+"""An earlier candidate is preferred if it is larger by no more than this factor."""
+
+_LARGEST = 800 * 600  # pixels of an image that are tried; of a larger one its middle
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The choice for a stream.
+
+    Attributes:
+        layout: Name of the layout.
+        parameters: Of the layout, which may refuse later images because of them.
+        recipe: Codec and options.
+        bytes_per_frame: Estimated size of a coded image.
+        gop: Frames from one key frame to the next.
+    """
+
+    layout: str
+    parameters: Parameters
+    recipe: Recipe
+    bytes_per_frame: float
+    gop: int
+
+    @property
+    def text(self) -> str:
+        """The choice in words: the same for the same choice, in every process."""
+        recipe, parameters = self.recipe, self.parameters.to_values()
+        return f"{self.layout} {parameters} {recipe.encoder} {dict(recipe.options)} gop {self.gop}"
+
+
+@dataclass(frozen=True, slots=True)
+class Coded:
+    """The cost of a few consecutive pictures, the first of which is a key frame.
+
+    The others are assumed to represent all others of a group of pictures.
+
+    Attributes:
+        key: Bytes of the key frame.
+        other: Mean bytes of the others.
+        key_seconds: CPU time of decoding the key frame; 0 if not measured.
+        other_seconds: Mean CPU time of decoding another one.
+    """
+
+    key: float
+    other: float
+    key_seconds: float = 0.0
+    other_seconds: float = 0.0
+
+    def bytes_per_frame(self, gop: int) -> float:
+        """Mean bytes per frame of a long video with a key frame every `gop` frames."""
+        return (self.key + (gop - 1) * self.other) / gop
+
+    def random_seconds(self, gop: int) -> float:
+        """Mean CPU time until a frame at a random place is decoded."""
+        return self.key_seconds + (gop - 1) / 2 * self.other_seconds
+
+
+def encode_on_trial(
+    pictures: Sequence[Picture],
+    recipe: Recipe,
+    *,
+    picture_format: str,
+    threads: int,
+    timed: bool = False,
+) -> Coded:
+    """Measure the cost of pictures.
+
+    Args:
+        pictures: Consecutive ones, at least one, all of one size.
+        recipe: Codec and options.
+        picture_format: Pixel format of the pictures.
+        threads: Threads of the encoder.
+        timed: Also measure decoding.
+
+    Raises:
+        EncoderRefusedError: The codec does not take such pictures.
+    """
+    rows, columns = pictures[0][0].shape[:2]
+    width, height = coded_size(recipe, columns, rows)
+    converter = PictureConverter()
+    context: Any = av.CodecContext.create(recipe.encoder, "w")
+    context.options = {**recipe.options, "g": str(len(pictures))}
+    context.time_base = Fraction(1, 30)
+    context.framerate = Fraction(30)
+    packets: list[Any] = []
+    try:
+        open_encoder(context, recipe, width, height, threads=threads)
+        for number, picture in enumerate(pictures):
+            frame = picture_to_frame(picture, picture_format, recipe.pixel_format, converter)
+            frame.pts = number
+            frame.time_base = context.time_base
+            frame.color_range = color_range(recipe)
+            packets += context.encode(frame)
+        packets += context.encode(None)
+        seconds = _decoding_seconds(context, packets, CODECS[recipe.codec].ffmpeg) if timed else []
+    except MemoryError:
+        raise
+    except (FFmpegError, ValueError) as error:
+        raise_if_scarce(error)
+        raise EncoderRefusedError(
+            f"{recipe.encoder} does not take pictures of {columns}x{rows}"
+        ) from None
+    sizes = [0] * len(pictures)
+    for packet in packets:
+        sizes[packet.pts] += packet.size
+    return Coded(*_key_and_others(sizes), *(_key_and_others(seconds) if timed else ()))
+
+
+def _key_and_others(values: Sequence[float]) -> tuple[float, float]:
+    """The first of some values, and the mean of the others."""
+    return float(values[0]), float(np.mean(values[1:] or values))
+
+
+def _decoding_seconds(encoder: Any, packets: Sequence[Any], codec: str) -> list[float]:
+    """CPU time of decoding each packet, the minimum of several runs."""
+    turns = []
+    for _ in range(_TURNS):
+        decoder: Any = av.CodecContext.create(codec, "r")
+        decoder.thread_count = 1
+        decoder.width, decoder.height = encoder.width, encoder.height
+        decoder.pix_fmt = encoder.pix_fmt
+        if encoder.extradata:
+            decoder.extradata = encoder.extradata
+        seconds = []
+        for packet in packets:
+            begun = time.thread_time()
+            decoder.decode(packet)
+            seconds.append(time.thread_time() - begun)
+        turns.append(seconds)
+    return [min(those) for those in zip(*turns, strict=True)]
+
+
+_TURNS = 3
+_DISTANCES = (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30)  # of key frames, where reading is to be fast
+
+
+def choose(
+    samples: Sequence[Pixels],
+    encoding: Encoding,
+    *,
+    codec: str | None,
+    preset: str | None,
+    gop: int,
+    threads: int,
+    purpose: Purpose | None = None,
+    known: Collection[str] = (),
+) -> Choice:
+    """The best lossless layout, recipe and distance of key frames, found by trying each.
+
+    Args:
+        samples: Pixels of consecutive images, at least one; about six are enough.
+        encoding: Of the images.
+        codec: The only codec to try, or None for all.
+        preset: The encoder's preset, or None for the default.
+        gop: Frames from one key frame to the next, unless the purpose sets it.
+        threads: Threads of the encoder.
+        purpose: What the video is for.
+        known: Texts of choices made before, for ``training``, for which times are measured: one of
+            these that is allowed is chosen again.
+
+    Returns:
+        The first, in the order of the encoding's layouts and their codecs, within 2 % of the
+        smallest. For ``archive``, the smallest; for ``training``, the one with the fastest decoding
+        of a random frame, among those not larger than the smallest by more than the purpose allows.
+
+    Raises:
+        OptionError: The codec has no form for any layout of the encoding.
+        EncoderRefusedError: No codec takes such pictures.
+    """
+    crops, share = _crops(samples, encoding)
+    is_fast = purpose is not None and purpose.is_training
+    tried: list[tuple[Choice, Coded]] = []
+    refusals: list[Exception] = []
+    for layout in _candidates(samples, encoding):
+        pictures = [layout.to_picture(pixels) for pixels in crops]
+        picture_format = layout.pixel_format
+        names = codecs_to_try(picture_format) if codec is None else [codec]
+        for name, fast in product(names, (False, True) if is_fast else (False,)):
+            try:
+                recipe = recipe_for(
+                    picture_format, lossless=True, codec=name, preset=preset, fast=fast
+                )
+                coded = encode_on_trial(
+                    pictures,
+                    recipe,
+                    picture_format=picture_format,
+                    threads=threads,
+                    timed=is_fast,
+                )
+            except (OptionError, EncoderRefusedError) as error:
+                refusals.append(error)
+            else:
+                size = coded.bytes_per_frame(gop) / share
+                tried.append((Choice(layout.name, layout.parameters, recipe, size, gop), coded))
+    if not tried:
+        # that an encoder refuses the size says more than that another has no such format
+        raise next((e for e in refusals if isinstance(e, EncoderRefusedError)), refusals[0])
+    smallest = min(choice.bytes_per_frame for choice, _ in tried)
+    if purpose is not None and purpose.is_training:
+        return _fastest(tried, share, (1 + purpose.larger / 100) * smallest, known)
+    near = NEAR if purpose is None else 1.0
+    return next(choice for choice, _ in tried if choice.bytes_per_frame <= near * smallest)
+
+
+def _fastest(
+    tried: Sequence[tuple[Choice, Coded]], share: float, most: float, known: Collection[str]
+) -> Choice:
+    """The choice, with its best distance of key frames, whose random frames decode fastest.
+
+    Args:
+        tried: All candidates, with their cost.
+        share: Share of the images' pixels that were tried.
+        most: Maximum bytes per frame; at least one candidate meets it.
+        known: Texts of choices to make again.
+    """
+    found = [
+        (coded.random_seconds(gop), replace(choice, bytes_per_frame=size, gop=gop))
+        for choice, coded in tried
+        for gop in {*_DISTANCES, choice.gop}
+        if (size := coded.bytes_per_frame(gop) / share) <= most
+    ]
+    again = [pair for pair in found if pair[1].text in known]
+    return min(again or found, key=lambda pair: (pair[0], pair[1].bytes_per_frame))[1]
+
+
+def _candidates(samples: Sequence[Pixels], encoding: Encoding) -> list[Layout]:
+    """The layouts that can hold the samples; byte planes only if nothing else can."""
+    fitted = [fit(name, encoding, samples) for name in encoding.exact]
+    found = [layout for layout in fitted if layout and _is_in_bounds(layout, samples[0])]
+    return [layout for layout in found if layout.name != "bytes"] or found
+
+
+def _is_in_bounds(layout: Layout, pixels: Pixels) -> bool:
+    encoding = layout.encoding
+    width, height = pixels.shape[1], int(pixels.shape[0] / encoding.rows)
+    return max(layout.picture_size(width, height)) <= MAX_SIDE
+
+
+def _crops(samples: Sequence[Pixels], encoding: Encoding) -> tuple[Sequence[Pixels], float]:
+    """The middle of large images, at even coordinates, and its share of their pixels.
+
+    Vertically stacked planes are left whole.
+    """
+    rows, columns = samples[0].shape[:2]
+    if encoding.rows != 1 or rows * columns <= _LARGEST:
+        return samples, 1.0
+    scale = float(np.sqrt(_LARGEST / (rows * columns)))
+    height, width = (max(2, int(side * scale) // 2 * 2) for side in (rows, columns))
+    top, left = ((side - kept) // 4 * 2 for side, kept in ((rows, height), (columns, width)))
+    middle = slice(top, top + height), slice(left, left + width)
+    return [pixels[middle] for pixels in samples], height * width / (rows * columns)
