@@ -173,6 +173,9 @@ class Core:
             )
         if own_net:
             self._prefix = ["nsenter", "-t", str(self._master.pid), "-n"]
+            # until then, who is started beside it would be in the network of the tests
+            net, here = (Path(f"/proc/{pid}/ns/net") for pid in (self._master.pid, "self"))
+            wait_until(lambda: net.readlink() != here.readlink())
         asking = [*self._prefix, sys.executable, str(HERE / "ros1_state.py"), self.uri]
         self._state = Process(asking, self.environment)
         wait_until(lambda: self._master.poll() is not None or self._state.ask("nodes") is not None)

@@ -360,7 +360,7 @@ def test_player_that_waits_loses_nothing(roscore: Core, tmp_path: Path) -> None:
 def test_player_that_waits_does_not_wait_for_ever(roscore: Core, tmp_path: Path) -> None:
     messages = [("/a", "x" * 1_000_000, "/n", 0)] * 40
     bag = write_strings(tmp_path / "many.bag", messages)
-    published = driver(roscore, bag, queue_size=2, wait_s=3.0)
+    published = driver(roscore, bag, queue_size=2, wait_s=1.0)
     published.ask("advertise")
     receiver = roscore.receiver("/a")
     published.ask("await_subscribers", 1)
