@@ -29,7 +29,8 @@ from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.options import UnpackOptions, UnpackSummary
-from mp4ds.unpacking.republish import KINDS, FreeTopics, Republished, republished_topic
+from mp4ds.unpacking.republish import Republished, free_topic, republished_topic
+from mp4ds.unpacking.types import KINDS
 from pictures import YUV, picture, sample_format
 from republished import (
     CAMERAS,
@@ -299,7 +300,7 @@ def in_turn(*tables: Sequence[str]) -> list[Any]:
 
 
 @pytest.mark.one_in(12)
-@pytest.mark.parametrize(("name", "kind", "to"), in_turn([*FATES], KINDS, [*TARGETS]))
+@pytest.mark.parametrize(("name", "kind", "to"), in_turn([*FATES], [*KINDS], [*TARGETS]))
 def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
     made = packed(name, SOURCE_OF[to])
     summary, messages = made.unpack(to, kind)
@@ -307,7 +308,7 @@ def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str)
 
 
 @pytest.mark.one_in(4)
-@pytest.mark.parametrize(("name", "kind", "to"), in_turn([*FOXGLOVE_FATES], KINDS, [*TARGETS]))
+@pytest.mark.parametrize(("name", "kind", "to"), in_turn([*FOXGLOVE_FATES], [*KINDS], [*TARGETS]))
 def test_foxglove_cameras_as_every_kind(packed: Pack, name: str, kind: str, to: str) -> None:
     made = packed(name, "mcap-protobuf")
     fate = fate_of(FOXGLOVE_FATES[name], name, kind)
@@ -910,15 +911,10 @@ def test_topics_are_those_of_image_transport(
 
 
 def test_no_topic_is_taken_twice() -> None:
-    free = FreeTopics(["/a", "/b", "/b_compressed_video"])
-    taken = [free.take(topic, "compressed-video") for topic in ("/a", "/a", "/b", "/c", "/c")]
-    assert taken == [
-        "/a_compressed_video",
-        "/a_compressed_video_compressed_video",
-        "/b_compressed_video_compressed_video",
-        "/c",
-        "/c_compressed_video",
-    ]
+    taken = {"/a", "/a_compressed_video", "/b"}
+    assert free_topic("/a", "compressed-video", taken) == "/a_compressed_video_compressed_video"
+    assert free_topic("/b", "raw", taken) == "/b_raw"
+    assert free_topic("/c", "raw", taken) == "/c"
 
 
 # ---------------------------------------------------------------- options, errors, command line

@@ -31,7 +31,7 @@ from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
 from mp4ds.options import WHAT, Parsed, TopicOptions, option, parse_resize
 from mp4ds.times import intervals, usual_interval
-from mp4ds.unpacking.types import VideoFields, type_of
+from mp4ds.unpacking.types import KINDS, VideoFields
 from mp4ds.video.images import ImageFile
 from mp4ds.video.packets import PacketReader, StandAlonePackets
 
@@ -203,7 +203,7 @@ class ImageForm:
     """The form to convert images to.
 
     Attributes:
-        kind: One of `mp4ds.unpacking.republish.KINDS`.
+        kind: One of `KINDS`.
         ros1: Whether the messages are for ROS 1.
         jpeg_quality: Of new JPEG files, 1 to 100.
         size: Width and height in pixels; None for as recorded.
@@ -323,9 +323,6 @@ def _raw(
 
 # ---------------------------------------------------------------- pictures
 
-VIDEO_KINDS = ("compressed-video", "ffmpeg")
-"""Kinds whose messages are packets of the video as it is."""
-
 _VIDEO_CODECS = ("h264", "h265", "av1", "vp9")  # formats of Foxglove's CompressedVideo
 
 Frames = Callable[[Choice, bool], Iterator[tuple[int, Given | bytes | bytearray]]]
@@ -349,7 +346,7 @@ def frames_of(stream: Stream, form: ImageForm) -> Frames:
     Raises:
         Refused: They cannot be converted; says why.
     """
-    if form.kind in VIDEO_KINDS:
+    if KINDS[form.kind].family == "video":
         return _video(stream, form.kind)
     if form.size is None and holds_files(stream.sidecar, form.kind):
         return partial(_own_files, stream, _own_formats(stream.sidecar, form))
@@ -391,7 +388,7 @@ def _video(stream: Stream, kind: str) -> Frames:
     sidecar = stream.sidecar
     codec = sidecar.video.codec
     if codec not in _VIDEO_CODECS:
-        known, name = ", ".join(_VIDEO_CODECS), type_of(kind).rpartition("/")[2]
+        known, name = ", ".join(_VIDEO_CODECS), KINDS[kind].type_name.rpartition("/")[2]
         raise Refused(f"{name} supports the codecs {known}, but this video is {codec}")
     if sidecar.body != "packet" and not sidecar.layout.is_shown:
         raise Refused(

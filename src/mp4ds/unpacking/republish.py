@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -21,7 +21,6 @@ from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.wire import Slots, WireError
 from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import (
-    VIDEO_KINDS,
     Frames,
     Given,
     ImageForm,
@@ -30,33 +29,10 @@ from mp4ds.unpacking.pictures import (
     holds_files,
     is_inverse_depth,
 )
-from mp4ds.unpacking.types import Types, type_of
+from mp4ds.unpacking.types import FAMILIES, KINDS, Types
 from mp4ds.video.packets import PacketReader
 
-KINDS = ("raw", "jpeg", "png", "compressed-video", "ffmpeg")
-"""What images can be converted to."""
-
-_SUFFIXES = {
-    "jpeg": "compressed",
-    "png": "compressed",
-    "compressed-video": "compressed_video",
-    "ffmpeg": "ffmpeg",
-}
 _TRANSPORTS = ("compressed", "compressedDepth", "ffmpeg", "foxglove", "compressed_video")
-_FAMILIES = {
-    "Image": "raw",
-    "RawImage": "raw",
-    "CompressedImage": "file",
-    "CompressedVideo": "video",
-    "FFMPEGPacket": "video",
-}
-_FAMILY_OF_KIND = {
-    "raw": "raw",
-    "jpeg": "file",
-    "png": "file",
-    "compressed-video": "video",
-    "ffmpeg": "video",
-}
 
 
 def republished_topic(topic: str, type_name: str, kind: str) -> str:
@@ -67,11 +43,11 @@ def republished_topic(topic: str, type_name: str, kind: str) -> str:
         type_name: Of its messages, which must be a camera's.
         kind: One of `KINDS`.
     """
-    family = _FAMILIES[type_name.replace(".", "/").rpartition("/")[2]]
+    family = FAMILIES[type_name.replace(".", "/").rpartition("/")[2]]
     stem, _, last = topic.rpartition("/")
     has_transport = family != "raw" and last in _TRANSPORTS and stem != ""
-    suffix = _SUFFIXES.get(kind)
-    if family == _FAMILY_OF_KIND[kind] and not (has_transport and last != suffix):
+    suffix = KINDS[kind].suffix
+    if family == KINDS[kind].family and not (has_transport and last != suffix):
         return topic
     if not has_transport:
         stem = topic
@@ -80,22 +56,11 @@ def republished_topic(topic: str, type_name: str, kind: str) -> str:
     return f"{stem}/{suffix}"
 
 
-class FreeTopics:
-    """Gives each republished topic a unique name.
-
-    Args:
-        taken: Existing topics.
-    """
-
-    def __init__(self, taken: Iterable[str]) -> None:
-        self._taken = set(taken)
-
-    def take(self, topic: str, kind: str) -> str:
-        """The topic, or one made from it and its kind, one of `KINDS`, where it is taken."""
-        while topic in self._taken:
-            topic += "_" + kind.replace("-", "_")
-        self._taken.add(topic)
-        return topic
+def free_topic(topic: str, kind: str, taken: Collection[str]) -> str:
+    """A topic, or one made from it and its kind, one of `KINDS`, where it is taken."""
+    while topic in taken:
+        topic += "_" + kind.replace("-", "_")
+    return topic
 
 
 # ---------------------------------------------------------------- calibrations
@@ -125,13 +90,6 @@ def resized(
 
 _NOT_DECODED = "its picture cannot be decoded"
 _REFERS = "video packets depend on each other, so none can be left out; use another form"
-_ALREADY = {
-    "raw": "raw images",
-    "jpeg": "JPEG files",
-    "png": "PNG files",
-    "compressed-video": "CompressedVideo",
-    "ffmpeg": "FFMPEGPackets",
-}
 
 
 @dataclass(frozen=True)
@@ -195,7 +153,7 @@ class Republisher:
         thinned: Topics with messages left out -> how many.
 
     Raises:
-        OptionError: There is no such kind, or it cannot be reduced.
+        OptionError: Images of that kind cannot be reduced.
     """
 
     def __init__(
@@ -208,8 +166,6 @@ class Republisher:
         jpeg_quality: int,
         reduction: Reduction | None = None,
     ) -> None:
-        if kind is not None and kind not in KINDS:
-            raise OptionError(f"`images` {kind!r} is not known. Use {', '.join(KINDS)}.")
         self._reduction = reduction or Reduction()
         check_kind(kind, self._reduction)
         self._kind = kind
@@ -270,7 +226,7 @@ class Republisher:
                     frames = frames_of(stream, form)
                     return self._thinned(_Plan(stream, kind, frames, is_kept, size, not is_done))
                 if is_kept is None:
-                    raise Refused(f"they are already {_ALREADY[kind]}")
+                    raise Refused(f"they are already {KINDS[kind].noun}")
             except Refused as reason:
                 self._keep(topic, str(reason), stream.count(is_kept))
         if is_kept is not None and _refers(stream):
@@ -300,7 +256,7 @@ class Republisher:
         sidecar = stream.sidecar
         channel = sidecar.channel.to_record(0)
         name = channel.type_name.replace("/msg/", "/")
-        if channel.message_encoding not in ("ros1", "cdr") or name != type_of(kind):
+        if channel.message_encoding not in ("ros1", "cdr") or name != KINDS[kind].ros1_type:
             return False
         if kind == "ffmpeg":
             return channel.message_encoding == self._encoding
@@ -316,7 +272,7 @@ class Republisher:
 
     def _declare(self, dataset: Dataset, planned: list[tuple[ChannelGroup, list[_Plan]]]) -> None:
         staying = [channel for channel in dataset.channels if channel.id not in self._emptied]
-        free = FreeTopics(channel.topic for channel in staying)
+        taken = {channel.topic for channel in staying}
         next_id = 1 + max((channel.id for channel in dataset.channels), default=0)
         topics: dict[tuple[str, str], str] = {}
         for item, plans in planned:
@@ -325,7 +281,8 @@ class Republisher:
             for kind in dict.fromkeys(plan.kind for plan in plans if plan.is_moved):
                 wanted = republished_topic(recorded.topic, recorded.type_name, kind)
                 if (recorded.topic, kind) not in topics:
-                    topics[recorded.topic, kind] = free.take(wanted, kind)
+                    topics[recorded.topic, kind] = free_topic(wanted, kind, taken)
+                    taken.add(topics[recorded.topic, kind])
                 topic = topics[recorded.topic, kind]
                 types = self._types_of(self._encoding, kind)
                 made[kind] = types.channel(recorded, next_id + len(self.channels), topic)
@@ -428,7 +385,8 @@ def check_kind(kind: str | None, reduction: Reduction) -> None:
     Raises:
         OptionError: Says what to do.
     """
-    if kind in VIDEO_KINDS and (reduction.leaves_out or reduction.resize is not None):
+    is_reduced = reduction.leaves_out or reduction.resize is not None
+    if kind and KINDS[kind].family == "video" and is_reduced:
         raise OptionError(
             f"`resize`, `every` and `max_rate` cannot be combined with `images` {kind}, which "
             "copies the video. Use raw, jpeg or png."

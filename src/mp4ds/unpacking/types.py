@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.types import RosVersion, make_store, ros1_version, ros2_version, types_of
@@ -126,29 +126,71 @@ def _begun(encoding: str, slots: Slots, *, has_seq: bool = False) -> PrimitiveWr
     return writer
 
 
-# ---------------------------------------------------------------- types
+# ---------------------------------------------------------------- kinds
 
 _DISTRIBUTION = "humble"
-_TYPES = {
-    "raw": "sensor_msgs/msg/Image",
-    "jpeg": "sensor_msgs/msg/CompressedImage",
-    "png": "sensor_msgs/msg/CompressedImage",
-    "compressed-video": "foxglove_msgs/msg/CompressedVideo",
-    "ffmpeg": "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
-}
 _VIDEO = "string frame_id\nuint8[] data\nstring format\n"
-_DEFINITIONS = {  # of the non-standard types
-    ("compressed-video", "ros1"): f"time timestamp\n{_VIDEO}",
-    ("compressed-video", "cdr"): f"builtin_interfaces/Time timestamp\n{_VIDEO}",
-    ("ffmpeg", "ros1"): (
-        "Header header\nuint8[] data\nint32 img_width\nint32 img_height\nstring encoding\n"
-        "uint64 pts\nuint8 flags\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What images can be converted to.
+
+    Attributes:
+        type_name: Type of the messages, as ROS 2 spells it.
+        family: ``raw``, ``file`` or ``video``.
+        noun: What the images are, for people.
+        suffix: Last part of the topic that image_transport gives them; None if it has none.
+        definitions: Message encoding -> definition, of a type that is not standard.
+    """
+
+    type_name: str
+    family: str
+    noun: str
+    suffix: str | None
+    definitions: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def ros1_type(self) -> str:
+        """Type of the messages, as ROS 1 spells it."""
+        return self.type_name.replace("/msg/", "/")
+
+
+KINDS: Mapping[str, Kind] = {
+    "raw": Kind("sensor_msgs/msg/Image", "raw", "raw images", None),
+    "jpeg": Kind("sensor_msgs/msg/CompressedImage", "file", "JPEG files", "compressed"),
+    "png": Kind("sensor_msgs/msg/CompressedImage", "file", "PNG files", "compressed"),
+    "compressed-video": Kind(
+        "foxglove_msgs/msg/CompressedVideo",
+        "video",
+        "CompressedVideo",
+        "compressed_video",
+        {
+            "ros1": f"time timestamp\n{_VIDEO}",
+            "cdr": f"builtin_interfaces/Time timestamp\n{_VIDEO}",
+        },
     ),
-    ("ffmpeg", "cdr"): (
-        "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\n"
-        "uint8 flags\nbool is_bigendian\nuint8[] data\n"
+    "ffmpeg": Kind(
+        "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+        "video",
+        "FFMPEGPackets",
+        "ffmpeg",
+        {
+            "ros1": "Header header\nuint8[] data\nint32 img_width\nint32 img_height\n"
+            "string encoding\nuint64 pts\nuint8 flags\n",
+            "cdr": "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\n"
+            "uint64 pts\nuint8 flags\nbool is_bigendian\nuint8[] data\n",
+        },
     ),
 }
+"""Names of kinds, as users write them."""
+
+FAMILIES = {kind.type_name.rpartition("/")[2]: kind.family for kind in KINDS.values()}
+"""Last part of the name of a camera's type -> its family."""
+FAMILIES["RawImage"] = FAMILIES["Image"]  # Foxglove's
+
+# ---------------------------------------------------------------- types
+
 _WIRES = {"ros1": "ros1", "cdr": "cdr-le"}
 _HASHES = {"ros1": "md5sum", "cdr": HASH_KEY}
 _DEFINITION = "message_definition"
@@ -156,17 +198,12 @@ _REMEMBERED = "ros1:"  # begins keys that tell what a ROS 2 channel was in ROS 1
 _OF_TYPE = ("type", "md5sum", _DEFINITION)
 
 
-def type_of(kind: str) -> str:
-    """The type of images of a kind, as spelled in ROS 1."""
-    return _TYPES[kind].replace("/msg/", "/")
-
-
 class Types:
     """Channels and messages of one kind for one target.
 
     Args:
         encoding: Message encoding of the target: ``ros1`` or ``cdr``.
-        kind: One of `mp4ds.unpacking.republish.KINDS`.
+        kind: One of `KINDS`.
     """
 
     def __init__(self, encoding: str, kind: str) -> None:
@@ -225,9 +262,9 @@ class Types:
 
     def _defined(self, encoding: str) -> tuple[Schema, str]:
         """The type's definition, and its md5sum or hash."""
-        name, version = _TYPES[self._kind], self._versions[encoding]
-        text = _DEFINITIONS.get((self._kind, encoding), "")
-        schema = Schema(name, version.schema_encoding if text else "", text.encode())
+        kind, version = KINDS[self._kind], self._versions[encoding]
+        text = kind.definitions.get(encoding, "")
+        schema = Schema(kind.type_name, version.schema_encoding if text else "", text.encode())
         return _generated(schema, version)
 
     def message(
@@ -258,7 +295,7 @@ class Types:
             if self._kind == "ffmpeg":
                 return ffmpeg_message(self.encoding, slots, frame_id, fields, body, is_key)
             return video_message(self.encoding, slots, frame_id, fields.codec, body)
-        wire, name = _WIRES[self.encoding], _TYPES[self._kind]
+        wire, name = _WIRES[self.encoding], KINDS[self._kind].type_name
         return plain_message(wire, name, frame_id, fields, slots, body)
 
 

@@ -45,7 +45,8 @@ from mp4ds.records import (
 from mp4ds.unpacking.image_folders import TopicImages, image_names, topic_images
 from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
 from mp4ds.unpacking.pictures import Reduction
-from mp4ds.unpacking.republish import KINDS, Republisher, check_kind
+from mp4ds.unpacking.republish import Republisher, check_kind
+from mp4ds.unpacking.types import KINDS
 
 TARGETS = ("bag", "rosbag2", "mcap", "images")
 _SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
