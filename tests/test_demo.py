@@ -111,9 +111,9 @@ def test_the_bag_shows_the_same_scene(made: Path) -> None:
                     assert message.P.tolist() == due.p.tolist()
 
 
-def test_each_kind_is_packed_and_comes_back(made: Path, tmp_path: Path) -> None:
-    for name in KINDS:
-        dataset, again = tmp_path / f"packed_{name}", tmp_path / f"again_{name}"
-        mp4ds.pack(made / name, dataset)
-        mp4ds.unpack(dataset, output=again)
-        assert load_tool("compare").main([str(made / name), str(again)]) == 0
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("name", KINDS)
+def test_each_kind_is_packed_and_comes_back(name: str, made: Path, tmp_path: Path) -> None:
+    mp4ds.pack(made / name, tmp_path / "packed")
+    mp4ds.unpack(tmp_path / "packed", output=tmp_path / f"again_{name}")
+    assert load_tool("compare").main([str(made / name), str(tmp_path / f"again_{name}")]) == 0

@@ -25,6 +25,7 @@ from PIL import Image
 import mp4ds
 from chromium import chromium
 from coded_scenes import CODED
+from commands import call, typed
 from mp4ds.cli.evaluate import print_evaluation
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, TargetError
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
@@ -614,31 +615,22 @@ def test_where_nothing_reaches_the_target(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- command line, documents
 
 
-def run(*command: str, cwd: Path, code: int = 0) -> str:
-    bin_folder = str(Path(sys.executable).parent)
-    done = subprocess.run(
-        command, cwd=cwd, capture_output=True, text=True, timeout=WATCHDOG_S, check=False,
-        env={**os.environ, "PATH": f"{bin_folder}:{os.environ['PATH']}"},
-    )  # fmt: skip
-    assert done.returncode == code, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
-    return done.stdout + done.stderr
-
-
-def test_the_command_line(tmp_path: Path) -> None:
+def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = recording(tmp_path)
+    monkeypatch.chdir(tmp_path)
     plain = ("--codecs", "h264", "--presets", "ultrafast", "--frames", "10", "--crf", "24")
-    given = ("mp4ds", "evaluate", str(path), *plain, "--target", "psnr_y=20")
-    out = run(*given, cwd=tmp_path)
+    given = ("evaluate", path, *plain, "--target", "psnr_y=20")
+    out = call(*given).out
     assert re.search(r"h264 +ultrafast +24 ", out)
     assert "smallest: --quality crf=24 --codec h264 --preset ultrafast" in out
     assert (tmp_path / "drive_evaluation" / "index.html").is_file()
     assert out.rstrip().endswith("index.html: 1 setting tried")
-    values = json.loads(run(*given, "--json", cwd=tmp_path))
+    values = json.loads(call(*given, "--json").out)
     assert (values["tried"], values["known"]) == (0, 1)
     for wrong in (("--crf", "x"), ("--target", "x=1"), ("--codecs", "vp9")):
-        out = run(*given, *wrong, cwd=tmp_path, code=2)
-        assert out.startswith(f"mp4ds: {wrong[0]}")
+        done = call(*given, *wrong)
+        assert done.code == 2
+        assert done.err.startswith(f"mp4ds: {wrong[0]}")
 
 
 @pytest.mark.browser
@@ -666,13 +658,14 @@ def commands_in(name: str) -> list[str]:
 @needs_vmaf
 def test_the_commands_of_the_page(tmp_path: Path) -> None:
     lines = commands_in("evaluate.md")
-    assert sum(line.startswith("mp4ds evaluate ") for line in lines) == 3
+    assert sum(line.startswith("mp4ds evaluate ") for line in lines) == 2
     for line in lines:
-        run("bash", "-c", line, cwd=tmp_path)
-    (code,) = re.findall(
-        r"```python\n(.*?)```", (ROOT / "docs" / "evaluate.md").read_text(), re.DOTALL
-    )
-    assert run(sys.executable, "-c", code, cwd=tmp_path).count("av1 12 crf 24") == 2
+        done = typed(line, tmp_path)
+        assert done.code == 0, done.err
+    text = (ROOT / "docs" / "evaluate.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    out = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, text=True)
+    assert out.count("av1 12 crf 24") == 2
 
 
 @needs_vmaf
@@ -680,5 +673,6 @@ def test_the_commands_of_the_paper_are_understood(tmp_path: Path) -> None:
     lines = commands_in("paper.md")
     assert len(lines) == 3
     for line in lines:
-        out = run("bash", "-c", line, cwd=tmp_path, code=2)
-        assert re.fullmatch(r"mp4ds: drive\S+: no such file or folder. Check the path.\n", out)
+        done = typed(line, tmp_path)
+        assert done.code == 2
+        assert re.fullmatch(r"mp4ds: drive\S+: no such file or folder. Check the path.\n", done.err)
