@@ -84,7 +84,7 @@ def digest(dataset: Path) -> str:
 def main() -> None:
     """Measure and print."""
     parser = parser_of(__doc__)
-    ways = ("pass", "one", "several", "killed", "dask")
+    ways = ("pass", "one", "several", "killed")
     parser.add_argument("--frames", type=int, default=1500)
     parser.add_argument("--window", type=int, default=75, help="frames of a part")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
@@ -107,7 +107,6 @@ def main() -> None:
             "one": ("in parts, 1 process", [*in_parts, "1"], 0),
             "several": (f"in parts, {chosen.jobs} processes", several, 0),
             "killed": ("the same, killed at half of the parts and resumed", several, half),
-            "dask": (f"Dask, {chosen.jobs} workers", [*several, "--cluster", "local"], 0),
         }
         header = ("packed", "clock s", "CPU s, all", "peak of all, MB", "videos")
         print_table(header, rows(source, [told[way] for way in chosen.only]))

@@ -6,20 +6,16 @@ import os
 import re
 import signal
 import socket
-import ssl
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, as_completed, wait
-from contextlib import suppress
+from concurrent.futures import Executor, as_completed
 from importlib import import_module
 from pathlib import Path
 
 import dask
-import psutil
 import pytest
-from distributed import Security
 
 import cluster_tasks
 from clusters import WITH_NANNY, RealCluster, Relay
@@ -259,8 +255,7 @@ def test_other_addresses_are_refused(address: str) -> None:
 
 @pytest.mark.parametrize(
     ("address", "module", "package"),
-    [("tcp://127.0.0.1:1", "distributed", "distributed"), ("local", "distributed", "distributed")]
-    + [("local", "cryptography", "cryptography")]
+    [("tcp://127.0.0.1:1", "distributed", "distributed")]
     + [(system, "dask_jobqueue", "dask-jobqueue") for system in access.BATCH_SYSTEMS],
 )
 def test_a_missing_package_is_named(
@@ -325,55 +320,6 @@ def is_alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return True
-
-
-def test_a_cluster_on_this_machine(tmp_path: Path) -> None:
-    executor = ClusterExecutor("local", 4)
-    assert not errors(executor, cluster_tasks.write, tmp_path, *numbered(4))
-    workers = {int(path.suffix.removeprefix(".by-")) for path in started(tmp_path)}
-    assert os.getpid() not in workers
-    until(lambda: not any(map(is_alive, workers)))
-
-
-def heard(port: int, said: bytes, context: ssl.SSLContext | None) -> bytes:
-    """What a stranger gets from a port: nothing where it is not let in."""
-    with (
-        suppress(OSError),
-        socket.create_connection(("127.0.0.1", port), 20) as plain,
-        context.wrap_socket(plain) if context else plain as made,
-    ):
-        made.sendall(said)
-        return made.recv(100)
-    return b""
-
-
-def test_strangers_do_not_reach_a_cluster_on_this_machine() -> None:
-    def listening() -> set[tuple[str, int]]:
-        family = [psutil.Process(), *psutil.Process().children(recursive=True)]
-        sockets = [each for process in family for each in process.net_connections("inet")]
-        return {tuple(each.laddr) for each in sockets if each.status == psutil.CONN_LISTEN}
-
-    stranger = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    stranger.check_hostname, stranger.verify_mode = False, ssl.CERT_NONE
-    other = Security.temporary().get_connection_args("client")["ssl_context"]
-    other.check_hostname, other.verify_mode = False, ssl.CERT_NONE
-    before = listening()
-    with ClusterExecutor("local", 2) as executor:
-        calls = [executor.submit(time.sleep, 1) for _ in range(2)]  # on one worker each
-        assert executor.submit(os.getpid).result() != os.getpid()
-        wait(calls)
-        found = listening() - before
-        assert found
-        assert {host for host, _ in found} == {"127.0.0.1"}
-        pages = ("", "status", "info/main/workers.html", "json/counts.json", "metrics")
-        closed = 0
-        for _, port in found:
-            got = {heard(port, f"GET /{page} HTTP/1.0\r\n\r\n".encode(), None) for page in pages}
-            if not all(answer.startswith(b"HTTP/1.1 404") for answer in got):
-                assert all(not answer or answer.startswith(b"\x15\x03") for answer in got)  # alert
-                assert {heard(port, b"\x00", context) for context in (stranger, other)} == {b""}
-                closed += 1
-        assert closed >= 3  # the scheduler and two workers
 
 
 # ---------------------------------------------------------------- batch systems

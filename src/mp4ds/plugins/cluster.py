@@ -1,4 +1,4 @@
-"""An executor whose calls run on Dask workers: of a cluster, batch jobs, or this machine."""
+"""An executor whose calls run on Dask workers: of a cluster, or of batch jobs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from urllib.parse import urlsplit
 
@@ -24,7 +23,7 @@ from mp4ds.packing.processes import CallError, call_error, release_memory
 
 if TYPE_CHECKING:
     from dask_jobqueue import JobQueueCluster
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -173,8 +172,6 @@ def _line(error: Exception) -> str:
 
 # ---------------------------------------------------------------- access
 
-LOCAL = "local"
-_LOOPBACK = "127.0.0.1"
 _SCHEMES = ("tcp", "tls")
 _CONNECT_SECONDS = 15.0
 _CONNECT_POLL_SECONDS = 0.1
@@ -273,13 +270,12 @@ def check_address(address: str) -> None:
     Raises:
         OptionError: Says what is wrong.
     """
-    if address not in (LOCAL, *BATCH_SYSTEMS) and not _is_of_scheduler(address):
+    if address not in BATCH_SYSTEMS and not _is_of_scheduler(address):
         raise OptionError(
             f"`cluster` {address!r} is neither tcp://HOST:PORT or tls://HOST:PORT of a Dask "
-            f"scheduler nor one of {', '.join(BATCH_SYSTEMS)}, {LOCAL}."
+            f"scheduler nor one of {', '.join(BATCH_SYSTEMS)}."
         )
-    needed = {LOCAL: "cryptography"} | dict.fromkeys(BATCH_SYSTEMS, "dask_jobqueue")
-    for name in filter(None, ("distributed", needed.get(address))):
+    for name in ("distributed", "dask_jobqueue")[: 1 + (address in BATCH_SYSTEMS)]:
         if find_spec(name) is None:
             raise OptionError(
                 f"`cluster` {address} needs {name.replace('_', '-')}, which is not installed. "
@@ -319,8 +315,6 @@ def _opened(address: str, tasks: int) -> Iterator[tuple[Client, Watch]]:
         refill = None
         if is_batch:
             place, refill = stack.enter_context(batch_cluster(address, tasks))
-        elif address == LOCAL:
-            place = stack.enter_context(_local_cluster(tasks))
         else:
             _check_scheduler(address)
         try:
@@ -374,38 +368,6 @@ def _unreachable(address: str, error: Exception) -> ClusterError:
         "Check the address, that `dask scheduler` is running there, and that no firewall "
         "blocks it.",
     )
-
-
-@contextmanager
-def _local_cluster(tasks: int) -> Iterator[LocalCluster]:
-    """Workers for this user only: connecting requires a certificate that is only in memory.
-
-    Dask also listens for HTTP, whatever the settings: on loopback, with nothing to see.
-    """
-    import dask
-    from dask.system import CPU_COUNT
-    from distributed import LocalCluster, Security
-
-    no_pages: dict[str, list[str]] = {
-        "distributed.scheduler.http.routes": [],
-        "distributed.worker.http.routes": [],
-    }
-    with (
-        dask.config.set(no_pages),  # workers get it when they start
-        TemporaryDirectory(prefix="mp4ds-") as folder,
-        LocalCluster(
-            n_workers=min(tasks, CPU_COUNT),
-            threads_per_worker=1,
-            host=_LOOPBACK,
-            security=Security.temporary(),
-            dashboard_address=None,
-            scheduler_kwargs={"dashboard_address": f"{_LOOPBACK}:0"},
-            worker_dashboard_address=f"{_LOOPBACK}:0",
-            local_directory=folder,
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-    ):
-        yield cluster
 
 
 def _patience(seconds: float) -> float:
@@ -466,8 +428,7 @@ class ClusterExecutor(Executor):
     Args:
         address: ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` of a scheduler, which is left as it
             is; ``slurm``, ``pbs``, ``sge``, ``lsf``, ``htcondor`` or ``oar`` for jobs of that
-            batch system, as dask-jobqueue is configured, which are ended after the last call;
-            ``local`` for workers on this machine.
+            batch system, as dask-jobqueue is configured, which are ended after the last call.
         calls: Maximum number of parallel calls.
 
     Raises:
