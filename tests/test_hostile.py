@@ -40,26 +40,6 @@ WIDTH, HEIGHT, FRAMES = 64, 48, 8
 MAX_MEMORY = 1000 * 2**20
 BAD_DOCUMENT = {"schema-invalid", "model-invalid"}
 COLUMNS = ("log_time", "stamp", "seq")
-NAMES = {
-    "parent": "../x.mp4",
-    "absolute": "/etc/passwd",
-    "subfolder": "a/b.mp4",
-    "windows": "C:\\x",
-    "backslash": "..\\x.mp4",
-    "empty": "",
-    "dot": ".",
-    "dots": "..",
-    "line-feed": "x.mp4\n",
-    "nul": "x.mp4\0",
-    "fullwidth-dots": "\uff0e\uff0e/x.mp4",
-    "one-dot-leader": "\u2024\u2024",
-    "zero-width": "x\u200b.mp4",
-    "right-to-left": "x\u202e4pm.",
-    "option": "-x.mp4",
-    "pattern": "%00d.mp4",
-    "protocol": "http:x.mp4",
-    "long": "x" * 129,
-}
 
 
 @pytest.fixture(scope="module")
@@ -205,23 +185,6 @@ def test_the_good_ones_are_accepted(pair: Path, dataset: Path, jail: Jail) -> No
 # ---------------------------------------------------------------- names of files
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_video_outside_of_the_folder_is_refused(name: str, pair: Path, jail: Jail) -> None:
-    changed(pair, put("video", "file", value=NAMES[name]))
-    refused(jail, pair, *BAD_DOCUMENT)
-
-
-@pytest.mark.one_in(3)
-@pytest.mark.parametrize(
-    "name", ["parent", "absolute", "empty", "dot", "line-feed", "fullwidth-dots"]
-)
-@pytest.mark.parametrize("key", ["sidecar", "video", "files"])
-def test_a_manifest_names_plain_files_only(key: str, name: str, dataset: Path, jail: Jail) -> None:
-    place = ("files", 0, "name") if key == "files" else ("streams", 0, key)
-    changed(dataset / "dataset.yaml", put(*place, value=NAMES[name]))
-    refused(jail, dataset, *BAD_DOCUMENT)
-
-
 def test_no_file_outside_is_touched(dataset: Path, tmp_path: Path, jail: Jail) -> None:
     outside = shutil.copy(dataset / f"{STEM}.mp4", tmp_path / "x.mp4")
     os.utime(outside, (1, 1))
@@ -295,43 +258,24 @@ def test_what_is_no_regular_file(name: str, kind: str, dataset: Path, jail: Jail
 # ---------------------------------------------------------------- YAML
 
 TEXTS: dict[str, bytes] = {
-    "empty": b"",
-    "nul": b"\0",
-    "no-map": b"- 1\n",
-    "scalar": b"hello\n",
-    "not-utf8": b"a: \xe4\n",
-    "utf16": "a: 1\n".encode("utf-16"),
     "laughs": b'a: &a ["lol"]\n'
     + b"".join(
         b"%c: &%c [%s]\n" % (98 + i, 98 + i, b",".join([b"*%c" % (97 + i)] * 9)) for i in range(9)
     ),
     "alias-of-itself": b"a: &a [*a]\n",
-    "anchor-alone": b"a: &a 1\n",
     "brackets": b"a: " + b"[" * 100_000,
     "closed-brackets": b"a: " + b"[" * 100_000 + b"]" * 100_000,
     "braces": b"{a: " * 100_000,
     "dashes": b"- " * 100_000,
     "questions": b"? " * 100_000,
     "indents": b"\n".join(b" " * n + b"a:" for n in range(1500)),
-    "two-documents": b"a: 1\n---\na: 2\n",
     "python-object": b'a: !!python/object/apply:os.system ["touch pwned"]\n',
-    "own-tag": b"a: !x 1\n",
-    "core-tag": b'a: !!int "8"\n',
-    "key-twice": b"a: 1\na: 2\n",
-    "key-twice-below": b"a: {b: 1, b: 1}\n",
-    "key-number": b"5: 1\n",
-    "key-null": b"~: 1\n",
-    "key-list": b"[1]: 1\n",
-    "key-map": b"? {a: 1}\n: 1\n",
     "lone-surrogate": b'a: "\\ud800"\n',
-    "infinite": b"a: 1e999\n",
-    "digits": b"a: 1" + b"0" * 5000 + b"\n",
     "many-digits": b"a: 1" + b"0" * 10_000_000 + b"\n",
     "structure": b"a: [" + b"x" * (17 * 2**20) + b"]\n",
 }
 
 
-@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", TEXTS)
 @pytest.mark.parametrize("to", ["sidecar", "manifest"])
 def test_yaml_beyond_the_subset(to: str, name: str, dataset: Path, jail: Jail) -> None:
@@ -340,40 +284,6 @@ def test_yaml_beyond_the_subset(to: str, name: str, dataset: Path, jail: Jail) -
     path.write_bytes(head + TEXTS[name])
     refused(jail, path if to == "sidecar" else dataset, "yaml-invalid")
     assert not list(dataset.glob("pwned"))
-
-
-VALUES: dict[str, bytes] = {
-    "date": b"2024-01-01",
-    "time": b"12:30:00",
-    "hexadecimal": b"0x8",
-    "octal": b"010",
-    "underscore": b"1_000",
-    "yes": b"yes",
-    "True": b"True",
-    "true": b"true",
-    "nan": b".nan",
-    "inf": b".inf",
-    "quoted": b'"8"',
-    "float": b"8.0",
-    "huge": b"1" + b"0" * 4000,
-    "null": b"null",
-    "list": b"[8]",
-    "map": b"{a: 8}",
-    "merge": b"8\n<<: {a: 1}",
-    "unknown-key": b"8\nfancy: 1",
-}
-
-
-@pytest.mark.parametrize("name", VALUES)
-def test_what_is_no_integer(name: str, pair: Path, jail: Jail) -> None:
-    edited(pair, b"frames: 8", b"frames: " + VALUES[name])
-    refused(jail, pair, *BAD_DOCUMENT)
-
-
-@pytest.mark.parametrize("value", [b".nan", b".inf", b"-.inf", b"nan", b'"0.0"', b"true", b"[]"])
-def test_a_calibration_has_finite_numbers(value: bytes, pair: Path, jail: Jail) -> None:
-    edited(pair, b"0.0,", value + b",")
-    refused(jail, pair, *BAD_DOCUMENT)
 
 
 def test_a_sidecar_larger_than_any(pair: Path, jail: Jail) -> None:
@@ -390,12 +300,6 @@ def test_many_unknown_keys(pair: Path, jail: Jail) -> None:
     edited(pair, b"frames: 8", b"frames: 8" + b"".join(b"\nk%d: 1" % n for n in range(20_000)))
     text = refused(jail, pair, *BAD_DOCUMENT)
     assert len(text) < 10_000
-
-
-def test_many_headers(pair: Path, jail: Jail) -> None:
-    # a writer stores messages verbatim before it comes to 257 different headers
-    changed(pair, put("headers", value=[{"frame_id": "cam"}] * 1000))
-    refused(jail, pair, *BAD_DOCUMENT)
 
 
 # ---------------------------------------------------------------- versions
@@ -421,39 +325,6 @@ def test_what_is_no_version(version: bytes, pair: Path, jail: Jail) -> None:
     refused(jail, pair, "version-unsupported")
 
 
-def test_no_version(pair: Path, jail: Jail) -> None:
-    changed(pair, drop("mp4ds"))
-    refused(jail, pair, "version-unsupported")
-
-
-def newer(document: Document) -> None:
-    document["mp4ds"] = "1.7"
-    document["fancy"] = {"a": [1, {"b": None}]}
-    document["video"]["sparkle"] = 7
-    document["headers"][0]["glitter"] = "x"
-    document["camera_info"]["calibrations"][0]["channel"] = {}
-    document["channel"]["schema"]["language"] = "en"
-
-
-def test_a_newer_minor_version_is_read_with_a_warning(pair: Path, jail: Jail) -> None:
-    before = load(pair)
-    changed(pair, newer)
-    with pytest.warns(UserWarning, match=r"1\.7.*video\.sparkle") as caught:
-        (stream,) = mp4ds.open(pair)
-    assert len(caught) == 1
-    assert len(list(stream)) == before["frames"]
-    outcome = jail.validate(pair)
-    bounded(outcome)
-    assert not outcome.error, outcome.text
-    assert outcome.problems == []
-    assert outcome.warned
-
-
-def test_a_newer_minor_version_may_not_break_the_rest(pair: Path, jail: Jail) -> None:
-    changed(pair, both(newer, put("frames", value=-1)))
-    refused(jail, pair, *BAD_DOCUMENT)
-
-
 def test_a_newer_minor_version_with_many_keys(pair: Path, jail: Jail) -> None:
     keys = b"".join(b"\nk%d: 1" % n for n in range(20_000))
     edited(pair, b'mp4ds: "1.1"', b'mp4ds: "1.7"' + keys)
@@ -461,17 +332,6 @@ def test_a_newer_minor_version_with_many_keys(pair: Path, jail: Jail) -> None:
     bounded(outcome)
     assert not outcome.error, outcome.text
     assert sum(map(len, outcome.warned)) < 10_000
-
-
-def test_unknown_keys_of_this_version_are_refused(pair: Path, jail: Jail) -> None:
-    changed(pair, both(newer, put("mp4ds", value="1.0")))
-    refused(jail, pair, *BAD_DOCUMENT)
-
-
-@pytest.mark.parametrize("kind", [b"dataset", b"torrent", b"5", b"null", b"[]", b"{}", b"true"])
-def test_another_kind(kind: bytes, pair: Path, jail: Jail) -> None:
-    edited(pair, b"kind: stream", b"kind: " + kind)
-    refused(jail, pair, "kind-unknown", "model-invalid")
 
 
 VERSION_0 = """\
@@ -489,23 +349,11 @@ img_timestamp: [1.5, 2.5]
     [
         ("[1.5, 2.5]", '["1/0"]'),
         ("[1.5, 2.5]", '["1e99999999"]'),
-        ("[1.5, 2.5]", "[1e308]"),
-        ("[1.5, 2.5]", "[.nan]"),
-        ("[1.5, 2.5]", "[]"),
         ("[1.5, 2.5]", "[[1]]"),
-        ("[1.5, 2.5]", "[null]"),
-        ("[1.5, 2.5]", "5"),
         ("[1.5, 2.5]", "{a: 1}"),
-        ("[/info, /image]", "/image"),
-        ("[/info, /image]", "[/a, /b, /c]"),
         ("width: 64", "width: 1e999999999"),
-        ("width: 64", "width: 1e308"),
-        ("width: 64", "width: -1"),
         ("width: 64", "width: {}"),
-        ("D: [0.1]", "D: [nan]"),
         ("D: [0.1]", "D: [[1]]"),
-        ("D: [0.1]", "D: 5"),
-        ("bagname: x.bag", "extra: 1"),
     ],
 )
 def test_a_hostile_version_0(old: str, new: str, pair: Path, jail: Jail) -> None:
@@ -521,9 +369,6 @@ GEOMETRY: dict[str, tuple[Change, set[str]]] = {
         both(*(put("image", key, value=10**9) for key in ("width", "height", "step"))),
         BAD_DOCUMENT,
     ),
-    "step": (put("image", "step", value=2**32 - 1), BAD_DOCUMENT),
-    "step-beyond": (put("image", "step", value=2**32), BAD_DOCUMENT),
-    "height": (put("image", "height", value=16384), BAD_DOCUMENT),
     "largest": (
         both(*(put("image", key, value=16384) for key in ("width", "height", "step"))),
         BAD_DOCUMENT,
@@ -535,18 +380,8 @@ GEOMETRY: dict[str, tuple[Change, set[str]]] = {
         ),
         {"geometry-mismatch"},
     ),
-    "zero": (put("image", "width", value=0), BAD_DOCUMENT),
-    "negative": (put("image", "height", value=-48), BAD_DOCUMENT),
-    "step-short": (put("image", "step", value=63), BAD_DOCUMENT),
-    "smaller-video": (put("video", "width", value=63), BAD_DOCUMENT),
-    "other-video": (put("video", "width", value=128), {"geometry-mismatch"}),
     "frames-most": (claiming(MAX_FRAMES), {"frame-count"}),
-    "frames-beyond": (claiming(MAX_FRAMES + 1), BAD_DOCUMENT),
     "frames-2**62": (claiming(2**62), BAD_DOCUMENT),
-    "frames-none": (put("frames", value=0), BAD_DOCUMENT),
-    "frames-negative": (put("frames", value=-8), BAD_DOCUMENT),
-    "no-headers": (put("headers", value=[]), BAD_DOCUMENT),
-    "infos-beyond": (put("camera_info", "messages", value=MAX_CAMERA_INFOS + 1), BAD_DOCUMENT),
 }
 
 
@@ -579,36 +414,13 @@ def test_millions_of_camera_infos_in_a_few_bytes(pair: Path, jail: Jail) -> None
 
 WHOLE = f"0*{FRAMES - 1}"
 RESIDUALS: dict[str, str] = {
-    "short": f"0*{FRAMES - 2}",
-    "long": f"0*{FRAMES}",
-    "few": "0 0 0",
-    "none": "",
-    "letters": "x",
-    "float": "1.5 " * (FRAMES - 1),
-    "exponent": "1e3 " * (FRAMES - 1),
-    "hexadecimal": "0x1 " * (FRAMES - 1),
-    "sign-alone": "- " * (FRAMES - 1),
-    "signs": "--1 " * (FRAMES - 1),
-    "sign-inside": "1-1 " * (FRAMES - 1),
-    "comma": "0,0,0,0,0,0,0",
-    "nul": "0\0" * (FRAMES - 1),
-    "arabic-digits": "\u0661 " * (FRAMES - 1),
-    "beyond-64-bits": "9" * 30 + " 0" * (FRAMES - 2),
-    "saturated": f"{2**63} " + "0 " * (FRAMES - 2),
     "run-beyond": "0*" + "9" * 30,
     "run-of-digits": "0*" + "9" * 5000,
-    "run-value-beyond": "9" * 5000 + "*7",
-    "run-negative": "0*-1",
-    "run-of-none": f"0*0 {WHOLE}",
     "many-runs-of-none": "0*0 " * 100_000 + WHOLE,
-    "run-empty": "*7",
-    "run-of-run": "0*1*7",
-    "two-stars": "0**7",
     "unlimited-spaces": "0 " + " " * 2**17 + "*",
 }
 
 
-@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", RESIDUALS)
 def test_columns_that_do_not_decode(name: str, pair: Path, jail: Jail) -> None:
     changed(pair, put("columns", "stamp", "values", value=RESIDUALS[name]))
@@ -617,10 +429,6 @@ def test_columns_that_do_not_decode(name: str, pair: Path, jail: Jail) -> None:
 
 
 COLUMN_CHANGES: dict[str, tuple[Change, set[str]]] = {
-    "start-beyond": (put("columns", "stamp", "start", value=2**63), BAD_DOCUMENT),
-    "step-beyond": (put("columns", "stamp", "step", value=-(2**63) - 1), BAD_DOCUMENT),
-    "start-float": (put("columns", "stamp", "start", value=1.0), BAD_DOCUMENT),
-    "start-true": (put("columns", "stamp", "start", value=True), BAD_DOCUMENT),
     "stamp-negative": (put("columns", "stamp", "start", value=-1), {"column-invalid"}),
     "stamp-beyond": (put("columns", "stamp", "start", value=2**62), {"column-invalid"}),
     "seq-negative": (put("columns", "seq", "start", value=-1), {"column-invalid"}),
@@ -637,15 +445,8 @@ COLUMN_CHANGES: dict[str, tuple[Change, set[str]]] = {
         put("columns", "ordinal", value=column(0, 2**62, WHOLE)),
         {"column-invalid"},
     ),
-    "digests-short": (put("digests", "values", value="00" * 8 * (FRAMES - 1)), {"column-invalid"}),
-    "digests-odd": (put("digests", "values", value="0" * 15), {"column-invalid"}),
-    "digests-junk": (put("digests", "values", value="zz" * 8 * FRAMES), {"column-invalid"}),
     "digests-wrong": (put("digests", "values", value="00" * 8 * FRAMES), {"digest-mismatch"}),
-    "digests-none": (drop("digests"), BAD_DOCUMENT),
-    "digests-other": (put("digests", "algorithm", value="md5"), BAD_DOCUMENT),
-    "no-stamp": (drop("columns", "stamp"), BAD_DOCUMENT),
     "template-no-base64": (put("headers", 0, "template", value="A"), {"header-mismatch"}),
-    "template-other-letters": (put("headers", 0, "template", value="!!!!"), BAD_DOCUMENT),
     "template-short": (put("headers", 0, "template", value="AAAA"), {"header-mismatch"}),
     "template-empty": (put("headers", 0, "template", value=""), {"header-mismatch"}),
     "template-long": (put("headers", 0, "template", value="AAAA" * 2**15), {"header-mismatch"}),
@@ -670,24 +471,12 @@ COLUMN_CHANGES: dict[str, tuple[Change, set[str]]] = {
         put("camera_info", "columns", "seq", "start", value=2**32),
         {"column-invalid"},
     ),
-    "info-matrix": (put("camera_info", "calibrations", 0, "k", value=[0.0] * 8), BAD_DOCUMENT),
-    "wire-unknown": (put("wire", value="x"), BAD_DOCUMENT),
     "wire-other": (put("wire", value="cdr-le"), {"digest-mismatch", "model-invalid"}),
     "schema-no-base64": (
         put("channel", "schema", value={"name": "a", "encoding": "b", "base64": "A"}),
         {"model-invalid", "header-mismatch", "stream-invalid"},
     ),
-    "schema-both": (put("channel", "schema", "base64", value="AAAA"), BAD_DOCUMENT),
-    "layout-unknown": (put("video", "layout", value="x"), BAD_DOCUMENT),
-    "layout-of-another-encoding": (put("video", "layout", value="rgb24"), BAD_DOCUMENT),
-    "encoding-unknown": (put("image", "encoding", value="rgb9"), BAD_DOCUMENT),
-    "encoding-of-another-layout": (put("image", "encoding", value="mono16"), BAD_DOCUMENT),
     "codec-other": (put("video", "codec", value="av1"), {"codec-mismatch"}),
-    "codec-unknown": (put("video", "codec", value="x"), {"codec-mismatch", *BAD_DOCUMENT}),
-    "pixel-format-unknown": (
-        put("video", "pixel_format", value="x"),
-        {"codec-mismatch", *BAD_DOCUMENT},
-    ),
 }
 
 
@@ -1024,22 +813,14 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
             ("filters", "filters", "magic"),
             ("filters-none", "filters", ""),
             ("filters-long", "filters", "sub " * 2**20),
-            ("level", "level", 10),
             ("level-0", "level", 0),
-            ("strategy", "strategy", 5),
             ("strategy-fixed", "strategy", 4),
-            ("memory", "memory_level", 10),
             ("memory-1", "memory_level", 1),
-            ("window", "window_bits", 16),
-            ("window-raw", "window_bits", -15),
-            ("header", "zlib_header", "xxxx"),
             ("header-other", "zlib_header", "ffff"),
             ("chunks-1", "chunk_bytes", 1),
             ("chunks-256", "chunk_bytes", 256),
-            ("chunks-beyond", "chunk_bytes", 2**40),
             ("before", "before", "A" * 4 * 2**20),
             ("before-broken", "before", "A"),
-            ("before-padding", "before", "AA=A"),
             ("after", "after", ""),
             ("after-long", "after", "A" * 4 * 2**20),
         ]
@@ -1115,42 +896,13 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     "packets-of-floats": ("jpeg", both(image_of("64FC4", 32), layout("bytes")), BAD),
     "packets-without-a-layout": ("jpeg", layout("planar422"), BAD_DOCUMENT),
     # parameters
-    **{
-        f"bits-{name}": ("bits", layout("gbr_bits", **parameters), BAD_DOCUMENT)
-        for name, parameters in {
-            "0": {"bits": 0, "shift": 4},
-            "negative": {"bits": -12, "shift": 4},
-            "13": {"bits": 13, "shift": 3},
-            "17": {"bits": 17, "shift": 0},
-            "2**40": {"bits": 2**40, "shift": 4},
-            "shift-beyond": {"bits": 12, "shift": 5},
-            "shift-2**40": {"bits": 12, "shift": 2**40},
-            "shift-negative": {"bits": 12, "shift": -1},
-            "none": {"bits": None, "shift": None},
-            "float": {"bits": 12.0, "shift": 4},
-            "text": {"bits": "12", "shift": 4},
-            "alone": {"bits": 12},
-            "with-a-table": {"bits": 12, "shift": 4, "table": [1]},
-            "unknown": {"bits": 12, "shift": 4, "gain": 2},
-        }.items()
-    },
     "bits-fewer": ("bits", layout("gbr_bits", bits=10, shift=4), {"codec-mismatch"}),
     "bits-shifted": ("bits", layout("gbr_bits", bits=12, shift=3), {"digest-mismatch"}),
     **{
         f"table-{name}": ("table", layout("table", table=table), BAD_DOCUMENT)
         for name, table in {
-            "empty": [],
-            "falling": [3, 2, 1],
-            "repeating": [5, 5],
-            "negative": [-1, 5],
-            "beyond": [0, 2**16],
             "beyond-64-bits": [0, 2**64],
-            "floats": [0.0, 1.0],
-            "text": ["0", "1"],
             "nested": [[0]],
-            "nothing": None,
-            "map": {"0": 1},
-            "large": list(range(4097)),
             "huge": list(range(60_000)),
         }.items()
     },
@@ -1160,13 +912,8 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     **{
         f"metres-{name}": ("metres", put("video", "parameters", value=value), BAD_YAML)
         for name, value in {
-            "hole-beyond": {"hole": 2**32, "scale": "product"},
-            "hole-negative": {"hole": -1, "scale": "product"},
             "hole-nan": {"hole": float("nan"), "scale": "product"},
-            "scale": {"hole": 0, "scale": "inches"},
-            "scale-empty": {"hole": 0, "scale": ""},
             "scale-long": {"hole": 0, "scale": "x" * 2**20},
-            "none": {},
         }.items()
     },
     "metres-hole": (
@@ -1238,36 +985,6 @@ def test_a_forged_sidecar_of_coded_pictures(
 
 
 # ---------------------------------------------------------------- manifests
-
-MANIFESTS: dict[str, tuple[Change, set[str]]] = {
-    "kind": (put("kind", value="stream"), {"kind-unknown", "model-invalid"}),
-    "format": (put("format", value="zip"), BAD_DOCUMENT),
-    "messages-beyond": (put("messages", value=2**63), BAD_DOCUMENT),
-    "messages-negative": (put("messages", value=-1), BAD_DOCUMENT),
-    "size-beyond": (put("files", 0, "size", value=2**63), BAD_DOCUMENT),
-    "sha256-short": (put("files", 0, "sha256", value="00"), BAD_DOCUMENT),
-    "sha256-upper": (put("files", 0, "sha256", value="A" * 64), BAD_DOCUMENT),
-    "frames-beyond": (put("streams", 0, "frames", value=10**9), BAD_DOCUMENT),
-    "no-files": (drop("files"), BAD_DOCUMENT),
-    "newer-major": (put("mp4ds", value="3.1"), {"version-unsupported"}),
-}
-
-
-@pytest.mark.parametrize("name", MANIFESTS)
-def test_a_hostile_manifest(name: str, dataset: Path, jail: Jail) -> None:
-    change, codes = MANIFESTS[name]
-    changed(dataset / "dataset.yaml", change)
-    refused(jail, dataset, *codes)
-
-
-def test_a_stream_that_is_listed_twice(dataset: Path, jail: Jail) -> None:
-    def twice(manifest: Document) -> None:
-        manifest["streams"] *= 2
-
-    changed(dataset / "dataset.yaml", twice)
-    refused(
-        jail, dataset, "messages-missing", "message-count", "manifest-inconsistent", "model-invalid"
-    )
 
 
 @pytest.mark.parametrize(
@@ -1353,18 +1070,4 @@ def test_no_change_of_a_value_raises_anything_foreign(name: str, seed: int, data
         mutant, what = _mutated(document, rng)
         path.write_bytes(yamlio.dump(mutant))
         found += [f"{what}: {text}" for text in _use(dataset)]
-    assert found == []
-
-
-@pytest.mark.parametrize("name", [f"{STEM}.yaml", "dataset.yaml"])
-def test_no_change_of_a_letter_raises_anything_foreign(name: str, dataset: Path) -> None:
-    path, rng = dataset / name, random.Random(7)
-    good, found = path.read_bytes(), []
-    good = good[: good.rindex(b"checksum:")]
-    for _ in range(60):
-        text = bytearray(good)
-        for _ in range(rng.randint(1, 3)):
-            text[rng.randrange(len(text))] = rng.choice(b"\n :-[]{}&*!|>'\"%@,#0x\x80\xff")
-        path.write_bytes(text)
-        found += [f"{bytes(text)!r}: {raised}" for raised in _use(dataset)]
     assert found == []

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from mp4ds.errors import OptionError
 from mp4ds.messages.arrangements import CHROMA_SHIFTS
@@ -135,24 +134,6 @@ def test_what_is_not_refused_comes_back(name: str, layout: str) -> None:
             assert refused_or_returned(fitted, other)
 
 
-@steady
-@given(st.data())
-def test_any_pixels_come_back_or_are_refused(data: st.DataObject) -> None:
-    name, layout = data.draw(st.sampled_from(PAIRS))
-    encoding = ENCODINGS[name]
-    width, height = rounded(encoding, data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9)))
-    shape = encoding.shape(width, height)
-    patterns = hnp.arrays(f"u{encoding.bytes_per_sample}", shape)
-    samples = [data.draw(patterns).view(encoding.dtype) for _ in range(2)]
-    fitted = fit(layout, encoding, samples[:1])
-    if fitted is None:
-        return
-    assert fitted.refuses(samples[0]) is None
-    for pixels in samples:
-        if fitted.refuses(pixels) is None:
-            assert bits_of(through(fitted, pixels)) == bits_of(pixels)
-
-
 @pytest.mark.parametrize("dtype", ["u2", "i2"])
 def test_every_word_comes_back(dtype: str) -> None:
     pixels = np.arange(65536, dtype=np.uint16).reshape(256, 256).view(dtype)
@@ -184,15 +165,6 @@ def test_signed_samples_keep_their_order() -> None:
     pixels = np.arange(-128, 128, dtype=np.int8).reshape(16, 16)
     (picture,) = bind("gray8", ENCODINGS["8SC1"]).to_picture(pixels)
     assert picture.ravel().tolist() == list(range(256))
-
-
-@pytest.mark.parametrize("word", [0x0000, 0x00FF, 0x0100, 0x01FF, 0x02FE, 0xFF00, 0xFFFF])
-def test_low_bytes_are_folded(word: int) -> None:
-    """A step of one never moves the low byte by more than one."""
-    fold = bind("fold", ENCODINGS["mono16"], Parameters(bits=16, shift=0, low=8))
-    (picture,) = fold.to_picture(np.array([[word]], np.uint16))
-    high, low = divmod(word, 256)
-    assert picture.tolist() == [[high], [255 - low if high % 2 else low]]
 
 
 @pytest.mark.parametrize(
@@ -524,38 +496,26 @@ def test_two_marks_of_a_hole_are_one_too_many() -> None:
     ("encoding", "layout", "parameters", "words"),
     [
         ("mono8", "gray16", {}, "does not carry mono8"),
-        ("mono8", "nonsense", {}, "does not carry mono8"),
-        ("rgb8", "bgr24", {}, "does not carry rgb8"),
         ("mono16", "gray16", {"bits": 12, "shift": 0}, "needs the parameters none"),
         ("mono16", "gray_bits", {}, "needs the parameters bits, shift"),
         ("mono16", "gray_bits", {"bits": 12}, "was given bits"),
         ("mono16", "gray_bits", {"bits": 11, "shift": 0}, "11 bits above 0"),
-        ("mono16", "gray_bits", {"bits": 16, "shift": 0}, "16 bits above 0"),
         ("mono16", "gray_bits", {"bits": 12, "shift": 5}, "12 bits above 5"),
-        ("mono16", "gray_bits", {"bits": 12, "shift": -1}, "12 bits above -1"),
-        ("mono16", "gray_bits", {"bits": 12, "shift": True}, "12 bits above True"),
         ("mono16", "gray_bits", {"bits": 12, "shift": 1.0}, "12 bits above 1.0"),
         ("mono16", "gray_bits", {"bits": 12.0, "shift": 0}, "12.0 bits"),
         ("mono16", "gray_bits", {"bits": 12, "shift": 0, "low": 3}, "was given bits, low, shift"),
         ("mono16", "fold", {"bits": 12, "shift": 0}, "needs the parameters bits, low, shift"),
-        ("mono16", "fold", {"bits": 12, "shift": 0, "low": 0}, "no layout has 0 low bits"),
         ("mono16", "fold", {"bits": 12, "shift": 0, "low": 1}, "no layout has 1 low bits of 12"),
         ("mono16", "fold", {"bits": 12, "shift": 0, "low": 9}, "no layout has 9 low bits of 12"),
-        ("mono16", "fold", {"bits": 12, "shift": 0, "low": -3}, "no layout has -3 low bits"),
         ("mono16", "fold", {"bits": 12, "shift": 0, "low": 3.0}, "no layout has 3.0 low bits"),
-        ("mono16", "fold", {"bits": 8, "shift": 0, "low": 8}, "no layout has 8 low bits of 8"),
         ("mono16", "fold", {"bits": 16, "shift": 0, "low": 5}, "no layout has 5 low bits of 16"),
         ("mono16", "fold", {"bits": 16, "shift": 1, "low": 8}, "16 bits above 1"),
         ("mono16", "palette", {}, "needs the parameters entries"),
-        ("mono16", "palette", {"entries": 0}, "a list of 0 values"),
         ("mono16", "palette", {"entries": 300}, "no power of two"),
         ("mono16", "palette", {"entries": 128}, "less than 256"),
-        ("mono16", "palette", {"entries": 8192}, "up to 4096"),
         ("mono16", "palette", {"entries": 512.0}, "a list of 512.0 values"),
-        ("32FC2", "palette", {"entries": 512}, "does not carry 32FC2"),
         ("rgba8", "opaque", {}, "needs the parameters alpha"),
         ("rgba8", "opaque", {"alpha": 256}, "an alpha of 256"),
-        ("rgba8", "opaque", {"alpha": -1}, "an alpha of -1"),
         ("8SC4", "opaque", {"alpha": 1}, "does not carry 8SC4"),
         ("mono16", "table", {"table": []}, "table of 0 values"),
         (
@@ -565,16 +525,13 @@ def test_two_marks_of_a_hole_are_one_too_many() -> None:
             f"table of {MAX_TABLE + 1} values",
         ),
         ("mono16", "table", {"table": [1, 65536]}, "beyond 0 to 65535"),
-        ("mono16", "table", {"table": [-1, 5]}, "beyond 0 to 65535"),
         ("mono16", "table", {"table": [1, 2.0]}, "beyond 0 to 65535"),
         ("mono16", "table", {"table": [1, 2, 2]}, "does not increase"),
         ("32FC1", "table", {"table": [2, 1]}, "does not increase"),
         ("32FC1", "table", {"table": [2**32]}, "beyond 0 to 4294967295"),
         ("32FC1", "metres16", {"hole": 2**32, "scale": "product"}, "no pattern of 32 bits"),
-        ("32FC1", "metres16", {"hole": -1, "scale": "product"}, "no pattern of 32 bits"),
         ("32FC1", "metres16", {"hole": 0, "scale": "sum"}, "scale 'sum'"),
         ("32FC1", "metres16", {"hole": 0}, "needs the parameters hole, scale"),
-        ("32FC2", "metres16", {"hole": 0, "scale": "product"}, "does not carry 32FC2"),
     ],
 )
 def test_layouts_that_cannot_be(

@@ -23,7 +23,7 @@ from mp4ds.format.fields import (
     document_of,
 )
 from mp4ds.format.manifest import Manifest
-from mp4ds.format.models import ChannelModel, LayoutParameters, SchemaModel, StreamSidecar
+from mp4ds.format.models import ChannelModel, LayoutParameters, StreamSidecar
 from mp4ds.format.sidecars import (
     dump_document,
     load_document,
@@ -382,16 +382,6 @@ def test_optional_keys_may_be_absent(kind: str, tmp_path: Path) -> None:
         assert document_of(load(write(tmp_path, document), kind)) == document
 
 
-@steady
-@given(st.binary(max_size=60), st.text(max_size=10), st.text(max_size=10))
-def test_any_definition_returns(data: bytes, name: str, encoding: str) -> None:
-    schema = Schema(name, encoding, data)
-    model = SchemaModel.from_record(schema)
-    assert model.to_record() == schema
-    assert (model.text is None) == (model.base64 is not None)
-    assert SchemaModel.model_validate(json.loads(model.model_dump_json())) == model
-
-
 Texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=30)
 
 
@@ -405,7 +395,7 @@ Texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=30)
 def test_any_channel_returns_through_the_file(
     topic: str, encoding: str, metadata: dict[str, str], definition: bytes | None
 ) -> None:
-    schema = None if definition is None else Schema("a/B", "ros2msg", definition)
+    schema = None if definition is None else Schema(topic, encoding, definition)
     original = Channel(3, topic, encoding, schema, metadata)
     document = stream()
     document["channel"] = document_of(ChannelModel.from_record(original))
@@ -418,8 +408,9 @@ def test_any_channel_returns_through_the_file(
 
 SIDES = [0, -1, 16385, 2**70, 1.0, "8", True, None]
 BAD_NAMES = ["", ".", "..", "../x.mp4", "/etc/passwd", "a/b.mp4", "a\\b.mp4", "C:x", ".hidden",
-             "a\0b", "a\n", "a b", "\u00e4.mp4", "-x.mp4", "_x", "x" * 129, 5,
-             None, ["a"]]  # fmt: skip
+             "a\0b", "a\n", "a b", "\u00e4.mp4", "-x.mp4", "_x", "x" * 129, "\uff0e\uff0e/x.mp4",
+             "\u2024\u2024", "x\u200b.mp4", "x\u202e4pm.", "%00d.mp4", "http:x.mp4", 5, None,
+             ["a"]]  # fmt: skip
 REFUSED: dict[str, list[tuple[str, Any]]] = {
     "stream": [
         *(("frames", value) for value in (0, -1, MAX_FRAMES + 1, 2**80, 1.0, "3", True, None, ...)),
@@ -432,7 +423,8 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *(("image.is_bigendian", value) for value in (-1, 256, True, 0.0, "0", None, ...)),
         *(("image.encoding", value) for value in ("rgba8", "", "RGB8", None, 8, ..., "mono16")),
         *(("image", value) for value in ([], None, {}, "rgb8", ...)),
-        *(("headers", value) for value in ([], {}, None, ["cam"], [{}], ...)),
+        *(("headers", value)
+          for value in ([], {}, None, ["cam"], [{}], [{"frame_id": "cam"}] * 257, ...)),
         *(
             (f"headers.0.{key}", value)
             for key in ("template", "padding")
@@ -543,6 +535,7 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *(("streams.0.sidecar", value) for value in BAD_NAMES),
         *(("streams.0.video", value) for value in BAD_NAMES),
         *(("files.0.name", value) for value in BAD_NAMES),
+        ("files.0.size", 2**63),
         *(("files.0.sha256", value) for value in ("", "b" * 63, None, ...)),
         *(("streams.0.frames", value) for value in (-1, MAX_FRAMES + 1, True, ...)),
         *(("time_range.start", value) for value in (-(2**63) - 1, 0.0, None, ...)),
@@ -642,27 +635,6 @@ def test_the_released_schema_refuses_it_too(kind: str) -> None:
         assert not validator.is_valid(edited(WHOLE[kind](), place, value)), (place, value)
 
 
-@steady
-@given(st.data())
-def test_random_damage_is_refused_in_one_sentence(data: st.DataObject) -> None:
-    kind = data.draw(st.sampled_from(list(WHOLE)))
-    document: Any = WHOLE[kind]()
-    node, places = document, []
-    while isinstance(node, (dict, list)) and node and data.draw(st.integers(0, 3)):
-        keys = list(node) if isinstance(node, dict) else [str(i) for i in range(len(node))]
-        places.append(data.draw(st.sampled_from(keys)))
-        node = node[places[-1]] if isinstance(node, dict) else node[int(places[-1])]
-    if not places:
-        return
-    junk = st.sampled_from([None, True, -1, 2**64, 0.5, "", "\0", [], {}, [[]], {"": ""}])
-    damaged = edited(document, ".".join(places), data.draw(junk))
-    model = Manifest if kind == "dataset" else StreamSidecar
-    try:
-        model.model_validate(damaged)
-    except ValueError:
-        return
-
-
 # ---------------------------------------------------------------- versions and files
 
 
@@ -684,13 +656,12 @@ def test_a_newer_minor_version_is_read_with_a_warning(kind: str, tmp_path: Path)
     assert "surprise" in str(caught[0].message)
     assert first in str(caught[0].message)
     assert document_of(model) == edited(WHOLE[kind](), "mp4ds", "1.7")
+    # what this version knows is read as strictly
+    with pytest.warns(UserWarning, match="1.7"), pytest.raises(FormatError):
+        load(write(tmp_path, edited(document, "profile", "best")), kind)
 
 
-def test_the_files_kinds_are_told_apart(tmp_path: Path) -> None:
-    with pytest.raises(FormatError):
-        load_stream(write(tmp_path, dataset()))
-    with pytest.raises(FormatError):
-        load_manifest(write(tmp_path, stream()))
+def test_an_unknown_kind_of_file(tmp_path: Path) -> None:
     with pytest.raises(FormatError) as caught:
         load_document(write(tmp_path, edited(stream(), "kind", "movie")))
     assert caught.value.code == "kind-unknown"
