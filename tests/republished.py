@@ -240,7 +240,6 @@ def halved(image: Array) -> Array:
 
 def psnr(a: Array, b: Array, peak: float = 255) -> float:
     """Of pictures, grey ones as colours."""
-    if a.ndim != b.ndim:
-        a, b = (x if x.ndim == 3 else np.repeat(x[..., None], 3, axis=2) for x in (a, b))
+    a, b = (x if x.ndim == 3 else np.repeat(x[..., None], 3, axis=2) for x in (a, b))
     error = np.mean((a[..., :3].astype(float) - b[..., :3].astype(float)) ** 2)
     return float(10 * np.log10(peak**2 / max(error, 1e-12)))

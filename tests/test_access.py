@@ -182,14 +182,6 @@ def test_a_file_that_was_cut_short_meanwhile(tmp_path: Path) -> None:
     access.close()
 
 
-@pytest.mark.parametrize("cut", [0, 40, 400])
-def test_what_is_no_video(cut: int, tmp_path: Path) -> None:
-    path = tmp_path / "v.mp4"
-    path.write_bytes(encoded_file(RECIPES["svt-8"])[:cut])
-    with pytest.raises((VideoError, UnknownStructure)):
-        opened(path, RECIPES["svt-8"])
-
-
 def test_it_counts_the_frames(tmp_path: Path) -> None:
     maker: Any = Samples()
     with pytest.raises(VideoError, match=rf"has {FRAMES} frames, not 3"):

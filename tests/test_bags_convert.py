@@ -20,7 +20,7 @@ from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.errors import ConversionError, OptionError
 from mp4ds.records import Channel, Schema
 from player_scenes import ros1_channel
-from sources import INFO, image_cdr, image_ros1, scene, typestore
+from sources import image_cdr, image_ros1, scene, typestore
 
 HEADER = "std_msgs/msg/Header"
 NO_SEQ = "messages with a header sequence number, which ROS 2 does not have"
@@ -260,18 +260,6 @@ def test_definitions_as_they_are_found() -> None:
         back = Converter("ros1" if target == "ros2" else "ros2").channel(made)
         assert back.schema
         assert normalize_msgtype(back.type_name) == normalize_msgtype(schema.name)
-
-
-def test_a_missing_definition_is_the_standard_one() -> None:
-    with_text = Converter("ros1").channel(standard("ros2"))
-    without = replace(standard("ros2"), schema=Schema(INFO, "", b""))
-    assert Converter("ros1").channel(without) == with_text
-    assert normalize_msgtype(with_text.type_name) == INFO
-
-
-def standard(world: str) -> Channel:
-    channel = ros1_channel(0, "/info", "sensor_msgs/CameraInfo", "/node")
-    return replace(Converter(world).channel(channel), metadata={})
 
 
 def test_bounds_do_not_change_payloads() -> None:

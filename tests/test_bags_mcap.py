@@ -18,7 +18,6 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
 
 from conftest import real
-from mp4ds.bags import protocols
 from mp4ds.bags.files import DamageError, unzstd
 from mp4ds.bags.mcap import McapReader, McapWriter
 from mp4ds.bags.rosbag2 import Rosbag2Reader
@@ -217,30 +216,6 @@ def test_a_channel_may_have_no_messages(tmp_path: Path) -> None:
     assert reader.first(channel) is None
 
 
-def disordered(count: int = 600) -> list[Record]:
-    channel = Channel(1, "/a", "cdr", IMAGE), Channel(2, "/b", "cdr", IMAGE)
-    order = np.random.default_rng(1).permutation(count)
-    # Near its place, and sometimes twice at the same time.
-    return [
-        Message(channel[i % 2], (i * 10 + int(order[i]) % 90) // 3, i, i, i.to_bytes(4, "little"))
-        for i in range(count)
-    ]
-
-
-def test_messages_come_in_log_time_order(tmp_path: Path) -> None:
-    written = messages(write_all(tmp_path / "a.mcap", disordered(), chunk_size=300))
-    got = messages(read(tmp_path / "a.mcap")[1])
-    assert list(map(fields, got)) == list(map(fields, sorted(written, key=lambda m: m.log_time)))
-    assert list(map(fields, got)) != list(map(fields, written))
-
-
-def test_what_is_held_back_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(protocols, "HOLD_BYTES", 40)
-    written = messages(write_all(tmp_path / "a.mcap", disordered(), chunk_size=300))
-    got = messages(read(tmp_path / "a.mcap")[1])
-    assert sorted(map(fields, got)) == sorted(map(fields, written))
-
-
 @pytest.mark.parametrize("chunked", [True, False])
 def test_without_an_index_the_file_is_read(tmp_path: Path, chunked: bool) -> None:
     path = tmp_path / "a.mcap"
@@ -292,24 +267,6 @@ def test_a_summary_that_begins_among_the_data_tells_nothing(tmp_path: Path) -> N
         messages(McapReader(path).records())
 
 
-def test_an_index_that_does_not_add_up_is_not_used(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer: Any = Writer(stream, index_types=IndexType.CHUNK)
-        writer.start()
-        channel = writer.register_channel("/a", "cdr", 0)
-        for time in (5, 3):
-            writer.add_message(channel, time, b"", time)
-        writer.finish()
-    reader = McapReader(path)
-    assert [m.log_time for m in messages(reader.records())] == [3, 5]
-    assert reader.times()[1].tolist() == [3, 5]
-    first = reader.first(reader.channels[0])
-    assert first is not None
-    assert first.log_time == 3
-    assert reader.stats() == {1: ChannelStats(2, 3, 5)}
-
-
 def test_times_past_int64_are_shortened(tmp_path: Path) -> None:
     channel = Channel(1, "/a", "cdr", None)
     write_all(
@@ -344,20 +301,6 @@ def test_a_decompressed_copy(tmp_path: Path) -> None:
     packed.write_bytes(packed.read_bytes()[:-50])
     with pytest.raises(SourceError, match=r"a.mcap.zstd: its zstd data is cut short"):
         Rosbag2Reader(packed)
-
-
-def test_compressed_payloads(tmp_path: Path) -> None:
-    channel = Channel(1, "/a", "cdr", None)
-    path = tmp_path / "a.mcap"
-    write_all(path, [Message(channel, 1, 1, 0, zstandard.compress(b"payload"))])
-    reader = McapReader(path, message_decompress=unzstd)
-    (message,) = messages(reader.records())
-    first = reader.first(message.channel)
-    assert first is not None
-    assert message.data == first.data == b"payload"
-    write_all(path, [Message(channel, 1, 1, 0, b"no zstd")])
-    with pytest.raises(SourceError, match=r"log time 1, topic /a: zstd data is damaged"):
-        list(McapReader(path, message_decompress=unzstd).records())
 
 
 @pytest.mark.parametrize(
@@ -416,36 +359,6 @@ def test_a_file_cut_short_anywhere(tmp_path: Path) -> None:
     for length in [*range(9, 200), *range(200, len(data), 9973), *range(len(data) - 60, len(data))]:
         path.write_bytes(data[:length])
         refuse(path, "mcap recover")
-
-
-def test_a_real_file_cut_short() -> None:
-    refuse(real("corrupt/truncated_a.mcap"), "mcap recover")
-
-
-@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
-def test_a_changed_byte_is_noticed(tmp_path: Path, compression: str) -> None:
-    whole = tmp_path / "a.mcap"
-    channel = Channel(1, "/a", "cdr", None)
-    write_all(
-        whole, [Message(channel, i, i, 0, bytes(50)) for i in range(9)], compression=compression
-    )
-    data = bytearray(whole.read_bytes())
-    start = chunk_data_at(data)
-    path = tmp_path / "changed.mcap"
-    for position in range(start, start + 40):
-        changed = bytearray(data)
-        changed[position] ^= 0x41
-        path.write_bytes(changed)
-        refuse(path, "damaged in its record at byte")
-
-
-def chunk_data_at(data: bytearray) -> int:
-    """Where the data of the first chunk begins."""
-    offset = 8
-    while data[offset] != 6:
-        offset += 9 + struct.unpack_from("<Q", data, offset + 1)[0]
-    length = struct.unpack_from("<I", data, offset + 9 + 28)[0]
-    return int(offset + 9 + 32 + length + 8)
 
 
 def record(opcode: int, body: bytes) -> bytes:
@@ -532,14 +445,6 @@ def test_a_huge_record_is_refused(tmp_path: Path) -> None:
     data = file_of()
     path.write_bytes(data[:-37] + struct.pack("<BQ", 5, 2**40) + data[-37:])
     refuse(path, "ends before its footer|bytes at byte")
-
-
-def test_private_records_are_counted(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    path.write_bytes(file_of(record(0x90, b"mine"), channel_record(0, "/a"), message_record(0)))
-    reader, records = read(path)
-    assert len(records) == 1
-    assert reader.skipped == {"private MCAP records (opcode 0x90)": 1}
 
 
 # Writing ----------------------------------------------------------------------------------

@@ -127,44 +127,9 @@ def test_real_recordings(name: str) -> None:
     check_index(reader, got)
 
 
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("name", FOLDERS)
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_real_recordings_round_trip(name: str, storage: str, tmp_path: Path) -> None:
-    reader, records = read(real(name))
-    target = tmp_path / "out"
-    omitted = copy(reader, records, target, storage)
-    back, again = read(target)
-    same = metadata(records, RECORD)[0]["storage"] == storage
-    same_fields = fields if same else plain_fields
-    assert list(map(same_fields, messages(again))) == list(map(same_fields, messages(records)))
-    as_set = [{c.identity if same else plain(c) for c in r.channels} for r in (back, reader)]
-    assert as_set[0] == as_set[1]
-    assert set(back.unused_schemas) == set(reader.unused_schemas)
-    old, new = (
-        parse_bag_info(metadata(found, RECORD)[0]["metadata.yaml"], tmp_path)
-        for found in (records, again)
-    )
-    assert (new.version, new.ros_distro) == (old.version, old.ros_distro or new.ros_distro)
-    assert set(omitted) <= {"sequence numbers (sqlite3 storage keeps none)"}
-    if name.endswith("wrong_rmw_test"):
-        return  # rosbags reads cdr only
-    with RosbagsReader(target) as public:
-        assert public.message_count == len(messages(records))
-        if not name.endswith(("convert_a", "convert_b", "talker")):
-            # There QoS is told in two ways, and rosbags leaves such topics out.
-            assert [(c.topic, t, bytes(d)) for c, t, d in public.messages()] == [
-                (m.channel.topic, m.log_time, bytes(m.data)) for m in messages(records)
-            ]
-
-
 def plain(channel: Channel) -> tuple[object, ...]:
     """A channel without its QoS and hash, which storages hold in ways of their own."""
     return replace(channel, metadata={}).identity
-
-
-def plain_fields(message: Message) -> tuple[Any, ...]:
-    return (*plain(message.channel), message.log_time, bytes(message.data))
 
 
 def copy(
@@ -457,24 +422,6 @@ def split(tmp_path: Path, storage: str, parts: list[list[Message]]) -> Path:
             shutil.move(file, tmp_path / "part0" / names[-1])
     edit(tmp_path / "part0", lambda info: info.update(relative_file_paths=names))
     return tmp_path / "part0"
-
-
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_split_files_are_one_recording(tmp_path: Path, storage: str) -> None:
-    parts = [scene()[:25], scene()[25:50], scene()[50:]]
-    reader, records = read(split(tmp_path, storage, parts))
-    assert list(map(fields, messages(records))) == list(map(fields, scene()))
-    assert len(reader.channels) == 4
-    check_index(reader, messages(records))
-
-
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_split_files_that_overlap(tmp_path: Path, storage: str) -> None:
-    mixed = scene()[:20] + scene()[30:40], scene()[20:30] + scene()[40:]
-    _, records = read(split(tmp_path, storage, [list(part) for part in mixed]))
-    got = messages(records)
-    assert sorted(map(fields, got), key=repr) == sorted(map(fields, scene()), key=repr)
-    assert [m.log_time for m in got] == sorted(m.log_time for m in got)
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
@@ -837,35 +784,6 @@ def test_equal_topics_of_one_file_stay_apart(tmp_path: Path) -> None:
     reader, records = read(path)
     assert [c.identity for c in reader.channels] == [channels()[0].identity] * 2
     assert [m.channel.id for m in messages(records)] == [0, 1, 0, 0, 0]
-
-
-def unclosed(tmp_path: Path, mode: str) -> Path:
-    """A copy of a database while somebody writes to it."""
-    with filled_database(tmp_path / "a.db3") as connection:
-        connection.execute(f"PRAGMA journal_mode = {mode}")
-        connection.execute("PRAGMA cache_size = 1")
-        connection.execute("UPDATE messages SET timestamp = 7")
-        for _ in range(100):
-            connection.execute("INSERT INTO messages SELECT NULL, 1, 9, zeroblob(1000)")
-        if mode == "WAL":
-            connection.commit()
-        (tmp_path / "copy").mkdir()
-        for file in tmp_path.glob("a.db3*"):
-            shutil.copyfile(file, tmp_path / "copy" / file.name)
-        connection.rollback()
-    return tmp_path / "copy" / "a.db3"
-
-
-def test_a_write_ahead_log_beside_the_database_is_read(tmp_path: Path) -> None:
-    path = unclosed(tmp_path, "WAL")
-    assert path.with_name("a.db3-wal").stat().st_size
-    assert len(messages(read(path)[1])) == 105
-
-
-def test_an_unfinished_transaction_is_refused(tmp_path: Path) -> None:
-    path = unclosed(tmp_path, "DELETE")
-    with pytest.raises(SourceError, match="not closed properly"):
-        Rosbag2Reader(path)
 
 
 @pytest.mark.parametrize("times", [None, "timestamp + 1"], ids=["fewer", "others"])

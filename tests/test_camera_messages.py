@@ -22,9 +22,10 @@ from rosbags.highlevel import AnyReader
 import mp4ds
 from coded_scenes import CODED, ODD, VERBATIM
 from definitions import PICTURES
-from encoders import cv, pillow
+from encoders import pillow
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from pictures import BAYER, CONTENTS, ENCODINGS, picture, pixels
+from republished import psnr
 from round_trips import Compare, Journey, journey, own_target
 from scenes import Scene
 from sources import SOURCES, scene
@@ -218,40 +219,6 @@ def still(encoding: str, n: int) -> NDArray[Any]:
     return pixels
 
 
-FILES: dict[str, Rewrite] = {
-    "png-pillow": lambda n: pillow(still("rgb8", n), "PNG"),
-    "png-pillow-optimized": lambda n: pillow(still("rgb8", n), "PNG", optimize=True),
-    **{
-        f"png-{encoding}-level-{level}": lambda n, encoding=encoding, level=level: cv(
-            still(encoding, n), ".png", cv2.IMWRITE_PNG_COMPRESSION, level
-        )
-        for encoding in ("bgr8", "mono16")
-        for level in range(1, 10)
-    },
-    **{
-        f"png-strategy-{strategy}": lambda n, strategy=strategy: cv(
-            still("mono8", n), ".png", cv2.IMWRITE_PNG_STRATEGY, strategy
-        )
-        for strategy in range(5)
-    },
-    **{
-        f"jpeg-quality-{quality}": lambda n, quality=quality: pillow(
-            still("rgb8", n), "JPEG", quality=quality
-        )
-        for quality in (1, 50, 100)
-    },
-}
-
-
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("name", FILES)
-def test_files_of_many_encoders(name: str, tmp_path: Path, compare: Compare) -> None:
-    recorded = with_data(CODED["jpeg-format-plain"](), FILES[name])
-    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag")
-    assert compare(done.sources, done.output) == []
-    assert done.frames(image_topic(recorded)) == (10, 10)
-
-
 # ---------------------------------------------------------------- Foxglove's schemas
 
 FOXGLOVE_EXPECTED: Mapping[str, tuple[int, int]] = {
@@ -300,13 +267,6 @@ def image_of(message: Any) -> NDArray[Any]:
         return found
     names = ("encoding", "width", "height", "step", "is_bigendian", "data")
     return pixels({name: getattr(message, name) for name in names})
-
-
-def psnr(one: NDArray[Any], other: NDArray[Any]) -> float:
-    """Of 8-bit samples, dB."""
-    assert one.shape == other.shape
-    error = float(np.mean((one.astype(float) - other.astype(float)) ** 2))
-    return 10 * float(np.log10(255**2 / max(error, 1e-9)))
 
 
 def least_psnr(done: Journey, topic: str) -> float:

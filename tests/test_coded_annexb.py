@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coded_tools import ENCODINGS, encode, refusal
+from coded_tools import refusal
 from mp4ds.video.nal import (
     MAX_UNITS,
     MAX_ZEROS,
@@ -115,11 +115,3 @@ def test_what_is_no_framing(framing: str) -> None:
 def test_lengths_that_do_not_add_up(packet: str) -> None:
     assert "length" in refusal(split_length_prefixed, bytes.fromhex(packet))
     assert refusal(split_length_prefixed, b"\0\0\0\1e" * (MAX_UNITS + 1))
-
-
-@pytest.mark.parametrize("name", [name for name in ENCODINGS if name.startswith("h26")])
-def test_packets_of_encoders(name: str) -> None:
-    for packet in encode(ENCODINGS[name], frames=4):
-        units, framing = split(packet.data)
-        assert join_length_prefixed(prefixed(units), framing) == packet.data
-        assert len(framing.split()) == len(units) == packet.data.count(b"\0\0\1")

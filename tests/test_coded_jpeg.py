@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
-import av
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -62,16 +59,6 @@ def test_headers_are_read(kind: str) -> None:
     assert decodes("mjpeg", [data]) == 1
 
 
-@pytest.mark.parametrize("sampling", ["411", "420", "422", "440", "444"])
-def test_sampling_of_opencv(sampling: str) -> None:
-    factor = getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{sampling}")
-    data = cv2.imencode(".jpg", PICTURE, [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factor])[1].tobytes()
-    assert parse(data).sampling == sampling
-    context: Any = av.CodecContext.create("mjpeg", "r")
-    frames = [*context.decode(av.Packet(data)), *context.decode(None)]
-    assert sampling in frames[0].format.name
-
-
 FACTORS = [across << 4 | down for across in range(1, 5) for down in range(1, 5)]
 
 
@@ -86,17 +73,6 @@ def test_every_sampling_taken_is_one_that_decodes(luma: int) -> None:
             taken += 1
             assert decodes("mjpeg", [data]) == 1
     assert taken or luma not in (0x11, 0x12, 0x21, 0x22, 0x41)
-
-
-def test_tables_may_be_absent() -> None:
-    """As USB cameras send motion JPEG."""
-    data = jpeg(PICTURE)
-    segments = re.compile(rb"\xff\xc4(..)", re.DOTALL)
-    while found := segments.search(data):
-        end = found.end() - 2 + int.from_bytes(found[1], "big")
-        data = data[: found.start()] + data[end:]
-    assert parse(data).width == 64
-    assert decodes("mjpeg", [data]) == 1
 
 
 def test_fill_bytes_before_markers() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from itertools import chain, pairwise
 from pathlib import Path
@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
 from rosbags.rosbag1 import Reader as BagReader
 
@@ -23,14 +22,11 @@ from mp4ds.bags import protocols
 from mp4ds.bags.combined import MultiReader
 from mp4ds.bags.formats import open_reader, open_sources
 from mp4ds.bags.mcap import McapReader
-from mp4ds.bags.protocols import SourcePart, merged
 from mp4ds.errors import SourceError
 from mp4ds.records import (
     EVERYTHING,
-    Channel,
     Excerpt,
     Message,
-    MetadataRecord,
     Record,
 )
 from sources import PERIOD, SOURCES, START, Scene, scene, write_bag, write_mcap, write_rosbag2
@@ -321,36 +317,6 @@ def write_one_by_one(path: Path, messages: Scene) -> None:
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def test_attachments_are_found_without_the_chunks(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    write_mcap(path, scene("mono8", frames=24))
-    with open_reader(path) as reader:
-        expected = others(reader.records())
-        assert len(expected) == 4
-    data = bytearray(path.read_bytes())
-    starts = list(chunk_starts(path))
-    assert len(starts) > 2
-    for start in starts:
-        (length,) = struct.unpack_from("<Q", data, start + 1)
-        data[start + 9 : start + 9 + length] = b"\xff" * length
-    path.write_bytes(data)
-    with open_reader(path) as reader:
-        assert reader.is_indexed
-        assert list(reader.records(NO_MESSAGES)) == expected
-        assert list(reader.records(Excerpt(5, 5))) == expected
-        with pytest.raises(SourceError, match="is damaged"):
-            list(reader.records(Excerpt(0)))
-
-
-def chunk_starts(path: Path) -> Iterator[int]:
-    data = path.read_bytes()
-    place = 8
-    while data[place] != 2:
-        if data[place] == 6:
-            yield place
-        place += 9 + struct.unpack_from("<Q", data, place + 1)[0]
-
-
 @pytest.mark.parametrize("files", [1, 3])
 def test_pages_outside_of_a_span_are_not_read(files: int, tmp_path: Path) -> None:
     span = Excerpt(START + 20 * PERIOD, START + 26 * PERIOD)
@@ -603,16 +569,6 @@ def test_private_records_are_counted_once(in_summary: bool, tmp_path: Path) -> N
         assert reader.skipped == {}
 
 
-def test_a_compressed_payload_outside_is_not_looked_at(tmp_path: Path) -> None:
-    write_rosbag2(tmp_path / "a", scene("mono8", frames=8), "mcap", compression="message")
-    path = next((tmp_path / "a").glob("*.mcap"))
-    with path.open("rb") as stream:
-        found = [r for r in StreamReader(stream).records if type(r).__name__ == "Message"]
-    assert len({message.log_time for message in found}) > 8
-    with open_reader(tmp_path / "a") as reader:
-        check(reader)
-
-
 # ---------------------------------------------------------------- databases
 
 
@@ -709,30 +665,6 @@ def test_counts_do_not_trust_the_index(columns: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- several recordings
 
 
-def test_parts_wait_until_their_time_has_come() -> None:
-    channel = Channel(1, "/a", "cdr", None)
-    times = {"a": (5, 5, 9), "b": (0, 5, 5, 7), "c": (5,), "d": (8, 10)}
-    opened: list[str] = []
-
-    def part(name: str) -> SourcePart:
-        def records() -> Iterator[Record]:
-            opened.append(name)
-            yield MetadataRecord(name, {})
-            for time in times[name]:
-                yield Message(channel, time, 0, 0, name.encode())
-
-        return SourcePart(min(times[name]), records)
-
-    found = []
-    for record in merged([part(name) for name in times]):
-        if isinstance(record, Message):
-            found.append((record.log_time, bytes(record.data).decode()))
-            assert set(opened) == {n for n in times if min(times[n]) <= record.log_time}
-    assert found == sorted((time, name) for name in times for time in times[name])
-    assert opened == ["b", "a", "c", "d"]
-    assert list(merged([])) == []
-
-
 def side_by_side(kind: str, folder: Path) -> list[Path]:
     """Three recordings: two of the same time and topics, one that follows and overlaps."""
     first, late = scene("mono8", frames=12), scene("mono8", frames=12, seed=1)
@@ -775,15 +707,6 @@ def test_recordings_side_by_side(kind: str, tmp_path: Path) -> None:
                 assert len(others(whole)) == 12
 
 
-def test_one_part_without_an_index(tmp_path: Path) -> None:
-    paths = side_by_side("mcap", tmp_path)
-    write_mcap(paths[1], scene("mono8", frames=8), indexed=False)
-    with open_sources(paths) as reader:
-        assert not reader.is_indexed
-        for seed in range(3):
-            check(reader, seed)
-
-
 def test_parts_that_are_not_in_order_are_merged_as_in_the_whole(tmp_path: Path) -> None:
     write_channels(tmp_path / "a.mcap", [("c", time) for time in range(1, 11)])
     disorder = [("d", 8), ("c", 2), ("c", 9), ("c", 3)]
@@ -792,15 +715,6 @@ def test_parts_that_are_not_in_order_are_merged_as_in_the_whole(tmp_path: Path) 
         assert not reader.is_indexed
         for seed in range(5):
             check(reader, seed)
-
-
-def test_what_is_passed_over_is_counted_once(tmp_path: Path) -> None:
-    paths = side_by_side("mcap", tmp_path)
-    with_record(paths[0], 0x90, b"mine", in_summary=False)
-    with open_sources(paths) as reader:
-        for _ in range(3):
-            list(reader.records())
-            assert reader.skipped == {"private MCAP records (opcode 0x90)": 1}
 
 
 def test_files_of_a_folder_that_overlap(tmp_path: Path) -> None:

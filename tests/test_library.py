@@ -24,7 +24,6 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.options import UnpackOptions
 from pictures import CAREFUL
 from sources import (
-    COMMON,
     IMAGE,
     INFO,
     PERIOD,
@@ -76,68 +75,11 @@ def colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
     return packed(tmp_path_factory.mktemp("colour"), source, gop=5), source
 
 
-# ---------------------------------------------------------------- frames
-
-
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("encoding", COMMON)
-@pytest.mark.parametrize(
-    ("variant", "shape"),
-    [
-        ("bag-none", {}),
-        ("mcap-ros2-zstd", {"width": 63, "height": 47}),
-        ("rosbag2-sqlite3-v9", {"pad": 8, "big_endian": True}),
-    ],
-)
-def test_frames_are_the_pixels_that_were_recorded(
-    encoding: str, variant: str, shape: dict[str, Any], tmp_path: Path
-) -> None:
-    source = scene(encoding, frames=5, **shape)
-    with mp4ds.open(packed(tmp_path, source, variant)) as dataset:
-        stream = dataset[TOPIC]
-        assert len(stream) == 5
-        for found in (list(stream), [stream[i] for i in range(5)], stream[:]):
-            for number, (frame, message) in enumerate(zip(found, images(source), strict=True)):
-                values = message.values
-                expected = expected_pixels(values)
-                assert np.array_equal(frame.data, expected)
-                assert frame.data.dtype == expected.dtype
-                assert frame.data.dtype.isnative
-                assert frame.data.shape == expected.shape
-                assert frame.data.flags.writeable
-                assert frame.index == number
-                assert frame.stamp_ns == values["header"]["stamp"]
-                assert frame.log_time_ns == message.log_time
-                assert frame.frame_id == "cam"
-                assert frame.encoding == encoding
-                assert frame.intrinsics is not None
-                assert frame.intrinsics.k[0] == pytest.approx(0.9 * values["width"])
-
-
-@pytest.mark.parametrize("encoding", COMMON)
-def test_frames_of_a_lossy_dataset_are_near(encoding: str, tmp_path: Path) -> None:
-    source = scene(encoding, frames=4, noisy=False, width=96, height=64)
-    with mp4ds.open(packed(tmp_path, source, quality="crf=10")) as dataset:
-        for frame, message in zip(dataset[TOPIC], images(source), strict=True):
-            expected = expected_pixels(message.values).astype(float)
-            assert frame.data.shape == expected.shape
-            if "16" in encoding:  # depth is never blurred
-                assert np.array_equal(frame.data, expected)
-            error = np.abs(frame.data - expected).mean()
-            assert error < (12 if "bayer" in encoding else 6)  # hard edges, smeared colours
-
-
 # ---------------------------------------------------------------- frames of coded messages
 
 
 def camera(source: Scene) -> list[Any]:
     return [message for message in source.messages if message.msgtype in PICTURES]
-
-
-def psnr(one: np.ndarray[Any, Any], other: np.ndarray[Any, Any]) -> float:
-    assert one.shape == other.shape
-    error = np.mean((one.astype(float) - other.astype(float)) ** 2)
-    return 10 * float(np.log10(255**2 / max(float(error), 1e-9)))
 
 
 PNG_ENCODINGS = {
@@ -166,26 +108,6 @@ def test_frames_of_png_files_are_their_pixels(name: str, tmp_path: Path) -> None
             assert frame.stamp_ns == message.values["header"]["stamp"]
             assert frame.log_time_ns == message.log_time
             assert frame.intrinsics is not None
-
-
-JPEGS = ["jpeg-rgb", "jpeg-gray", "jpeg-444", "jpeg-422", "jpeg-progressive", "jpeg-restart"]
-
-
-@pytest.mark.parametrize("name", [*JPEGS, "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
-def test_frames_of_jpeg_files(name: str, tmp_path: Path) -> None:
-    source = CODED[name](frames=5)
-    with mp4ds.open(packed(tmp_path, source)) as dataset:
-        (stream,) = dataset
-        assert len(stream) == 5
-        for number, (frame, message) in enumerate(zip(stream, camera(source), strict=True)):
-            data = np.frombuffer(bytes(message.values["data"]), np.uint8)
-            expected = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-            assert frame.encoding == ("mono8" if expected.ndim == 2 else "rgb8")
-            if expected.ndim == 3:
-                expected = expected[..., ::-1]
-            # decoders round and interpolate chroma in their own ways
-            assert psnr(frame.data, expected) > (55 if name in ("jpeg-gray", "jpeg-444") else 27)
-            assert np.array_equal(stream[number].data, frame.data)
 
 
 def as_rgb(frame: av.VideoFrame) -> np.ndarray[Any, Any]:
@@ -225,21 +147,6 @@ def test_frames_of_packets(name: str, tmp_path: Path) -> None:
         for number in (9, 0, 5, 4, 7, 1, -1):
             number %= len(stream)
             assert np.array_equal(stream[number].data, frames[number].data)
-
-
-def test_numbers_and_slices(colour: tuple[Path, Scene]) -> None:
-    with mp4ds.open(colour[0]) as dataset:
-        stream = dataset[TOPIC]
-        every = list(stream)
-        assert [frame.index for frame in every] == list(range(12))
-        for number in (*range(12), *range(-12, 0)):
-            frame = stream[number]
-            assert frame.index == number % 12
-            assert np.array_equal(frame.data, every[number].data)
-        for part in (slice(2, 7), slice(None, None, 3), slice(8, 2, -2), slice(-3, None),
-                     slice(5, 5), slice(0, 100), slice(None, None, -1)):  # fmt: skip
-            assert [frame.index for frame in stream[part]] == list(range(12))[part]
-        assert stream[np.int64(3)].index == 3  # type: ignore[call-overload]
 
 
 def test_columns(colour: tuple[Path, Scene]) -> None:

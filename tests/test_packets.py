@@ -6,16 +6,13 @@ import json
 import shutil
 import subprocess
 from array import array
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
-import numpy as np
 import pytest
 
 from coded_tools import (
-    DECODERS,
     ENCODINGS,
     HEIGHT,
     IN_ORDER,
@@ -28,12 +25,10 @@ from coded_tools import (
     scene,
     superframe,
 )
-from mp4ds.errors import Refused, VideoError
+from mp4ds.errors import VideoError
 from mp4ds.messages.coded import CodedPicture
 from mp4ds.video import av1, h264, h265, nal
-from mp4ds.video.codecs import recipe_for
 from mp4ds.video.coded_messages import PictureParser, body_of
-from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketReader, PacketWriter, StandAlonePackets
 
 STEP = 33_333
@@ -172,31 +167,6 @@ def test_a_vp9_superframe(tmp_path: Path) -> None:
     check(tmp_path / "a.mp4", "vp9", [frames[0], superframe(frames[1], frames[2]), frames[3]])
 
 
-def test_jpeg_of_all_kinds(tmp_path: Path) -> None:
-    picture, other = scene(2)
-    bodies = [
-        jpeg(picture, subsampling=0),
-        jpeg(picture, subsampling=1),
-        jpeg(picture, subsampling=2, progressive=True),
-        jpeg(picture[..., 0]),
-        jpeg(other, restart_marker_blocks=2),
-        jpeg(other, exif=b"Exif\0\0" + bytes(3000)),
-        jpeg(other, comment=b"\xff\xd8\xff\xd9"),
-        jpeg(other) + b"\0\0 trailing \xff\xd8",
-        jpeg(other, keep_rgb=True),
-    ]
-    check(tmp_path / "a.mp4", "mjpeg", bodies)
-
-
-def test_jpeg_whose_coded_data_are_damaged(tmp_path: Path) -> None:
-    """What does not decode comes back all the same."""
-    body = bytearray(jpeg(next(scene(1))))
-    at = body.index(b"\xff\xda") + 20
-    body[at : at + 200] = b"\x55" * 200
-    pictures = write(tmp_path / "a.mp4", "mjpeg", [bytes(body)] * 3)
-    assert read(tmp_path / "a.mp4", "mjpeg", pictures) == [bytes(body)] * 3
-
-
 @pytest.mark.parametrize("codec", ["h264", "h265"])
 def test_parameters_that_were_sent_before(codec: str, tmp_path: Path) -> None:
     """The track's header holds them, so that the file plays."""
@@ -317,23 +287,6 @@ def test_what_a_reader_expects(code: str, options: dict[str, Any], video: Path) 
     assert str(video) in str(caught.value)
 
 
-def test_what_is_no_video_of_ours(tmp_path: Path, video: Path) -> None:
-    cases = {
-        "none.mp4": None,
-        "text.mp4": b"kind: stream\n" * 50,
-        "empty.mp4": b"",
-        "cut.mp4": video.read_bytes()[:-200],
-        "image.mp4": jpeg(next(scene(1))),
-    }
-    for name, content in cases.items():
-        if content is not None:
-            (tmp_path / name).write_bytes(content)
-        with pytest.raises(VideoError) as caught:
-            PacketReader(tmp_path / name, codec="mjpeg")
-        expected = "file-missing" if content is None else "video-unreadable"
-        assert caught.value.code == expected, name
-
-
 def patched(video: Path, box: bytes, offset: int, value: int) -> Path:
     """The video with a 32-bit field of a box changed, counted from the box's type."""
     data = bytearray(video.read_bytes())
@@ -385,54 +338,6 @@ def test_packets_stand_alone(name: str, tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
-def test_our_videos_stand_alone(codec: str, tmp_path: Path) -> None:
-    """They hold parameters in the header of the track only."""
-    path = tmp_path / "a.mp4"
-    recipe = recipe_for("rgb24", lossless=False, codec=codec, crf=30)
-    encoder = VideoEncoder(
-        path, recipe, picture_format="rgb24", width=WIDTH, height=HEIGHT,
-        gop=4, threads=1, rate=30.0,
-    )  # fmt: skip
-    for number, picture in enumerate(scene(10)):
-        encoder.write((picture,), number * STEP)
-    encoder.close()
-    packets = standing_alone(path, codec)
-    with PacketReader(path, codec=codec, frames=10, coded_size=SIZE) as reader:
-        keys = [index for index, key in enumerate(reader.keyframes) if key]
-    assert len(keys) > 1
-    for key in keys:
-        assert decodes(codec, packets[key:]) == 10 - key
-    parser = PictureParser(codec)
-    pictures = [parser.parse(packet) for packet in packets]
-    assert [n for n, picture in enumerate(pictures) if picture.keyframe] == keys
-    assert {(picture.width, picture.height) for picture in pictures} == {SIZE}
-    _same_pictures(path, codec, packets)
-    check(tmp_path / "b.mp4", codec, packets)  # and go into another video
-
-
-def _same_pictures(path: Path, codec: str, packets: list[bytes]) -> None:
-    context: Any = av.CodecContext.create(DECODERS.get(codec, codec), "r")
-    frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))]
-    frames += context.decode(None)
-    with av.open(str(path)) as container:
-        for alone, whole in zip(frames, container.decode(video=0), strict=True):
-            assert np.array_equal(alone.to_ndarray(), whole.to_ndarray())
-
-
-def test_lossless_video_as_packets(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    recipe = recipe_for("gray", lossless=True, codec="ffv1")
-    with av.open(str(path), "w", format="mp4") as container:
-        stream: Any = container.add_stream(recipe.encoder, rate=Fraction(30))
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gray"
-        for picture in scene(3):
-            frame = av.VideoFrame.from_ndarray(picture[..., 0].copy(), format="gray")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    assert len(standing_alone(path, "ffv1")) == 3
-
-
 def test_damaged_parameters(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write(path, "h264", [packet.data for packet in encode(ENCODINGS["h264"], frames=2)])
@@ -445,9 +350,3 @@ def test_damaged_parameters(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- real videos
-
-
-def test_a_refusal_is_a_reason() -> None:
-    """Which users read: one clause, in plain words."""
-    with pytest.raises(Refused, match=r"^it .*[^.]$"):
-        PictureParser("h264").parse(b"\xff\xd8")

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import mp4ds
-from coded_scenes import CODED
 from mp4ds.dataset.views import Placement
 from mp4ds.format.models import Calibration, Roi
 from mp4ds.messages.encodings import ENCODINGS as KNOWN
@@ -78,24 +77,21 @@ def test_frames_of_every_encoding(encoding: str, tmp_path: Path) -> None:
         for frame, number in zip(stream.get(ORDER), ORDER, strict=True):
             assert frame.index == number % FRAMES
             assert same(frame.data, expected[number])
-        for part in (slice(None), slice(1, 8, 3), slice(None, None, -2)):
+            assert frame.data.flags.writeable
+        images = [message for message in source.messages if message.topic == TOPIC]
+        for frame, message in zip(stream, images, strict=True):
+            assert frame.stamp_ns == message.values["header"]["stamp"]
+            assert frame.log_time_ns == message.log_time
+            assert (frame.frame_id, frame.encoding) == ("cam", encoding)
+            assert frame.intrinsics is not None
+            assert frame.intrinsics.k[0] == pytest.approx(0.9 * message.values["width"])
+        assert same(stream[np.int64(3)].data, expected[3])  # type: ignore[call-overload]
+        for part in (slice(None), slice(1, 8, 3), slice(None, None, -2), slice(7, 2, -2),
+                     slice(-3, None), slice(5, 5), slice(0, 100)):  # fmt: skip
             found = stream[part]
             assert [frame.index for frame in found] == list(range(FRAMES))[part]
             assert all(same(frame.data, expected[frame.index]) for frame in found)
         assert same(stream.read(ORDER, format="native"), np.stack([expected[i] for i in ORDER]))
-
-
-@pytest.mark.parametrize("name", ["jpeg-rgb", "png-16-bit-cv2-9", "depth-16UC1-rvl", "video-h264",
-                                  "video-h265", "video-av1", "video-vp9"])  # fmt: skip
-def test_frames_of_coded_messages(name: str, tmp_path: Path) -> None:
-    with mp4ds.open(packed(tmp_path, CODED[name](frames=FRAMES))) as dataset:
-        (stream,) = dataset
-        every = [frame.data for frame in stream]
-        order = [number % len(every) for number in ORDER]
-        assert len(every) >= 7
-        for frame, number in zip(stream.get(order), order, strict=True):
-            assert same(frame.data, every[number])
-        assert same(stream.read(order, format="native"), np.stack([every[i] for i in order]))
 
 
 @pytest.mark.one_in(3)

@@ -31,7 +31,6 @@ from mp4ds.video.references import (
     frame_bytes,
     packets_of_groups,
     read_structure,
-    write_packet,
 )
 from remote_servers import web_server
 from sources import SOURCES, scene
@@ -152,41 +151,6 @@ def frame(*references: int, shown: bool = True) -> CodedFrame:
 
 
 @pytest.mark.parametrize(
-    ("frames", "text"),
-    [
-        ([frame()], "k"),
-        ([frame(1, 12)], "1,12"),
-        ([frame(4, shown=False), frame(shown=False), frame(1, 2)], "4+k+1,2"),
-    ],
-)
-def test_a_packet(frames: list[CodedFrame], text: str) -> None:
-    assert write_packet(frames) == text
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("k 2", "packet 1 refers to 2 frames back, before the key frame"),
-        ("k 1 1+4", "packet 2 refers to 4"),
-        ("k 1 1,1", "do not increase"),
-        ("k 1 2,1", "do not increase"),
-    ],
-)
-def test_structures_that_contradict_themselves(text: str, problem: str) -> None:
-    with pytest.raises(ValueError, match=problem):
-        read_structure(text)
-
-
-@pytest.mark.parametrize(
-    ("texts", "plain"),
-    [(["k 1 1,2"], True), (["k"], True), (["k 1", "k 1 2"], False), (["k 1+2+1"], False),
-     (["k 1 12"], False), (["k 1 k"], False)],
-)  # fmt: skip
-def test_where_every_frame_needs_the_one_before(texts: list[str], plain: bool) -> None:
-    assert Structures(texts, np.zeros(1, np.int64)).is_plain == plain
-
-
-@pytest.mark.parametrize(
     ("bound", "most"), [("MAX_STRUCTURES", 1), ("MAX_STRUCTURE_CHARS", 40), ("MAX_CHARS", 90)]
 )
 def test_too_many_structures_are_not_recorded(
@@ -299,38 +263,10 @@ def without(video: dict[str, Any]) -> None:
     del video["references"]
 
 
-def test_without_them_all_is_the_same(packed: Path, tmp_path: Path) -> None:
-    path = edited(packed, tmp_path, without)
-    assert mp4ds.validate(path, deep=True) == []
-    with mp4ds.open(packed) as dataset, mp4ds.open(path) as other:
-        (one,), (two,) = dataset, other
-        every = [frame.data for frame in one]
-        for number in (49, 3, 17, 16, 30):
-            assert np.array_equal(one[number].data, every[number])
-            assert np.array_equal(two[number].data, every[number])
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        *("", "1", "k  1", "k 1 ", " k", "k 0", "k 01", "k 1,", "k +1", "k -1", "k 1234567"),
-        *("k\n1", "K 1", "k 1;1", "k 1\n", "k \u0661"),
-    ],
-)
-def test_what_is_no_structure(text: str, packed: Path, tmp_path: Path) -> None:
-    path = edited(packed, tmp_path, setting([text, "k"]))
-    assert {problem.code for problem in mp4ds.validate(path)} <= {"schema-invalid", "model-invalid"}
-    assert mp4ds.validate(path)
-    with pytest.raises(FormatError):
-        Stream(path)
-
-
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("structures", "code"),
     [
-        ([], "schema-invalid"),
-        (["k"] * 257, "schema-invalid"),
         (["k" + " 1" * 2**15], "schema-invalid"),
         (["k" + " 1" * (2**15 - 1)] * 17, "model-invalid"),
     ],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import random
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -667,15 +666,3 @@ def test_damage_is_refused_or_read(name: str) -> None:
             refusal(partial(parser.packet, clip.packets[1].data, key=False))
     for data in mutations(clip.configuration or b"\0", 500):
         refusal(ReferenceParser, clip.codec, data)
-
-
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9", "ffv1", "png"])
-def test_noise_is_refused_or_read(codec: str) -> None:
-    rng = random.Random(codec)
-    for _ in range(500):
-        noise = rng.randbytes(rng.randrange(200))
-        refusal(ReferenceParser, codec, noise)
-        if codec in ("h264", "h265"):
-            continue
-        parser = ReferenceParser(codec, b"")
-        refusal(partial(parser.packet, noise, key=rng.random() < 0.5))

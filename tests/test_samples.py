@@ -25,7 +25,6 @@ from mp4ds.video.codecs import recipe_for
 from mp4ds.video.mp4 import SampleTable, read_sample_table
 from test_packets import write as write_packets
 from test_video import LOSSLESS, LOSSY, encode, noise
-from waiting import lines_run
 
 Change = Callable[[bytes], bytes]
 STEP = 33_333
@@ -426,16 +425,6 @@ def long_video(frames: int, *, step: int = 33_333, frame_bytes: int = 100) -> by
     moov = box(b"mvhd", head) + box(b"trak", box(b"mdia", mdia))
     mdat = struct.pack(">I4sQ", 1, b"mdat", 16 + int(sizes.sum()))
     return mdat + bytes(int(sizes.sum())) + box(b"moov", moov)
-
-
-def test_hours_of_frames_are_left_to_numpy() -> None:
-    data = long_video(432_000)
-    table = read_bytes(data)
-    assert len(table.order) == 432_000
-    assert table.sync.sum() == 432_000 // 30
-    assert (table.places[0], table.places[-1] + table.sizes[-1]) == (16, data.rindex(b"moov") - 4)
-    assert np.array_equal(table.places[1:], table.places[:-1] + table.sizes[:-1])
-    assert lines_run(lambda: read_bytes(data)) < 5_000  # some 20 ms
 
 
 # ---------------------------------------------------------------- what is refused

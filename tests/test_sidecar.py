@@ -476,7 +476,8 @@ REFUSED: dict[str, list[tuple[str, Any]]] = {
         *(("video.codec", value) for value in ("hevc", "png", "H264", "", None, ...)),
         *(("video.pixel_format", value) for value in ("yuvj420p", "", 5, "gray")),
         *(("video.references.structures.1", value)
-          for value in ("", "1", "k 0", "k  1", "k 1 ", "k+", "k 1\n", 1, None)),
+          for value in ("", "1", "k 0", "k 01", "k  1", "k 1 ", " k", "k+", "k +1", "k -1", "k 1,",
+                        "k 1;1", "k 1234567", "k\n1", "k 1\n", "K 1", "k \u0661", 1, None)),
         *(("video.references.structures", value) for value in ([], "k", ["k"] * 257, None, ...)),
         *(("video.references.groups", value) for value in ([0, 0], "0*2", None, ...)),
         ("video.codec", "ffv1"),

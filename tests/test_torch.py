@@ -466,24 +466,6 @@ def test_threads_that_share_a_dataset(drives: list[Path]) -> None:
         assert list(pool.map(alike, range(8))) == [True] * 8
 
 
-def test_a_forked_child_opens_its_own(drives: list[Path]) -> None:
-    """And ends, though the parent's decoders have threads that the child has not."""
-    dataset = FrameDataset(drives[0])
-    sample = dataset[6]
-    child = os.fork()
-    if child == 0:
-        status = 1
-        try:
-            signal.alarm(60)
-            if torch.equal(dataset[6][LEFT], sample[LEFT]):
-                dataset.close()
-                status = 0
-        finally:
-            os._exit(status)
-    assert os.waitpid(child, 0)[1] == 0
-    assert torch.equal(dataset[6][LEFT], sample[LEFT])
-
-
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 def test_what_was_dropped_does_not_stop_workers(drives: list[Path]) -> None:
     """A worker that collects the parent's garbage must not wait for threads of its decoders."""
@@ -667,14 +649,6 @@ def test_processes_of_a_training_get_equal_numbers(
     else:
         assert set(seen) == set(range(total))
         assert max(seen.values()) <= 2
-
-
-@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
-def test_workers_of_one_process_share_an_epoch(drives: list[Path], workers: int) -> None:
-    stream = FrameStream(drives, topics=[LEFT], window=GOP)
-    batches = loader(stream, workers, "fork" if workers else None, batch_size=4)
-    seen = [int(number) for batch in batches for number in batch["index"]]
-    assert sorted(seen) == list(range(3 * FRAMES))
 
 
 @pytest.mark.parametrize("buffer", [0, 7])

@@ -190,14 +190,6 @@ Transforms = st.builds(
 # ---------------------------------------------------------------- parsing
 
 
-@pytest.mark.parametrize("kind", MANY_KINDS)
-def test_messages_of_several_transforms(kind: str) -> None:
-    own, write = MANY_KINDS[kind]
-    for items in (TREE, TREE[:1], []):
-        assert parse_transforms(own, write(items)) == items
-        assert parse_transforms(own, memoryview(write(items))) == items
-
-
 @pytest.mark.parametrize("kind", ONE_KINDS)
 def test_messages_of_one_transform(kind: str) -> None:
     own, write = ONE_KINDS[kind]

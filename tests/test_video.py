@@ -33,6 +33,7 @@ from mp4ds.video.pixels import PictureMaker
 from mp4ds.video.planes import PlaneMaker
 from pictures import BAYER, picture
 from pixel_kinds import rounded
+from republished import psnr
 
 Pixels = NDArray[Any]
 
@@ -148,11 +149,6 @@ def decode(path: Path, told: dict[str, Any]) -> list[Any]:
     with video_decoder(path, **told) as decoder:
         assert decoder.coded_frames == told["frames"]
         return [copied(planes) for planes in decoder.pictures()]
-
-
-def psnr(a: Pixels, b: Pixels) -> float:
-    error = np.mean((a.astype(float) - b.astype(float)) ** 2)
-    return float("inf") if error == 0 else float(10 * np.log10(255**2 / error))
 
 
 # ---------------------------------------------------------------- lossless

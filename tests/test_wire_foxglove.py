@@ -509,19 +509,6 @@ def test_mutated_messages_are_harmless(source: str, kind: str, data: st.DataObje
     harmless(form(source, kind), data.draw(mutations(whole(source, kind))))
 
 
-@settings(steady, max_examples=200)
-@given(st.data())
-def test_mutated_blanks_are_harmless(data: st.DataObject) -> None:
-    of = form("protobuf", "RawImage")
-    blank = of.split(memoryview(whole("protobuf", "RawImage"))).blank
-    try:
-        template = of.template(data.draw(mutations(blank)))
-        head, tail = template.around(Slots(STAMPS[-1]), 12)
-    except WireError:
-        return
-    assert isinstance(head + tail, bytes)
-
-
 @pytest.mark.parametrize("kind", ALL)
 @settings(steady, max_examples=200)
 @given(st.binary(max_size=200))
