@@ -121,7 +121,7 @@ def test_plays_and_tells(drive: Path) -> None:
 
 def test_keys(drive: Path) -> None:
     with terminal(drive, "--ros2", "--pause", "--topics", "/camera/*") as shown:
-        shown.until("1x paused · 0 messages")
+        shown.until("1x paused  0 messages")
         shown.press(b"\x1b[C")
         shown.until("1 messages")
         shown.press(b"s\x1b[C")
@@ -142,7 +142,7 @@ def test_keys(drive: Path) -> None:
 def test_signals(drive: Path, number: signal.Signals, code: int) -> None:
     """Ctrl-C ends with 0, as `ros2 bag play` does."""
     with terminal(drive, "--ros2", "-r", "0.2") as shown:
-        shown.until(r"0\.2x playing · [1-9]")
+        shown.until(r"0\.2x playing  [1-9]")
         os.kill(shown.process.pid, number)
         assert shown.end() == code
         assert "stopped before the end" in shown.text

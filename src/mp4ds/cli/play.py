@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 
 import click
@@ -14,6 +14,7 @@ from mp4ds.cli.nodes import Dialect, NodeCommand, RosOptions, accepted, node_nam
 from mp4ds.cli.options import argument, command, option, takes
 from mp4ds.cli.output import complain, is_json, is_quiet, say, show, shown
 from mp4ds.cli.process import caught_signals
+from mp4ds.cli.progress import Row, display
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.play import open_player
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary
@@ -22,6 +23,8 @@ from mp4ds.plugins.ros.names import SERVICE_EVENTS
 _FASTER = 1.1
 _NS = 1_000_000_000
 _SLOW_S = 0.5  # warned about at once; less is only mentioned in the summary
+_SLOWING = "slowing down: messages are not ready in time (--drop drops late frames instead)"
+_DROPPING = "dropping late frames: they are not decoded in time"
 
 DIALECT = Dialect(
     lists={
@@ -128,55 +131,37 @@ def _rounded(rate: float) -> float:
 
 @contextmanager
 def _progress(*, is_shown: bool) -> Iterator[Callable[[PlayProgress], None]]:
-    """Show the position on a terminal, and warn anywhere if playback cannot keep up."""
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console(stderr=True)
+    """Show the position, and warn if playback cannot keep up."""
     silent = is_quiet()  # asked here: other threads do not know the command
     warned: set[str] = set()
 
-    def warn(state: PlayProgress) -> None:
-        for is_due, text in (
-            (
-                state.slowed_s >= _SLOW_S,
-                "slowing down: messages are not ready in time (--drop drops late frames instead)",
-            ),
-            (state.dropped, "dropping late frames: they are not decoded in time"),
-        ):
-            if is_due and not silent and text not in warned:
-                warned.add(text)
-                complain(text)
-
-    if silent or not is_shown or not console.is_terminal:
-        yield warn
-        return
-    with console.status("") as status:
+    with display(timed=False) if is_shown else nullcontext(lambda _: None) as show_rows:
 
         def report(state: PlayProgress) -> None:
-            warn(state)
-            status.update(Text(_progress_line(state)))
+            for is_due, text in ((state.slowed_s >= _SLOW_S, _SLOWING), (state.dropped, _DROPPING)):
+                if is_due and not silent and text not in warned:
+                    warned.add(text)
+                    complain(text)
+            show_rows([_row(state)])
 
         yield report
+
+
+def _row(state: PlayProgress) -> Row:
+    now, length = state.time_ns - state.start_ns, max(1, state.end_ns - state.start_ns)
+    texts = [
+        f"{now / _NS:.1f} of {length / _NS:.1f} s",
+        f"{state.rate:g}x {shown(state.state)}".strip(),
+        f"{state.messages} messages",
+        f"slowed by {state.slowed_s:.1f} s" if state.slowed_s >= _SLOW_S else "",
+        f"{state.dropped} late frames dropped" if state.dropped else "",
+    ]
+    return Row("playing", "  ".join(filter(None, texts)), min(1.0, now / length))
 
 
 def _note(text: str) -> None:
     if not is_quiet():
         complain(text)
-
-
-def _progress_line(state: PlayProgress) -> str:
-    now, length = ((time - state.start_ns) / _NS for time in (state.time_ns, state.end_ns))
-    parts = [
-        f"{now:.1f} of {length:.1f} s",
-        f"{state.rate:g}x {shown(state.state)}".strip(),
-        f"{state.messages} messages",
-    ]
-    if state.slowed_s >= _SLOW_S:
-        parts.append(f"slowed by {state.slowed_s:.1f} s")
-    if state.dropped:
-        parts.append(f"{state.dropped} late frames dropped")
-    return " · ".join(parts)
 
 
 def _print(summary: PlaySummary) -> None:
