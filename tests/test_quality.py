@@ -28,7 +28,7 @@ from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
 from mp4ds.video.scores import find_ffmpeg, largest_crf, scores_of
 from round_trips import unpacked
-from scenes import Record, Scene, instant, scene, together
+from scenes import Record, instant, scene, together
 from sources import SOURCES
 
 TOPIC = "/cam/image_raw"
@@ -237,38 +237,6 @@ def test_in_parts_too_and_each_time_alike(tmp_path: Path, executor: InlineExecut
     assert leftovers(tmp_path) == []
 
 
-def test_easy_images_have_a_higher_crf_than_hard_ones(tmp_path: Path) -> None:
-    """The search begins with what the images need."""
-    crfs = []
-    for name, noise in (("easy", 0.0), ("hard", 8.0)):
-        (tmp_path / name).mkdir()
-        paths = recording(tmp_path / name, [noise])
-        dataset = tmp_path / name / "dataset"
-        mp4ds.pack(paths, dataset, PackOptions(quality="psnr=40", **QUICK))
-        with mp4ds.open(dataset) as opened:
-            crfs.append(int(opened.streams[0].sidecar.video.options["crf"]))
-    assert crfs[0] > crfs[1] + 5
-
-
-def test_a_last_window_of_one_frame(tmp_path: Path) -> None:
-    (tmp_path / "source").mkdir()
-    recorded = scene("rgb8", frames=WINDOW + 1, width=66, height=47)
-    paths = SOURCES["mcap-unindexed"](tmp_path / "source", recorded)
-    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="ssim=0.95", **QUICK))
-    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
-    found = quality_of(tmp_path / "dataset")
-    assert (found.metric, found.windows) == ("ssim", 2)
-    assert found.mean >= 0.95
-    assert found.worst_window >= 0.945
-
-
-@pytest.mark.parametrize("quality", ["crf=20", "visual", "lossless"])
-def test_other_profiles_say_nothing_of_scores(quality: str, tmp_path: Path) -> None:
-    paths = recording(tmp_path, [0.0])
-    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality=quality))
-    assert b"quality" not in (tmp_path / "dataset/cam_image_raw.yaml").read_bytes()
-
-
 # ---------------------------------------------------------------- out of reach
 
 
@@ -374,24 +342,6 @@ def test_vmaf(tmp_path: Path) -> None:
     same = (inner > 0) & (inner < WINDOW - 1)
     assert np.abs(found.decode(len(own)) - own)[same].max() < 0.02
     assert found.mean == pytest.approx(own.mean(), abs=0.5)
-
-
-@needs_vmaf
-def test_vmaf_of_a_scene_at_rest(tmp_path: Path) -> None:
-    (tmp_path / "source").mkdir()
-    moving = scene("mono8", frames=WINDOW, width=64, height=48, noisy=False)
-    still = next(m for m in moving.messages if m.topic == TOPIC).values["data"]
-    messages = [
-        Record(m.topic, m.msgtype, m.log_time, {**m.values, "data": still}, m.publisher)
-        if m.topic == TOPIC
-        else m
-        for m in moving.messages
-    ]
-    paths = SOURCES["bag-none"](tmp_path / "source", Scene(messages, moving.silent))
-    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="vmaf=99.5", **QUICK))
-    found = quality_of(tmp_path / "dataset")
-    assert (found.windows, found.limited) == (1, 1)
-    assert 96 < found.mean < 98
 
 
 def test_without_libvmaf_it_is_said_how_to_get_it(

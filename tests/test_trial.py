@@ -18,7 +18,7 @@ from mp4ds.messages.layouts import bind, fit
 from mp4ds.packing.options import PackOptions
 from mp4ds.plan import Purpose
 from mp4ds.video.codecs import lossless_codecs, recipe_for
-from mp4ds.video.encoder import NEAR, Choice, VideoEncoder, choose, encode_on_trial
+from mp4ds.video.encoder import Choice, VideoEncoder, choose, encode_on_trial
 from pictures import picture
 from pixel_kinds import as_message, rounded
 from round_trips import unpacked
@@ -128,22 +128,6 @@ def test_inter_coding_is_chosen_for_what_stays() -> None:
     assert chosen(noise, "mono8").recipe.codec == "ffv1"
 
 
-def test_left_aligned_values_are_shifted() -> None:
-    samples = [(pixels >> 4) << 4 for pixels in scene("mono16")]
-    choice = chosen(samples, "mono16")
-    assert choice.layout in ("gray_bits", "fold")
-    assert (choice.parameters.bits, choice.parameters.shift) == (12, 4)
-
-
-def test_an_alpha_that_says_nothing_is_left_out() -> None:
-    samples = scene("rgba8")[:1] * 6
-    assert chosen(samples, "rgba8").layout == "rgba"
-    samples[0][..., 3] = 255
-    choice = chosen(samples, "rgba8")
-    assert (choice.layout, choice.parameters.alpha) == ("opaque", 255)
-    assert choice.recipe.codec == "h264"
-
-
 def test_noise_below_the_signal_is_folded_away() -> None:
     """What inter coding finds again is in the high bits."""
     rng = np.random.default_rng(0)
@@ -167,18 +151,6 @@ def test_values_that_change_are_listed_in_each_picture() -> None:
     assert choice.bytes_per_frame < samples[0].nbytes / 8
 
 
-def test_few_values_are_numbered() -> None:
-    rng = np.random.default_rng(0)
-    levels = np.unique(rng.integers(300, 60000, 200)).astype(np.uint16)
-    y, x = np.mgrid[:64, :96]
-    smooth = [100 + 70 * np.sin((x + n) / 15) + 40 * np.cos(y / 9) for n in range(6)]
-    noisy = [surface + rng.normal(0, 2, surface.shape) for surface in smooth]
-    samples = [levels[np.clip(surface, 40, 160).astype(int)] for surface in noisy]
-    choice = chosen(samples, "16UC1")
-    assert choice.layout == "table"
-    assert set(choice.parameters.table or ()) == set(np.unique(samples).tolist())
-
-
 @pytest.mark.parametrize("scale", ["product", "quotient"])
 def test_metres_are_stored_as_millimetres(scale: str) -> None:
     rng = np.random.default_rng(0)
@@ -196,14 +168,6 @@ def test_metres_are_stored_as_millimetres(scale: str) -> None:
     assert chosen(samples, "32FC1").layout == "palette"
     noise = [s + rng.normal(0, 0.01, s.shape).astype(np.float32) for s in samples]
     assert chosen(noise, "32FC1").layout == "bytes"
-
-
-def test_the_earlier_of_two_near_ones_is_taken() -> None:
-    """Its order is that of the encoding's layouts and the codecs of their pictures."""
-    samples = scene("mono16")
-    choice = chosen(samples, "mono16")
-    every = [chosen(samples, "mono16", codec=codec).bytes_per_frame for codec in ("h264", "ffv1")]
-    assert choice.bytes_per_frame <= NEAR * min(every)
 
 
 @pytest.mark.one_in(5)
@@ -224,13 +188,6 @@ def test_a_codec_that_was_asked_for(encoding: str) -> None:
             continue
         with pytest.raises(OptionError, match=f"codec {codec} has no lossless form for .*ffv1"):
             chosen(samples, encoding, codec=codec)
-
-
-def test_a_preset_that_was_asked_for() -> None:
-    samples = scene("mono8")
-    choice = chosen(samples, "mono8", codec="h264", preset="ultrafast")
-    assert choice.recipe.options["preset"] == "ultrafast"
-    assert chosen(samples, "mono8", codec="ffv1", preset="ultrafast").recipe.codec == "ffv1"
 
 
 def test_one_sample_and_tiny_images() -> None:
