@@ -305,6 +305,20 @@ def test_a_message_that_cannot_be_taken(side: Side) -> None:
     assert [*source.warnings] == ["/robot/name: a message could not be recorded: ValueError('no')"]
 
 
+def test_a_topic_of_several_types(side: Side) -> None:
+    """One of them is recorded, and that is said."""
+    both = channel("/robot/name", STRING), channel("/robot/name", "std_msgs/msg/Header")
+    with side.open() as publisher:
+        for one in both:
+            publisher.advertise(one)
+        source = recorder()
+        source.start(wanted("/robot/*"), Heard().take)
+        assert until(lambda: sum(map(publisher.subscribers, both)) == 1)
+        source.close()
+    (warning,) = source.warnings
+    assert warning.startswith("/robot/name: has several types: only std_msgs/msg/")
+
+
 def test_hidden_topics_are_left_out(side: Side) -> None:
     hidden, plain = channel("/robot/_internal", STRING), channel("/robot/name", STRING)
     heard = Heard()

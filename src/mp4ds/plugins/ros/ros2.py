@@ -120,13 +120,14 @@ class Ros2Node(Node):
     def _part(self) -> None:
         """Wait until subscribers have what was sent, as long as they may take."""
         end = time.monotonic() + (_PARTING_S if self._parting_s is None else self._parting_s)
-        found = {id(writer): (channel.topic, writer) for channel, writer in self._channels.values()}
-        late = sorted(
-            {topic for topic, one in found.values() if not one.wait(_left(end))},
-        )
+        late: set[str] = set()
+        for channel, writer in self._channels.values():
+            if channel.topic not in late and not writer.wait(max(0.0, end - time.monotonic())):
+                late.add(channel.topic)
         if late and self._parting_s is not None:
+            topics = ", ".join(sorted(late))
             warnings.warn(
-                f"{', '.join(late)}: subscribers have not acknowledged every message in time",
+                f"{topics}: subscribers have not acknowledged every message in time",
                 stacklevel=2,
             )
         self._channels.clear()
@@ -148,10 +149,6 @@ class Ros2Node(Node):
         schema = Schema(type_name, _ENCODING if definition else "", definition.encode())
         metadata = {QOS_KEY: qos_text(qos), **({HASH_KEY: type_hash} if type_hash else {})}
         return Channel(next(self._numbers), name, "cdr", schema, metadata)
-
-
-def _left(end: float) -> float:
-    return max(0.0, end - time.monotonic())
 
 
 def is_topic(name: str) -> bool:
