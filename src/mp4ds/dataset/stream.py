@@ -154,6 +154,11 @@ class Stream(Images):
     def __len__(self) -> int:
         return self.sidecar.frames
 
+    @property
+    def are_jpeg_files(self) -> bool:
+        """Whether the messages hold JPEG files that are in the video as they are."""
+        return self.sidecar.body == "packet" and self.sidecar.video.codec == "mjpeg"
+
     # ------------------------------------------------------------ pictures
 
     def open_video(self, *, sequential: bool) -> VideoDecoder:
@@ -347,11 +352,7 @@ class Stream(Images):
         return (index for index in indices if self.sound is None or self.sound[index])
 
     def count(self, is_wanted: NDArray[np.bool_] | None = None) -> int:
-        """How many frames can be read.
-
-        Args:
-            is_wanted: Count only these, shape (frames,); None: all.
-        """
+        """How many frames can be read, as far as is known."""
         marks = [mark for mark in (is_wanted, self.sound) if mark is not None]
         return int(np.logical_and.reduce(marks).sum()) if marks else len(self)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.columns import marked
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.images import Images
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.verbatim import VerbatimImages
@@ -24,7 +25,6 @@ from mp4ds.unpacking.pictures import (
     FrameTimes,
     Reduction,
     files_of,
-    holds_files,
     resized_view,
 )
 from mp4ds.video.images import ImageFile
@@ -48,7 +48,7 @@ class _Files:
         file: Encodes them; None if their files are written as recorded.
     """
 
-    part: Stream | VerbatimImages
+    part: Images
     numbers: NDArray[np.int64]
     is_kept: NDArray[np.bool_]
     kind: str
@@ -57,29 +57,26 @@ class _Files:
 
     def all(self) -> Iterator[tuple[int, bytes | memoryview | None]]:
         """The files, each with its frame's number in the part; None: it has no picture."""
-        if isinstance(self.part, VerbatimImages):
-            return self._verbatim(self.part)
-        self.part.verify_video()
-        if self.file is None:
-            return files_of(self.part, marked(self.is_kept))
-        return self._encoded(self.part, self.file)
-
-    def _encoded(self, stream: Stream, file: ImageFile) -> Iterator[tuple[int, bytes | None]]:
-        for index, picture in stream.recorded_pictures(marked(self.is_kept), self.view.scale):
-            made = None
-            if picture is not None:
-                made = file.encode(stream.pixels(picture, self.view, index))
-            yield index, made
-
-    def _verbatim(self, part: VerbatimImages) -> Iterator[tuple[int, bytes | memoryview | None]]:
-        for index, shown in part.all_shown():
-            if not self.is_kept[index]:
-                continue
-            if self.file is None:
-                yield index, shown.file
-            else:
-                pixels = part.pixels((shown.pixels,), self.view, index)
-                yield index, self.file.encode(pixels)
+        part, file = self.part, self.file
+        if isinstance(part, Stream):
+            part.verify_video()
+            if file is None:
+                yield from files_of(part, marked(self.is_kept))
+                return
+            for index, picture in part.recorded_pictures(marked(self.is_kept), self.view.scale):
+                made = None
+                if picture is not None:
+                    made = file.encode(part.pixels(picture, self.view, index))
+                yield index, made
+        elif isinstance(part, VerbatimImages):
+            for index, shown in part.all_shown():
+                if not self.is_kept[index]:
+                    continue
+                pixels = (shown.pixels,)
+                yield (
+                    index,
+                    file.encode(part.pixels(pixels, self.view, index)) if file else shown.file,
+                )
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,7 @@ class TopicImages:
     @property
     def count(self) -> int:
         """How many are written, unless some cannot be decoded."""
-        return sum(_readable(files.part, files.is_kept) for files in self._files)
+        return sum(files.part.count(files.is_kept) for files in self._files)
 
     def write(self, folder: Path, on_file: Callable[[], None]) -> int:
         """Write one file per frame, named by its number in the topic, and stamps.csv.
@@ -168,13 +165,11 @@ def topic_images(
     refused, thinned = Counter[str](), 0
     made = []
     for place, part in enumerate(frames.parts):
-        if not isinstance(part, Stream | VerbatimImages):
-            continue
         numbers = frames.numbers_of(place)
         kept = is_kept[numbers]
-        thinned += _readable(part, ~kept)
+        thinned += part.count(~kept)
         size = reduction.size_of(part)
-        keeps_files = size is None and _holds_jpeg(part) and image_format != "png"
+        keeps_files = size is None and part.are_jpeg_files and image_format != "png"
         kind = "jpeg" if keeps_files else image_format or "png"
         view = resized_view(part, size)
         try:
@@ -183,18 +178,8 @@ def topic_images(
                 file = ImageFile(view.encoding.name, kind, quality=jpeg_quality)
             made.append(_Files(part, numbers, kept, kind, view, file))
         except OptionError as error:
-            refused[str(error).rstrip(".")] += _readable(part, kept)
+            refused[str(error).rstrip(".")] += part.count(kept)
     return TopicImages(topic, frames, thinned, refused, made)
-
-
-def _holds_jpeg(part: Stream | VerbatimImages) -> bool:
-    if isinstance(part, Stream):
-        return holds_files(part.sidecar, "jpeg")
-    return part.are_jpeg_files
-
-
-def _readable(part: Stream | VerbatimImages, is_wanted: NDArray[np.bool_]) -> int:
-    return part.count(is_wanted) if isinstance(part, Stream) else int(is_wanted.sum())
 
 
 def image_names(folder: Path) -> set[str] | None:

@@ -348,7 +348,7 @@ def frames_of(stream: Stream, form: ImageForm) -> Frames:
     """
     if KINDS[form.kind].family == "video":
         return _video(stream, form.kind)
-    if form.size is None and holds_files(stream.sidecar, form.kind):
+    if form.size is None and holds_files(stream, form.kind):
         return partial(_own_files, stream, _own_formats(stream.sidecar, form))
     makers = [_maker(stream, header, form) for header in stream.sidecar.headers]
     if stream.sidecar.body == "pixels" and makers[0][0].scale is None:
@@ -356,10 +356,11 @@ def frames_of(stream: Stream, form: ImageForm) -> Frames:
     return partial(_from_pictures, stream, makers)
 
 
-def holds_files(sidecar: StreamSidecar, kind: str) -> bool:
+def holds_files(stream: Stream, kind: str) -> bool:
     """Whether the messages of a stream hold JPEG or PNG files already."""
     if kind == "jpeg":
-        return sidecar.body == "packet" and sidecar.video.codec == "mjpeg"
+        return stream.are_jpeg_files
+    sidecar = stream.sidecar
     is_metres = any(is_inverse_depth(sidecar, header) for header in sidecar.headers)
     return kind == "png" and sidecar.body == "png" and not is_metres
 

@@ -261,7 +261,7 @@ class Republisher:
         if kind == "ffmpeg":
             return channel.message_encoding == self._encoding
         if kind in ("jpeg", "png"):
-            is_file = holds_files(sidecar, kind) or (kind == "jpeg" and sidecar.body == "jpeg")
+            is_file = holds_files(stream, kind) or (kind == "jpeg" and sidecar.body == "jpeg")
             return is_file and not any(header.prefix for header in sidecar.headers)
         return True
 
@@ -407,7 +407,7 @@ def _fewer(plan: _Plan, channel: Channel, choice: Choice) -> Iterator[tuple[int,
 def _kind_of(stream: Stream) -> str:
     """The kind of a stream's images, or what they become if that kind cannot be resized."""
     sidecar = stream.sidecar
-    if sidecar.body == "jpeg" or holds_files(sidecar, "jpeg"):
+    if sidecar.body == "jpeg" or stream.are_jpeg_files:
         return "jpeg"
     if sidecar.body in ("png", "rvl"):
         is_metres = any(is_inverse_depth(sidecar, header) for header in sidecar.headers)
