@@ -10,6 +10,7 @@ from typing import Any
 
 from mp4ds.bags.combined import MultiReader
 from mp4ds.bags.protocols import BagReader, BagWriter
+from mp4ds.bags.rosbag2_metadata import METADATA_FILE, read_bag_info
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.outputs import begins_with
 from mp4ds.files.sources import (
@@ -85,8 +86,6 @@ def format_of(path: Path) -> str:
 
 def recording_names(path: Path) -> set[str] | None:
     """Names of a recording's files; see `mp4ds.files.outputs.Owned`."""
-    from mp4ds.bags.rosbag2_metadata import METADATA_FILE, read_bag_info
-
     if path.is_file():
         return {""} if begins_with(path, *_FILE_MAGIC) else None
     try:

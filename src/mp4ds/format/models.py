@@ -481,7 +481,7 @@ class VideoModel(Model):
     def _check_references(self, references: References) -> None:
         if not CODECS[self.codec].is_free:
             raise ValueError(f"a video of codec {self.codec} has no references")
-        if references.split and not CODECS[self.codec].is_split:
+        if references.split and not CODECS[self.codec].split:
             raise ValueError(f"a packet of codec {self.codec} holds one frame")
 
 

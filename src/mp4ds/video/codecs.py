@@ -30,7 +30,7 @@ class Codec:
         framing: How packets are framed: ``units`` (NAL), ``obus`` (AV1), or not at all.
         references: The parser of frame references, as ``module:name``.
         is_free: Whether a frame may be independent of the one before it, which is worth recording.
-        is_split: Whether packets may hold several coded frames.
+        split: What finds the coded frames of a packet, as ``module:name``; empty: it has one.
     """
 
     ffmpeg: str
@@ -41,7 +41,7 @@ class Codec:
     pictures: str = ""
     framing: str = ""
     is_free: bool = False
-    is_split: bool = False
+    split: str = ""
 
 
 CODECS: Mapping[str, Codec] = {
@@ -58,7 +58,7 @@ CODECS: Mapping[str, Codec] = {
     "av1": Codec(
         "av1", "av1:Av1References", "libdav1d",
         ("av1", "libsvtav1", "libaom-av1", "librav1e"), ("av01",),
-        "av1:Av1Pictures", "obus", is_free=True, is_split=True,
+        "av1:Av1Pictures", "obus", is_free=True, split="av1:split_temporal_unit",
     ),
     "vp9": Codec(
         "vp9", "vp9:Vp9References", "vp9", ("vp9", "libvpx-vp9"), ("vp09",),

@@ -408,11 +408,9 @@ def frame_bytes(codec: str, packet: bytes, *, part: int, parts: int, key: bool) 
     Raises:
         UnknownStructure: There are more or fewer.
     """
-    if not CODECS[codec].is_split:
+    if not CODECS[codec].split:
         return packet
-    from mp4ds.video.av1 import split_temporal_unit
-
-    found = split_temporal_unit(packet)
+    found = part_of(CODECS[codec].split)(packet)
     if len(found) != parts:
         raise UnknownStructure(f"it holds {len(found)} coded frames, {parts} are due")
     header, start, end = found[part]
