@@ -56,11 +56,10 @@ from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.parts import PartsFolder, PlanNote, digest_source
 from mp4ds.packing.planning import (
-    Plan,
-    Resources,
     dataset_at,
     divide,
     open_recording,
+    processes_for,
     surveyed,
 )
 from mp4ds.packing.processes import ProcessExecutor
@@ -75,24 +74,30 @@ from mp4ds.video.scores import find_ffmpeg
 _REPORT_SECONDS = 0.1
 
 
-def pack_in_one_pass(
-    reader: BagReader, plan: Plan, folder: Path, target: Path, report: Report | None, exact: Exact
-) -> PackSummary:
+def _pack_in_one_pass(parted: PartedPack, exact: Exact) -> PackSummary:
     """Pack a whole recording; its files are hashed while they are read.
-
-    Args:
-        reader: The recording.
-        plan: Of a single piece.
-        folder: The folder to fill, empty.
-        target: Its final name.
-        report: Called with progress several times a second.
-        exact: Streams made lossless because they cannot reach the score.
 
     Raises:
         SourceError: The recording is damaged, or changed while it was being read.
         OutOfReachError: A stream cannot reach the requested score.
-        OSError: It cannot be written.
+        WriteError: It cannot be written.
     """
+    target = parted.target
+    with (
+        parted.plan.open() as reader,
+        staged(target, force=parted.force, owned=dataset_files, sources=parted.paths) as folder,
+    ):
+        folder.mkdir()
+        try:
+            return _fill(folder, reader, parted, exact)
+        except OSError as error:
+            if isinstance(error, SourceError) or error.errno is None:
+                raise
+            raise WriteError(target, error) from error
+
+
+def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> PackSummary:
+    plan, report = parted.plan, parted.report
     total = sum(map(source_size, reader.files))
     stats = reader.stats()
     counts: dict[str, int | None] = {}
@@ -118,7 +123,7 @@ def pack_in_one_pass(
         next_report = now + _REPORT_SECONDS
         report(
             PackProgress(
-                dataset=target,
+                dataset=parted.target,
                 phase="packing",
                 done=1.0 if done else min(1.0, packed),
                 bytes_read=sum(topic.raw_bytes for topic in part.topics.values()),
@@ -143,7 +148,7 @@ def pack_in_one_pass(
     write_manifest(part, reader, origin, str(plan.options.quality))
     progress(part, done=True)
     source_bytes = None if plan.options.slice else total
-    return with_latched(summarize(part, target, source_bytes, origin), reader)
+    return with_latched(summarize(part, parted.target, source_bytes, origin), reader)
 
 
 # ---------------------------------------------------------------- pack
@@ -528,8 +533,7 @@ def _planned(
     with open_recording(
         paths, salvage=options.salvage, images=options.images, asked=options.slice
     ) as reader:
-        means = Resources.of(options).for_one_of(recordings)
-        plan = divide(reader, paths, options, means)
+        plan = divide(reader, paths, options, recordings)
         if note is not None:
             folder.check(PlanNote.of(plan), shared=is_shared)
         if not options.join:
@@ -538,24 +542,6 @@ def _planned(
     return PartedPack(
         plan, paths, target, options.force, progress, is_new=note is None, is_shared=is_shared
     )
-
-
-def _pack_in_one_pass(parted: PartedPack, exact: Exact) -> PackSummary:
-    with (
-        parted.plan.open() as reader,
-        staged(
-            parted.target, force=parted.force, owned=dataset_files, sources=parted.paths
-        ) as folder,
-    ):
-        folder.mkdir()
-        try:
-            return pack_in_one_pass(
-                reader, parted.plan, folder, parted.target, parted.report, exact
-            )
-        except OSError as error:
-            if isinstance(error, SourceError) or error.errno is None:
-                raise
-            raise WriteError(parted.target, error) from error
 
 
 def _pack_all(
@@ -573,8 +559,7 @@ def _executor(packs: Sequence[PartedPack], options: PackOptions) -> Executor:
         pieces = sum(len(pack.plan.pieces) for pack in packs)
         executor: Executor = plugin("cluster")(options.cluster, pieces)
         return executor
-    means = Resources.of(options)
-    return ProcessExecutor(min(means.slots(pack.plan) for pack in packs))
+    return ProcessExecutor(min(processes_for(pack.plan) for pack in packs))
 
 
 def _paths(sources: Sequence[Path | str] | Path | str) -> list[Path]:

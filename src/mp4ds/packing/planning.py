@@ -224,39 +224,16 @@ def _open_one(path: Path) -> BagReader:
 # ---------------------------------------------------------------- resources
 
 
-@dataclass(frozen=True, slots=True)
-class Resources:
-    """Resources of a machine for a pack.
-
-    Attributes:
-        cores: Processors.
-        jobs: Requested number of processes, or None.
-    """
-
-    cores: int
-    jobs: int | None = None
-
-    @classmethod
-    def of(cls, options: PackOptions) -> Resources:
-        """Those of this machine, within the options' limits."""
-        return cls(available_cores(), options.jobs)
-
-    def for_one_of(self, recordings: int) -> Resources:
-        """The share of each of several recordings packed at the same time."""
-        if recordings < 2:
-            return self
-        return replace(self, cores=max(1, self.cores // recordings), jobs=None)
-
-    def slots(self, plan: Plan) -> int:
-        """Number of processes for a job: as requested, or as many as cores and memory serve."""
-        encoders = sum(
-            decision.key.width * decision.key.height * _bytes_a_pixel(track)
-            for decisions in (plan.survey or Survey()).decisions.values()
-            for decision in decisions
-            for track in decision.plans[:1]
-        )
-        busy = self.cores // max(1, plan.threads * plan.workers)
-        return self.jobs or max(1, min(busy, _memory() // 2 // (encoders or 1)))
+def processes_for(plan: Plan) -> int:
+    """Processes that pack at a time: as requested, or as many as cores and memory serve."""
+    encoders = sum(
+        decision.key.width * decision.key.height * _bytes_a_pixel(track)
+        for decisions in (plan.survey or Survey()).decisions.values()
+        for decision in decisions
+        for track in decision.plans[:1]
+    )
+    busy = available_cores() // max(1, plan.threads * plan.workers)
+    return plan.options.jobs or max(1, min(busy, _memory() // 2 // (encoders or 1)))
 
 
 def _bytes_a_pixel(plan: TrackPlan) -> int:
@@ -328,7 +305,7 @@ def spans_of(cuts: Sequence[int]) -> list[tuple[int | None, int | None]]:
 
 
 def divide(
-    reader: BagReader, paths: Sequence[Path], options: PackOptions, means: Resources
+    reader: BagReader, paths: Sequence[Path], options: PackOptions, recordings: int = 1
 ) -> Plan:
     """Divide a recording into pieces.
 
@@ -336,7 +313,7 @@ def divide(
         reader: The recording.
         paths: What it was opened from.
         options: How to pack.
-        means: The available resources.
+        recordings: How many are packed at the same time.
 
     Returns:
         The plan, without its survey.
@@ -352,20 +329,22 @@ def divide(
     if reader.is_indexed:
         channels = [channel for channel in reader.channels if selected(channel.topic)]
         pieces = _pieces(reader, channels, options)
+    cores = max(1, available_cores() // recordings)
+    frames = Counter[str]()
     if len(pieces) > 1:
-        # at least as many cores as streams, and one for each encoder, make one piece faster
-        spare = max(1, means.cores // len(pieces))
+        # where there are more cores than pieces, each has several: for streams, then for encoders
+        spare = max(1, cores // len(pieces))
         workers = min(spare, len(packed))
         threads = max(1, spare // workers)
+        stats = reader.stats()
+        for channel in packed:
+            frames[channel.topic] += stats[channel.id].count if channel.id in stats else 0
     else:
         pieces = [Piece("all", EVERYTHING)]
-        cores = means.jobs or means.cores
+        if recordings == 1:
+            cores = options.jobs or cores
         workers = min(cores, len(cameras) or 1)
         threads = max(1, -(-cores // workers))
-    stats = reader.stats() if len(pieces) > 1 else {}
-    frames = Counter[str]()
-    for channel in packed:
-        frames[channel.topic] += stats[channel.id].count if channel.id in stats else 0
     return Plan(
         paths=list(map(spelled, paths)),
         sources=[SourceState.of(path) for path in reader.files],
