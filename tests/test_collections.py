@@ -27,7 +27,7 @@ from mp4ds.errors import (
     TargetExistsError,
 )
 from mp4ds.plugins.info import brief
-from mp4ds.plugins.reporting.report import reports
+from mp4ds.plugins.reporting.report import ReportOptions, reports
 from mp4ds.unpacking.unpack import unpack_each
 from waiting import WATCHDOG_S, until
 
@@ -233,6 +233,8 @@ def test_the_page_of_all(drives: Path, tmp_path: Path) -> None:
     assert all((tmp_path / "page" / picture).exists() for picture in pictures)
     assert "not shown" in page
     assert reports(drives, tmp_path / "page").datasets == 3  # replaces its own
+    with pytest.raises(OptionError, match="`output`"):
+        reports(drives, tmp_path / "page", ReportOptions(output=tmp_path / "one"))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "index.html").write_text("mine")
     with pytest.raises(TargetExistsError):

@@ -320,16 +320,19 @@ def reports(
     Args:
         datasets: Datasets, folders of them, or patterns; on this machine.
         folder: Where to make the page. Each report is in its dataset.
-        options: How the reports are made; without `output`.
+        options: How the reports are made.
         jobs: Datasets at a time; None for one per core.
         progress: Called with a phrase, and the share done.
 
     Raises:
         SourceError: A path is not a dataset.
+        OptionError: An option is for single reports only.
         TargetError: The page cannot be written there.
         WriteError: The page could not be written.
     """
     chosen = options or ReportOptions()
+    if chosen.output is not None:
+        raise OptionError("`output` works with one dataset only: each report is in its dataset.")
     found = datasets_in(datasets)
     for path in found:
         _check_local(path)
