@@ -26,6 +26,7 @@ _LEVELS = "uint8 UNKNOWN=0\nuint8 DEBUG=1\nuint8 INFO=2\nuint8 WARNING=3\nuint8 
 
 _DEFINITIONS = {
     TF: "geometry_msgs/TransformStamped[] transforms\n",
+    "tf/msg/tfMessage": "geometry_msgs/TransformStamped[] transforms\n",
     PACKET: (
         "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\n"
         "uint8 flags\nbool is_bigendian\nuint8[] data\n"
@@ -40,6 +41,7 @@ _DEFINITIONS = {
         "builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n"
         "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
     ),
+    f"{TRANSFORM}s": "foxglove_msgs/FrameTransform[] transforms\n",
     LOG: (
         f"builtin_interfaces/Time timestamp\n{_LEVELS}uint8 FATAL=5\nuint8 level\n"
         "string message\nstring name\nstring file\nuint32 line\n"

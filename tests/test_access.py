@@ -24,8 +24,6 @@ from test_references import (
     Recipe,
     encoded_file,
     samples,
-    svt,
-    x264,
 )
 
 ALIKE = ("svt-super-resolution", "svt-resized")  # have frames of several sizes
@@ -129,45 +127,11 @@ class Counting(FrameAccess):
         return super()._packet(sample)
 
 
-@pytest.mark.parametrize(
-    ("recipe", "most"),
-    [(svt(10, gop=45), 14), (x264("bframes=7:b-adapt=0:b-pyramid=none:keyint=45", gop=45), 10)],
-    ids=["av1", "h264"],
-)
-def test_frames_that_are_not_needed_are_not_decoded(
-    recipe: Recipe, most: int, tmp_path: Path
-) -> None:
-    maker: Any = Samples()
-    path = written(tmp_path, recipe)
-    access = Counting(path, codec=recipe.codec, frames=FRAMES, maker=maker)
-    list(access.pictures_of([FRAMES - 2]))  # what the frames refer to is known from now on
-    access.reads = 0
-    list(access.pictures_of([FRAMES - 3]))
-    assert 1 < access.reads <= most
-    access.close()
-
-
 def damaged(data: bytes, *, places: Iterator[int]) -> bytes:
     changed = bytearray(data)
     for place in places:
         changed[place] ^= 0xFF
     return bytes(changed)
-
-
-def test_a_damaged_packet_is_told_with_its_frame(tmp_path: Path) -> None:
-    recipe = RECIPES["ffv1"]  # which has checksums
-    path = written(tmp_path, recipe)
-    expected = whole(path)
-    with opened(path, recipe) as access:
-        first, size = int(access.table.places[21]), int(access.table.sizes[21])
-    path.write_bytes(
-        damaged(path.read_bytes(), places=iter(range(first + size // 2, first + size)))
-    )
-    with opened(path, recipe) as access:
-        with pytest.raises(VideoError, match=r"v\.mp4.* frame 24 "):
-            list(access.pictures_of([24]))
-        # what does not need it is still there
-        assert list(access.pictures_of([20])) == [(20, expected[20])]
 
 
 def test_a_file_that_was_cut_short_meanwhile(tmp_path: Path) -> None:

@@ -226,16 +226,6 @@ def test_all_real_bags_are_known() -> None:
         assert found <= set(REAL_BAGS)
 
 
-def test_a_payload_is_a_slice_of_its_chunk(tmp_path: Path) -> None:
-    path = make_bag(tmp_path / "a.bag", [plain()], [[(0, 1, b"one"), (0, 2, b"two")]])
-    with Ros1Reader(path) as reader:
-        one, two = (message.data for message in reader.records())
-    assert isinstance(one, memoryview)
-    assert isinstance(two, memoryview)
-    assert one.obj is two.obj
-    assert one.readonly
-
-
 def test_messages_come_in_log_time_order_then_file_order(tmp_path: Path) -> None:
     chunks = [
         [(1, 5, b"b5"), (0, 5, b"a5"), (0, 9, b"a9"), (0, 5, b"a5 again")],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import shutil
 import sqlite3
 import tempfile
@@ -25,6 +24,7 @@ from mp4ds.bags.rosbag2_metadata import RECORD, TABLES_RECORD, native_qos, parse
 from mp4ds.bags.rosbag2_sqlite import SqliteReader, SqliteWriter
 from mp4ds.errors import ConversionError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
+from test_bags_mcap import check_index, messages
 
 TESTS = "rosbag2/ros2_rosbag2"
 PY = f"{TESTS}/rosbag2_py__test__resources__"
@@ -58,10 +58,6 @@ UNUSED = Schema("pkg/msg/Unused", "ros2msg", b"int8 x")
 HASH = "RIHS01_" + "0" * 64
 
 
-def messages(records: Iterable[Record]) -> list[Message]:
-    return [record for record in records if isinstance(record, Message)]
-
-
 def metadata(records: Iterable[Record], name: str) -> list[dict[str, str]]:
     return [dict(r.metadata) for r in records if isinstance(r, MetadataRecord) and r.name == name]
 
@@ -89,20 +85,6 @@ def payloads_of(path: Path) -> list[tuple[str, int, bytes]]:
             return [tuple(row) for row in connection.execute(query)]
     with path.open("rb") as stream:
         return [(c.topic, m.log_time, m.data) for _, c, m in make_reader(stream).iter_messages()]
-
-
-def check_index(reader: Rosbag2Reader, got: list[Message]) -> None:
-    times, stats = reader.times(), reader.stats()
-    for channel in reader.channels:
-        own = [m for m in got if m.channel is channel]
-        assert (times[channel.id].tolist() if own else []) == [m.log_time for m in own]
-        first = reader.first(channel)
-        assert (first and fields(first)) == (fields(own[0]) if own else None)
-        if stats:
-            assert stats[channel.id].count == len(own)
-            assert all(stats[channel.id].start <= m.log_time for m in own)
-            assert all(m.log_time <= stats[channel.id].end for m in own)
-    assert all(m.channel in reader.channels for m in got)
 
 
 @pytest.mark.parametrize("name", FOLDERS)
@@ -381,23 +363,6 @@ def test_an_abandoned_recording_is_not_finished(tmp_path: Path, storage: str) ->
     with pytest.raises(RuntimeError, match="stop"):
         write(tmp_path / "a", storage, stop())
     assert not (tmp_path / "a" / "metadata.yaml").exists()
-
-
-def test_a_full_disk_is_an_operating_system_error(tmp_path: Path) -> None:
-    writer = SqliteWriter(tmp_path / "a.db3")
-    writer.add_channel(channels()[0])
-    writer._connection.execute("PRAGMA max_page_count = 20")
-
-    def fill() -> None:
-        for time in range(100):
-            writer.write(Message(channels()[0], time, time, 0, bytes(4000)))
-
-    with pytest.raises(OSError, match="full") as caught:
-        fill()
-    assert caught.value.errno == errno.ENOSPC
-    writer.__exit__(OSError, caught.value, None)
-    with pytest.raises(OSError, match="unable to open"):
-        SqliteWriter(tmp_path / "missing" / "a.db3")
 
 
 # Split and compressed recordings ----------------------------------------------------------

@@ -155,16 +155,6 @@ def test_real_videos(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", VIDEO)
-def test_a_video_begins_with_a_key_frame(name: str) -> None:
-    packets = encode(ENCODINGS[name])
-    parser = PictureParser(ENCODINGS[name].codec)
-    keys = [number for number, packet in enumerate(packets) if packet.keyframe]
-    for packet in packets[1 : keys[1]]:
-        assert refusal(parser.parse, packet.data)
-    assert parser.parse(packets[keys[1]].data).keyframe
-
-
-@pytest.mark.parametrize("name", VIDEO)
 def test_after_a_gap_the_next_key_frame_is_awaited(name: str) -> None:
     codec = ENCODINGS[name].codec
     packets = encode(ENCODINGS[name])
@@ -280,18 +270,6 @@ def obu(kind: int, payload: bytes = b"", flags: int = 2) -> bytes:
 UNIT = encode(ENCODINGS["av1"], frames=1)[0].data
 
 
-def test_delimiters_are_a_framing() -> None:
-    assert UNIT.startswith(av1.DELIMITER)
-    bare, framing = av1.strip(UNIT)
-    assert (bytes(bare), framing) == (UNIT[2:], "td")
-    assert av1.strip(bare) == (bare, "")
-    assert av1.join(bytes(bare), framing) == UNIT
-    assert av1.join(bytes(bare), "") == bare
-    assert refusal(av1.join, bytes(bare), "dt")
-    assert PictureParser("av1").parse(UNIT).framing == "td"
-    assert PictureParser("av1").parse(bare).framing == ""
-
-
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
@@ -318,14 +296,6 @@ def test_delimiters_are_a_framing() -> None:
 )
 def test_what_no_mp4_keeps_of_av1(body: bytes, reason: str) -> None:
     assert reason in refusal(PictureParser("av1").parse, body)
-
-
-def test_metadata_are_kept() -> None:
-    header = av1.sequence_header(UNIT)
-    at = 2 + len(header)
-    assert UNIT[2:at] == header
-    assert PictureParser("av1").parse(UNIT[:at] + obu(5, b"\4\1") + UNIT[at:]).keyframe
-    assert av1.sequence_header(obu(5)) == b""
 
 
 def test_a_key_frame_without_its_header() -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import copy
-import hashlib
 import io
 import os
 import random
@@ -25,15 +24,13 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
+from edits import Change, Document, agreed, changed, load
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from jail import Jail, Outcome
 from mp4ds import Mp4dsError, VersionError, yamlio
 from mp4ds.format.fields import FORMAT_VERSION, MAX_CAMERA_INFOS, MAX_FRAMES
 from scenes import Scene
 from sources import SOURCES, scene
-
-Document = dict[str, Any]
-Change = Callable[[Document], None]
 
 STEM = "cam_image_raw"
 WIDTH, HEIGHT, FRAMES = 64, 48, 8
@@ -61,34 +58,12 @@ def dataset(packed_bag: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(packed_bag, tmp_path / "dataset"))
 
 
-def load(path: Path) -> Document:
-    return yamlio.load(path.read_bytes(), str(path))
-
-
-def changed(path: Path, change: Change) -> None:
-    """Change a file, so that its checksum fits again."""
-    document = load(path)
-    change(document)
-    path.write_bytes(yamlio.dump(document))
-
-
 def edited(path: Path, old: bytes, new: bytes) -> None:
     """Change a file as text, without its checksum."""
     text = path.read_bytes()
     text = text[: text.rindex(b"checksum:")]
     assert old in text
     path.write_bytes(text.replace(old, new, 1))
-
-
-def agreed(folder: Path) -> None:
-    """Let the manifest say what the files are now."""
-
-    def change(manifest: Document) -> None:
-        for entry in manifest["files"]:
-            data = (folder / entry["name"]).read_bytes()
-            entry["size"], entry["sha256"] = len(data), hashlib.sha256(data).hexdigest()
-
-    changed(folder / "dataset.yaml", change)
 
 
 def put(*place: str | int, value: Any) -> Change:

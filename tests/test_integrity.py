@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import random
 import re
 import shutil
@@ -16,7 +15,8 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
-from mp4ds import Mp4dsError, SourceError, yamlio
+from edits import Document, agreed, changed, digest
+from mp4ds import Mp4dsError, SourceError
 from mp4ds.unpacking.options import UnpackOptions
 from scenes import Scene
 from sources import SOURCES, load_tool, scene
@@ -38,7 +38,6 @@ DAMAGED_YAML = {
 CHANGED_FILE = {"size-mismatch", "hash-mismatch"}
 
 compare = load_tool("compare").compare
-Document = dict[str, Any]
 MakePacked = Callable[[str], tuple[list[Path], Path]]
 
 
@@ -85,27 +84,6 @@ def codes(path: Path, *, deep: bool = True) -> list[str]:
 def places(path: Path, code: str) -> str:
     """Where the problems of a code are, as text."""
     return "\n".join(p.place for p in mp4ds.validate(path, deep=True) if p.code == code)
-
-
-def digest(path: Path) -> Document:
-    data = path.read_bytes()
-    return {"name": path.name, "size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-
-
-def changed(path: Path, change: Callable[[Document], None]) -> None:
-    """Change a file, so that its checksum fits again."""
-    document = yamlio.load(path.read_bytes(), str(path))
-    change(document)
-    path.write_bytes(yamlio.dump(document))
-
-
-def agreed(folder: Path) -> None:
-    """Let the manifest say what the files are now, so that only the contradiction is left."""
-
-    def change(manifest: Document) -> None:
-        manifest["files"] = [digest(folder / entry["name"]) for entry in manifest["files"]]
-
-    changed(folder / "dataset.yaml", change)
 
 
 def unpacked(folder: Path, to: str, output: Path) -> str:

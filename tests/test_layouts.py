@@ -89,26 +89,6 @@ def test_the_general_layout_gives_all_pixels_back(name: str, layout: str) -> Non
                     assert bits_of(through(general, view, target)) == bits_of(pixels)
 
 
-@pytest.mark.one_in(2)
-@pytest.mark.parametrize(("name", "layout"), WITH_PARAMETERS)
-def test_a_fitted_layout_gives_the_samples_back(name: str, layout: str) -> None:
-    for seed in range(4):
-        encoding = ENCODINGS[name]
-        for width, height in SIZES:
-            pixels = suited(layout, encoding, width, height, seed)
-            fitted = fit(layout, encoding, [pixels])
-            if fitted is None:
-                assert width * height < 600, "not even of many samples"
-                continue
-            assert bind(layout, encoding, fitted.parameters) is not fitted
-            for big in (False, True):
-                view = as_message(pixels, encoding, pad=3, is_bigendian=big)
-                assert fitted.refuses(view) is None
-                assert bits_of(through(fitted, view)) == bits_of(pixels)
-                out = np.empty(pixels.shape, pixels.dtype.newbyteorder(">" if big else "<"))
-                assert bits_of(through(fitted, view, out)) == bits_of(pixels)
-
-
 def refused_or_returned(layout: Layout, pixels: np.ndarray) -> bool:
     """Exactly one of both; the picture of folded bits has room for some that are refused."""
     refused = layout.refuses(pixels) is not None

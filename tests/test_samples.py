@@ -324,12 +324,6 @@ def same(a: SampleTable, b: SampleTable, shift: int = 0) -> bool:
     )
 
 
-def test_places_of_64_bits(b_frames: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    path.write_bytes(changed(b_frames, TABLES, to_long_places))
-    assert same(read_bytes(b_frames), check(path))
-
-
 @pytest.mark.parametrize("at_end", [True, False])
 def test_more_than_four_gigabytes(at_end: bool, b_frames: bytes, tmp_path: Path) -> None:
     """The frames behind a large box, which takes no room on the disk."""

@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from conftest import real
+from foxglove_wire import fill
 from mp4ds.bags.formats import open_reader
 from mp4ds.messages.transforms import (
     MAX_TRANSFORMS,
@@ -28,6 +28,7 @@ from mp4ds.messages.transforms import (
 )
 from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel, Message, Schema
+from scenes import build, typestore
 
 TURN = (0.0, 0.0, math.sin(0.5), math.cos(0.5))
 TREE = [
@@ -45,74 +46,23 @@ def parse_transforms(channel: Channel, data: bytes | memoryview) -> list[Transfo
 # ---------------------------------------------------------------- writers of messages
 
 
-def store_of(encoding: str) -> Any:
-    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
-    stamped = "geometry_msgs/TransformStamped[] transforms"
-    one = (
-        "builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n"
-        "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation"
-    )
-    many = "foxglove_msgs/FrameTransform[] transforms"
-    for name, text in (
-        ("tf2_msgs/msg/TFMessage", stamped),
-        ("tf/msg/tfMessage", stamped),
-        ("foxglove_msgs/msg/FrameTransform", one),
-        ("foxglove_msgs/msg/FrameTransforms", many),
-    ):
-        if name not in store.types:
-            store.register(get_types_from_msg(text, name))
-    return store
-
-
-STORES = {encoding: store_of(encoding) for encoding in ("ros1", "cdr")}
-
-
-def ros(encoding: str, name: str, transforms: Sequence[Transform], *, little: bool = True) -> bytes:
-    store = STORES[encoding]
-    types = store.types
-
-    def parts(item: Transform) -> tuple[Any, Any]:
-        return (
-            types["geometry_msgs/msg/Vector3"](*item.translation),
-            types["geometry_msgs/msg/Quaternion"](*item.rotation),
-        )
-
-    time = types["builtin_interfaces/msg/Time"](17, 18)
-    seq = {"seq": 3} if encoding == "ros1" else {}
-    stamped = [
-        types["geometry_msgs/msg/TransformStamped"](
-            types["std_msgs/msg/Header"](stamp=time, frame_id=item.parent, **seq),
-            item.child,
-            types["geometry_msgs/msg/Transform"](*parts(item)),
-        )
-        for item in transforms
+def ros(encoding: str, name: str, items: Sequence[Transform], *, little: bool = True) -> bytes:
+    nodes = [
+        {**node(item), "header": {"stamp": 17, "frame_id": item.parent}, "transform": node(item)}
+        for item in items
     ]
-    singles = [
-        types["foxglove_msgs/msg/FrameTransform"](time, item.parent, item.child, *parts(item))
-        for item in transforms
-    ]
-    if name == "foxglove_msgs/msg/FrameTransform":
-        message = singles[0]
-    else:
-        message = types[name](stamped if "tf" in name else singles)
+    store = typestore(encoding)
+    is_one = name == "foxglove_msgs/msg/FrameTransform"
+    message = build(encoding, name, nodes[0] if is_one else {"transforms": nodes})
     if encoding == "ros1":
         return bytes(store.serialize_ros1(message, name))
     return bytes(store.serialize_cdr(message, name, little_endian=little))
 
 
-def fill(message: Any, item: Transform) -> Any:
-    message.timestamp.seconds = 17
-    message.parent_frame_id, message.child_frame_id = item.parent, item.child
-    for part, values in (("translation", item.translation), ("rotation", item.rotation)):
-        for name, value in zip("xyzw", values, strict=False):
-            setattr(getattr(message, part), name, value)
-    return message
-
-
 def protobuf(transforms: Sequence[Transform]) -> bytes:
     message = FrameTransforms()
     for item in transforms:
-        fill(message.transforms.add(), item)
+        fill(message.transforms.add(), in_nanoseconds(item))
     return bytes(message.SerializeToString())
 
 
@@ -124,6 +74,10 @@ def node(item: Transform) -> dict[str, Any]:
         "translation": dict(zip("xyz", item.translation, strict=True)),
         "rotation": dict(zip("xyzw", item.rotation, strict=True)),
     }
+
+
+def in_nanoseconds(item: Transform) -> dict[str, Any]:
+    return {**node(item), "timestamp": 17}
 
 
 def channel(encoding: str, type_name: str, data: bytes = b"", topic: str = "/tf_static") -> Channel:
@@ -138,42 +92,39 @@ ONE_SCHEMA, MANY_SCHEMA = (
 PROTOBUF = channel("protobuf", MANY, MANY_SCHEMA)
 
 Writer = Callable[[Sequence[Transform]], bytes]
-MANY_KINDS: dict[str, tuple[Channel, Writer]] = {
+Kinds = dict[str, tuple[Channel, Writer]]
+
+
+def ros_kinds(name: str) -> Kinds:
+    """A type in each serialization of ROS."""
+    ros2 = channel("cdr", name)
+    return {
+        f"ros1 {name}": (
+            channel("ros1", name.replace("/msg/", "/")),
+            lambda items: ros("ros1", name, items),
+        ),
+        f"cdr {name}": (ros2, lambda items: ros("cdr", name, items)),
+        f"cdr-be {name}": (ros2, lambda items: ros("cdr", name, items, little=False)),
+    }
+
+
+MANY_KINDS: Kinds = {
     "protobuf": (PROTOBUF, protobuf),
     "json": (
         channel("json", MANY),
         lambda items: json.dumps({"transforms": [node(item) for item in items]}).encode(),
     ),
+    **ros_kinds("tf2_msgs/msg/TFMessage"),
+    **ros_kinds("tf/msg/tfMessage"),
+    **ros_kinds("foxglove_msgs/msg/FrameTransforms"),
 }
-for _name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove_msgs/msg/FrameTransforms"):
-    _ros1 = (channel("ros1", _name.replace("/msg/", "/")), _name)
-    MANY_KINDS[f"ros1 {_name}"] = (
-        _ros1[0],
-        lambda items, name=_name: ros("ros1", name, items),
-    )
-    for _little in (True, False):
-        MANY_KINDS[f"cdr {_name} {'le' if _little else 'be'}"] = (
-            channel("cdr", _name),
-            lambda items, name=_name, little=_little: ros("cdr", name, items, little=little),
-        )
-ONE_KINDS: dict[str, tuple[Channel, Callable[[Transform], bytes]]] = {
+ONE_KINDS: Kinds = {
     "protobuf": (
         channel("protobuf", ONE, ONE_SCHEMA),
-        lambda item: bytes(fill(FrameTransform(), item).SerializeToString()),
+        lambda items: bytes(fill(FrameTransform(), in_nanoseconds(items[0])).SerializeToString()),
     ),
-    "json": (channel("json", ONE), lambda item: json.dumps(node(item)).encode()),
-    "ros1": (
-        channel("ros1", "foxglove_msgs/FrameTransform"),
-        lambda item: ros("ros1", "foxglove_msgs/msg/FrameTransform", [item]),
-    ),
-    "cdr": (
-        channel("cdr", "foxglove_msgs/msg/FrameTransform"),
-        lambda item: ros("cdr", "foxglove_msgs/msg/FrameTransform", [item]),
-    ),
-    "cdr-be": (
-        channel("cdr", "foxglove_msgs/msg/FrameTransform"),
-        lambda item: ros("cdr", "foxglove_msgs/msg/FrameTransform", [item], little=False),
-    ),
+    "json": (channel("json", ONE), lambda items: json.dumps(node(items[0])).encode()),
+    **ros_kinds("foxglove_msgs/msg/FrameTransform"),
 }
 
 Numbers = st.floats(allow_nan=False, allow_infinity=False)
@@ -194,7 +145,7 @@ Transforms = st.builds(
 def test_messages_of_one_transform(kind: str) -> None:
     own, write = ONE_KINDS[kind]
     for item in TREE:
-        assert parse_transforms(own, write(item)) == [item]
+        assert parse_transforms(own, write([item])) == [item]
 
 
 @settings(deadline=None, max_examples=30)
@@ -236,7 +187,7 @@ def test_fields_are_found_by_the_recorded_descriptor() -> None:
     renumbered = files.SerializeToString()
     message = message_factory.GetMessages(files.file)[MANY]()
     for item in TREE:
-        fill(message.transforms.add(), item)
+        fill(message.transforms.add(), in_nanoseconds(item))
     data = message.SerializeToString()
     assert parse_transforms(PROTOBUF, data) == []  # of other numbers: unknown fields
     assert parse_transforms(channel("protobuf", MANY, renumbered), data) == TREE
@@ -335,7 +286,7 @@ def test_damaged_messages_end_in_a_wire_error(data: st.DataObject) -> None:
 def test_a_count_that_the_message_does_not_hold(kind: str) -> None:
     own, write = MANY_KINDS[kind]
     payload = bytearray(write(TREE))
-    order = ">" if kind.endswith("be") else "<"
+    order = ">" if kind.startswith("cdr-be") else "<"
     struct.pack_into(f"{order}I", payload, 0 if kind.startswith("ros1") else 4, 2**32 - 1)
     with pytest.raises(WireError):
         parse_transforms(own, bytes(payload))

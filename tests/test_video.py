@@ -31,7 +31,7 @@ from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.images import ImageFile
 from mp4ds.video.pixels import PictureMaker
 from mp4ds.video.planes import PlaneMaker
-from pictures import BAYER, picture
+from pictures import picture
 from pixel_kinds import rounded
 from republished import psnr
 
@@ -285,23 +285,6 @@ def test_colours_are_rounded_to_the_nearest() -> None:
         assert abs(errors.mean()) < 0.06
 
 
-@pytest.mark.parametrize("codec", LOSSY)
-@pytest.mark.parametrize(("width", "height"), [(96, 66), (97, 65), (64, 64)])
-def test_a_coloured_scene_stays_near(codec: str, width: int, height: int, tmp_path: Path) -> None:
-    y, x = np.mgrid[:height, :width]
-    pictures = [
-        np.stack([x * 2 + n, y * 3, 255 - x - y - n], axis=-1).clip(0, 255).astype(np.uint8)
-        for n in range(6)
-    ]
-    recipe = recipe_for("rgb24", lossless=False, codec=codec, crf=12)
-    told = encode(tmp_path / "v.mp4", recipe, pictures, "rgb24")
-    for original, pixels in zip(pictures, decode(tmp_path / "v.mp4", told), strict=True):
-        assert pixels.shape == original.shape
-        assert psnr(original, pixels) > 38
-        bias = (pixels.astype(float) - original).mean(axis=(0, 1))
-        assert np.abs(bias).max() < 2
-
-
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("codec", LOSSY)
 @pytest.mark.parametrize("encoding", YUV)
@@ -354,56 +337,7 @@ def plane_samples(frame: av.VideoFrame, index: int) -> Pixels:
     return np.frombuffer(bytes(plane), dtype).reshape(plane.height, -1)[:, : plane.width]
 
 
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("codec", LOSSY)
-@pytest.mark.parametrize("encoding", BAYER)
-@pytest.mark.parametrize(("width", "height"), [(128, 96), (127, 95)])
-def test_a_demosaiced_video_gives_the_mosaic_back(
-    codec: str, encoding: str, width: int, height: int, tmp_path: Path
-) -> None:
-    """And shows the colours of the scene, not those of another pattern."""
-    y, x = np.mgrid[:height, :width].astype(float)
-    colour = np.stack([40 + x, 200 - y, 90 + 40 * np.sin(x / 20 + y / 25)], axis=-1)
-    colour = colour.clip(0, 255).astype(np.uint8)
-    mosaic = np.empty((height, width), np.uint8)
-    for place, letter in enumerate(encoding[6:10]):
-        rows, columns = slice(place // 2, None, 2), slice(place % 2, None, 2)
-        mosaic[rows, columns] = colour[rows, columns, "rgb".index(letter)]
-    recipe = recipe_for("rgb24", lossless=False, codec=codec, crf=12)
-    told = encode(tmp_path / "v.mp4", recipe, [mosaic] * 3, encoding)
-    for pixels in decode(tmp_path / "v.mp4", told):
-        assert pixels.shape == mosaic.shape
-        assert psnr(mosaic, pixels) > 35
-    shown = decode(tmp_path / "v.mp4", {**told, "picture_format": "rgb24"})[1]
-    inner = (slice(4, -4), slice(4, -4))
-    assert psnr(colour[inner], shown[inner]) > 33
-
-
 # ---------------------------------------------------------------- random access
-
-
-@pytest.mark.one_in(3)
-@pytest.mark.parametrize("gop", [1, 3, 60])
-@pytest.mark.parametrize("codec", ["h264 lossless", "ffv1 lossless", *LOSSY])
-def test_any_frame_is_found(codec: str, gop: int, tmp_path: Path) -> None:
-    """By its number, at whatever times the frames are shown."""
-    name, _, lossless = codec.partition(" ")
-    recipe = recipe_for("gray", lossless=bool(lossless), codec=name, crf=30)
-    rng = random.Random(gop)
-    gaps = [1, 2, 40_000, 33_333, 1_000_000_000, 999, 1] * 4
-    rng.shuffle(gaps)
-    ticks = [0, *itertools.accumulate(gaps)]
-    pictures = scene_pictures("mono8", 64, 48, len(ticks))
-    told = encode(tmp_path / "v.mp4", recipe, pictures, "gray", ticks=ticks, gop=gop)
-    decoded = decode(tmp_path / "v.mp4", told)
-    numbers = [*range(len(ticks)), *reversed(range(len(ticks)))]
-    numbers += rng.choices(range(len(ticks)), k=30)
-    with video_decoder(tmp_path / "v.mp4", **told, sequential=False) as decoder:
-        for number in numbers:
-            assert same(decoder.picture(number), decoded[number]), number
-        mixed = [copied(planes) for planes in decoder.pictures()]
-        assert all(map(np.array_equal, mixed, decoded))
-        assert same(decoder.picture(5), decoded[5])
 
 
 @pytest.mark.parametrize("codec", [*LOSSY, "h264 lossless", "ffv1 lossless"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from contextlib import suppress
 from typing import Any
 
@@ -304,50 +303,21 @@ def test_more_around_the_body_than_a_header_may_hold(name: str) -> None:
 
 
 def coded(name: str, msgtype: str, body: bytes, *, stamp: int = 0, seq: int = 0) -> bytes:
-    """A message of `OTHERS`, written by hand: fields in the order of its definition."""
-    out = bytearray(PREFIX[name])
-    order = ">" if name == "cdr-be" else "<"
-
-    def put(code: str, value: int) -> None:
-        if name != "ros1":
-            out.extend(bytes(-(len(out) - 4) % struct.calcsize(code)))
-        out.extend(struct.pack(order + code, value))
-
-    def text(value: bytes) -> None:
-        raw = value + (b"" if name == "ros1" else b"\0")
-        put("I", len(raw))
-        out.extend(raw)
-
-    def data() -> None:
-        put("I", len(body))
-        out.extend(body)
-
-    if name == "ros1" and not msgtype.startswith("foxglove"):
-        put("I", seq)
-    put("I", stamp // 10**9)
-    put("I", stamp % 10**9)
-    text(b"cam")
-    if msgtype == "ffmpeg_image_transport_msgs/msg/FFMPEGPacket":
-        put("i", 640)
-        put("i", 480)
-        text(b"libx264")
-        put("Q", 2**40 + 7)
-        put("B", 1)
-        put("B", 0)
-        data()
-    elif msgtype == "sensor_msgs/msg/CompressedImage":
-        text(b"bayer_rggb8; jpeg compressed ")
-        data()
-    elif msgtype == "foxglove_msgs/msg/RawImage":
-        put("I", 4)
-        put("I", 3)
-        text(b"mono8")
-        put("I", 4)
-        data()
-    else:
-        data()
-        text(b"h264")
-    return bytes(out)
+    """A message of `OTHERS`."""
+    values = {
+        "header": {"seq": seq, "stamp": stamp, "frame_id": "cam"},
+        "timestamp": stamp,
+        "frame_id": "cam",
+        "data": body,
+        "pts": 2**40 + 7,
+        "flags": 1,
+        "width": 640,
+        "height": 480,
+        "step": 640,
+        "encoding": "mono8",
+        "format": "h264",
+    }
+    return serialize(name, msgtype, values)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -509,13 +509,6 @@ def test_mutated_messages_are_harmless(source: str, kind: str, data: st.DataObje
     harmless(form(source, kind), data.draw(mutations(whole(source, kind))))
 
 
-@pytest.mark.parametrize("kind", ALL)
-@settings(steady, max_examples=200)
-@given(st.binary(max_size=200))
-def test_noise_is_harmless(kind: str, noise: bytes) -> None:
-    harmless(form("protobuf", kind), noise)
-
-
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["RawImage", "CameraCalibration"])
 @settings(steady, max_examples=300)
