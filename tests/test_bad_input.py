@@ -786,7 +786,7 @@ def test_a_command_line_that_cannot_be_understood(
         result = call(*(paths.get(argument, argument) for argument in arguments))
         assert result.code == 2
         assert "Traceback" not in result.err
-        assert "Error" in result.err
+        assert re.search(r"^Error: |^mp4ds: \S+ .* (below|from) ", result.err, re.MULTILINE)
 
 
 @pytest.mark.parametrize("seconds", ["0", "3601", "nan", "inf"])

@@ -105,7 +105,7 @@ def test_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             assert printed, f"nothing was run before:\n{block.text}"
             assert_printed(block.text, printed.replace(f"{tmp_path}/", ""))
         else:
-            assert block.kind in ("console", "yaml"), block.kind
+            assert block.kind in ("console", "yaml", "markdown"), block.kind
 
 
 def test_there_are_tutorials_and_they_run_something() -> None:
