@@ -209,7 +209,7 @@ class CameraRouter:
 
     def _state_of(self, channel: Channel) -> _CameraChannel:
         if channel.identity not in self._channels:
-            inspector = MessageInspector(channel, transcode=self._settings.transcode)
+            inspector = MessageInspector(channel, transcode=self._settings.options.transcode)
             state = self._channels[channel.identity] = _CameraChannel(inspector)
             decisions = self._survey.decisions.get(channel.id) if self._survey else None
             if decisions is not None:

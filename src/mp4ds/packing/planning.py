@@ -96,7 +96,7 @@ class Plan:
     @property
     def streams(self) -> StreamSettings:
         """How streams are encoded."""
-        return StreamSettings.of(self.options, self.threads)
+        return StreamSettings(self.options, self.threads)
 
     def open(self) -> BagReader:
         """The recording, open.

@@ -26,7 +26,6 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.tracks import FALLS, Coding, TrackPlan, WindowCoder, out_of_reach
 from mp4ds.plan import (
     LOSSLESS,
-    Purpose,
     QualitySetting,
     QualityTarget,
     parse_quality,
@@ -53,46 +52,25 @@ class StreamSettings:
     """How to encode streams.
 
     Attributes:
-        quality: The requested quality.
-        codec: Name of the codec, or None for the default.
-        preset: Preset of the encoder, or None for the default.
-        gop: Most frames between key frames.
-        threads: Threads of each encoder.
-        transcode: Whether JPEG topics are re-encoded.
-        purpose: What the dataset is for; None for nothing in particular.
+        options: Of the pack.
+        threads: Of each encoder.
         known: Texts of plans to prefer, where there is a choice.
     """
 
-    quality: QualitySetting
-    codec: str | None
-    preset: str | None
-    gop: int
+    options: PackOptions
     threads: int
-    transcode: bool = False
-    purpose: Purpose | None = None
     known: frozenset[str] = frozenset()
 
-    @classmethod
-    def of(cls, options: PackOptions, threads: int) -> StreamSettings:
-        """Those of a pack.
-
-        Raises:
-            OptionError: An option is not valid.
-        """
-        return cls(
-            quality=options.quality or parse_quality(LOSSLESS),
-            codec=options.codec,
-            preset=options.preset,
-            gop=options.group_frames,
-            threads=threads,
-            transcode=options.transcode,
-            purpose=options.purpose,
-        )
+    @property
+    def quality(self) -> QualitySetting:
+        """The requested quality."""
+        return self.options.quality or parse_quality(LOSSLESS)
 
     @property
     def is_fast(self) -> bool:
         """Whether to encode in the least time, with nothing tried."""
-        return self.purpose is not None and self.purpose.is_speed
+        purpose = self.options.purpose
+        return purpose is not None and purpose.is_speed
 
 
 # ---------------------------------------------------------------- one key
@@ -162,23 +140,25 @@ gets less close to a noisy original."""
 def _lossy_plan(key: StreamKey, settings: StreamSettings, rate: float | None) -> TrackPlan:
     quality = settings.quality
     layout = layout_for(ENCODINGS[key.encoding], lossless=False)
-    crf, preset = quality.crf, settings.preset
+    crf, preset = quality.crf, settings.options.preset
     if settings.is_fast and quality.target is None:
-        preset = preset or fastest_preset(settings.codec or DEFAULT_LOSSY)
+        preset = preset or fastest_preset(settings.options.codec or DEFAULT_LOSSY)
     if crf is None:  # the search for a score starts there
         crf, table_preset = visual_setting(rate)
-        if settings.codec in (None, *AV1):
-            usual = PURPOSE_PRESET if settings.purpose else str(table_preset)
+        if settings.options.codec in (None, *AV1):
+            usual = PURPOSE_PRESET if settings.options.purpose else str(table_preset)
             preset = preset or (_SCORE_PRESET if quality.target else usual)
     recipe = recipe_for(
         layout.pixel_format,
         lossless=False,
-        codec=settings.codec,
+        codec=settings.options.codec,
         crf=crf,
         preset=preset,
         varied=quality.target is not None,
     )
-    return TrackPlan(Coding(layout, recipe, settings.gop), str(quality), quality.target)
+    return TrackPlan(
+        Coding(layout, recipe, settings.options.group_frames), str(quality), quality.target
+    )
 
 
 def _scored_plans(
@@ -205,7 +185,9 @@ def _scored_plans(
             raise
         return _lossless_plans(samples, settings, f"kept lossless: {reason}")
     found = TrackPlan(coding.with_crf(crf), str(target), target)
-    return [found] if is_jpeg else [found, _general_plan(key.encoding, settings.gop)]
+    return (
+        [found] if is_jpeg else [found, _general_plan(key.encoding, settings.options.group_frames)]
+    )
 
 
 _MOST_SEARCHED = 5  # encodings of the samples
@@ -279,15 +261,15 @@ def _lossless_plans(
         choose,
         pixels,
         encoding,
-        gop=settings.gop,
+        gop=settings.options.group_frames,
         threads=settings.threads,
-        purpose=settings.purpose,
+        purpose=settings.options.purpose,
         known=settings.known,
     )
-    codec = settings.codec if asked else None  # otherwise they were meant for lossy videos
+    codec = settings.options.codec if asked else None  # otherwise they were meant for lossy videos
     try:
         try:
-            best = tried(codec=codec, preset=settings.preset if asked else None)
+            best = tried(codec=codec, preset=settings.options.preset if asked else None)
         except (OptionError, EncoderRefusedError) as error:
             if codec is None:
                 raise
@@ -302,19 +284,19 @@ def _lossless_plans(
     plan = TrackPlan(Coding(layout, best.recipe, best.gop), note=note)
     if layout.name == encoding.general:
         return [plan]
-    return [plan, _general_plan(encoding.name, settings.gop)]
+    return [plan, _general_plan(encoding.name, settings.options.group_frames)]
 
 
 def _fast_plans(seen: CameraMessage, settings: StreamSettings) -> list[TrackPlan]:
     """Without loss, by what encodes in the least time (spec/notes.md)."""
     layout = layout_for(ENCODINGS[seen.key.encoding], lossless=True)
     able = lossless_codecs(layout.pixel_format)
-    codec, preset = settings.codec, settings.preset
+    codec, preset = settings.options.codec, settings.options.preset
     if codec is None or codec not in able:  # of those that are, H.264 has the fastest presets
         codec, preset = ("h264" if "h264" in able else able[0]), None
     preset = preset or fastest_preset(codec)
     recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset)
-    return [TrackPlan(Coding(layout, recipe, settings.gop))]
+    return [TrackPlan(Coding(layout, recipe, settings.options.group_frames))]
 
 
 def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
@@ -443,7 +425,7 @@ def survey_channel(
         starts: Log times, ns, at which parts begin; None for the recording's start.
         settings: What was asked for.
     """
-    inspector = MessageInspector(channel, transcode=settings.transcode)
+    inspector = MessageInspector(channel, transcode=settings.options.transcode)
     decisions: dict[StreamKey, Decision] = {}
     step = -(-len(starts) // _MAX_LOOKS) or 1
     for start in starts[::step]:
