@@ -10,7 +10,7 @@ from mp4ds.cli.progress import progress_of
 from mp4ds.errors import counted, interrupted, path_text
 from mp4ds.options import WHERE
 from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
-from mp4ds.plugins.evaluating.page import told
+from mp4ds.plugins.evaluating.page import findings_of
 from mp4ds.plugins.evaluating.results import Evaluation
 
 _SPARE = {  # see `Column`
@@ -31,7 +31,7 @@ _SPARE = {  # see `Column`
 
 def print_evaluation(result: Evaluation) -> None:
     """Print what was found."""
-    for item in chain.from_iterable(map(told, result.cameras)):
+    for item in chain.from_iterable(map(findings_of, result.cameras)):
         if isinstance(item, str):
             say(item)
             continue

@@ -228,16 +228,16 @@ def evaluate(
         RemoteError: A store or web server fails.
         OSError: It cannot be written.
     """
-    asked = options or EvaluateOptions()
-    goal, settings, place = asked.target, settings_of(asked), location(source)
+    options = options or EvaluateOptions()
+    goal, settings, place = options.target, settings_of(options), location(source)
     ffmpeg = _ffmpeg(goal)
     with open_cameras(place) as (found, left_out):
-        cameras = _selected(found, left_out, asked)
+        cameras = _selected(found, left_out, options)
         origin = min((int(camera.times[0]) for camera in found), default=0)
         result = Evaluation(place, _folder(place, output), [], left_out, versions_of(ffmpeg))
         names = FileNames()
         with _work_in(result.output) as work:
-            run = _Run(asked, settings, ffmpeg, result)
+            run = _Run(options, settings, ffmpeg, result)
             for number, camera in enumerate(cameras):
 
                 def tell(what: str, share: float, number: int = number) -> None:
@@ -259,7 +259,7 @@ def evaluate(
             raise SourceError(place, f"has no camera to try settings on{why}")
         rated = [(camera.cells, camera.reachable) for camera in result.cameras]
         result.recommended = recommend(rated, goal)
-        write_files(result, asdict(asked))
+        write_files(result, asdict(options))
     return result
 
 

@@ -90,7 +90,7 @@ Row = dict[str, str]
 """A row of a table: headings and texts."""
 
 
-def told(camera: CameraEvaluation) -> Iterator[str | list[Row]]:
+def findings_of(camera: CameraEvaluation) -> Iterator[str | list[Row]]:
     """What was found for a camera, in sentences and tables."""
     clip = camera.clip
     width, height = clip.image_size
@@ -311,7 +311,7 @@ def _section(result: Evaluation, camera: CameraEvaluation) -> Iterator[str]:
     yield f"<h2>{escape(camera.topic)}</h2>"
     plots = "".join(f"<figure>{svg_of(plot(camera, kind), SIZE)}</figure>" for kind in COSTS)
     yield f'<div class="plots">{plots}</div>'
-    for item in told(camera):
+    for item in findings_of(camera):
         yield f"<p>{escape(item)}</p>" if isinstance(item, str) else _table(item)
     yield "<h3>The same detail in each, enlarged twice</h3>"
     shown = {"encoder input": camera.ground_truth}

@@ -96,8 +96,8 @@ def export(
             )
         if path.is_dir():
             files = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
-            told = {**asdict(summary), "output": target.name, "files": files}
-            note: dict[str, object] = {"mp4ds": __version__, **told}
+            note: dict[str, object] = {"mp4ds": __version__, **asdict(summary)}
+            note |= {"output": target.name, "files": files}
             abouts = [one.manifest.about for one in opened if one.manifest and one.manifest.about]
             if abouts:
                 note["about"] = [document_of(about) for about in abouts]

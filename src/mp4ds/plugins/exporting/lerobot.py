@@ -357,7 +357,7 @@ def _tasks_table(tasks: Sequence[str]) -> Any:
     """The table of tasks, which pandas reads with the task as its index."""
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": [*tasks]})
     kinds = [("task_index", "int64", "int64"), ("task", "unicode", "object")]
-    told = {
+    described = {
         "index_columns": ["task"],
         "column_indexes": [],
         "columns": [
@@ -368,7 +368,7 @@ def _tasks_table(tasks: Sequence[str]) -> Any:
         "creator": {"library": "pyarrow", "version": pa.__version__},
         "pandas_version": "2.0.0",
     }
-    return table.replace_schema_metadata({"pandas": json.dumps(told)})
+    return table.replace_schema_metadata({"pandas": json.dumps(described)})
 
 
 def _episode_row(episode: Episode, task: str, fps: int) -> dict[str, Any]:

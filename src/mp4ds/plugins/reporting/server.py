@@ -146,14 +146,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send(self, file: BinaryIO, path: Path, with_body: bool) -> None:
         size = os.fstat(file.fileno()).st_size
-        asked = self.headers.get("Range")
-        part = (0, size) if asked is None else byte_range(asked, size)
+        wanted = self.headers.get("Range")
+        part = (0, size) if wanted is None else byte_range(wanted, size)
         if part is None:
             self._refuse(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, f"bytes */{size}")
             return
         start, end = part
-        self.send_response(HTTPStatus.OK if asked is None else HTTPStatus.PARTIAL_CONTENT)
-        if asked is not None:
+        self.send_response(HTTPStatus.OK if wanted is None else HTTPStatus.PARTIAL_CONTENT)
+        if wanted is not None:
             self.send_header("Content-Range", f"bytes {start}-{end - 1}/{size}")
         self.send_header("Content-Type", _TYPES.get(path.suffix, "application/octet-stream"))
         self.send_header("Content-Length", str(end - start))
@@ -178,17 +178,17 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
 
-def byte_range(asked: str, size: int) -> tuple[int, int] | None:
+def byte_range(wanted: str, size: int) -> tuple[int, int] | None:
     """The first byte of a range and the one after its last (RFC 9110, section 14).
 
     Args:
-        asked: The header ``Range``.
+        wanted: The header ``Range``.
         size: Size of the file.
 
     Returns:
         All of it if the header is of another kind; None if the range is outside the file.
     """
-    match = re.fullmatch(r"bytes=([0-9]*)-([0-9]*)", asked.strip()[:_LONGEST_RANGE])
+    match = re.fullmatch(r"bytes=([0-9]*)-([0-9]*)", wanted.strip()[:_LONGEST_RANGE])
     if not match or not (match[1] or match[2]):
         return 0, size
     if not match[1]:

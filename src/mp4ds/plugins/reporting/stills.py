@@ -208,11 +208,11 @@ def spread(count: int, wanted: int) -> list[int]:
     return [(2 * number + 1) * count // (2 * wanted) for number in range(wanted)]
 
 
-def _places(topic: Topic, asked: Slice) -> tuple[int, int]:
+def _places(topic: Topic, span: Slice) -> tuple[int, int]:
     """The first frame of a slice, by header stamps, and the one after its last."""
     stamps = topic.stamps
     first, last = int(stamps.min()), int(stamps.max())
-    start, end = asked.times(first, last, topic.topic)
+    start, end = span.times(first, last, topic.topic)
     inside = np.ones(len(stamps), np.bool_)
     inside &= True if start is None else stamps >= start
     inside &= True if end is None else stamps < end
