@@ -19,7 +19,6 @@ from test_references import (
     FRAMES,
     HEIGHT,
     RECIPES,
-    REFUSED,
     WIDTH,
     Recipe,
     encoded_file,
@@ -105,18 +104,6 @@ def test_any_requests(
                 assert next(pictures) == (number, expected[number])
 
 
-def read_last(path: Path, recipe: Recipe) -> None:
-    with opened(path, recipe) as access:
-        list(access.pictures_of([FRAMES - 1]))
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_unknown_structures_are_refused(name: str, tmp_path: Path) -> None:
-    path = written(tmp_path, REFUSED[name])
-    with pytest.raises(UnknownStructure):
-        read_last(path, REFUSED[name])
-
-
 class Counting(FrameAccess):
     """Counts the packets that are read."""
 
@@ -125,13 +112,6 @@ class Counting(FrameAccess):
     def _packet(self, sample: int) -> bytes:
         self.reads += 1
         return super()._packet(sample)
-
-
-def damaged(data: bytes, *, places: Iterator[int]) -> bytes:
-    changed = bytearray(data)
-    for place in places:
-        changed[place] ^= 0xFF
-    return bytes(changed)
 
 
 def test_a_file_that_was_cut_short_meanwhile(tmp_path: Path) -> None:

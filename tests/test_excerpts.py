@@ -7,6 +7,7 @@ import struct
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
@@ -668,11 +669,7 @@ def test_counts_do_not_trust_the_index(columns: str, tmp_path: Path) -> None:
 def side_by_side(kind: str, folder: Path) -> list[Path]:
     """Three recordings: two of the same time and topics, one that follows and overlaps."""
     first, late = scene("mono8", frames=12), scene("mono8", frames=12, seed=1)
-    shift = 9 * PERIOD
-    moved = [
-        type(message)(**{**vars_of(message), "log_time": message.log_time + shift})
-        for message in late.messages
-    ]
+    moved = [replace(m, log_time=m.log_time + 9 * PERIOD) for m in late.messages]
     parts = [first, Scene(first.messages[::2], first.silent), Scene(moved)]
     paths = []
     for number, part in enumerate(parts):
@@ -685,10 +682,6 @@ def side_by_side(kind: str, folder: Path) -> list[Path]:
             write_rosbag2(path, part, kind.partition("-")[2])
         paths.append(path)
     return paths
-
-
-def vars_of(message: Any) -> dict[str, Any]:
-    return {name: getattr(message, name) for name in message.__dataclass_fields__}
 
 
 @pytest.mark.one_in(2)

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
 
 from mp4ds.errors import OptionError
 from mp4ds.messages.arrangements import CHROMA_SHIFTS
@@ -21,13 +19,9 @@ from mp4ds.messages.encodings import (
     SCALES,
     Parameters,
     pixel_view,
-    put_padding,
-    row_padding,
 )
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit, layout_for, why_not
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, bound, rounded, suited, values
-
-steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 SIZES = [(w, h) for w in (1, 2, 3, 4, 7, 8) for h in (1, 2, 3, 5, 6)]
 WITH_PARAMETERS = [pair for pair in PAIRS if LAYOUTS[pair[1]].parameters]
@@ -552,36 +546,6 @@ def test_a_view_is_the_message_itself(name: str) -> None:
                 start = y * step + width * encoding.pixel_bytes
                 assert data[start : start + pad] == before[start : start + pad]
                 assert not any(data[y * step : start])
-
-
-@steady
-@given(
-    st.sampled_from(["mono8", "rgb8", "nv12", "nv24"]),
-    st.integers(0, 4),
-    st.booleans(),
-    st.sampled_from([0, 205, None]),
-)
-@example("mono8", 0, True, 0)
-def test_padding(name: str, pad: int, last: bool, value: int | None) -> None:
-    """What follows the pixels of rows is told, and comes back."""
-    encoding = ENCODINGS[name]
-    width, height = rounded(encoding, 4, 2)
-    row_bytes = width * encoding.pixel_bytes
-    rows = np.full((encoding.shape(width, height)[0], row_bytes + pad), 7, np.uint8)
-    rows[:, row_bytes:] = np.arange(pad) if value is None else value
-    size = {"width": width, "height": height, "step": row_bytes + pad}
-    data = rows.tobytes() if last else rows.tobytes()[: rows.size - pad]
-    assert why_not(name, **size, size=len(data)) is None
-    found = row_padding(memoryview(data), encoding, **size)
-    is_zero = not rows[: None if last else -1, row_bytes:].any()
-    assert (found is None) == (not pad or (last and is_zero))
-    if found is not None:
-        made = bytearray(data)
-        view = np.frombuffer(made, np.uint8)
-        for row in range(len(rows)):
-            view[row * rows.shape[1] + row_bytes : (row + 1) * rows.shape[1]] = 9
-        put_padding(made, found, row_bytes=row_bytes, step=rows.shape[1])
-        assert bytes(made) == data
 
 
 # ---------------------------------------------------------------- what has no layout

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import pytest
 from hypothesis import given, settings
@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from conftest import real
 from mp4ds.bags.formats import open_reader
 from mp4ds.errors import OptionError
-from mp4ds.messages.serializations import form_of, wire_of
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, ImageFields, Parts
 from mp4ds.packing.calibrations import (
     IMAGE_WINDOW,
@@ -22,7 +21,7 @@ from mp4ds.packing.calibrations import (
     choose_pairs,
     pair_camera_infos,
 )
-from mp4ds.records import Channel, Message, Schema
+from mp4ds.records import Channel, Schema
 
 RAW = ("sensor_msgs/Image", "sensor_msgs/msg/Image", "foxglove.RawImage", "foxglove_msgs/RawImage")
 CODED = (
@@ -457,38 +456,6 @@ def test_too_many_channels_are_not_compared() -> None:
         assert len(found.pair()) == paired
 
 
-Stamps = st.lists(st.sampled_from([0, 1, 2, 3, 5, 8, 9]), max_size=8)
-
-
-@settings(deadline=None)
-@given(
-    st.lists(
-        st.tuples(st.sampled_from(["/a", "/b", "/c/image_raw", "/c/image"]), Stamps), max_size=4
-    ),
-    st.lists(Stamps, max_size=3),
-    st.booleans(),
-)
-def test_what_pairs_follows_the_rule(
-    images: Sequence[tuple[str, list[int]]], infos: Sequence[list[int]], final: bool
-) -> None:
-    found = Recording()
-    for topic, stamps in images:
-        found.add(topic, stamps, raw())
-    for number, stamps in enumerate(infos):
-        found.add(f"/info{number}", stamps, info())
-    pairs = found.pair(final=final, in_order=True)
-    assert len(set(pairs.values())) == len(pairs)
-    for info_topic, image_topic in pairs.items():
-        own = infos[int(info_topic[-1])]
-        candidates = [set(stamps) - {0} for topic, stamps in images if topic == image_topic]
-        assert any(
-            len(set(own) & stamps) >= min(3, len(own), *([] if not final else [len(stamps)]))
-            for stamps in candidates
-        )
-        if not final:
-            assert len(set(own) - {0}) >= 3
-
-
 # ---------------------------------------------------------------- real recordings
 
 REAL: list[tuple[str, dict[str, str]]] = [
@@ -517,9 +484,3 @@ def test_real_recordings_by_name(name: str, pairs: dict[str, str]) -> None:
         topics = {own.id: own.topic for own in reader.channels}
         found = pair_camera_infos(reader.channels)
     assert {topics[i]: topics[j] for i, j in found.items()} == pairs
-
-
-def split(record: Message) -> Parts:
-    data, schema = memoryview(record.data), record.channel.schema
-    wire = wire_of(record.channel.message_encoding, data)
-    return form_of(wire, record.channel.type_name, schema.data if schema else b"").split(data)

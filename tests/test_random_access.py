@@ -603,14 +603,6 @@ def test_any_stamps(stamps: list[int], time: int, mode: str, tolerance: int | No
         assert word in str(error)
 
 
-@settings(max_examples=200, deadline=None)
-@given(stamps=st.lists(NANOSECONDS, min_size=1, max_size=9), start=NANOSECONDS, end=NANOSECONDS)
-def test_any_span(stamps: list[int], start: int, end: int) -> None:
-    found = StampIndex("/cam", np.array(stamps, np.int64)).between(start, end)
-    due = [(s, number) for number, s in enumerate(stamps) if start <= s < end]
-    assert found.tolist() == [number for _, number in sorted(due)]
-
-
 def test_frames_by_stamp(colour: mp4ds.Topic) -> None:
     stamps = colour.stamps.tolist()
     for number, stamp in enumerate(stamps):
