@@ -229,9 +229,7 @@ def test_a_store_that_refuses_is_told_before_the_work(
     folder_url: str,
     s3: Server,
     staging: Path,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("mp4ds.packing.pack._planned", None)
     s3.fails = lambda heard: 403 if heard.method == "PUT" else None
     with pytest.raises(TargetError, match=r"cannot be uploaded: access denied"):
         mp4ds.pack(source, f"{folder_url}/drive", FAST)
