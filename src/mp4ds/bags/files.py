@@ -308,16 +308,16 @@ def recover(compression: str, data: memoryview, size: int) -> Recovered:
             while made[-1] and not machine.eof:  # bz2 compares a checksum with the last of a block
                 made.append(machine.decompress(b""))
             gathered.writelines(made)
+            if gathered.tell() > size:
+                problem = f"the {found} data of a chunk unpacks to more than {size} bytes{limit}"
+                is_sound = is_verified
+                gathered.truncate(size)
+                break
             if machine.eof:
                 used, problem = end - len(machine.unused_data or b""), ""
                 if gathered.tell() != size:
                     problem = f"a chunk holds {gathered.tell()} bytes instead of {size}"
                     is_sound = is_verified
-                break
-            if gathered.tell() > size:
-                problem = f"the {found} data of a chunk unpacks to more than {size} bytes{limit}"
-                is_sound = is_verified
-                gathered.truncate(size)
                 break
     except _DAMAGE:
         problem, is_sound = f"the {found} data of a chunk is damaged", is_verified
