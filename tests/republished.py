@@ -231,6 +231,15 @@ def subscribed(told: str, data: bytes) -> tuple[str, Array]:
     return encoding, image
 
 
+def image_of(message: Read) -> Array:
+    """The pixels in the order in which the message has them; those of a file as OpenCV has them."""
+    if message.type_name == IMAGE:
+        return pixels(vars(message.value))
+    image = cv2.imdecode(message.value.data, cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image
+
+
 def halved(image: Array) -> Array:
     """The mean of 2 x 2 pixels: decoders have chroma of half the resolution grow in their ways."""
     height, width = (side // 2 for side in image.shape[:2])

@@ -28,8 +28,8 @@ from mp4ds.records import Message
 from mp4ds.unpacking.options import UnpackOptions
 from mp4ds.unpacking.pictures import Reduction, at_most, times_of
 from mp4ds.unpacking.republish import Republisher
-from pictures import picture, pixels
-from republished import CAMERAS, Read, file_picture, psnr, read
+from pictures import picture
+from republished import CAMERAS, Read, file_picture, image_of, psnr, read
 from scenes import Record, Scene, odd_scene, scene
 from test_republish import Packed, still
 
@@ -67,15 +67,6 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., P
 
     yield pack
     found.clear()
-
-
-def image_of(message: Read) -> NDArray[Any]:
-    """The pixels in the order in which the message has them; those of a file as OpenCV has them."""
-    if message.type_name == IMAGE:
-        return pixels(vars(message.value))
-    image = cv2.imdecode(message.value.data, cv2.IMREAD_UNCHANGED)
-    assert image is not None
-    return image
 
 
 def rows(messages: Iterable[Read]) -> list[tuple[Any, ...]]:
