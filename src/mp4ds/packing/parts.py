@@ -298,7 +298,7 @@ class PartsFolder:
                 self.path, "holds an unfinished pack that was started elsewhere", _ANEW
             )
         if note.paths != plan.paths:
-            listed = ", ".join(note.paths)
+            listed = ", ".join(str(location(path)) for path in note.paths)  # without signatures
             raise OptionError(f"{self.path} holds an unfinished pack of {listed}. {_ANEW}")
         for name, value in plan.options.items():
             if note.options.get(name) != value:
