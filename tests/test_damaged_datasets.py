@@ -126,7 +126,7 @@ def test_a_camera_that_is_left_out_may_be_damaged(
     with pytest.raises(FormatError, match=r"/left|left_image_raw.* `salvage` restores what can"):
         mp4ds.unpack(dataset, "bag", out)
     assert not out.exists()
-    options = UnpackOptions(exclude=["/left/*"], salvage=damage.startswith("sidecar"))
+    options = UnpackOptions(exclude=["/left/*"])
     summary = mp4ds.unpack(dataset, "bag", out, options)
     whole, rest = messages(packed[0]), messages(out)
     assert rest == Counter({key: n for key, n in whole.items() if not key[0].startswith("/left/")})
@@ -137,17 +137,31 @@ def test_a_camera_that_is_left_out_may_be_damaged(
     assert len(list(pictures.glob("*/*.*g"))) == 2 * FRAMES
 
 
-@pytest.mark.parametrize("place", [0.2, 0.9])
-def test_messages_that_are_left_out_may_be_salvaged(
+def test_calibrations_of_a_damaged_sidecar_may_be_wanted(dataset: Path, tmp_path: Path) -> None:
+    flip(file_of(dataset, "left.yaml"), 0.5)
+    with pytest.raises(FormatError, match=r"left_image_raw\.yaml: .* `salvage` restores"):
+        mp4ds.unpack(dataset, "bag", tmp_path / "x.bag", UnpackOptions(exclude=["/left/image_raw"]))
+
+
+@pytest.mark.parametrize("place", [0.2, 0.4, 0.9, 0.999])
+def test_messages_that_are_left_out_may_be_damaged(
     place: float, dataset: Path, packed: tuple[Path, Path], tmp_path: Path
 ) -> None:
     flip(dataset / "messages.mcap", place)
     out = tmp_path / "out.bag"
-    with pytest.raises(FormatError, match=r"messages\.mcap: .* `salvage` restores"):
-        mp4ds.unpack(dataset, "bag", out, UnpackOptions(topics=["/left/*"]))
-    mp4ds.unpack(dataset, "bag", out, UnpackOptions(topics=["/left/*"], salvage=True))
+    summary = mp4ds.unpack(dataset, "bag", out, UnpackOptions(topics=["/left/*"]))
     whole = messages(packed[0])
     assert messages(out) == Counter({k: n for k, n in whole.items() if k[0].startswith("/left/")})
+    assert any("messages.mcap" in note for note in summary.notes)
+    with pytest.raises(FormatError, match=r"messages\.mcap: .* `salvage` restores"):
+        mp4ds.unpack(dataset, "bag", tmp_path / "y.bag", UnpackOptions(topics=["/left/*", "/imu"]))
+
+
+def test_messages_that_may_be_wanted(dataset: Path, tmp_path: Path) -> None:
+    """Nothing tells which topics a file has that is zero throughout."""
+    zero(dataset / "messages.mcap", 0, 10**9)
+    with pytest.raises(FormatError, match=r"messages\.mcap: .* `salvage` restores"):
+        mp4ds.unpack(dataset, "bag", tmp_path / "x.bag", UnpackOptions(topics=["/left/*"]))
 
 
 # ---------------------------------------------------------------- what can be read
@@ -372,12 +386,15 @@ def test_on_the_command_line(dataset: Path, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- other commands
 
 
-@pytest.mark.parametrize("damage", [name for name in DAMAGES if name.startswith("video")])
+@pytest.mark.parametrize("damage", [*DAMAGES, "messages"])
 def test_what_an_export_or_a_player_does_not_need(
     damage: str, dataset: Path, packed: tuple[Path, Path], tmp_path: Path
 ) -> None:
     options = {"topics": ["/right/*"]}
-    DAMAGES[damage](dataset)
+    if damage == "messages":
+        flip(dataset / "messages.mcap", 0.4)
+    else:
+        DAMAGES[damage](dataset)
     target, whole = tmp_path / "export", tmp_path / "whole"
     summary = mp4ds.export(dataset, "tum", target, mp4ds.ExportOptions(**options))
     expected = mp4ds.export(packed[1], "tum", whole, mp4ds.ExportOptions(**options))

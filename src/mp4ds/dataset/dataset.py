@@ -24,7 +24,7 @@ from mp4ds.dataset.channels import (
 )
 from mp4ds.dataset.columns import Choice, everything, last_of, within
 from mp4ds.dataset.images import Images, VideoImages
-from mp4ds.dataset.messages import MessagesFile, RecordedMessage, as_recorded
+from mp4ds.dataset.messages import MessagesFile, RecordedMessage, SalvagedMessages, as_recorded
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.verbatim import VerbatimImages, verbatim_images
@@ -69,6 +69,7 @@ class Dataset:
         streams: Its streams; none for a video without a sidecar, see `mp4ds.open`.
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams.
         is_salvaged: Whether messages may be missing; see `mp4ds.dataset.salvage`.
+        damage: What is wrong with files that have nothing of the selected topics.
 
     Args:
         path: The folder, a manifest, a sidecar, or a video next to its sidecar; or its URL.
@@ -81,6 +82,7 @@ class Dataset:
     """
 
     is_salvaged = False
+    damage = ""
 
     def __init__(self, path: Path | str, *, jpeg_quality: int = 95) -> None:
         self.path = location(path)
@@ -284,6 +286,13 @@ class Dataset:
         """Number of a topic's messages in messages.mcap, from its index."""
         channels, counts = self._file.channels, self._file.counts
         return sum(counts.get(channel.id, 0) for channel in channels if channel.topic == topic)
+
+    @property
+    def salvaged_topics(self) -> list[str]:
+        """Topics of which messages are left in a damaged messages.mcap."""
+        if not isinstance(self._file, SalvagedMessages):
+            return []
+        return [item.topic for item in self._file.channels if self._file.counts.get(item.id)]
 
     def verify_messages(self) -> None:
         """Check messages.mcap against its SHA-256: not all of its contents have their own checksum.

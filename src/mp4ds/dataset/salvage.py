@@ -104,6 +104,47 @@ HOW_TO_SALVAGE = (
 # ---------------------------------------------------------------- opening
 
 
+def open_selected(
+    path: Path | str,
+    selected: Callable[[str], bool],
+    *,
+    jpeg_quality: int = 95,
+    verify_messages: bool = False,
+) -> Dataset:
+    """Open a dataset; damage to files with nothing of the selected topics is noted, and no error.
+
+    Args:
+        path: See `Dataset`.
+        selected: Whether a topic is wanted.
+        jpeg_quality: See `Dataset`.
+        verify_messages: Compare messages.mcap with its SHA-256, too.
+
+    Raises:
+        SourceNotFoundError: The path does not exist.
+        FormatError: It is damaged, and selected topics have, or may have, something to lose.
+    """
+    try:
+        dataset = Dataset(path, jpeg_quality=jpeg_quality)
+        _ = dataset.channels  # opens messages.mcap
+        if verify_messages:
+            dataset.verify_messages()
+        return dataset
+    except VersionError:
+        raise
+    except FormatError as error:
+        try:
+            dataset, losses = open_damaged(path, selected=selected, jpeg_quality=jpeg_quality)
+        except (SourceError, FormatError):
+            raise error from None
+        # nothing vouches for what is still there of a damaged messages.mcap
+        there = dataset.salvaged_topics
+        lost = (loss for loss in losses if loss.file != MESSAGES_NAME or loss.messages != 0)
+        if any(map(selected, there)) or any(lost):
+            raise
+        dataset.damage = str(error)
+        return dataset
+
+
 def open_damaged(
     path: Path | str, *, selected: Callable[[str], bool], jpeg_quality: int
 ) -> tuple[Dataset, list[Loss]]:

@@ -18,7 +18,7 @@ from mp4ds.bags.protocols import BagWriter, begun_by, in_span
 from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
-from mp4ds.dataset.salvage import examine, open_damaged
+from mp4ds.dataset.salvage import examine, open_damaged, open_selected
 from mp4ds.dataset.slicing import latched_at, sliced, span_in
 from mp4ds.errors import (
     ConversionError,
@@ -65,8 +65,8 @@ def unpack(
     """Write a dataset's recording.
 
     Every message of a lossless stream is checked against its digest, and each sidecar, and
-    messages.mcap unless a slice is taken, against the manifest. Damage is an error, unless it is
-    in videos of topics that are left out, or `salvage` asks for what can be read.
+    messages.mcap unless a slice is taken, against the manifest. Damage is an error, unless only
+    topics that are left out have it, or `salvage` asks for what can be read.
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
@@ -105,7 +105,7 @@ def _unpack_here(
     progress: Callable[[UnpackProgress], None] | None,
 ) -> UnpackSummary:
     with ExitStack() as stack:
-        whole, losses = _opened(dataset, chosen)
+        whole, losses = _opened(dataset, chosen, verify=to != "images" and not chosen.slice)
         stack.enter_context(whole)
         given = location(output) if output else default_output(whole.path, to)
         target = Path(os.path.abspath(given))  # noqa: PTH100
@@ -121,8 +121,7 @@ def _unpack_here(
             # where log times do not tell the order, nothing can be cut out, only left out
             is_filtered = bool(chosen.slice) and to != "images" and not whole.is_in_time
             is_filtered = is_filtered and _converts_none(chosen)
-            needs_messages = to != "images" or _needs_messages(whole, chosen.selected)
-            if needs_messages and (is_filtered or not chosen.slice):
+            if is_filtered or (to == "images" and _needs_messages(whole, chosen)):
                 whole.verify_messages()
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
@@ -150,17 +149,22 @@ def _unpack_here(
             raise WriteError(target, error) from error
 
 
-def _opened(dataset: Path | str, options: UnpackOptions) -> tuple[Dataset, list[Loss]]:
+def _opened(
+    dataset: Path | str, options: UnpackOptions, *, verify: bool = False
+) -> tuple[Dataset, list[Loss]]:
     """The dataset, and what is lost of it by files that cannot be read."""
+    selected, quality = options.selected, options.jpeg_quality
     if options.salvage:
-        return open_damaged(dataset, selected=options.selected, jpeg_quality=options.jpeg_quality)
-    return Dataset(dataset, jpeg_quality=options.jpeg_quality), []
+        return open_damaged(dataset, selected=selected, jpeg_quality=quality)
+    opened = open_selected(dataset, selected, jpeg_quality=quality, verify_messages=verify)
+    return opened, []
 
 
-def _needs_messages(dataset: Dataset, selected: Selection) -> bool:
-    """Whether images of selected topics are stored verbatim."""
+def _needs_messages(dataset: Dataset, options: UnpackOptions) -> bool:
+    """Whether images of selected topics are stored verbatim, and all of them are wanted."""
     manifest = dataset.manifest
-    return any(selected(item.topic) for item in manifest.verbatim) if manifest else False
+    verbatim = manifest.verbatim if manifest and not options.slice else ()
+    return any(options.selected(item.topic) for item in verbatim)
 
 
 def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
@@ -179,6 +183,8 @@ def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
 
 def _notes(dataset: Dataset, selected: Selection) -> Iterator[str]:
     """What else the output does not have of the recording."""
+    if dataset.damage:
+        yield f"damaged, but not needed for the selected topics: {dataset.damage}"
     for stream in dataset.streams:
         if stream.sidecar.digests is None and selected(stream.topic):
             yield (

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from mp4ds._version import __version__
 from mp4ds.dataset.collections import datasets_in
-from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.salvage import HOW_TO_SALVAGE
+from mp4ds.dataset.salvage import HOW_TO_SALVAGE, open_selected
 from mp4ds.dataset.slicing import sliced
 from mp4ds.errors import OptionError, advising
 from mp4ds.files.outputs import listed_names, staged
@@ -70,7 +69,10 @@ def export(
     target = Path(os.path.abspath(output))  # noqa: PTH100
     write = _WRITERS[to] if to in _WRITERS else _lerobot_writer()
     with ExitStack() as stack, advising(HOW_TO_SALVAGE):
-        opened = [stack.enter_context(Dataset(path)) for path in paths]
+        opened = [
+            stack.enter_context(open_selected(path, chosen.uses, verify_messages=not chosen.slice))
+            for path in paths
+        ]
         path = stack.enter_context(
             staged(
                 target,

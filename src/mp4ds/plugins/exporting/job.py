@@ -242,11 +242,12 @@ class ExportSource:
     """
 
     def __init__(self, dataset: Dataset, options: ExportOptions, *, in_colour: bool) -> None:
-        dataset.verify_messages()
         self.dataset = dataset
         self.exported: Counter[str] = Counter()
         self.left_out: dict[str, Counter[str]] = {}
         self.notes: list[str] = []
+        if dataset.damage:
+            self.notes.append(f"damaged, but not needed for the selected topics: {dataset.damage}")
         options.selected.check(dataset.all_topics)
         self._options, self._in_colour = options, in_colour
         dataset.verify_sidecars(options.chosen)

@@ -9,10 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from mp4ds.dataset.collections import datasets_in
-from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.salvage import HOW_TO_SALVAGE
+from mp4ds.dataset.salvage import HOW_TO_SALVAGE, open_selected
 from mp4ds.errors import advising
-from mp4ds.plugins.playing.options import PlayOptions
+from mp4ds.plugins.playing.options import PlayOptions, Wanted
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary
 from mp4ds.plugins.playing.timeline import Timeline
 from mp4ds.plugins.ros.node import Node, NodeOptions, open_node, sourced
@@ -71,8 +70,9 @@ def open_player(
     chosen = replace(chosen, names=chosen.names.in_world(world))
     with ExitStack() as stack:
         stack.enter_context(advising(HOW_TO_SALVAGE))
+        wanted = Wanted(chosen)
         opened = [
-            stack.enter_context(Dataset(place, jpeg_quality=chosen.jpeg_quality))
+            stack.enter_context(open_selected(place, wanted, jpeg_quality=chosen.jpeg_quality))
             for place in datasets_in(datasets)
         ]
         timeline = Timeline(opened, chosen, world)
