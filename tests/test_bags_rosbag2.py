@@ -339,6 +339,11 @@ def test_what_sqlite3_cannot_hold_is_counted(tmp_path: Path) -> None:
     assert [c.topic for c in Rosbag2Reader(tmp_path / "a").channels] == ["/image", "/ros1"]
 
 
+def test_a_database_that_cannot_be_made(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="unable to open"):
+        SqliteWriter(tmp_path / "missing" / "a.db3")
+
+
 def test_what_sqlite3_cannot_hold_at_all(tmp_path: Path) -> None:
     with Rosbag2Writer(tmp_path / "a", storage="sqlite3") as writer:
         with pytest.raises(ConversionError, match="topic /none: has no schema"):
@@ -481,11 +486,15 @@ def test_a_database_alone_tells_that_its_payloads_are_compressed(tmp_path: Path)
     assert list(map(fields, messages(read(tmp_path / "a" / "a_0.db3")[1]))) == expected
 
 
-def test_payloads_that_are_not_compressed_as_told(tmp_path: Path) -> None:
-    write(tmp_path / "a", "sqlite3", scene()[1:])
+@pytest.mark.parametrize(
+    ("storage", "place"),
+    [("sqlite3", "message 1, topic /on"), ("mcap", r"message of log time \d+, topic /on")],
+)
+def test_payloads_that_are_not_compressed_as_told(tmp_path: Path, storage: str, place: str) -> None:
+    write(tmp_path / "a", storage, scene()[1:])
     told = {"compression_mode": "message", "compression_format": "zstd"}
     edit(tmp_path / "a", lambda info: info.update(told))
-    with pytest.raises(SourceError, match=r"message 1, topic /on: zstd data is damaged"):
+    with pytest.raises(SourceError, match=rf"{place}: zstd data is damaged"):
         read(tmp_path / "a")
 
 
