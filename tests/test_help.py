@@ -44,6 +44,29 @@ def test_options_stand_by_what_they_are_about(command: str) -> None:
     assert not re.search(r"<[a-z]+( range)?>|x<=|x>=|\{|\]\]", done.stdout)
 
 
+@pytest.mark.parametrize(
+    ("command", "usage", "needed"),
+    [
+        ("play", "DATASET...", True),
+        ("record", "[TOPIC...]", False),
+        ("demo", "[OUTPUT]", False),
+        ("import images", "FOLDER", True),
+    ],
+)
+def test_usage_tells_what_may_be_left_out(command: str, usage: str, needed: bool) -> None:
+    done = CliRunner(env={"COLUMNS": "80"}).invoke(commands, [*command.split(), "--help"])
+    assert done.stdout.splitlines()[0].endswith(f" {command} [OPTIONS] {usage}")
+    if needed:
+        done = CliRunner().invoke(commands, command.split())
+        assert (done.exit_code, f"Missing argument '{usage}'" in done.stderr) == (2, True)
+
+
+def test_images_have_no_options_of_damage_or_shares() -> None:
+    done = CliRunner().invoke(commands, ["import", "images", "--help"])
+    assert "--keep-going" in done.stdout
+    assert not re.search("--(salvage|join|shard|camera-info)", done.stdout)
+
+
 def test_sentences_are_whole(tmp_path: Path) -> None:
     done = run("--help", folder=tmp_path)
     text = " ".join(done.stdout.split())

@@ -156,6 +156,7 @@ def test_signals(drive: Path, number: signal.Signals, code: int) -> None:
         (["{}", "--ros2", "-s", "3"], 2, "'3' is not one of 'sqlite3', 'mcap'"),
         (["{}", "--ros2", "--log-level", "loud"], 2, "--log-level 'loud'"),
         (["{}", "--ros2", "--publish-service-requests"], 2, "services are not called"),
+        (["{}", "--ros2", "--message-order", "sent"], 2, "in which they were received"),
         (["{}", "--ros1", "--wait-for-all-acked", "5"], 2, "works with ros2, not with ros1"),
         (["{}", "--ros2", "--queue", "5"], 2, "works with ros1, not with ros2"),
         (["{}", "--ros2", "--rate-control-topic", "/a"], 2, "works with ros1, not with ros2"),

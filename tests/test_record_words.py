@@ -111,6 +111,7 @@ def test_options_of_jazzy_are_taken() -> None:
         ("--topics", "--topics requires an argument"),
         ("--max-cache-size 1G", "'1G' is not a valid integer"),
         ("--duration soon", "--duration 'soon' is not a number of seconds"),
+        ("-a --duration +1e9", "--duration 1000000000 is not from 0 to 999999999 seconds"),
     ],
 )
 def test_a_value_that_is_wrong(typed: str, said: str) -> None:

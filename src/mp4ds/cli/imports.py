@@ -13,7 +13,7 @@ from mp4ds.cli.output import say, show
 from mp4ds.cli.pack import print_pack
 from mp4ds.cli.progress import pack_progress
 from mp4ds.errors import counted, path_text
-from mp4ds.options import WHERE
+from mp4ds.options import HOW, WHERE
 from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.plugins.demo import demo
 
@@ -32,7 +32,7 @@ def import_command() -> None:
 @argument("folder", "FOLDER", "Folder of images, plain or in a known layout.")
 @_output
 @takes(ImageFolder, "images")
-@takes(PackOptions)
+@takes(PackOptions, without=("camera_info", "join", "salvage"))
 def images_command(folder: str, output: str, images: ImageFolder, options: PackOptions) -> None:
     """Make a dataset from a folder of timestamped images.
 
@@ -69,7 +69,14 @@ import_command.add_command(ros_mp4_command)
     default="demo.mcap",
     type=click.Path(path_type=Path),
 )
-@option("--seconds", type=float, default=3.0, metavar="N", help="Length of the recording.")
+@option(
+    "--seconds",
+    type=float,
+    default=3.0,
+    panel=HOW,
+    metavar="N",
+    help="Length of the recording.  [default: 3]",
+)
 @_force
 def demo_command(output: Path, seconds: float, force: bool) -> None:
     """Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -44,6 +44,11 @@ class Argument(click.Argument):
     def __init__(self, *args: Any, help: str, **values: Any) -> None:  # noqa: A002
         super().__init__(*args, **values)
         self.text = help
+
+    def get_usage_pieces(self, ctx: click.Context) -> list[str]:
+        """The argument in the line of usage, in brackets if it may be left out."""
+        words = self.make_metavar(ctx)
+        return [words if self.required else f"[{words}]"]
 
 
 class Option(click.Option):
@@ -146,14 +151,21 @@ datasets_argument = argument(
 )
 
 
-def takes(kind: type[Options], name: str = "options") -> Callable[[Callable[..., Any]], Any]:
+def takes(
+    kind: type[Options], name: str = "options", without: Collection[str] = ()
+) -> Callable[[Callable[..., Any]], Any]:
     """Give a command the options of a dataclass, and its function an object of it.
 
     Args:
         kind: The dataclass.
         name: Of the function's parameter.
+        without: Fields that have no meaning for the command.
     """
-    fields = [(field, item) for field, item in declared_in(kind) if item.flags is not None]
+    fields = [
+        (field, item)
+        for field, item in declared_in(kind)
+        if item.flags is not None and field not in without
+    ]
     hints = get_type_hints(kind)
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -50,6 +50,14 @@ DIALECT = Dialect(
 """What `rosbag play` and `ros2 bag play` write in another way."""
 
 
+def _check_order(_: click.Context, __: click.Parameter, value: str | None) -> None:
+    if value not in (None, "received"):
+        raise click.UsageError(
+            f"--message-order {value} is not supported: messages are played in the order in which "
+            "they were received."
+        )
+
+
 def _refuse(_: click.Context, parameter: click.Parameter, value: object) -> None:
     if value:
         raise click.UsageError(
@@ -59,7 +67,9 @@ def _refuse(_: click.Context, parameter: click.Parameter, value: object) -> None
 
 
 @command(cls=NodeCommand, dialect=DIALECT)
-@argument("datasets", "DATASET...", "Datasets; several are merged by time.", nargs=-1)
+@argument(
+    "datasets", "DATASET...", "Datasets; several are merged by time.", nargs=-1, required=True
+)
 @option(
     "--storage",
     type=click.Choice(["sqlite3", "mcap"]),
@@ -67,7 +77,7 @@ def _refuse(_: click.Context, parameter: click.Parameter, value: object) -> None
     metavar="TEXT",
     help="Accepted for compatibility with `ros2 bag play`; ignored.",
 )
-@option("--message-order", type=click.Choice(["received"]), hidden=True, expose_value=False)
+@option("--message-order", hidden=True, callback=_check_order, expose_value=False)
 @option("--progress-bar-update-rate", "bar_rate", type=float, hidden=True)
 @accepted("--disable-loan-message", "--try-future-version")
 @accepted("--storage-config-file", "--progress-bar-separation-lines", values=1)

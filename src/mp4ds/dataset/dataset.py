@@ -229,7 +229,7 @@ class Dataset:
         found = self._topic(topic)
         if found is None:
             known = ", ".join(self.topics) or "none"
-            raise KeyError(f"{self.path} has no stream {topic!r}; there are: {known}")
+            raise KeyError(f"{self.path} has no topic {topic!r}; there are: {known}")
         return found
 
     def __contains__(self, topic: object) -> bool:

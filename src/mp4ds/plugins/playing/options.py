@@ -124,7 +124,7 @@ class PlayOptions(ReductionOptions):
         panel=WHERE,
     )
     clock: float | None = option(
-        "Publish /clock at this rate; the default of the rate is 100, or 40 with --ros2.",
+        "Publish /clock, at this rate if one is given; default: 100, or 40 with --ros2.",
         None,
         "--clock",
         "--hz",
@@ -207,7 +207,7 @@ class PlayOptions(ReductionOptions):
         """Refuse options that are invalid or contradict each other."""
         super().__post_init__()
         if self.clock is not None and not 0 < self.clock <= 10_000:
-            raise OptionError(f"`clock` {self.clock:g} is not a rate from 0 to 10000 Hz.")
+            raise OptionError(f"`clock` {self.clock:g} is not a rate above 0 and up to 10000 Hz.")
         if self.until_sec is not None and not math.isfinite(self.until_sec):
             raise OptionError(f"`until_sec` {self.until_sec:g} is not a number of seconds.")
         if self.publish_as not in (None, *KINDS):
