@@ -183,6 +183,34 @@ def test_restart_begins_anew(
     assert facts(tmp_path / "dataset") == expected
 
 
+def test_parts_without_a_plan_are_made_again(
+    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fail_at(tmp_path, source, monkeypatch, PARTS[2])
+    (tmp_path / WORK / "plan.json").unlink()
+    executor = use(monkeypatch, InlineExecutor())
+    mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, codec="ffv1"))
+    assert executor.ran == PARTS
+    assert len(mp4ds.Dataset(tmp_path / "dataset").streams) == 1
+
+
+def test_parts_that_are_being_discarded_keep_their_plan(
+    tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fail_at(tmp_path, source, monkeypatch, PARTS[2])
+    other = replace(IN_PARTS, codec="ffv1")
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            mp4ds.pack(source, tmp_path / "dataset", replace(other, restart=True))
+    with pytest.raises(OptionError, match="different `codec`"):
+        mp4ds.pack(source, tmp_path / "dataset", other)
+
+
 @pytest.mark.parametrize("damage", ["record", "video", "sidecar", "missing"])
 def test_a_part_that_is_not_whole_is_made_again(
     damage: str,

@@ -106,7 +106,7 @@ class PartedPack:
         Raises:
             Mp4dsError: It holds the parts of another pack.
         """
-        if anew and alone:
+        if alone and (anew or self.folder.note() is None):  # parts without a plan may be of any
             self.folder.clear()
         note = PlanNote.of(self.plan)
         if self.folder.note() is None:

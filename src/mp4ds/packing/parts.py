@@ -342,10 +342,11 @@ class PartsFolder:
             TargetError: They cannot be removed.
         """
         try:
-            (self.path / _PLAN_NAME).unlink(missing_ok=True)
             for path in self.path.iterdir():
                 if path.is_dir():
                     shutil.rmtree(path)
+            # last: if this is killed, parts that remain must not be taken for those of another plan
+            (self.path / _PLAN_NAME).unlink(missing_ok=True)
         except OSError as error:
             raise TargetError(
                 self.path, f"cannot be emptied: {error.strerror}", "Remove it yourself."
