@@ -140,7 +140,7 @@ def test_a_piece_that_is_missing(unfinished: Path) -> None:
     (unfinished / PIECE).unlink()
     result = salvaged(unfinished)
     assert result.code == 0, result
-    assert "lost: 000002.mcap: pieces 2 to 2 of the recording are missing" in result.out
+    assert "lost: 000002.mcap: this piece of the recording is missing" in result.out
 
 
 def test_a_part_that_is_damaged(unfinished: Path) -> None:
@@ -148,6 +148,7 @@ def test_a_part_that_is_damaged(unfinished: Path) -> None:
     data = video.read_bytes()
     video.write_bytes(data[:-20] + bytes(20))
     assert_refused(unfinished, PART)
+    assert_refused(unfinished, "]. Move that part out of the folder to recover the others.\n")
     shutil.rmtree(unfinished / PART)
     (unfinished / PART).mkdir()
     assert_refused(unfinished, PART)

@@ -262,7 +262,8 @@ def recover(
             )
         except FormatError as error:
             remedy = "Move that part out of the folder to recover the others."
-            raise SourceError(path, f"has a damaged part: {error}", remedy) from None
+            problem = f"has a damaged part: {str(error).removesuffix('.')}"
+            raise SourceError(path, problem, remedy) from None
 
 
 def _gaps(found: Mapping[int, bool]) -> list[Loss]:
@@ -270,7 +271,9 @@ def _gaps(found: Mapping[int, bool]) -> list[Loss]:
     losses = []
     for before, after in pairwise([-1, *found]):
         if after > before + 1:
-            missing = f"pieces {before + 1} to {after - 1} of the recording are missing"
+            missing = "this piece of the recording is missing"
+            if after > before + 2:
+                missing = f"pieces {before + 1} to {after - 1} of the recording are missing"
             losses.append(Loss(f"{before + 1:06}.mcap", None, None, missing))
     return losses
 
