@@ -350,6 +350,13 @@ def test_a_plain_folder_round_trip(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+def test_names_of_files_are_no_formulas(tmp_path: Path) -> None:
+    plain(tmp_path / "in", ["=1.png", "2.png"])
+    mp4ds.pack(tmp_path / "in", tmp_path / "ds", folder(rate="2", topic="@cam"))
+    lines = attachments(tmp_path / "ds" / "messages.mcap")["images.csv"].decode().splitlines()
+    assert lines[1:] == ["'@cam,0,2.png", "'@cam,500000000,./=1.png"]
+
+
 ROS_CALIBRATION = """\
 image_width: 32
 image_height: 24
