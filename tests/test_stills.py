@@ -238,7 +238,7 @@ def test_what_cannot_be_saved(drive: Path, tmp_path: Path) -> None:
         frames(drive, tmp_path / "out.gif", StillOptions(topic=COLOUR, at="#0"))
     with pytest.raises(OptionError, match=f"`topic` of {COLOUR}, {DEPTH}|{DEPTH}, {COLOUR}"):
         frames(drive, tmp_path / "out.png", StillOptions(at="#0"))
-    with pytest.raises(OptionError, match="no stream '/nowhere'"):
+    with pytest.raises(OptionError, match="no topic '/nowhere'"):
         frames(drive, tmp_path / "out.png", StillOptions(topic="/nowhere", at="#0"))
     (tmp_path / "out.png").write_bytes(b"mine")
     with pytest.raises(TargetExistsError):

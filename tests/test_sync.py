@@ -182,7 +182,7 @@ def test_a_topic_that_changes_its_size_is_one_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("topics", "options", "problem"),
     [
-        (["/none"], {"tolerance_ns": 1}, "no stream '/none'; there are: /left/image, /right"),
+        (["/none"], {"tolerance_ns": 1}, "no topic '/none'; there are: /left/image, /right"),
         ("/left/image", {"tolerance_ns": 1}, r"such as \['/left/image'\]"),
         ([], {"tolerance_ns": 1}, "no topics"),
         (["/left/image", "/left/image"], {"tolerance_ns": 1}, "twice"),

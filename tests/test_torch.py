@@ -299,7 +299,7 @@ def test_nothing_matches(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"topics": ["/up"]}, "has no stream '/up'; there are: /"),
+        ({"topics": ["/up"]}, "has no topic '/up'; there are: /"),
         ({"topics": []}, "topics is empty"),
         ({"offsets": 2}, "offsets is 2, but a list such as (-1, 0)"),
         ({"topics": LEFT}, "topics is a list"),

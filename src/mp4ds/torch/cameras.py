@@ -358,7 +358,7 @@ def _choose(sources: list[CameraSource], topic: str, path: Path | str) -> Camera
     found = [s for s in sources if topic in (s.topic, s.name)]
     if not found:
         known = ", ".join(dict.fromkeys(s.topic for s in sources)) or "none"
-        raise OptionError(f"{path}: has no stream {topic!r}; there are: {known}.")
+        raise OptionError(f"{path}: has no topic {topic!r}; there are: {known}.")
     if len(found) > 1:
         names = ", ".join(s.name for s in found)
         raise OptionError(
