@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mp4ds.errors import Mp4dsError, OptionError, RemoteError, SourceError, TargetError
+from mp4ds.errors import Mp4dsError, OptionError, Refused, RemoteError, SourceError, TargetError
 
 HTTP = ("http", "https")
 INSTALL = "pip install 'mp4ds[remote]'"
@@ -73,10 +73,6 @@ class Facts(NamedTuple):
     is_folder: bool
     size: int | None
     tag: str
-
-
-class NoRangesError(Exception):
-    """A web server sends the whole file when asked for a part."""
 
 
 class Store:
@@ -255,7 +251,7 @@ def _sentences(path: Place, done: str = "read") -> Iterator[None]:
         yield
     except Mp4dsError:
         raise
-    except NoRangesError:
+    except Refused:
         problem = "its web server does not support range requests"
         raise _refusal(path, f"cannot be read remotely: {problem}", "Download it first.") from None
     except Exception as error:

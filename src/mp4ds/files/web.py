@@ -6,7 +6,7 @@ from typing import Any
 
 from fsspec.implementations.http import HTTPFileSystem
 
-from mp4ds.files.store import NoRangesError
+from mp4ds.errors import Refused
 
 
 class RangeFileSystem(HTTPFileSystem):  # type: ignore[misc]
@@ -16,7 +16,7 @@ class RangeFileSystem(HTTPFileSystem):  # type: ignore[misc]
         """A range; one byte more if the server sends more.
 
         Raises:
-            NoRangesError: The server does not support ranges.
+            Refused: The server does not support ranges.
         """
         options = {**self.kwargs, **kwargs}
         headers = {
@@ -28,7 +28,7 @@ class RangeFileSystem(HTTPFileSystem):  # type: ignore[misc]
         async with session.get(self.encode_url(url), headers=headers, **options) as response:
             self._raise_not_found_for_status(response, url)
             if response.status != 206 and start > 0:
-                raise NoRangesError
+                raise Refused("the web server does not support range requests")
             data = bytearray()
             while missing := end - start + 1 - len(data):
                 piece = await response.content.read(missing)
