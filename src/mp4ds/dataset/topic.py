@@ -602,15 +602,20 @@ class Topic:
     ) -> Iterator[Frame]:
         """The frames of a part from its pictures; their index is that in the part."""
         process = os.getpid()
-        with self.parts[owner].naming_frames():
-            for number, picture in pictures:
-                yield self._frame(owner, number, number, picture, view)
-                if os.getpid() != process:
-                    self._opened.inherited.append(pictures)
-                    raise RuntimeError(
-                        f"an iterator over {self.topic} that process {process} began cannot go on "
-                        f"in process {os.getpid()}, a fork of it: begin it again there"
-                    )
+        try:
+            with self.parts[owner].naming_frames():
+                for number, picture in pictures:
+                    yield self._frame(owner, number, number, picture, view)
+                    if os.getpid() != process:
+                        self._opened.inherited.append(pictures)
+                        raise RuntimeError(
+                            f"an iterator over {self.topic} that process {process} began cannot "
+                            f"go on in process {os.getpid()}, a fork of it: begin it again there"
+                        )
+        finally:
+            # closes its decoder: Python 3.10's contextlib leaves this frame in a cycle with what
+            # ended it, until the next collection of garbage
+            del pictures
 
     def _merged(self, indices: Integers, parts: Mapping[int, Iterator[Frame]]) -> Iterator[Frame]:
         """Frames in a given order, with an iterator for each part.
