@@ -314,7 +314,8 @@ class Republisher:
         is_reduced = plan.size is not None or plan.is_kept is not None
         if infos is None or not is_reduced or not selected(infos.channel.topic):
             return
-        given, is_wanted = infos, np.ones(len(infos), np.bool_)
+        given = infos
+        is_wanted: NDArray[np.bool_] = np.ones(len(infos), np.bool_)
         if plan.size is not None:
             try:
                 given = resized(infos, stream, plan.size)
