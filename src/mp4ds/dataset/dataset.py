@@ -69,7 +69,7 @@ class Dataset:
         streams: Its streams; none for a video without a sidecar, see `mp4ds.open`.
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams.
         is_salvaged: Whether messages may be missing; see `mp4ds.dataset.salvage`.
-        damage: What is wrong with files that have nothing of the selected topics.
+        damage: Which damaged file was left out, as no selected topic needs it; empty if none was.
 
     Args:
         path: The folder, a manifest, a sidecar, or a video next to its sidecar; or its URL.

@@ -141,7 +141,7 @@ def open_selected(
         lost = (loss for loss in losses if loss.file != MESSAGES_NAME or loss.messages != 0)
         if any(map(selected, there)) or any(lost):
             raise
-        dataset.damage = str(error)
+        dataset.damage = f"damaged, but not needed for the selected topics: {error}"
         return dataset
 
 

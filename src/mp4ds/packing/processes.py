@@ -49,7 +49,7 @@ class CallError(Exception):
 
 
 def call_error(error: BaseException) -> CallError:
-    """What is told of the error of a call, wherever it ran."""
+    """An error of a call as its caller gets it, wherever the call ran."""
     if isinstance(error, CallError):
         return error
     if isinstance(error, Mp4dsError):

@@ -184,7 +184,7 @@ def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
 def _notes(dataset: Dataset, selected: Selection) -> Iterator[str]:
     """What else the output does not have of the recording."""
     if dataset.damage:
-        yield f"damaged, but not needed for the selected topics: {dataset.damage}"
+        yield dataset.damage
     for stream in dataset.streams:
         if stream.sidecar.digests is None and selected(stream.topic):
             yield (

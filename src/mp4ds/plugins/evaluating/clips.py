@@ -86,7 +86,7 @@ def open_cameras(place: Path) -> Iterator[tuple[list[Camera], dict[str, str]]]:
         Its cameras, and the topics of those whose images no encoder takes, with the reason.
 
     Raises:
-        SourceError: It is none of these.
+        SourceError: It is not a recording, a dataset or a video.
         FormatError: It is a dataset, and breaks a rule of the format.
     """
     if names_dataset(place):

@@ -245,9 +245,7 @@ class ExportSource:
         self.dataset = dataset
         self.exported: Counter[str] = Counter()
         self.left_out: dict[str, Counter[str]] = {}
-        self.notes: list[str] = []
-        if dataset.damage:
-            self.notes.append(f"damaged, but not needed for the selected topics: {dataset.damage}")
+        self.notes = [dataset.damage] if dataset.damage else []
         options.selected.check(dataset.all_topics)
         self._options, self._in_colour = options, in_colour
         dataset.verify_sidecars(options.chosen)
