@@ -25,7 +25,7 @@ from mp4ds.bags.files import (
     unreadable,
 )
 from mp4ds.errors import SourceError
-from mp4ds.files.urls import expect
+from mp4ds.files.ranges import expect
 from mp4ds.records import Attachment, Channel, Loss, Message, MetadataRecord, Schema
 
 MAGIC = b"\x89MCAP0\r\n"

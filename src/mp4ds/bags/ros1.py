@@ -44,7 +44,7 @@ from mp4ds.bags.ros1_records import (
     unpack_chunk,
 )
 from mp4ds.errors import ConversionError, OptionError, TargetExistsError
-from mp4ds.files.urls import expect
+from mp4ds.files.ranges import expect
 from mp4ds.records import Channel, Excerpt, Message, Record
 
 CACHED_CHUNKS = 8

@@ -19,6 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from mp4ds.errors import TargetError, TargetExistsError, WriteError, counted
+from mp4ds.files.urls import remote
 
 try:
     import fcntl
@@ -431,7 +432,7 @@ def check_place(target: Path, sources: Sequence[Path]) -> None:
         TargetError: It would be, or there is no folder to write to.
     """
     place = target.resolve()
-    for source in (path.resolve() for path in sources):
+    for source in (path.resolve() for path in sources if not remote(path)):
         if place == source or source in place.parents or place in source.parents:
             raise TargetError(
                 target,

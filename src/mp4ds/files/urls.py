@@ -6,308 +6,49 @@ to know where a file is. Local paths never get here, and fsspec is imported for 
 
 from __future__ import annotations
 
-import io
+import os
 import re
-from bisect import bisect_left, bisect_right
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property
+import stat
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 from reprlib import repr as shortened
-from threading import Lock
-from typing import Any, BinaryIO, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 from urllib.parse import quote, unquote, urlsplit
 
-from mp4ds.errors import RemoteError, SourceError
-from mp4ds.files.store import HTTP, Facts, Place, Range, Store
+from mp4ds.errors import Mp4dsError, OptionError, Refused, RemoteError, SourceError, TargetError
+from mp4ds.files.ranges import Blocks, Range, RemoteFile
 
-Fetch = Callable[[Sequence[Range]], list[bytes]]
-"""Fetches ranges, all at once."""
-
-KEPT_BYTES = 32 * 2**20
-"""Kept per open file, for other readers of the same bytes."""
-
-_IDLE_BYTES = 2**20
-_LEAST, _MOST = 2**17, 2**22  # read-ahead: at first, and after a while of reading in order
-_FILL_BYTES = 2 * _MOST
-_FIRST_BATCH_BYTES, _BATCH_BYTES, _BATCH_RANGES = 2**19, 2**23, 256
-_GAP = 2**16  # smaller gaps cost less to fetch than a second request
-
-
-class Segments:
-    """The most recently fetched bytes of a file, shared by all its current readers.
-
-    Threads may share it.
-    """
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._data: OrderedDict[int, bytes] = OrderedDict()  # by first byte, the latest last
-        self._starts: list[int] = []
-        self._size = 0
-        self._users = 0
-
-    def claim(self) -> None:
-        """Keep bytes until `release`."""
-        with self._lock:
-            self._users += 1
-
-    def release(self) -> None:
-        """Drop what is no longer needed."""
-        with self._lock:
-            self._users -= 1
-            if not self._users:
-                self._shrink(_IDLE_BYTES)
-
-    def add(self, start: int, data: bytes) -> None:
-        """Keep fetched bytes; segments are never nested."""
-        end = start + len(data)
-        with self._lock:
-            number = bisect_right(self._starts, start) - 1
-            if number >= 0 and self._end(number) >= end:
-                self._data.move_to_end(self._starts[number])
-                return
-            number = bisect_left(self._starts, start)
-            while number < len(self._starts) and self._end(number) <= end:
-                self._size -= len(self._data.pop(self._starts.pop(number)))
-            self._starts.insert(number, start)
-            self._data[start] = data
-            self._size += len(data)
-            self._shrink(KEPT_BYTES)
-
-    def _end(self, number: int) -> int:
-        start = self._starts[number]
-        return start + len(self._data[start])
-
-    def _shrink(self, size: int) -> None:
-        while self._size > size and self._data:
-            start, data = self._data.popitem(last=False)
-            del self._starts[bisect_left(self._starts, start)]
-            self._size -= len(data)
-
-    def at(self, place: int) -> tuple[int, bytes] | None:
-        """The kept bytes that hold a place, and where they begin."""
-        with self._lock:
-            number = bisect_right(self._starts, place) - 1
-            if number < 0:
-                return None
-            start = self._starts[number]
-            data = self._data[start]
-            if place >= start + len(data):
-                return None
-            self._data.move_to_end(start)
-            return start, data
-
-    def hold(self, start: int, end: int) -> bool:
-        """Whether all bytes of a range are kept."""
-        while start < end:
-            found = self.at(start)
-            if found is None:
-                return False
-            start = found[0] + len(found[1])
-        return True
-
-    def next_start(self, place: int, default: int) -> int:
-        """Where the next kept bytes begin after a place."""
-        with self._lock:
-            number = bisect_right(self._starts, place)
-            return self._starts[number] if number < len(self._starts) else default
-
-
-class RemoteFile(io.RawIOBase):
-    """A remote file, open for reading; `read` returns less than requested only at the end.
-
-    Sequential reading fetches more and more ahead, random reading little more than requested.
-    Ranges announced by `expect` are fetched while earlier ones are being used.
-
-    Args:
-        size: Bytes of the file.
-        fetch: Fetches ranges; reading raises its errors.
-        segments: The kept bytes of the file.
-    """
-
-    def __init__(self, size: int, fetch: Fetch, segments: Segments) -> None:
-        super().__init__()
-        self._size = size
-        self._fetch = fetch
-        self._segments = segments
-        self._place = 0
-        self._read_to = 0
-        self._ahead = 0
-        self._plan: _Plan | None = None
-        segments.claim()
-
-    def expect(self, ranges: Iterable[Range]) -> None:
-        """See `mp4ds.files.urls.expect`; replaces earlier announcements."""
-        self._drop_plan()
-        missing = (span for span in ranges if not self._segments.hold(*span))
-        self._plan = _Plan(missing, self._load)
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Read that many bytes, or all that are left."""
-        place = self._place
-        wanted = self._size if size is None or size < 0 else place + size
-        end = max(place, min(wanted, self._size))
-        pieces: list[bytes | memoryview] = []
-        while place < end:
-            if self._plan:
-                self._plan.reach(place)
-            found = self._segments.at(place)
-            if found is None:
-                self._fill(place, end)
-                continue
-            start, data = found
-            piece = memoryview(data)[place - start : end - start]
-            pieces.append(piece)
-            place += len(piece)
-            self._read_to = place
-        self._place = place
-        return b"".join(pieces)
-
-    def _fill(self, place: int, end: int) -> None:
-        """Fetch what is missing from a position on, and something after it."""
-        if 0 <= place - self._read_to <= _GAP:
-            self._ahead = min(max(2 * self._ahead, _LEAST), _MOST)
-        else:
-            self._ahead = _LEAST
-        wanted = min(max(end, place + self._ahead), place + _FILL_BYTES, self._size)
-        stop = self._segments.next_start(place, wanted)
-        # After a file's last bytes, readers usually want those before them.
-        start = max(0, min(place, self._size - _LEAST)) if stop == self._size else place
-        self._load([(start, min(stop, wanted))])
-
-    def _load(self, ranges: Iterable[Range]) -> None:
-        pieces = list(_split(ranges, _MOST))
-        for (start, _), data in zip(pieces, self._fetch(pieces), strict=True):
-            self._segments.add(start, data)
-
-    def readinto(self, buffer: Any, /) -> int:
-        """Read into a buffer."""
-        view = memoryview(buffer).cast("B")
-        data = self.read(len(view))
-        view[: len(data)] = data
-        return len(data)
-
-    def readable(self) -> bool:
-        """Always."""
-        return True
-
-    def seekable(self) -> bool:
-        """Always."""
-        return True
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Change the position; costs nothing."""
-        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._size}[whence]
-        if base + offset < 0:
-            raise ValueError(f"seek to {base + offset}, before the file")
-        self._place = base + offset
-        return self._place
-
-    def tell(self) -> int:
-        """The position."""
-        return self._place
-
-    def close(self) -> None:
-        """Stop fetching, and drop what was fetched."""
-        if not self.closed:
-            self._drop_plan()
-            self._segments.release()
-        super().close()
-
-    def _drop_plan(self) -> None:
-        if self._plan:
-            self._plan.close()
-            self._plan = None
-
-
-def _split(ranges: Iterable[Range], most: int) -> Iterator[Range]:
-    """Ranges in pieces of that many bytes at most."""
-    for start, end in ranges:
-        for first in range(start, end, most):
-            yield first, min(first + most, end)
-
-
-class _Plan:
-    """Fetches announced ranges in batches, each while the previous one is being used.
-
-    Args:
-        ranges: In the order of reading.
-        load: Fetches ranges and keeps them.
-    """
-
-    def __init__(self, ranges: Iterable[Range], load: Callable[[Iterable[Range]], None]) -> None:
-        self._batches = _batches(ranges)
-        self._load = load
-        self._worker = ThreadPoolExecutor(1, "mp4ds-fetch")
-        self._current: list[Range] = []
-        self._next: list[Range] = []
-        self._coming: Future[None] | None = None
-        self._begin_next()
-
-    def reach(self, place: int) -> None:
-        """Wait for the bytes at a position, if they are the next announced ones."""
-        while _holds(self._next, place) and not _holds(self._current, place):
-            if self._coming is None:
-                self._coming = self._worker.submit(self._load, self._next)
-            coming, self._coming = self._coming, None
-            coming.result()
-            self._current = self._next
-            self._begin_next()
-            if self._next:
-                self._coming = self._worker.submit(self._load, self._next)
-
-    def _begin_next(self) -> None:
-        self._next = next(self._batches, [])
-
-    def close(self) -> None:
-        """Stop fetching."""
-        self._worker.shutdown(wait=False, cancel_futures=True)
-
-
-def _holds(ranges: Sequence[Range], place: int) -> bool:
-    return any(start <= place < end for start, end in ranges)
-
-
-def _batches(ranges: Iterable[Range]) -> Iterator[list[Range]]:
-    """Ranges to fetch at once, merging those close to each other.
-
-    The batches grow, since readers may stop early.
-    """
-    batch: list[Range] = []
-    size, most = 0, _FIRST_BATCH_BYTES
-    for start, end in _split(ranges, _MOST):
-        length = end - start
-        if batch and (size + length > most or len(batch) == _BATCH_RANGES):
-            yield batch
-            batch, size, most = [], 0, min(2 * most, _BATCH_BYTES)
-        if batch and 0 <= start - batch[-1][1] <= _GAP:
-            size += start - batch[-1][1]
-            batch[-1] = batch[-1][0], end
-        else:
-            batch.append((start, end))
-        size += length
-    if batch:
-        yield batch
-
-
-# ---------------------------------------------------------------- path
+_HTTP = ("http", "https")
+_S3 = ("s3", "s3a")
+_HUB = "hf"  # of Hugging Face, whose files would read ahead, and fetch one range after another
+_INSTALL = "Run: pip install 'mp4ds[remote]'"
+# Many small ranges are requested at once, on that many connections; botocore's default is 10.
+_AT_ONCE, _HUB_AT_ONCE = 32, 8
+# By default s3fs keeps ten parts of 50 MiB in memory.
+_S3_UPLOAD = {"chunksize": 2**24, "max_concurrency": 4}
+_TAGS = ("ETag", "etag", "blob_id", "md5Hash", "Content-MD5")
+_TIMES = ("LastModified", "Last-Modified", "mtime")
+_GONE = "could not be read: it no longer exists"
+_NETWORK = "Check the network, and try again."
+_ACCESS = "Check the address and your credentials for it."
 
 _SIGNS = ("dataset.yaml", "metadata.yaml")
 """Files that identify a recording's or dataset's folder on a web server, which lists nothing."""
 
 _FILE_SUFFIXES = (".bag", ".mcap", ".db3", ".zstd", ".mp4", ".yaml", ".yml")
 
+if TYPE_CHECKING:
+    # all that reads a path may be given one at a URL, which has what reading needs of it; it is no
+    # path at run time, so that what only the local file system has is an error there
+    _Path = Path
+else:
+    _Path = object
 
-class RemoteStat(NamedTuple):
-    """The part of a stat result that stores provide; sizes in bytes, times in nanoseconds."""
 
-    st_size: int
-    st_mtime_ns: int = 0
-
-
-class RemotePath(Place):
+class RemotePath(_Path):
     """A URL with the parts of `pathlib.Path` that reading needs.
 
     A store's information is requested once and cached for the object's life; a new object sees
@@ -315,18 +56,20 @@ class RemotePath(Place):
 
     Args:
         url: With its scheme; a web address keeps its query, also for files in a folder.
-        store: Its file system's store; None to find it.
+        file_system: fsspec's, of another path in the same store; None to find it.
     """
 
-    def __init__(self, url: str, store: Store | None = None) -> None:
+    def __init__(self, url: str, file_system: Any = None) -> None:
         self.scheme, _, rest = url.partition("://")
         self.scheme = self.scheme.lower()
+        self._on_web = self.scheme in _HTTP
         query = ""
-        if self.scheme in HTTP:
+        if self._on_web:
             rest, _, query = rest.partition("#")[0].partition("?")
         self._rest = rest.rstrip("/")
         self._query = f"?{query}" if query else ""
-        self._given_store = store
+        if file_system is not None:
+            self._files = file_system
 
     @property
     def url(self) -> str:
@@ -352,35 +95,18 @@ class RemotePath(Place):
     def __reduce__(self) -> tuple[object, ...]:
         return RemotePath, (self.url,)
 
-    @cached_property
-    def _store(self) -> Store:
-        return self._given_store or Store(self)
-
-    def check(self) -> None:
-        """Refuse a scheme that cannot be used.
-
-        Raises:
-            OptionError: Says what to do.
-        """
-        _ = self._store
-
     # ---------------------------------------------------------------- names
 
     @property
     def name(self) -> str:
         """The last part."""
         name = self._rest.rpartition("/")[2]
-        return unquote(name) if self.scheme in HTTP else name
+        return unquote(name) if self._on_web else name
 
     @property
     def suffix(self) -> str:
         """Its extension, with the dot."""
         return PurePosixPath(self.name).suffix
-
-    @property
-    def suffixes(self) -> list[str]:
-        """All its extensions."""
-        return PurePosixPath(self.name).suffixes
 
     @property
     def stem(self) -> str:
@@ -392,22 +118,12 @@ class RemotePath(Place):
         """Its parent folder; for a bucket or host, itself."""
         return self._at(self._rest.rpartition("/")[0] or self._rest)
 
-    @property
-    def parents(self) -> Sequence[RemotePath]:
-        """All its parent folders, the nearest first."""
-        found = []
-        path = self
-        while path.parent != path:
-            path = path.parent
-            found.append(path)
-        return found
-
     def _at(self, rest: str) -> RemotePath:
-        return RemotePath(f"{self.scheme}://{rest}{self._query}", self._store)
+        return RemotePath(f"{self.scheme}://{rest}{self._query}", self.__dict__.get("_files"))
 
     def __truediv__(self, name: str) -> RemotePath:  # type: ignore[override]
         tail = str(name).strip("/")
-        return self._at(f"{self._rest}/{quote(tail) if self.scheme in HTTP else tail}")
+        return self._at(f"{self._rest}/{quote(tail) if self._on_web else tail}")
 
     def with_name(self, name: str) -> RemotePath:
         """A sibling with another name."""
@@ -417,10 +133,6 @@ class RemotePath(Place):
         """The same with another extension."""
         return self.with_name(PurePosixPath(self.name).with_suffix(suffix).name)
 
-    def absolute(self) -> RemotePath:
-        """Itself."""
-        return self
-
     def resolve(self) -> RemotePath:  # type: ignore[override]
         """Itself."""
         return self
@@ -428,16 +140,75 @@ class RemotePath(Place):
     # ---------------------------------------------------------------- what is there
 
     @cached_property
-    def _facts(self) -> Facts | None:
-        may_be_folder = self.scheme in HTTP and self.suffix not in _FILE_SUFFIXES
+    def _files(self) -> Any:
+        """The file system of its store.
+
+        Raises:
+            OptionError: The scheme is unknown, or its dependency is not installed.
+        """
+        try:
+            import fsspec
+            from fsspec.config import conf
+            from fsspec.core import url_to_fs
+        except ImportError:
+            raise OptionError(f"{self}: URLs need an optional dependency. {_INSTALL}") from None
+        if self.scheme not in fsspec.available_protocols():
+            raise OptionError(
+                f"{self}: {self.scheme}:// is not supported. Use s3, gs, hf, https, http, file, or "
+                "another fsspec scheme."
+            )
+        options: dict[str, Any] = {}
+        if self.scheme in _S3 and "config_kwargs" not in conf.get("s3", {}):
+            options["config_kwargs"] = {"max_pool_connections": _AT_ONCE}
+        try:
+            found = url_to_fs(self.url, **options)[0]
+            if self._on_web:
+                from mp4ds.files.web import RangeFileSystem
+
+                found = RangeFileSystem(**found.storage_options)
+        except ImportError as error:
+            is_of_extra = self.scheme in (*_S3, *_HTTP)
+            remedy = _INSTALL if is_of_extra else _text(error)
+            raise OptionError(
+                f"{self}: {self.scheme}:// URLs need an optional dependency. {remedy}."
+            ) from None
+        except Exception as error:
+            problem = f"could not be opened: {_explained(error)[1]}"
+            raise RemoteError(self, problem, _ACCESS) from None
+        return found
+
+    def check(self) -> None:
+        """Refuse a scheme that cannot be used.
+
+        Raises:
+            OptionError: Says what to do.
+        """
+        _ = self._files
+
+    @property
+    def _key(self) -> str:
+        """What its store calls it."""
+        return str(self._files._strip_protocol(self.url))
+
+    @cached_property
+    def _info(self) -> Mapping[str, Any] | None:
+        """What its store says of it; None for nothing there."""
+        may_be_folder = self._on_web and self.suffix not in _FILE_SUFFIXES
         if may_be_folder and any((self / sign).is_file() for sign in _SIGNS):
-            return Facts(True, None, "")
-        return self._store.look(self)
+            return {"type": "directory"}
+        try:
+            with _sentences(self):
+                self._files.invalidate_cache()
+                info: Mapping[str, Any] = self._files.info(self._key)
+        except FileNotFoundError:
+            return None
+        return info
 
     @property
     def tag(self) -> str:
         """The store's tag of the content, which changes with it; may be empty."""
-        return self._facts.tag if self._facts else ""
+        info = self._info or {}
+        return next((f"{name} {info[name]}" for name in (*_TAGS, *_TIMES) if info.get(name)), "")
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:
         """Whether anything exists.
@@ -446,40 +217,50 @@ class RemotePath(Place):
             SourceError: The store refuses to tell.
             RemoteError: It does not answer.
         """
-        return self._facts is not None
+        return self._info is not None
 
     def is_dir(self, *, follow_symlinks: bool = True) -> bool:
         """Whether it is a folder; on a web server, one of a recording or dataset."""
-        return self._facts is not None and self._facts.is_folder
+        return self._info is not None and self._info.get("type") == "directory"
 
     def is_file(self, *, follow_symlinks: bool = True) -> bool:
         """Whether it is a file."""
-        return self._facts is not None and not self._facts.is_folder
+        return self.exists() and not self.is_dir()
 
-    def stat(self, *, follow_symlinks: bool = True) -> RemoteStat:  # type: ignore[override]
-        """Its size.
+    def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
+        """Its kind and size; no times.
 
         Raises:
             FileNotFoundError: It does not exist.
             SourceError: The size is unknown.
         """
-        return RemoteStat(0 if self.is_dir() else self._size())
+        kind, size = (stat.S_IFDIR, 0) if self.is_dir() else (stat.S_IFREG, self._size())
+        return os.stat_result((kind, 0, 0, 0, 0, 0, size, 0, 0, 0), {"st_mtime_ns": 0})
 
     def _size(self) -> int:
-        facts = self._facts
-        if facts is None:
+        if self._info is None:
             raise FileNotFoundError(2, "No such file", str(self))
-        if facts.size is None:
+        size: int | None = self._info.get("size")
+        if size is None:
             raise SourceError(
                 self,
                 "cannot be read remotely: the server does not report its size",
                 "Download it first.",
             )
-        return facts.size
+        return size
 
     def iterdir(self) -> Iterator[RemotePath]:  # type: ignore[override]
         """Its direct entries; none on a web server, which does not list."""
-        return (self / name for name in self._store.names(self))
+        if self._on_web:
+            return iter(())
+        try:
+            with _sentences(self):
+                self._files.invalidate_cache()
+                found = self._files.ls(self._key, detail=False)
+        except (FileNotFoundError, NotADirectoryError):
+            return iter(())
+        keys = sorted({str(key).rstrip("/") for key in found} - {self._key})
+        return (self / key.rpartition("/")[2] for key in keys)
 
     def rglob(self, name: str) -> Iterator[RemotePath]:  # type: ignore[override]
         """The files with a name (not a pattern) in and below it; none on a web server."""
@@ -487,22 +268,30 @@ class RemotePath(Place):
 
     def files(self) -> list[RemotePath]:
         """All files in and below it; none on a web server, which does not list."""
-        return [self / path for path in self._store.files(self)]
+        if self._on_web:
+            return []
+        with _sentences(self):
+            self._files.invalidate_cache()
+            keys = self._files.find(self._key)
+        return [self / key for key in sorted(str(key).removeprefix(self._key) for key in keys)]
 
     # ---------------------------------------------------------------- content
 
     @cached_property
-    def _segments(self) -> Segments:
-        return Segments()
+    def _blocks(self) -> Blocks:
+        return Blocks()
 
     @cached_property
     def _open_size(self) -> int:
+        """Its size; a web server that sends whole files when asked for a part is refused."""
         size = self._size()
-        self._store.check_ranges(self, size)
+        if self._on_web and size > 1:
+            try:
+                with _sentences(self):
+                    self._files.cat_file(self._key, start=size - 1, end=size)
+            except FileNotFoundError:
+                raise RemoteError(self, _GONE) from None
         return size
-
-    def _fetch(self, ranges: Sequence[Range]) -> list[bytes]:
-        return self._store.fetch(self, ranges)
 
     def open(self, mode: str = "rb") -> BinaryIO:  # type: ignore[override]
         """Open it for reading by ranges.
@@ -516,7 +305,36 @@ class RemotePath(Place):
             raise ValueError(f"mode {mode!r}: a remote file is opened with 'rb' only")
         if self.is_dir():
             raise IsADirectoryError(21, "Is a folder", str(self))
-        return cast(BinaryIO, RemoteFile(self._open_size, self._fetch, self._segments))
+        return cast(BinaryIO, RemoteFile(self._open_size, self._fetch, self._blocks))
+
+    def _fetch(self, ranges: Sequence[Range]) -> list[bytes]:
+        """Ranges of it, all at once.
+
+        Raises:
+            RemoteError: The store does not return them, or the file has changed.
+        """
+        starts, ends = [start for start, _ in ranges], [end for _, end in ranges]
+        try:
+            with _sentences(self, "fetched"):
+                if self.scheme == _HUB:
+                    ask = partial(self._files.cat_file, self._key, cache_type="none")
+                    with ThreadPoolExecutor(_HUB_AT_ONCE) as pool:
+                        found = list(pool.map(lambda span: ask(start=span[0], end=span[1]), ranges))
+                else:
+                    options = {"batch_size": _AT_ONCE} if self._files.async_impl else {}
+                    found = self._files.cat_ranges(
+                        [self._key] * len(ranges), starts, ends, **options
+                    )
+                for error in found:
+                    if isinstance(error, BaseException):
+                        raise error
+        except FileNotFoundError:
+            raise RemoteError(self, _GONE) from None
+        for (start, end), data in zip(ranges, found, strict=True):
+            if len(data) != end - start:
+                problem = f"got {len(data)} of {end - start} bytes from byte {start} on"
+                raise RemoteError(self, f"could not be read: {problem}", _NETWORK)
+        return found
 
     def read_bytes(self) -> bytes:
         """All of it."""
@@ -528,7 +346,7 @@ class RemotePath(Place):
     @property
     def is_writable(self) -> bool:
         """Whether its kind of store accepts uploads."""
-        return self.scheme not in HTTP
+        return not self._on_web
 
     def upload(self, local: Path) -> RemotePath:
         """Upload a file here, replacing what is there.
@@ -540,8 +358,10 @@ class RemotePath(Place):
             TargetError: The store denies access.
             RemoteError: It does not respond, or has stored less.
         """
-        self._store.put(local, self)
-        now = RemotePath(self.url, self._store)
+        with _sentences(self, "uploaded"):
+            options = _S3_UPLOAD if self.scheme in _S3 else {}
+            self._files.put_file(str(local), self._key, **options)
+        now = self._at(self._rest)
         sizes = now.stat().st_size if now.exists() else 0, local.stat().st_size
         if sizes[0] != sizes[1]:
             problem = f"could not be uploaded: only {sizes[0]} of {sizes[1]} bytes arrived"
@@ -555,10 +375,11 @@ class RemotePath(Place):
             TargetError: The store denies access.
             RemoteError: It does not answer.
         """
-        self._store.remove(self)
+        with suppress(FileNotFoundError), _sentences(self, "removed"):
+            self._files.rm_file(self._key)
 
 
-# ---------------------------------------------------------------- remote
+# ---------------------------------------------------------------- locations
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
 _LOCAL = ("file", "local")
@@ -603,13 +424,104 @@ def spelled(path: Path) -> str:
     return found.url if found else str(path.absolute())
 
 
-def expect(stream: object, ranges: Iterable[tuple[int, int]]) -> None:
-    """Announce which bytes of a file will be read, so that a remote one fetches them in time.
+# ---------------------------------------------------------------- errors
+
+_REFUSED = (401, 403)
+_MISSING = (404, 410)
+_PARSER = "aiohttp.http_exceptions"
+_BROKEN_OFF = ("ContentLengthError", "TransferEncodingError", "IncompleteReadError")
+_NO_CREDENTIALS = "Credentials"  # in the names of errors of store libraries
+_MAX_TEXT, _MAX_CAUSES = 300, 8
+
+
+@contextmanager
+def _sentences(path: RemotePath, done: str = "read") -> Iterator[None]:
+    """Translate fsspec's errors; a missing file becomes a FileNotFoundError.
 
     Args:
-        stream: From ``open("rb")`` of a local path or a `RemotePath`.
-        ranges: First byte and end of each, in the order of reading; other bytes may be read
-            between.
+        path: What is being accessed.
+        done: The operation, as a participle.
     """
-    if isinstance(stream, RemoteFile):
-        stream.expect(ranges)
+    try:
+        yield
+    except Mp4dsError:
+        raise
+    except Refused:
+        problem = "cannot be read remotely: its web server does not support range requests"
+        raise SourceError(path, problem, "Download it first.") from None
+    except Exception as error:
+        verdict, reason = _explained(error)
+        if verdict == "missing" and done != "uploaded":
+            raise FileNotFoundError(str(path)) from None
+        what = "access denied: " if verdict == "refused" else ""
+        if verdict == "failed" or done == "fetched":  # the latter was allowed before
+            done = "read" if done == "fetched" else done
+            raise RemoteError(path, f"could not be {done}: {what}{reason}", _NETWORK) from None
+        kind = SourceError if done == "read" else TargetError
+        raise kind(path, f"cannot be {done}: {what}{reason}", _ACCESS) from None
+
+
+def _explained(error: BaseException) -> tuple[str, str]:
+    """Classify an error of fsspec or its dependencies.
+
+    Returns:
+        ``missing``, ``refused`` or ``failed``; and why, as the end of a sentence.
+    """
+    causes = list(_causes(error))
+    statuses = [status for status in map(_status, causes) if status]
+    reason = next(filter(None, map(_text, reversed(causes))), type(error).__name__)
+    if any(status in _REFUSED for status in statuses):
+        return "refused", reason
+    if any(isinstance(e, PermissionError) or _NO_CREDENTIALS in type(e).__name__ for e in causes):
+        return "refused", reason
+    if any(status in _MISSING for status in statuses):
+        return "missing", reason
+    # For fsspec, a URL to which a web server does not respond does not exist.
+    if isinstance(error, FileNotFoundError) and not any(map(_is_of_network, causes)):
+        return "missing", reason
+    return "failed", reason
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    cause: BaseException | None = error
+    for _ in range(_MAX_CAUSES):
+        if cause is None:
+            return
+        yield cause
+        cause = cause.__cause__
+
+
+def _status(error: BaseException) -> int | None:
+    """The HTTP status that a server answered with."""
+    if type(error).__module__ == _PARSER:  # which numbers its own errors as if they were answers
+        return None
+    response = getattr(error, "response", None)
+    if isinstance(response, Mapping):
+        return _number(response.get("ResponseMetadata", {}).get("HTTPStatusCode"))
+    return _number(getattr(error, "status", None)) or _number(getattr(error, "code", None))
+
+
+def _number(value: object) -> int | None:
+    return int(str(value)) if str(value).isdecimal() else None
+
+
+def _is_of_network(error: BaseException) -> bool:
+    is_aiohttp = type(error).__module__.startswith("aiohttp")
+    return is_aiohttp or isinstance(error, ConnectionError) or _is_timeout(error)
+
+
+def _is_timeout(error: BaseException) -> bool:
+    return type(error).__name__.endswith("TimeoutError")  # there are many kinds
+
+
+def _text(error: BaseException) -> str:
+    if _is_timeout(error):
+        return "it took too long to answer"
+    if type(error).__name__ in _BROKEN_OFF:
+        return "the server closed the connection before it had sent all"
+    message = getattr(error, "message", None)
+    if isinstance(message, str) and _status(error):
+        return f"{_status(error)} {message.rstrip('.')}"  # the URL may hold a secret
+    told = message if type(error).__module__ == _PARSER else error
+    text = " ".join(str(told).split()).rstrip(".")
+    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]} ..."

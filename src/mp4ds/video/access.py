@@ -13,7 +13,7 @@ import numpy as np
 from av.error import FFmpegError
 
 from mp4ds.errors import FormatError, Refused, VideoError, reason_of
-from mp4ds.files.urls import expect
+from mp4ds.files.ranges import expect
 from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.coded import UnknownStructure
 from mp4ds.messages.encodings import Pixels

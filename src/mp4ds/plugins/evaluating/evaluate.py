@@ -21,7 +21,7 @@ import numpy as np
 from mp4ds._version import __version__
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, counted
 from mp4ds.files.outputs import check_place, refuse_not_ours, work_folder, write_synced
-from mp4ds.files.urls import location, remote
+from mp4ds.files.urls import location
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import LONG, WHAT, Parsed, TopicOptions, jobs, option, parse_words
 from mp4ds.plan import FileNames
@@ -286,7 +286,7 @@ def _selected(
 def _folder(source: Path, output: Path | str | None) -> Path:
     name = output or f"{source.name if source.is_dir() else source.stem}_evaluation"
     target = Path(os.path.abspath(name))  # noqa: PTH100 - keeps links, unlike resolve()
-    check_place(target, [] if remote(source) else [source])
+    check_place(target, [source])
     if os.path.lexists(target) and not _is_evaluation(target):
         refuse_not_ours(target, None)
     return target
