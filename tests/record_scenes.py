@@ -1,4 +1,4 @@
-"""A recorder's source that plays a recording: in this process, or in one that is killed.
+"""A node that plays a recording to a recorder: in this process, or in one that is killed.
 
     python record_scenes.py RECORDING DATASET RATE
 
@@ -11,97 +11,131 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from mp4ds.bags.formats import open_sources
-from mp4ds.bags.protocols import Format
-from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.recording.record import RecordSummary, open_recorder
-from mp4ds.plugins.recording.source import Source
-from mp4ds.plugins.ros.node import Service
-from mp4ds.records import Message
+from mp4ds.packing.processes import CallError, ProcessExecutor
+from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.recording.record import Recorder, RecordSummary, open_recorder
+from mp4ds.plugins.ros.node import Receive
+from mp4ds.records import Channel, Message
 
 
-class PlayedSource(Source):
-    """The messages of a recording, then the end.
+class PlayedNode:
+    """The messages of a recording, at their log times, which are those of /clock.
 
     Args:
         paths: The recording.
         rate: Times the recorded speed; None for as fast as they are read.
-        is_endless: Whether the recorder goes on after the end.
         before: Called before each message, by its number.
         altered: What messages of a topic become, by their number in the topic.
     """
 
     address = "a recording"
+    poll_s = discovery_s = 0.0
+    wants_clock = True
 
     def __init__(
         self,
         paths: Sequence[Path],
         *,
         rate: float | None = None,
-        is_endless: bool = False,
         before: Callable[[int], object] = lambda number: None,
         altered: Mapping[str, Callable[[Message, int], Message]] = {},
     ) -> None:
-        self.warnings, self.topics, self.waiting_for = {}, {}, ""
-        self._stop: Callable[[object], object] = lambda _: None
+        self.lost: Counter[str] = Counter()
+        self.stop: Callable[[], object] = lambda: None  # called at the end
         self._paths = list(paths)
         self._rate = rate
-        self._is_endless = is_endless
         self._before = before
         self._altered = altered
+        self._receivers: dict[str, Receive] = {}
+        self._thread = threading.Thread(target=self._play, daemon=True)
         with open_sources(self._paths) as reader:
-            self.format: Format = reader.format
-            self.profile = reader.profile
+            self.world = reader.profile
+            self._channels: list[Channel] = list(reader.channels)
 
-    def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
-        threading.Thread(target=self._play, args=(wanted, take), daemon=True).start()
+    def follow_clock(self, on_time: Callable[[int], None]) -> None:
+        self._tick = on_time
+        on_time(1)  # it runs: topics are looked for
 
-    def _play(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+    def topics(self, is_wanted: Callable[[str, str], bool]) -> Mapping[str, Sequence[str]]:
+        kinds = {one.topic: [one.type_name] for one in self._channels}
+        new = {topic: kind for topic, kind in kinds.items() if is_wanted(topic, *kind)}
+        if not new and self._thread.ident is None:  # all that are wanted are subscribed to
+            self._thread.start()
+        return new
+
+    def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> None:
+        self._receivers[topic] = receive
+
+    def _play(self) -> None:
         begun, first = time.monotonic(), None
         counts: Counter[str] = Counter()
         with open_sources(self._paths) as reader:
             for number, record in enumerate(reader.records()):
-                if not isinstance(record, Message) or not wanted(record.channel.topic):
+                topic = record.channel.topic if isinstance(record, Message) else ""
+                if topic not in self._receivers:
                     continue
                 self._before(number)
                 first = record.log_time if first is None else first
                 if self._rate:
                     due = begun + (record.log_time - first) / 1e9 / self._rate
                     time.sleep(max(0.0, due - time.monotonic()))
-                topic = record.channel.topic
-                self.topics[topic] = None
                 alter = self._altered.get(topic, lambda message, number: message)
-                take(alter(replace(record, data=bytes(record.data)), counts[topic]))
+                message = alter(record, counts[topic])
                 counts[topic] += 1
-        if not self._is_endless:
-            self._stop(None)
+                self._tick(message.log_time)
+                data = bytes(message.data)
+                self._receivers[topic](message.channel, data, message.publish_time)
+        self.stop()
 
-    @property
-    def lost(self) -> Counter[str]:
-        return Counter()
-
-    def serve(self, services: Sequence[Service]) -> None:
-        (self._stop,) = (one.answer for one in services if one.name == "stop")
+    def serve(self, services: object) -> None:
+        pass
 
     def close(self) -> None:
         pass
 
+    def __enter__(self) -> PlayedNode:
+        return self
 
-def recorded(source: PlayedSource, target: Path, **options: Any) -> RecordSummary:
-    with open_recorder(
-        (), target, RecordOptions(**{"all": True, **options}), source=source
-    ) as recorder:
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def recorded(node: PlayedNode, target: Path, **options: Any) -> RecordSummary:
+    with played(node, (), target, RecordOptions(**{"all": True, **options})) as recorder:
         return recorder.run()
 
 
+@contextmanager
+def played(node: PlayedNode, *arguments: Any, **options: Any) -> Iterator[Recorder]:
+    """A recorder that ends with the recording."""
+    with open_recorder(*arguments, node=node, **options) as recorder:  # type: ignore[arg-type]
+        node.stop = recorder.stop
+        yield recorder
+
+
+def fail_to_pack(piece: int, problem: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the process that packs fail at one of the pieces."""
+    submit = ProcessExecutor.submit
+
+    def fail(self: ProcessExecutor, call: Any, folder: Path, number: int, *rest: Any) -> Any:
+        if number == piece and not rest:
+            raise CallError(problem)
+        return submit(self, call, folder, number, *rest)
+
+    monkeypatch.setattr(ProcessExecutor, "submit", fail)
+
+
 def _main(recording: str, dataset: str, rate: str) -> None:
-    source = PlayedSource([Path(recording)], rate=float(rate), is_endless=True)
-    with open_recorder((), dataset, RecordOptions(all=True), source=source) as recorder:
+    node = PlayedNode([Path(recording)], rate=float(rate))
+    with open_recorder((), dataset, RecordOptions(all=True), node=node) as recorder:  # type: ignore[arg-type]
         recorder.run()
 
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,19 +27,15 @@ from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.processes import CallError
+from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.packing.spool import SpoolFolder
 from mp4ds.plugins.recording import spool
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.recording.packing import PackingProcess
-from mp4ds.plugins.recording.record import (
-    RecordProgress,
-    open_recorder,
-)
-from mp4ds.plugins.recording.spool import MessageBuffer
+from mp4ds.plugins.recording.receiving import MessageBuffer
+from mp4ds.plugins.recording.record import RecordProgress
 from mp4ds.plugins.ros.names import NodeNames
 from mp4ds.records import Channel, Message, Schema
-from record_scenes import PlayedSource, recorded
+from record_scenes import PlayedNode, fail_to_pack, played, recorded
 from scenes import Scene, scene
 from sources import SOURCES
 from waiting import WATCHDOG_S, until
@@ -87,7 +84,7 @@ def reasons(summary: mp4ds.PackSummary, topic: str) -> dict[str, int]:
 )
 def test_what_comes_is_there(source: str, encoding: str, tmp_path: Path, compare: Compare) -> None:
     paths = write(tmp_path, source, scene(encoding, frames=20))
-    summary = recorded(PlayedSource(paths), tmp_path / "live")
+    summary = recorded(PlayedNode(paths), tmp_path / "live")
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
     (made,) = summary.datasets
     assert {item.frames for item in made.topics if "image" in item.topic} == {20}
@@ -105,7 +102,7 @@ def test_what_comes_is_there(source: str, encoding: str, tmp_path: Path, compare
 def test_packets_on_both_sides_of_a_cut(kind: str, tmp_path: Path, compare: Compare) -> None:
     """Pieces are cut at key frames of the video, whatever else is cut in between."""
     paths = write(tmp_path, "rosbag2-mcap-v5", CODED[kind](frames=40))
-    (made,) = recorded(PlayedSource(paths), tmp_path / "live").datasets
+    (made,) = recorded(PlayedNode(paths), tmp_path / "live").datasets
     assert {item.topic: item.frames for item in made.topics}["/cam/video"] == 40
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
     assert compare(paths, again(tmp_path / "live", tmp_path, "rosbag2")) == []
@@ -130,7 +127,7 @@ def test_times_that_are_not_in_order(case: str, tmp_path: Path) -> None:
         return replace(message, log_time=time)
 
     topics = {message.channel.topic for message in messages(paths)}
-    recorded(PlayedSource(paths, altered=dict.fromkeys(topics, altered)), tmp_path / "live")
+    recorded(PlayedNode(paths, altered=dict.fromkeys(topics, altered)), tmp_path / "live")
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
     found = [
         (message.channel.topic, message.log_time, bytes(message.data))
@@ -143,7 +140,7 @@ def test_times_that_are_not_in_order(case: str, tmp_path: Path) -> None:
 
 def test_quality(tmp_path: Path, compare: Compare) -> None:
     paths = write(tmp_path)
-    recorded(PlayedSource(paths), tmp_path / "live", quality="visual")
+    recorded(PlayedNode(paths), tmp_path / "live", quality="visual")
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
     found = compare(paths, again(tmp_path / "live", tmp_path), ignore_pixels=["/cam/image_raw"])
     assert found == []
@@ -210,21 +207,21 @@ def test_topics_that_ros_renames() -> None:
 
 
 class Opened:
-    """What the command opens instead of a source of ROS."""
+    """Lets the command record from a node that plays a recording, and keeps its options."""
 
-    def __init__(self, source: PlayedSource, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.kind, self.options = "", RecordOptions()
-        self._source = source
-        monkeypatch.setattr("mp4ds.plugins.recording.record.open_source", self)
+    def __init__(self, node: PlayedNode, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.options = RecordOptions()
+        self._node = node
+        monkeypatch.setattr("mp4ds.cli.record.open_recorder", self)
 
-    def __call__(self, kind: str, options: RecordOptions) -> PlayedSource:
-        self.kind, self.options = kind, options
-        return self._source
+    def __call__(self, topics: Any, dataset: Any, options: RecordOptions, **rest: Any) -> Any:
+        self.options = options
+        return played(self._node, topics, dataset, options, **rest)
 
 
 def test_what_launch_files_append(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = PlayedSource(write(tmp_path, of=scene("mono8", frames=2)))
-    opened = Opened(source, monkeypatch)
+    node = PlayedNode(write(tmp_path, of=scene("mono8", frames=2)))
+    opened = Opened(node, monkeypatch)
     told = call(
         *("record", "--ros2", "-o", tmp_path / "live", "camera", "--no-progress"),
         *("--ros-args", "-r", "__node:=bag", "-r", "__ns:=/robot"),
@@ -232,7 +229,7 @@ def test_what_launch_files_append(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     )
     assert (told.code, told.err) == (0, "")
     names = opened.options.names
-    assert (opened.kind, names.node, names.namespace) == ("ros2", "bag", "/robot")
+    assert (opened.options.to, names.node, names.namespace) == ("ros2", "bag", "/robot")
     assert names.use_sim_time
     with mp4ds.open(tmp_path / "live") as dataset:
         assert len(dataset["/cam/image_raw"]) == 2  # as the source calls it
@@ -241,15 +238,15 @@ def test_what_launch_files_append(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_one_that_may_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second signal says where the rest is."""
-    opened = Opened(PlayedSource(write(tmp_path)), monkeypatch)
+    opened = Opened(PlayedNode(write(tmp_path)), monkeypatch)
 
-    def wait(*_: object) -> bool:
+    def wait(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(PackingProcess, "wait", wait)
+    monkeypatch.setattr("mp4ds.plugins.recording.record.wait", wait)
     monkeypatch.chdir(tmp_path)
     told = call("record", "--ros1", "-o", "", "-a", "--no-progress")
-    assert opened.kind == "ros1"
+    assert opened.options.to == "ros1"
     assert told.code == 130
     found = re.search(r"pack --salvage \S+/mp4ds_[\d_-]+\.recording -o ", told.err)
     assert found, told.err
@@ -257,7 +254,7 @@ def test_one_that_may_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_nothing_to_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As ROS's own recorders do: a recording without messages, and that is no failure."""
-    Opened(PlayedSource(write(tmp_path, of=scene("mono8", frames=2))), monkeypatch)
+    Opened(PlayedNode(write(tmp_path, of=scene("mono8", frames=2))), monkeypatch)
     told = call("record", "--ros1", "-o", tmp_path / "live", "/nothing", "--no-progress")
     assert told.code == 0, told
     assert told.out == f"{tmp_path / 'live'}: empty: no matching topic was published\n"
@@ -277,9 +274,9 @@ def test_nothing_to_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     ],
 )
 def test_options_that_make_no_sense(options: dict[str, Any], said: str, tmp_path: Path) -> None:
-    source = PlayedSource(write(tmp_path, "rosbag2-mcap-v5"))
+    node = PlayedNode(write(tmp_path, "rosbag2-mcap-v5"))
     with pytest.raises(OptionError, match=said):
-        recorded(source, tmp_path / "live", **options)
+        recorded(node, tmp_path / "live", **options)
     assert not list(tmp_path.glob("live*"))
 
 
@@ -287,10 +284,10 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
     paths = write(tmp_path, of=scene("mono8", frames=2))
     (tmp_path / "live").mkdir()
     with pytest.raises(TargetExistsError):
-        recorded(PlayedSource(paths), tmp_path / "live")
+        recorded(PlayedNode(paths), tmp_path / "live")
     (tmp_path / "live").rmdir()
-    recorded(PlayedSource(paths), tmp_path / "live")
-    recorded(PlayedSource(paths), tmp_path / "live", force=True)
+    recorded(PlayedNode(paths), tmp_path / "live")
+    recorded(PlayedNode(paths), tmp_path / "live", force=True)
     assert mp4ds.validate(tmp_path / "live") == []
 
 
@@ -299,7 +296,7 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
 
 def test_datasets_of_a_length(tmp_path: Path, compare: Compare) -> None:
     paths = write(tmp_path)
-    summary = recorded(PlayedSource(paths), tmp_path / "live", max_duration=0.5)
+    summary = recorded(PlayedNode(paths), tmp_path / "live", max_duration=0.5)
     made = [item.dataset for item in summary.datasets]
     assert [path.name for path in made] == ["live_0", "live_1", "live_2"]
     mp4ds.pack(made, tmp_path / "whole")
@@ -308,7 +305,7 @@ def test_datasets_of_a_length(tmp_path: Path, compare: Compare) -> None:
 
 def test_datasets_of_a_size(tmp_path: Path, compare: Compare) -> None:
     paths = write(tmp_path, of=scene("mono8", frames=40, width=160, height=120))
-    summary = recorded(PlayedSource(paths), tmp_path / "live", max_size=200_000)
+    summary = recorded(PlayedNode(paths), tmp_path / "live", max_size=200_000)
     made = [item.dataset for item in summary.datasets]
     assert len(made) > 1
     mp4ds.pack(made, tmp_path / "whole")
@@ -319,8 +316,8 @@ def test_pauses_and_splits_on_demand(tmp_path: Path) -> None:
     paths = write(tmp_path)
     with open_sources(paths) as reader:
         total = sum(isinstance(record, Message) for record in reader.records())
-    source = PlayedSource(paths, before=lambda number: controls(number))
-    with open_recorder((), tmp_path / "live", RecordOptions(all=True), source=source) as recorder:
+    node = PlayedNode(paths, before=lambda number: controls(number))
+    with played(node, (), tmp_path / "live", RecordOptions(all=True)) as recorder:
 
         def controls(number: int) -> None:
             if number == total // 4:
@@ -347,11 +344,11 @@ def test_packing_that_is_too_slow(
     monkeypatch.setattr(spool, "WINDOW_NS", 2_000_000_000)
     paths = write(tmp_path, of=scene("bayer_rggb8", frames=60, width=320, height=240))
     is_received = threading.Event()
-    pack = PackingProcess.pack
+    submit = ProcessExecutor.submit
 
-    def slow(self: PackingProcess, folder: Path, number: int) -> None:
+    def slow(self: ProcessExecutor, *call: Any) -> Any:
         assert is_received.wait(WATCHDOG_S)
-        pack(self, folder, number)
+        return submit(self, *call)
 
     def watch(progress: RecordProgress) -> None:
         seen.append(progress)
@@ -359,11 +356,10 @@ def test_packing_that_is_too_slow(
             is_received.set()
 
     seen: list[RecordProgress] = []
-    monkeypatch.setattr(PackingProcess, "pack", slow)
-    source = PlayedSource(paths, rate=4.0)
+    monkeypatch.setattr(ProcessExecutor, "submit", slow)
+    node = PlayedNode(paths, rate=4.0)
     options = RecordOptions(all=True, buffer=1)
-    opened = open_recorder((), tmp_path / "live", options, source=source, progress=watch)
-    with opened as recorder:
+    with played(node, (), tmp_path / "live", options, progress=watch) as recorder:
         summary = recorder.run()
     assert max(progress.spool_bytes for progress in seen) > 3_000_000
     assert not summary.dropped
@@ -376,16 +372,9 @@ def test_packing_that_fails(
 ) -> None:
     """The recording goes on, what was recorded stays, and the command that packs it is named."""
     paths = write(tmp_path)
-    pack = PackingProcess.pack
-
-    def fail(self: PackingProcess, folder: Path, number: int) -> None:
-        if number == 1:
-            raise CallError("the encoder is out of order")
-        pack(self, folder, number)
-
-    monkeypatch.setattr(PackingProcess, "pack", fail)
+    fail_to_pack(1, "the encoder is out of order", monkeypatch)
     with pytest.raises(RecordError, match=r"out of order.*--salvage .*live\.recording"):
-        recorded(PlayedSource(paths), tmp_path / "live")
+        recorded(PlayedNode(paths), tmp_path / "live")
     assert not (tmp_path / "live").exists()
     names = {path.name for path in (tmp_path / "live.recording").iterdir()}
     assert {"000000", "000001.mcap", "000002.mcap"} < names
@@ -403,7 +392,7 @@ def test_a_packing_process_that_dies(
     python.chmod(0o755)
     monkeypatch.setattr("sys.executable", str(python))
     with pytest.raises(RecordError, match="exited with code 7"):
-        recorded(PlayedSource(paths), tmp_path / "live")
+        recorded(PlayedNode(paths), tmp_path / "live")
     mp4ds.pack(tmp_path / "live.recording", tmp_path / "live", SALVAGE)
     assert compare(paths, again(tmp_path / "live", tmp_path)) == []
 
@@ -441,12 +430,13 @@ def test_times_that_no_recording_can_hold(tmp_path: Path, monkeypatch: pytest.Mo
 
     fields = {"/cam/image_raw": "log_time", "/imu": "publish_time"}
     each = {topic: partial(altered, field) for topic, field in fields.items()}
-    Opened(PlayedSource(paths, altered=each), monkeypatch)
+    Opened(PlayedNode(paths, altered=each), monkeypatch)
     told = call("record", "--ros1", "-a", "-o", tmp_path / "live", "--no-progress")
     assert told.code == 1
     why = "their log time is negative or too large"
-    for topic in fields:
-        assert f"{topic}: 5 messages left out: {why}" in told.out
+    # a negative time of publishing is none: middlewares that do not know it say 0
+    for topic, count in (("/cam/image_raw", 5), ("/imu", 3)):
+        assert f"{topic}: {count} messages left out: {why}" in told.out
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
     with mp4ds.open(tmp_path / "live") as dataset:
         assert len(dataset["/cam/image_raw"]) == 15
@@ -474,7 +464,7 @@ def test_a_disk_that_is_full(
     write_message = McapWriter.write
     monkeypatch.setattr(McapWriter, "write", refuse)
     with pytest.raises(RecordError, match=r"No space left.*--salvage .*live\.recording"):
-        recorded(PlayedSource(paths), tmp_path / "live")
+        recorded(PlayedNode(paths), tmp_path / "live")
     monkeypatch.undo()
     assert not (tmp_path / "live").exists()
     mp4ds.pack(tmp_path / "live.recording", tmp_path / "live", SALVAGE)
@@ -595,19 +585,19 @@ def test_a_recording_that_is_being_made_is_left_alone(tmp_path: Path) -> None:
                 mp4ds.pack(folder, tmp_path / "early", SALVAGE)
             seen.append(number)
 
-    recorded(PlayedSource(write(tmp_path), before=look), tmp_path / "live")
+    recorded(PlayedNode(write(tmp_path), before=look), tmp_path / "live")
     assert seen == [30]
     assert not (tmp_path / "early").exists()
 
 
 def test_a_piece_is_written_before_the_next_one_begins(tmp_path: Path) -> None:
     """Or a recorder that is killed would leave a gap."""
-    folder = SpoolFolder(tmp_path / "drive.recording")
-    folder.path.mkdir()
-    writer = spool.SpoolWriter(folder, "ros1", [], lambda *_: None)
+    jobs, process = ThreadPoolExecutor(1), ProcessExecutor(1)
+    split = spool.Split(tmp_path / "drive", RecordOptions(), "ros1", [], process, jobs, print)
     channel = Channel(1, "/a", "ros1", Schema("std_msgs/String", "ros1msg", b"string data"), {})
     for time in (0, 1, 2, spool.WINDOW_NS):
-        writer.write(Message(channel, time, time, 0, bytes(5)))
-    salvaged = McapSalvage(folder.piece(0))
+        split.write(Message(channel, time, time, 0, bytes(5)))
+    salvaged = McapSalvage(split.folder.piece(0))
     assert [m.log_time for m in salvaged.records() if isinstance(m, Message)] == [0, 1, 2]
-    writer.abandon()
+    split.abandon()
+    split.lock.close()

@@ -6,7 +6,7 @@ import base64
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,10 @@ from mp4ds.bags.formats import open_reader
 from mp4ds.bags.rosbag2_metadata import read_bag_info
 from mp4ds.errors import OptionError
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
+from mp4ds.plugins.recording.receiving import Source
 from mp4ds.plugins.recording.record import open_recorder, recorder_services
-from mp4ds.plugins.recording.source import Source, open_source
 from mp4ds.plugins.ros.names import NodeNames
-from mp4ds.plugins.ros.node import NodeOptions
+from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
 from mp4ds.plugins.ros.qos import Qos, asked_qos, qos_text, recorded_qos
 from mp4ds.plugins.ros.ros2 import installed_definition, is_hidden, standard_definition
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
@@ -45,12 +45,13 @@ def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
         yield found
 
 
-def recorder(**options: Any) -> Source:
-    return open_source("ros2", RecordOptions(**options))
-
-
-def wanted(*topics: str, **options: Any) -> Wanted:
-    return Wanted(topics, RecordOptions(all=not topics, **options))
+def receiving(
+    take: Callable[[Message], None], *topics: str, node: Node | None = None, **options: Any
+) -> Source:
+    """A recorder's source, which is not started; without topics, of all there are."""
+    chosen = RecordOptions(all=not topics, **options)
+    named = NodeOptions("rosbag2_recorder", chosen.names, unpublished=chosen.unpublished)
+    return Source(node or open_node("ros2", named), chosen, Wanted(topics, chosen), take)
 
 
 class Heard:
@@ -74,11 +75,11 @@ def test_every_message_is_received(side: Side) -> None:
     latched = channel("/robot/map", STRING, qos=LATCHED)
     sent = {one.topic: [message(one.type_name, n) for n in range(9)] for one in (strings, lossy)}
     heard = Heard()
-    source = recorder()
+    source = receiving(heard.take)
     with side.open() as publisher:
         publisher.advertise(latched)
         publisher.publish(latched, message(STRING, 77), 0)
-        source.start(wanted(), heard.take)
+        source.start()
         for one in (strings, lossy):
             publisher.advertise(one)
             assert until(lambda one=one: publisher.subscribers(one) == 1)
@@ -200,9 +201,10 @@ def test_ros_renames_topics(side: Side) -> None:
     with side.open(names=names) as publisher:
         publisher.advertise(found)
         publisher.clock(clock)
-        source = recorder(use_sim_time=True, names=names)
-        source.serve(recorder_services(Controls()))
-        source.start(wanted("name", names=names), heard.take)
+        node = side.open(node="rosbag2_recorder", names=names)
+        node.serve(recorder_services(Controls()))
+        source = receiving(heard.take, "name", node=node, use_sim_time=True, names=names)
+        source.start()
 
         def arrives() -> bool:
             publisher.clock(clock)
@@ -214,7 +216,7 @@ def test_ros_renames_topics(side: Side) -> None:
         source.close()
     assert asked == {"paused": False}
     assert {*heard.payloads} == {*source.topics} == {"/robot/name"}
-    assert ("bag" in source.address) != source.address.endswith("(Cyclone DDS)")
+    assert ("bag" in node.address) != node.address.endswith("(Cyclone DDS)")
 
 
 def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
@@ -225,8 +227,8 @@ def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
         for one in (plain, latched):
             publisher.advertise(one)
         publisher.publish(latched, message(STRING, 77), 0)
-        source = recorder(use_sim_time=True, polling_interval=10.0)
-        source.start(wanted("/robot/*"), heard.take)
+        source = receiving(heard.take, "/robot/*", use_sim_time=True, polling_interval=10.0)
+        source.start()
         assert source.waiting_for == "/clock"
         publisher.publish(plain, message(STRING, 1), 0)
         publisher.clock(0)  # as simulators do at first: no time yet
@@ -250,8 +252,8 @@ def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
 def test_the_clock_is_recorded_by_itself(side: Side) -> None:
     heard, clock = Heard(), 1_700_000_000 * 10**9
     with side.open() as publisher:
-        source = recorder(use_sim_time=True, polling_interval=10.0)
-        source.start(wanted(), heard.take)
+        source = receiving(heard.take, use_sim_time=True, polling_interval=10.0)
+        source.start()
 
         def arrives() -> bool:
             publisher.clock(clock + len(heard.times))
@@ -265,9 +267,8 @@ def test_the_clock_is_recorded_by_itself(side: Side) -> None:
 def test_services(side: Side) -> None:
     """Those of rosbag2's recorder."""
     controls = Controls()
-    source = recorder()
-    source.serve(recorder_services(controls))
-    source.start(wanted(), Heard().take)
+    node = side.open(node="rosbag2_recorder")
+    node.serve(recorder_services(controls))
 
     def call(name: str, kind: str) -> dict[str, Any]:
         return side.peer.call(f"/rosbag2_recorder/{name}", kind, {})
@@ -278,7 +279,7 @@ def test_services(side: Side) -> None:
     assert call("resume", "Resume") == {}
     assert call("split_bagfile", "SplitBagfile") == {}
     assert call("stop", "Stop") == {}
-    source.close()
+    node.close()
     assert (controls.is_paused, controls.asked) == (False, ["split", "stop"])
 
 
@@ -292,10 +293,10 @@ def test_a_message_that_cannot_be_taken(side: Side) -> None:
             raise ValueError("no")
         taken.append(message)
 
-    source = recorder()
+    source = receiving(take)
     with side.open() as publisher:
         publisher.advertise(recorded)
-        source.start(wanted(), take)
+        source.start()
         assert until(lambda: publisher.subscribers(recorded) == 1)
         for number in range(3):
             publisher.publish(recorded, message(STRING, number), 0)
@@ -311,8 +312,8 @@ def test_a_topic_of_several_types(side: Side) -> None:
     with side.open() as publisher:
         for one in both:
             publisher.advertise(one)
-        source = recorder()
-        source.start(wanted("/robot/*"), Heard().take)
+        source = receiving(Heard().take, "/robot/*")
+        source.start()
         assert until(lambda: sum(map(publisher.subscribers, both)) == 1)
         source.close()
     (warning,) = source.warnings
@@ -325,8 +326,8 @@ def test_hidden_topics_are_left_out(side: Side) -> None:
     with side.open() as publisher:
         for one in (hidden, plain):
             publisher.advertise(one)
-        source = recorder()
-        source.start(wanted(), heard.take)
+        source = receiving(heard.take)
+        source.start()
         assert until(lambda: publisher.subscribers(plain) == 1)
         source.close()
     assert [*source.topics] == ["/robot/name"]
@@ -341,8 +342,8 @@ def test_events_of_services(side: Side) -> None:
     heard = Heard()
     with side.open() as publisher:
         publisher.advertise(events)
-        source = recorder()
-        source.start(wanted(), heard.take)
+        source = receiving(heard.take)
+        source.start()
         assert until(lambda: publisher.subscribers(events) == 1)
         publisher.publish(events, bytes([0, 1, 0, 0, *range(32)]), 0)
         assert until(lambda: heard.payloads["/arm/_service_event"])
@@ -356,8 +357,8 @@ def test_topics_that_nobody_listens_to(side: Side) -> None:
     with side.open() as publisher:
         for one in (heard_by, leaf):
             publisher.advertise(one)
-        source = recorder(ignore_leaf=True)
-        source.start(wanted("/robot/*"), Heard().take)
+        source = receiving(Heard().take, "/robot/*", ignore_leaf=True)
+        source.start()
         assert until(lambda: publisher.subscribers(heard_by) == 2)
         source.close()
     assert [*source.topics] == ["/robot/name"]
@@ -367,8 +368,8 @@ def test_topics_that_nobody_publishes_yet(monkeypatch: pytest.MonkeyPatch) -> No
     plain, heard = channel("/robot/name", STRING), Heard()
     with SIDES["rclpy"](monkeypatch) as side:
         side.peer.subscribe("/robot/name", STRING)
-        source = recorder(unpublished=True, discover=False)
-        source.start(wanted(), heard.take)
+        source = receiving(heard.take, unpublished=True, discover=False)
+        source.start()
         with side.open() as publisher:
             publisher.advertise(plain)
             assert publisher.subscribers(plain) == 2
@@ -385,8 +386,8 @@ def test_a_type_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     with SIDES["rclpy"](monkeypatch) as side, side.open() as publisher:
         publisher.advertise(channel("/robot/name", STRING))
         del side.peer._bus.kinds[STRING]
-        source = recorder()
-        source.start(wanted(), Heard().take)
+        source = receiving(Heard().take)
+        source.start()
         source.close()
     (warning,) = source.warnings
     assert "'std_msgs/msg/String' is not installed" in warning
@@ -407,8 +408,8 @@ def test_a_definition_that_is_announced(monkeypatch: pytest.MonkeyPatch) -> None
     heard = Heard()
     with SIDES["dds"](monkeypatch) as side, side.open() as publisher:
         publisher.advertise(recorded)
-        source = recorder()
-        source.start(wanted(), heard.take)
+        source = receiving(heard.take)
+        source.start()
         assert until(lambda: publisher.subscribers(recorded) == 1)
         payload = bytes(store.serialize_cdr(whole(store), "my_msgs/msg/Whole"))
         publisher.publish(recorded, payload, 0)
@@ -446,8 +447,8 @@ def test_a_definition_that_a_node_describes(
         if described != "nobody":
             side.peer.ask("describe", "robot/other", {})
             side.peer.ask("describe", "robot/part", {} if described == "unknown" else texts)
-        source = recorder()
-        source.start(wanted("/robot/part"), heard.take)
+        source = receiving(heard.take, "/robot/part")
+        source.start()
 
         def arrives() -> bool:
             message = base64.b64encode(payload).decode()

@@ -16,10 +16,8 @@ import mp4ds
 from commands import Result, call, tree
 from mp4ds.errors import RecordError
 from mp4ds.files.sources import RECORDING_NAME
-from mp4ds.packing.processes import CallError
 from mp4ds.plugins.recording import spool
-from mp4ds.plugins.recording.packing import PackingProcess
-from record_scenes import PlayedSource, recorded
+from record_scenes import PlayedNode, fail_to_pack, recorded
 from scenes import scene
 from sources import SOURCES
 
@@ -36,18 +34,11 @@ def left(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = replace(scene("bayer_rggb8", frames=FRAMES), silent={})
     paths = SOURCES["bag-none"](folder / "source", made)
     (folder / "robot" / "drives").mkdir(parents=True)
-    pack = PackingProcess.pack
-
-    def fail(self: PackingProcess, folder: Path, number: int) -> None:
-        if number == 2:
-            raise CallError("the disk is tired")
-        pack(self, folder, number)
-
     with pytest.MonkeyPatch.context() as tired:
         tired.setattr(spool, "WINDOW_NS", 100_000_000)
-        tired.setattr(PackingProcess, "pack", fail)
+        fail_to_pack(2, "the disk is tired", tired)
         with pytest.raises(RecordError, match="the disk is tired"):
-            recorded(PlayedSource(paths), folder / "robot" / "drives" / "drive")
+            recorded(PlayedNode(paths), folder / "robot" / "drives" / "drive")
     return folder
 
 
@@ -82,8 +73,8 @@ def test_a_recorder_leaves_what_it_finds(unfinished: Path) -> None:
     """It names the folder and the command, and records; nothing is recovered or removed."""
     (unfinished / "notes.txt").write_text("mine")
     before = tree(unfinished.parent)
-    source = PlayedSource([*(unfinished.parents[2] / "source").iterdir()])
-    summary = recorded(source, unfinished.parent / "next")
+    node = PlayedNode([*(unfinished.parents[2] / "source").iterdir()])
+    summary = recorded(node, unfinished.parent / "next")
     (warning,) = summary.warnings
     assert f"mp4ds pack --salvage {unfinished} -o {unfinished.parent / 'drive'}" in warning
     shutil.rmtree(unfinished.parent / "next")
@@ -99,7 +90,7 @@ def test_a_recorder_leaves_files_of_the_user(tmp_path: Path) -> None:
     def put(number: int) -> None:
         (tmp_path / "live.recording" / "notes.txt").write_text("mine")
 
-    recorded(PlayedSource(paths, before=put), tmp_path / "live")
+    recorded(PlayedNode(paths, before=put), tmp_path / "live")
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
     assert [path.name for path in (tmp_path / "live.recording").iterdir()] == ["notes.txt"]
 

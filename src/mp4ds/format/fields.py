@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from mp4ds.messages.encodings import MAX_SIDE
+from mp4ds.plan import MAX_GOP
 from mp4ds.times import INT64_MAX, INT64_MIN, decode_column
 
 T = TypeVar("T")
@@ -41,6 +42,7 @@ FileName = Annotated[
 ]
 Base64 = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/]*={0,2}$")]
 Version = Annotated[str, Field(pattern=r"^(0|[1-9][0-9]*)\.(0|[1-9][0-9]*)$")]
+Gop = Annotated[int, Field(ge=1, le=MAX_GOP)]
 Body = Literal["pixels", "packet", "png", "rvl", "jpeg"]
 Profile = Annotated[
     str,

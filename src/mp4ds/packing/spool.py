@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import IO
+from typing import IO, Literal
 
 from mp4ds.bags.combined import bounded
 from mp4ds.bags.mcap_records import copy_verified
@@ -25,11 +25,11 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, Refused, SourceError
 from mp4ds.files.outputs import check_target, is_mine, lock, staged, work_folder
 from mp4ds.files.sources import RECORDING_NAME
-from mp4ds.format.fields import Model, Profile
+from mp4ds.format.fields import Gop, Model, Profile
 from mp4ds.format.manifest import About, LossEntry
 from mp4ds.packing.manifest import dataset_files, summary_of
 from mp4ds.packing.options import PackOptions, PackSummary
-from mp4ds.plan import MAX_GOP, SPEED
+from mp4ds.plan import SPEED
 from mp4ds.records import Loss
 
 _NAME = re.compile(r"([0-9]{6})(\.mcap)?")
@@ -41,11 +41,11 @@ class SpoolSettings(Model):
     """How the pieces of a spool are packed: all of them alike, so that parts fit together."""
 
     format: Format
-    profile: str
+    profile: Literal["ros1", "ros2"]
     quality: Profile
     codec: str | None
     preset: str | None
-    gop: int | None
+    gop: Gop | None
 
     def options(self, *, salvage: bool = False) -> PackOptions:
         """The options of a pack."""
@@ -121,12 +121,7 @@ class SpoolFolder:
         """
         try:
             with self._settings_path.open("rb") as file:
-                settings = SpoolSettings.model_validate_json(file.read(_MOST_BYTES))
-            if settings.profile not in ("ros1", "ros2"):
-                raise ValueError(settings.profile)
-            if settings.gop is not None and not 1 <= settings.gop <= MAX_GOP:
-                raise ValueError(settings.gop)
-            return settings
+                return SpoolSettings.model_validate_json(file.read(_MOST_BYTES))
         except ValueError:
             raise SourceError(
                 self._settings_path,
@@ -142,23 +137,43 @@ class SpoolFolder:
         """Where the part of a piece is."""
         return self.path / f"{number:06}"
 
-    def pack(self, number: int, pack: PackPiece) -> None:
-        """Make the part of a piece, which is then removed.
-
-        Raises:
-            Mp4dsError: It could not be packed; it is still there.
-        """
-        pack(self.piece(number), self.part(number), self.settings().options())
-        self.piece(number).unlink()
-
-    def join(self, count: int, target: Path, *, force: bool, about: About | None) -> PackSummary:
-        """Make the dataset of all parts.
+    def join(
+        self,
+        parts: Sequence[Path],
+        target: Path,
+        *,
+        force: bool,
+        about: About | None,
+        losses: Sequence[Loss] = (),
+        is_foreign: bool = False,
+    ) -> PackSummary:
+        """Make the dataset of all parts, perhaps from somebody else; the spool is no source of it.
 
         Raises:
             Mp4dsError: It could not be made; the parts are still there.
         """
-        parts = [self.part(number) for number in range(count)]
-        return _joined(parts, self.settings(), target, force=force, about=about)
+        with (
+            staged(target, force=force, owned=dataset_files, sources=parts) as made,
+            ExitStack() as stack,
+        ):
+            made.mkdir()
+            datasets = [stack.enter_context(Dataset(part)) for part in parts]
+            manifests = [one.manifest for one in datasets if one.manifest]
+            known = [entry.to_record() for one in manifests for entry in one.losses]
+            changes = {
+                "about": about,
+                "format": self.settings().format,
+                "library": "",
+                "sources": [],
+                "losses": list(map(LossEntry.from_record, bounded([*losses, *known]))),
+            }
+            try:
+                concat(datasets, made, changes=changes)
+            except Refused as reason:
+                raise SourceError(self.path, f"cannot be joined: {reason}") from None
+            for problem in validate(made) if is_foreign else ():
+                raise FormatError(problem.code, self.path, str(problem))
+            return replace(summary_of(made), dataset=target)
 
     def remove(self, count: int) -> None:
         """Remove the folder with all parts; files that somebody else put there stay."""
@@ -174,41 +189,6 @@ class SpoolFolder:
 def _remove_empty(folder: Path) -> None:
     if not any(folder.iterdir()):
         folder.rmdir()
-
-
-def _joined(
-    parts: Sequence[Path],
-    settings: SpoolSettings,
-    target: Path,
-    *,
-    force: bool,
-    about: About | None,
-    losses: Sequence[Loss] = (),
-    is_foreign: bool = False,
-) -> PackSummary:
-    """Join parts, perhaps from somebody else; the spool is no source of the dataset."""
-    with (
-        staged(target, force=force, owned=dataset_files, sources=parts) as made,
-        ExitStack() as stack,
-    ):
-        made.mkdir()
-        datasets = [stack.enter_context(Dataset(part)) for part in parts]
-        manifests = [one.manifest for one in datasets if one.manifest]
-        known = [entry.to_record() for one in manifests for entry in one.losses]
-        changes = {
-            "about": about,
-            "format": settings.format,
-            "library": "",
-            "sources": [],
-            "losses": list(map(LossEntry.from_record, bounded([*losses, *known]))),
-        }
-        try:
-            concat(datasets, made, changes=changes)
-        except Refused as reason:
-            raise SourceError(parts[0].parent, f"cannot be joined: {reason}") from None
-        for problem in validate(made) if is_foreign else ():
-            raise FormatError(problem.code, parts[0].parent, str(problem))
-        return replace(summary_of(made), dataset=target)
 
 
 # ---------------------------------------------------------------- recovery
@@ -257,8 +237,8 @@ def recover(
         if not parts:
             raise SourceError(path, "holds no messages that can be read")
         try:
-            return _joined(
-                parts, settings, target, force=force, about=about, losses=losses, is_foreign=True
+            return folder.join(
+                parts, target, force=force, about=about, losses=losses, is_foreign=True
             )
         except FormatError as error:
             remedy = "Move that part out of the folder to recover the others."

@@ -6,8 +6,8 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -19,13 +19,22 @@ from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.pack import checked_codec
+from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.plan import SPEED, Purpose
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.recording.packing import PackingProcess, Split
-from mp4ds.plugins.recording.source import Source, open_source
-from mp4ds.plugins.recording.spool import MessageBuffer
-from mp4ds.plugins.ros.node import Service, action, quick_switches, sourced
-from mp4ds.records import Message, MetadataRecord
+from mp4ds.plugins.recording.receiving import MessageBuffer, Source
+from mp4ds.plugins.recording.spool import Split
+from mp4ds.plugins.ros.node import (
+    Node,
+    NodeOptions,
+    Service,
+    action,
+    open_node,
+    quick_switches,
+    sourced,
+)
+from mp4ds.plugins.ros.qos import load_overrides
+from mp4ds.records import Channel, Message, MetadataRecord
 from mp4ds.times import INT64_MAX
 
 _NS = 1_000_000_000
@@ -33,6 +42,10 @@ _REPORT_S = 0.2
 _FLUSH_S = 0.5
 _BEHIND = 1 / 8
 """Of the buffer: with so much in it, nothing is synced, which would hold up writing."""
+
+_NICE = 10
+_NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
+"""Node names of ROS's own recorders."""
 
 _LAST_NS = {"ros1": 2**32 * _NS - 1, "ros2": INT64_MAX}
 """The latest time that a bag or rosbag2 can hold."""
@@ -140,7 +153,7 @@ def open_recorder(
     dataset: Path | str | None = None,
     options: RecordOptions | None = None,
     *,
-    source: Source | None = None,
+    node: Node | None = None,
     progress: Callable[[RecordProgress], None] | None = None,
 ) -> Iterator[Recorder]:
     """A recorder that has not started yet; arguments as for `record`.
@@ -149,25 +162,26 @@ def open_recorder(
         topics: Names or globs.
         dataset: The folder to make.
         options: How to record.
-        source: Where messages come from, closed at the end; None to open one by the options.
+        node: Where messages come from, closed at the end; None: as the options say.
         progress: Called a few times a second.
     """
     chosen = options or RecordOptions()
-    kind = source.profile if source else chosen.to or sourced("record")
-    chosen = replace(chosen, names=chosen.names.in_world(kind))
+    world = node.world if node else chosen.to or sourced("record")
+    chosen = replace(chosen, names=chosen.names.in_world(world))
     wanted = Wanted(topics, chosen)
     _check(chosen)
-    others = _bag_info(chosen.custom_data) if kind == "ros2" else []
-    source = source or open_source(kind, chosen)
-    with ExitStack() as stack:
-        stack.callback(source.close)
-        target = (
-            Path(dataset)
-            if dataset is not None
-            else Path(f"{datetime.now():mp4ds_%Y_%m_%d-%H_%M_%S}")
+    others = _bag_info(chosen.custom_data) if world == "ros2" else []
+    made = dataset if dataset is not None else f"{datetime.now():mp4ds_%Y_%m_%d-%H_%M_%S}"
+    if node is None:
+        node_options = NodeOptions(
+            chosen.node or _NODES.get(world, ""),
+            chosen.names,
+            overrides=load_overrides(chosen.qos_overrides),
+            unpublished=chosen.unpublished,
         )
-        made = target.absolute()
-        yield Recorder(made, chosen, wanted, source, others, progress)
+        node = open_node(world, node_options)
+    with node:
+        yield Recorder(Path(made).absolute(), chosen, wanted, node, others, progress)
 
 
 def _check(options: RecordOptions) -> None:
@@ -212,14 +226,14 @@ def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:
 class Recorder:
     """Records until it is stopped; see `open_recorder`.
 
-    A thread of its own writes messages into a spool; pieces of it that are complete are packed,
-    one after another, by another process.
+    A thread of its own takes messages out of a buffer and writes them; the pieces that are complete
+    are packed, one after another, by another process.
 
     Args:
         target: The dataset, an absolute path.
         options: How to record.
         wanted: Which topics to record.
-        source: Where messages come from.
+        node: Where messages come from; closed when recording ends.
         others: What the recording holds besides messages.
         progress: Called a few times a second.
     """
@@ -229,26 +243,31 @@ class Recorder:
         target: Path,
         options: RecordOptions,
         wanted: Wanted,
-        source: Source,
+        node: Node,
         others: Sequence[MetadataRecord],
         progress: Callable[[RecordProgress], None] | None,
     ) -> None:
         self._target = target
         self._options = options
-        self._wanted = wanted
-        self._source = source
+        self._node = node
         self._others = others
         self._progress = progress
-        self._buffer = MessageBuffer(options.buffer * 10**6, _LAST_NS[source.profile])
-        self._packing = PackingProcess()
+        self._buffer = MessageBuffer(options.buffer * 10**6, _LAST_NS[node.world])
+        self._source = Source(node, options, wanted, self._take)
         self._changed = threading.Event()
         self._is_stopped = False
         self._is_paused = options.start_paused
         self._is_split_asked = False
         self._splits: list[Split] = []
+        self._process = ProcessExecutor(1, nice=_NICE)
+        self._jobs = ThreadPoolExecutor(1, "packing")  # waits for the process
         self._rates: dict[str, tuple[float, int, int, float, float]] = {}
         self._error: Exception | None = None
-        self.address = source.address
+
+    @property
+    def address(self) -> str:
+        """What it is connected to, for display."""
+        return self._node.address
 
     @property
     def received(self) -> int:
@@ -296,23 +315,38 @@ class Recorder:
         Raises:
             Mp4dsError: As for `record`.
         """
+        self._warn_of_unfinished()
         try:
-            with quick_switches(), self._packing:
-                return self._run()
+            # the process ends before the thread that waits for it
+            with quick_switches(), self._jobs, self._process:
+                begun = self._record()
         finally:
             for split in self._splits:
                 split.lock.close()
+        for split in self._splits:
+            if error := split.error or (self._error if split.made is None else None):
+                raise split.failure(error)
+        if self._error is not None:
+            raise self._error
+        return RecordSummary(
+            datasets=[split.made for split in self._splits if split.made],
+            seconds=time.monotonic() - begun,
+            dropped=dict(self._buffer.dropped),
+            lost=dict(self._source.lost),
+            untimed=dict(self._buffer.untimed),
+            warnings=list(self._source.warnings),
+        )
 
-    def _run(self) -> RecordSummary:
-        summary = RecordSummary()
-        self._warn_of_unfinished()
+    def _record(self) -> float:
+        """Record until stopped, and pack everything; returns when recording began."""
         begun = time.monotonic()
         self._begin_split()
         writer = threading.Thread(target=self._write, name="spool", daemon=True)
         writer.start()
         try:
-            self._source.serve(recorder_services(self))
-            self._source.start(self._wanted, self._take)
+            if self._node.world == "ros2":  # `rosbag record` has no services
+                self._node.serve(recorder_services(self))
+            self._source.start()
             while not self._is_stopped:
                 self._changed.wait(_REPORT_S)
                 self._changed.clear()
@@ -326,40 +360,33 @@ class Recorder:
         finally:
             self._source.close()
             self._buffer.close()
-            self._drain(writer, begun)
-        for split in self._splits:
-            if error := split.error or (self._error if split.made is None else None):
-                raise split.failure(error)
-        if self._error is not None:
-            raise self._error
-        summary.datasets = [split.made for split in self._splits if split.made]
-        summary.seconds = time.monotonic() - begun
-        summary.dropped = dict(self._buffer.dropped)
-        summary.lost = dict(self._source.lost)
-        summary.untimed = dict(self._buffer.untimed)
-        summary.warnings = list(self._source.warnings)
-        return summary
+            while writer.is_alive():
+                writer.join(_REPORT_S)
+                self._report(begun, "finishing")
+            packed = self._jobs.submit(bool)  # runs after all others
+            while wait([packed], _REPORT_S).not_done:
+                self._report(begun, "finishing")
+        return begun
 
     def _take(self, message: Message) -> None:
         if not self._is_paused:
             self._buffer.put(message)
 
-    def _drain(self, writer: threading.Thread, begun: float) -> None:
-        """Write what is still buffered, and pack what is not packed."""
-        while writer.is_alive():
-            writer.join(_REPORT_S)
-            self._report(begun, "finishing")
-        while not self._packing.wait(_REPORT_S):
-            self._report(begun, "finishing")
-
     def _begin_split(self) -> None:
-        number = len(self._splits)
-        is_numbered = bool(self._options.max_duration or self._options.max_size or number)
-        target = self._target
-        if is_numbered:
+        number, target = len(self._splits), self._target
+        if self._options.max_duration or self._options.max_size or number:
             target = target.with_name(f"{target.name}_{number}")
-        split = Split(target, self._options, self._source, self._others, self._packing)
-        self._splits.append(split)
+        self._splits.append(
+            Split(
+                target,
+                self._options,
+                self._node.world,
+                self._others,
+                self._process,
+                self._jobs,
+                self._source.warn,
+            )
+        )
         self._is_split_asked = False
 
     def _write(self) -> None:
@@ -369,30 +396,34 @@ class Recorder:
                 self._write_all(disk)
             except Exception as error:  # it is raised by `run`
                 self._error = error
-                self._splits[-1].spool.abandon()
+                self._splits[-1].abandon()
                 self.stop()
 
     def _write_all(self, disk: ThreadPoolExecutor) -> None:
         syncing: Future[None] | None = None
         next_flush = time.monotonic() + _FLUSH_S
         while True:
+            split = self._splits[-1]
             try:
                 message = self._buffer.take(max(0.0, next_flush - time.monotonic()))
             except EOFError:
-                self._splits[-1].close()
+                split.close(self._announced())
                 return
             if message is not None:
-                if self._is_split_asked or self._splits[-1].is_full:
-                    self._splits[-1].close()
+                if self._is_split_asked or split.is_full:
+                    split.close(self._announced())
                     self._begin_split()
-                self._splits[-1].spool.write(message)
+                self._splits[-1].write(message)
             if time.monotonic() >= next_flush:
-                spool = self._splits[-1].spool
-                spool.flush()
+                self._splits[-1].flush()
                 is_behind = self._buffer.bytes > self._options.buffer * 10**6 * _BEHIND
                 if not is_behind and (syncing is None or syncing.done()):
-                    syncing = disk.submit(_sync, spool.paths)
+                    syncing = disk.submit(_sync, self._splits[-1].paths)
                 next_flush = time.monotonic() + _FLUSH_S
+
+    def _announced(self) -> list[Channel]:
+        """Channels that are in a dataset even if they have no messages."""
+        return [channel for channel in list(self._source.topics.values()) if channel]
 
     def _report(self, begun: float, state: str) -> None:
         if self._progress is None:
@@ -417,10 +448,9 @@ class Recorder:
 
     def _topic(self, topic: str, now: float) -> TopicProgress:
         count, size = self._buffer.received[topic], self._buffer.received_bytes[topic]
-        then, its_count, its_size, hz, rate = self._rates.get(topic, (now, count, size, 0.0, 0.0))
-        if now - then >= 1.0 or topic not in self._rates:
-            elapsed = max(now - then, _REPORT_S)
-            hz, rate = (count - its_count) / elapsed, (size - its_size) / elapsed
+        then, its_count, its_size, hz, rate = self._rates.get(topic, (0.0, count, size, 0.0, 0.0))
+        if now - then >= 1.0:
+            hz, rate = (count - its_count) / (now - then), (size - its_size) / (now - then)
             self._rates[topic] = (now, count, size, hz, rate)
         return TopicProgress(
             messages=count,

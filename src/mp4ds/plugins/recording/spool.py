@@ -1,98 +1,47 @@
-"""Writes what arrives, with as little work as possible, into pieces of a spool that are cut."""
+"""One dataset of a recording: a spool, cut into pieces that are packed while the next is written.
+
+What arrives is written with as little work as possible. Another process, of low priority, makes a
+part of each complete piece by the code of `pack`, and at the end the dataset of all parts.
+"""
 
 from __future__ import annotations
 
-import threading
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 from mp4ds.bags.mcap import McapWriter
+from mp4ds.errors import Mp4dsError, RecordError, TargetError, WriteError
+from mp4ds.files.outputs import check_target
+from mp4ds.files.sources import UNFINISHED, salvage_command
+from mp4ds.format.sidecars import load_about
 from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.inspection import begins_anew, depends_on_others
-from mp4ds.packing.spool import SpoolFolder
+from mp4ds.packing.manifest import dataset_files, folder_size
+from mp4ds.packing.options import PackSummary
+from mp4ds.packing.pack import pack
+from mp4ds.packing.processes import CallError, ProcessExecutor
+from mp4ds.packing.spool import SpoolFolder, SpoolSettings
+from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.ros.node import World
 from mp4ds.records import Channel, Message, MetadataRecord
-from mp4ds.times import INT64_MAX
 
-WINDOW_NS = 5 * 10**9
+_NS = 10**9
+WINDOW_NS = 5 * _NS
 """Log time that a piece covers."""
 
-_LATE_NS = 10**9
+_LATE_NS = _NS
 """How much later than its log time a message may come: threads that receive take turns."""
 
-_GROUP_NS = 60 * 10**9
+_GROUP_NS = 60 * _NS
 """How long a piece stays open, at most, for the next key frame of a video."""
 
-
-class MessageBuffer:
-    """Messages on their way from the threads that receive them to the one that writes them.
-
-    Args:
-        most_bytes: Limit of buffered payloads; beyond, the oldest messages are dropped and counted.
-        last_ns: The latest log or publish time that the recording can hold; the first one is 0.
-    """
-
-    def __init__(self, most_bytes: int, last_ns: int = INT64_MAX) -> None:
-        self.dropped: Counter[str] = Counter()
-        self.untimed: Counter[str] = Counter()  # with a time that no recording can hold
-        self.received: Counter[str] = Counter()
-        self.received_bytes: Counter[str] = Counter()
-        self._most = most_bytes
-        self._last_ns = last_ns
-        self._bytes = 0
-        self._messages: deque[Message] = deque()
-        self._changed = threading.Condition()
-        self._is_closed = False
-
-    @property
-    def bytes(self) -> int:
-        """Buffered payloads."""
-        return self._bytes
-
-    def put(self, message: Message) -> None:
-        """Add a message, from any thread; it never waits."""
-        topic = message.channel.topic
-        with self._changed:
-            if self._is_closed:
-                return
-            self.received[topic] += 1
-            self.received_bytes[topic] += len(message.data)
-            times = message.log_time, message.publish_time
-            if min(times) < 0 or max(times) > self._last_ns:
-                self.untimed[topic] += 1
-                return
-            while self._messages and self._bytes + len(message.data) > self._most:
-                dropped = self._messages.popleft()
-                self._bytes -= len(dropped.data)
-                self.dropped[dropped.channel.topic] += 1
-            self._messages.append(message)
-            self._bytes += len(message.data)
-            self._changed.notify()
-
-    def take(self, wait_s: float) -> Message | None:
-        """The next message; None if none came in time.
-
-        Raises:
-            EOFError: There are no more.
-        """
-        with self._changed:
-            self._changed.wait_for(lambda: self._messages or self._is_closed, wait_s)
-            if self._messages:
-                message = self._messages.popleft()
-                self._bytes -= len(message.data)
-                return message
-            if self._is_closed:
-                raise EOFError
-            return None
-
-    def close(self) -> None:
-        """Take no more messages; buffered ones are still given out."""
-        with self._changed:
-            self._is_closed = True
-            self._changed.notify_all()
+_FAILURES = (CallError, CancelledError, OSError)
 
 
 @dataclass
@@ -112,50 +61,107 @@ class _Piece:
     packets: set[int] = field(default_factory=set)
 
 
-class SpoolWriter:
-    """The spool of one dataset.
+class Split:
+    """One dataset of a recording.
 
     Args:
-        folder: Where to write it.
-        profile: ``ros1`` or ``ros2``.
+        target: Where to make it.
+        options: How to record.
+        profile: Where messages come from.
         others: What the recording holds besides messages.
-        on_closed: Called with number and payload bytes of each complete piece, in their order.
+        process: Packs the pieces, and joins the parts.
+        jobs: One thread, which waits for the process, and is closed after it.
+        warn: Called with a sentence.
+
+    Attributes:
+        made: The dataset, once it is complete.
+        error: Why it is not.
 
     Raises:
-        OSError: It cannot be written.
+        TargetError: It cannot be made there.
+        WriteError: The disk refused.
     """
 
     def __init__(
         self,
-        folder: SpoolFolder,
-        profile: str,
+        target: Path,
+        options: RecordOptions,
+        profile: World,
         others: Sequence[MetadataRecord],
-        on_closed: Callable[[int, int], None],
+        process: ProcessExecutor,
+        jobs: ThreadPoolExecutor,
+        warn: Callable[[str], None],
     ) -> None:
-        self.raw_bytes: Counter[str] = Counter()  # by topic
-        self.bytes = 0
-        self.span: tuple[int, int] | None = None
-        self._folder = folder
+        self.target = target
+        self.made: PackSummary | None = None
+        self.error: Exception | None = None
+        self.folder = SpoolFolder(target.with_name(target.name + UNFINISHED))
+        self._options = options
         self._profile = profile
-        self._on_closed = on_closed
+        self._process = process
+        self._jobs = jobs
+        self._warn = warn
+        self._span: tuple[int, int] | None = None
+        self._raw_bytes: Counter[str] = Counter()  # by topic
+        self._bytes = self._packed_bytes = self._parts_bytes = 0
         self._depends: dict[int, bool] = {}
         self._open: list[_Piece] = []  # all but the newest take what is late
-        self._next = 0
-        piece = self._begin(0)
-        for record in others:
-            piece.writer.add_metadata(record)
-        self.flush()
+        self._count = 0  # of pieces
+        check_target(target, force=options.force, owned=dataset_files)
+        settings = SpoolSettings(
+            format="bag" if profile == "ros1" else "rosbag2",
+            profile=profile,
+            quality=str(options.quality),
+            codec=options.codec,
+            preset=options.preset,
+            gop=options.gop,
+        )
+        try:
+            self.lock = self.folder.begin(settings)
+            piece = self._begin(0)
+            for record in others:
+                piece.writer.add_metadata(record)
+            self.flush()
+        except FileExistsError:
+            raise TargetError(
+                self.folder.path,
+                "already exists: a recording of this name was not finished",
+                "Choose another name, or recover that one first: "
+                f"{salvage_command(self.folder.path)}",
+            ) from None
+        except OSError as error:
+            raise WriteError(target, error) from None
+
+    @property
+    def spool_bytes(self) -> int:
+        """Bytes of messages that are not packed yet."""
+        return self._bytes - self._packed_bytes
+
+    @property
+    def size(self) -> int:
+        """Bytes so far."""
+        return self.spool_bytes + self._parts_bytes
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the next message belongs into another dataset."""
+        most_ns = round((self._options.max_duration or 0) * _NS)
+        if most_ns and self._span and self._span[1] - self._span[0] >= most_ns:
+            return True
+        return self._options.max_size is not None and self.size >= self._options.max_size
 
     @property
     def paths(self) -> Sequence[Path]:
         """The files that are being written."""
         return [piece.writer.path for piece in self._open]
 
+    # ------------------------------------------------------------ writing
+
     def _begin(self, start: int) -> _Piece:
-        path = self._folder.piece(self._next)
+        path = self.folder.piece(self._count)
         writer = McapWriter(path, profile=self._profile, compression="none")
-        self._open.append(_Piece(self._next, writer, start))
-        self._next += 1
+        self._open.append(_Piece(self._count, writer, start))
+        self._count += 1
         return self._open[-1]
 
     def write(self, message: Message) -> None:
@@ -165,19 +171,19 @@ class SpoolWriter:
             OSError: It cannot be written.
         """
         time, newest = message.log_time, self._open[-1]
-        if self.span is None:
+        if self._span is None:
             newest.start = time
         elif abs(time - newest.start) >= WINDOW_NS:
             self.flush()  # or a kill would leave a gap before what the new piece already has
             self._begin(time)
-        start, end = self.span or (time, time)
-        self.span = min(start, time), max(end, time)
+        start, end = self._span or (time, time)
+        self._span = min(start, time), max(end, time)
         self._write(self._piece_for(message), message)
         while len(self._open) > 1:
             age = abs(time - self._open[1].start)
             if age < _LATE_NS or (self._open[0].packets and age < _GROUP_NS):
                 break
-            self._close(self._open.pop(0))
+            self._complete(self._open.pop(0))
 
     def _piece_for(self, message: Message) -> _Piece:
         channel = message.channel.id
@@ -201,9 +207,9 @@ class SpoolWriter:
             if self._depends[channel.id]:
                 piece.packets.add(channel.id)
         piece.writer.write(message)
-        self.raw_bytes[channel.topic] += len(message.data)
+        self._raw_bytes[channel.topic] += len(message.data)
         piece.bytes += len(message.data)
-        self.bytes += len(message.data)
+        self._bytes += len(message.data)
 
     def flush(self) -> None:
         """Give the system what was written so far, so that it outlives this process.
@@ -214,12 +220,12 @@ class SpoolWriter:
         for piece in self._open:
             piece.writer.flush()
 
-    def _close(self, piece: _Piece) -> None:
+    def _complete(self, piece: _Piece) -> None:
         piece.writer.finish()
-        self._on_closed(piece.number, piece.bytes)
+        self._jobs.submit(self._pack, piece)
 
     def close(self, announced: Iterable[Channel]) -> None:
-        """Complete all pieces.
+        """Complete all pieces, and have the dataset made when they are packed.
 
         Args:
             announced: Channels, some of which may have no messages.
@@ -230,7 +236,8 @@ class SpoolWriter:
         for channel in announced:
             self._open[-1].writer.add_channel(channel)
         while self._open:
-            self._close(self._open.pop(0))
+            self._complete(self._open.pop(0))
+        self._jobs.submit(self._join)
 
     def abandon(self) -> None:
         """Close all files as they are, with what the disk still takes."""
@@ -238,3 +245,59 @@ class SpoolWriter:
             self.flush()
         while self._open:
             self._open.pop().writer.abandon()
+
+    # ------------------------------------------------------------ packing
+
+    def _pack(self, piece: _Piece) -> None:
+        if self.error is not None:  # what is not packed is kept as it is
+            return
+        try:
+            self._process.submit(_pack, self.folder.path, piece.number).result()
+            self._parts_bytes += folder_size(self.folder.part(piece.number))
+            self._packed_bytes += piece.bytes
+        except _FAILURES as error:
+            self.error = error
+            self._warn(
+                f"{self.folder.path}: no more is packed, what comes is still recorded: {error}"
+            )
+
+    def _join(self) -> None:
+        if self.error is not None:
+            return
+        options = self._options
+        join = partial(_join, force=options.force, about=options.about)
+        try:
+            made = self._process.submit(join, self.folder.path, self._count, self.target).result()
+            raw = self._raw_bytes
+            topics = [replace(topic, raw_bytes=raw[topic.topic]) for topic in made.topics]
+            self.made = replace(made, topics=topics, source_bytes=self._bytes, is_copy=False)
+            self.lock.close()
+            self.folder.remove(self._count)
+        except (Mp4dsError, *_FAILURES) as error:
+            self.error = error
+
+    def failure(self, error: Exception) -> Exception:
+        """What to raise because of an error; what was recorded stays where it is."""
+        if isinstance(error, Mp4dsError):
+            return error
+        return RecordError(self.folder.path, self.target, error)
+
+
+# ---------------------------------------------------------------- in the process
+
+
+def _pack(folder: Path, number: int) -> None:
+    """Make the part of a piece, which is then removed."""
+    spool = SpoolFolder(folder)
+    with spool.locked(shared=True):
+        pack(spool.piece(number), spool.part(number), spool.settings().options())
+        spool.piece(number).unlink()
+
+
+def _join(folder: Path, count: int, target: Path, *, force: bool, about: str | None) -> PackSummary:
+    """Make the dataset of all parts, which stay."""
+    spool = SpoolFolder(folder)
+    told = load_about(about) if about is not None else None
+    with spool.locked(shared=True):
+        parts = [spool.part(number) for number in range(count)]
+        return spool.join(parts, target, force=force, about=told)

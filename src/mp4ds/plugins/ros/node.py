@@ -11,13 +11,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from mp4ds.errors import OptionError, PublishError
 from mp4ds.plugins.ros.names import PLAIN, NodeNames
 from mp4ds.plugins.ros.qos import Qos
 from mp4ds.records import Channel
 
+World = Literal["ros1", "ros2"]
 CLOCK = "/clock"
 _Node = TypeVar("_Node", bound="Node")
 
@@ -92,13 +93,13 @@ class Node(ABC):
     """A node. A context manager; one thread publishes, callbacks come from any thread.
 
     Attributes:
-        world: What messages are to be converted to: ``ros1`` or ``ros2``; None: as recorded.
+        world: Its ROS.
         discovery_s: How long `topics` takes to find all topics that there are.
         poll_s: The least time between two calls of `topics`.
         lost: Messages that were lost on their way here, as far as that is known, by topic.
     """
 
-    world: str | None
+    world: World
     discovery_s = 0.0
     poll_s = 0.01
 

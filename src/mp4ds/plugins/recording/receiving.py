@@ -1,23 +1,20 @@
-"""Where a recorder gets its messages from: a node that subscribes to wanted topics."""
+"""How messages come to a recorder: a node subscribes to wanted topics, and a buffer holds them."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
-from mp4ds.bags.protocols import Format
 from mp4ds.errors import Mp4dsError, Refused
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions, Service, open_node
-from mp4ds.plugins.ros.qos import load_overrides
+from mp4ds.plugins.ros.node import CLOCK, Node
 from mp4ds.plugins.ros.ros2 import is_hidden
 from mp4ds.records import Channel, Message
+from mp4ds.times import INT64_MAX
 
 _CLOCK_POLL_S = 0.01
-_NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
-"""Node names of ROS's own recorders."""
 
 
 class Source:
@@ -26,26 +23,30 @@ class Source:
     Args:
         node: Closed with this.
         options: How to record.
+        wanted: Which topics to receive.
+        take: Called with each message, from any thread; it does not block. Each channel has an
+            id of its own.
 
     Attributes:
-        profile: ``ros1`` or ``ros2``.
-        format: The format of ROS's own recorder.
-        address: What it is connected to, to be displayed.
         warnings: Sentences, each to be shown once.
         topics: Topics subscribed to, with their channel if it is known before the first message.
         waiting_for: The clock topic that the recording waits for; empty once the clock runs.
     """
 
-    def __init__(self, node: Node, options: RecordOptions) -> None:
-        self.profile = node.world or ""
-        self.format: Format = "bag" if node.world == "ros1" else "rosbag2"
-        self.address = node.address
+    def __init__(
+        self,
+        node: Node,
+        options: RecordOptions,
+        wanted: Wanted,
+        take: Callable[[Message], None],
+    ) -> None:
         self.warnings: dict[str, None] = {}
         self.topics: dict[str, Channel | None] = {}
         self.waiting_for = ""
         self._node = node
         self._options = options
-        self._recorded_as: Callable[[str], str] = str
+        self._wanted = wanted
+        self._take = take
         self._failed: Counter[str] = Counter()
         self._sim_time_ns: int | None = None
         self._subscribed: set[str] = set()
@@ -55,49 +56,37 @@ class Source:
     @property
     def lost(self) -> Counter[str]:
         """Messages that the middleware reports as lost, or that could not be taken, by topic."""
-        by_node = {self._recorded_as(topic): count for topic, count in self._node.lost.items()}
+        recorded_as = self._wanted.recorded_as
+        by_node = {recorded_as(topic): count for topic, count in self._node.lost.items()}
         return self._failed + Counter(by_node)
 
     def warn(self, sentence: str) -> None:
         """Add a warning."""
         self.warnings[sentence] = None
 
-    def start(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+    def start(self) -> None:
         """Start receiving, in threads of its own.
 
         With a simulated time, it subscribes to topics only once /clock has published a time, as
         `ros2 bag record` does: earlier messages would have none, and latched ones still arrive.
 
-        Args:
-            wanted: Which topics to receive.
-            take: Called with each message, from any thread; it does not block. Each channel has an
-                id of its own.
-
         Raises:
             PublishError: The middleware refuses.
         """
-        self._recorded_as = wanted.recorded_as
         names = self._options.names
         if self._options.use_sim_time or names.use_sim_time or self._node.wants_clock:
             self.waiting_for = names.renamed(CLOCK)
             self._node.follow_clock(self._tick)
         else:
-            self._look(wanted, take)
-        self._thread = threading.Thread(
-            target=self._keep_looking, args=(wanted, take), name="topics", daemon=True
-        )
+            self._look()
+        self._thread = threading.Thread(target=self._keep_looking, name="topics", daemon=True)
         self._thread.start()
-
-    def serve(self, services: Sequence[Service]) -> None:
-        """Offer remote control, as `ros2 bag record` does; `rosbag record` has none."""
-        if self.profile == "ros2":
-            self._node.serve(services)
 
     def _tick(self, time_ns: int) -> None:
         if time_ns:  # 0 means that the clock has not started
             self._sim_time_ns, self.waiting_for = time_ns, ""
 
-    def _keep_looking(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+    def _keep_looking(self) -> None:
         is_clear = self.waiting_for == ""  # then it has looked once
         while self.waiting_for:
             if self._ended.wait(_CLOCK_POLL_S):
@@ -108,34 +97,35 @@ class Source:
             if self._ended.wait(poll_s if is_clear else 0.0):
                 return
             try:
-                self._look(wanted, take)
+                self._look()
                 is_clear = True
             except Mp4dsError as error:
                 self.warn(f"new topics are not noticed: {error}")
                 self._ended.wait(poll_s)
 
-    def _look(self, wanted: Wanted, take: Callable[[Message], None]) -> None:
+    def _look(self) -> None:
         """Subscribe to new topics."""
-        is_leaf_wanted = not self._options.ignore_leaf or self.profile != "ros2"
-        heard = None if is_leaf_wanted else self._node.subscribed_topics()
+        is_ros2, options = self._node.world == "ros2", self._options
+        heard = self._node.subscribed_topics() if is_ros2 and options.ignore_leaf else None
 
         def is_new(topic: str, kind: str) -> bool:
-            is_shown = self._options.hidden or self.profile != "ros2" or not is_hidden(topic)
-            is_due = topic not in self._subscribed and (heard is None or topic in heard)
-            return is_due and is_shown and wanted(topic, kind)
+            if topic in self._subscribed or (heard is not None and topic not in heard):
+                return False
+            is_shown = options.hidden or not is_ros2 or not is_hidden(topic)
+            return is_shown and self._wanted(topic, kind)
 
         for topic, kinds in self._node.topics(is_new).items():
             self._subscribed.add(topic)
-            self._subscribe(topic, kinds, take)
+            self._subscribe(topic, kinds)
 
-    def _subscribe(self, topic: str, kinds: Sequence[str], take: Callable[[Message], None]) -> None:
-        name = self._recorded_as(topic)
+    def _subscribe(self, topic: str, kinds: Sequence[str]) -> None:
+        name = self._wanted.recorded_as(topic)
 
         def receive(channel: Channel, data: bytes, sent_ns: int) -> None:
             # middlewares swallow, or crash on, what a callback raises
             try:
                 now = time.time_ns() if self._sim_time_ns is None else self._sim_time_ns
-                take(Message(channel, now, sent_ns if sent_ns > 0 else now, 0, data))
+                self._take(Message(channel, now, sent_ns if sent_ns > 0 else now, 0, data))
             except Exception as error:
                 self._failed[name] += 1
                 self.warn(f"{name}: a message could not be recorded: {error!r}")
@@ -161,24 +151,69 @@ class Source:
         self._node.close()
 
 
-def open_source(kind: str, options: RecordOptions) -> Source:
-    """Open a source.
+class MessageBuffer:
+    """Messages on their way from the threads that receive them to the one that writes them.
 
     Args:
-        kind: ``ros1`` or ``ros2``.
-        options: How to record.
-
-    Raises:
-        OptionError: An option is not valid there.
-        PublishError: The middleware is not installed, or cannot be reached.
+        most_bytes: Limit of buffered payloads; beyond, the oldest messages are dropped and counted.
+        last_ns: The latest log or publish time that the recording can hold; the first one is 0.
     """
-    node = open_node(
-        kind,
-        NodeOptions(
-            options.node or _NODES[kind],
-            options.names,
-            overrides=load_overrides(options.qos_overrides),
-            unpublished=options.unpublished,
-        ),
-    )
-    return Source(node, options)
+
+    def __init__(self, most_bytes: int, last_ns: int = INT64_MAX) -> None:
+        self.dropped: Counter[str] = Counter()
+        self.untimed: Counter[str] = Counter()  # with a time that no recording can hold
+        self.received: Counter[str] = Counter()
+        self.received_bytes: Counter[str] = Counter()
+        self._most = most_bytes
+        self._last_ns = last_ns
+        self._bytes = 0
+        self._messages: deque[Message] = deque()
+        self._changed = threading.Condition()
+        self._is_closed = False
+
+    @property
+    def bytes(self) -> int:
+        """Buffered payloads."""
+        return self._bytes
+
+    def put(self, message: Message) -> None:
+        """Add a message, from any thread; it never waits."""
+        topic = message.channel.topic
+        with self._changed:
+            if self._is_closed:
+                return
+            self.received[topic] += 1
+            self.received_bytes[topic] += len(message.data)
+            times = message.log_time, message.publish_time
+            if min(times) < 0 or max(times) > self._last_ns:
+                self.untimed[topic] += 1
+                return
+            while self._messages and self._bytes + len(message.data) > self._most:
+                dropped = self._messages.popleft()
+                self._bytes -= len(dropped.data)
+                self.dropped[dropped.channel.topic] += 1
+            self._messages.append(message)
+            self._bytes += len(message.data)
+            self._changed.notify()
+
+    def take(self, wait_s: float) -> Message | None:
+        """The next message; None if none came in time.
+
+        Raises:
+            EOFError: There are no more.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._messages or self._is_closed, wait_s)
+            if self._messages:
+                message = self._messages.popleft()
+                self._bytes -= len(message.data)
+                return message
+            if self._is_closed:
+                raise EOFError
+            return None
+
+    def close(self) -> None:
+        """Take no more messages; buffered ones are still given out."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
