@@ -81,7 +81,6 @@ ENCODINGS = {
     "vp9": Encoding("vp9", "libvpx-vp9", {"deadline": "realtime", "cpu-used": "8"}),
     "vp9-rgb": Encoding("vp9", "libvpx-vp9", {"lossless": "1"}, "gbrp"),
     "mjpeg": Encoding("mjpeg", "mjpeg", pixel_format="yuvj420p"),
-    "png": Encoding("png", "png", pixel_format="rgb24"),
 }
 DECODERS = {"h265": "hevc", "av1": "libdav1d"}
 IN_ORDER = [name for name, encoding in ENCODINGS.items() if encoding.in_order]

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mp4ds.errors import VideoError
-from mp4ds.messages.coded import UnknownStructure
 from mp4ds.video.access import FrameAccess
+from mp4ds.video.coded import UnknownStructure
 from test_references import (
     FRAMES,
     HEIGHT,

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coded_tools import refusal
-from mp4ds.video.nal import (
+from mp4ds.video.h264 import (
+    H264,
     MAX_UNITS,
     MAX_ZEROS,
     join,
-    join_length_prefixed,
     join_plain,
     split,
     split_length_prefixed,
@@ -50,7 +50,7 @@ def test_framing(data: str, framing: str) -> None:
     assert found == framing
     assert units == re.split(b"\0*\0\0\x01", packet.rstrip(b"\0"))[1:]
     assert join(units, framing) == packet
-    assert join_length_prefixed(memoryview(prefixed(units)), framing) == packet
+    assert H264.body(prefixed(units), framing) == packet
 
 
 @settings(deadline=None)
@@ -61,7 +61,7 @@ def test_any_framing_comes_back(units: list[bytes], data: st.DataObject) -> None
     framing = " ".join(map(str, lengths)) + (f" +{trailing}" if trailing else "")
     packet = join(units, framing)
     assert split(packet) == (units, framing)
-    assert join_length_prefixed(prefixed(units), framing) == packet
+    assert H264.body(prefixed(units), framing) == packet
     assert split(join_plain(units)) == (units, " ".join("4" for _ in units))
     assert split_length_prefixed(prefixed(units)) == units
 

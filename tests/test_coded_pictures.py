@@ -23,27 +23,30 @@ from coded_tools import (
 )
 from conftest import real
 from mp4ds.errors import Refused
-from mp4ds.messages.coded import REORDERED, NoPicture
-from mp4ds.video import av1, h264, h265, nal, vp9
-from mp4ds.video.coded_messages import PACKET_CODECS, PictureParser
+from mp4ds.video import av1, h264, h265
+from mp4ds.video.codecs import CODECS, PACKET_CODECS
+from mp4ds.video.coded import REORDERED, NoPicture, StreamParser, split_superframe
+from mp4ds.video.h264 import H264, join_plain, split
+from mp4ds.video.h265 import H265
 
 VIDEO = [name for name in IN_ORDER if ENCODINGS[name].codec in ("h264", "h265", "av1", "vp9")]
-UNITS = {"h264": h264, "h265": h265}
+UNITS = {"h264": H264, "h265": H265}
+PARSE_SPS = {"h264": h264.parse_sps, "h265": h265.parse_sps}
 START = b"\0\0\0\1"
 
 
 def first_refused(codec: str, bodies: list[bytes]) -> int | None:
-    parser = PictureParser(codec)
+    parser = CODECS[codec].parser()
     for number, body in enumerate(bodies):
-        if refusal(parser.parse, body):
+        if refusal(parser.picture, body):
             return number
     return None
 
 
 def without(codec: str, body: bytes, *kinds: int) -> bytes:
     """A body without NAL units of some types."""
-    units = nal.split(body)[0]
-    return nal.join_plain([u for u in units if UNITS[codec].unit_type(u) not in kinds])
+    units = split(body)[0]
+    return join_plain([u for u in units if UNITS[codec].unit_type(u) not in kinds])
 
 
 @pytest.mark.one_in(3)
@@ -52,17 +55,15 @@ def without(codec: str, body: bytes, *kinds: int) -> bytes:
 def test_streams_in_order(name: str, width: int, height: int) -> None:
     encoding = ENCODINGS[name]
     packets = encode(encoding, frames=11, width=width, height=height)
-    parser = PictureParser(encoding.codec)
+    parser = CODECS[encoding.codec].parser()
     for packet in packets:
-        picture = parser.parse(memoryview(packet.data))
+        picture = parser.picture(memoryview(packet.data))
         assert (picture.width, picture.height) == (width, height)
-        assert picture.keyframe == (packet.keyframe or encoding.codec in ("mjpeg", "png"))
+        assert picture.keyframe == (packet.keyframe or encoding.codec == "mjpeg")
 
 
 def test_every_codec_is_tried() -> None:
     assert {ENCODINGS[name].codec for name in IN_ORDER} == set(PACKET_CODECS)
-    with pytest.raises(ValueError, match=r"ffv1.*h264"):
-        PictureParser("ffv1")
 
 
 @pytest.mark.parametrize("name", [name for name in ENCODINGS if name not in IN_ORDER])
@@ -70,8 +71,8 @@ def test_pictures_out_of_order(name: str) -> None:
     """All are refused from the first that is sent after one shown later."""
     encoding = ENCODINGS[name]
     packets = encode(encoding, frames=12, gop=12)
-    parser = PictureParser(encoding.codec)
-    reasons = [refusal(parser.parse, packet.data) for packet in packets]
+    parser = CODECS[encoding.codec].parser()
+    reasons = [refusal(parser.picture, packet.data) for packet in packets]
     times = [packet.pts for packet in packets]
     first = next(n for n in range(1, len(times)) if times[n] < times[n - 1])
     assert reasons[:first] == [""] * first
@@ -141,12 +142,12 @@ def test_real_videos(name: str) -> None:
     packets, size = packets_of(real(f"video/{name}"), REAL[name])
     times = [packet.pts for packet in packets]
     expected = next((n for n in range(1, len(times)) if times[n] < times[n - 1]), len(times))
-    parser = PictureParser(REAL[name])
+    parser = CODECS[REAL[name]].parser()
     for number, packet in enumerate(packets):
         if number >= expected:
-            assert refusal(parser.parse, packet.data) == REORDERED
+            assert refusal(parser.picture, packet.data) == REORDERED
             continue
-        picture = parser.parse(packet.data)
+        picture = parser.picture(packet.data)
         assert (picture.width, picture.height) == size
         assert picture.keyframe == packet.keyframe
 
@@ -160,13 +161,13 @@ def test_after_a_gap_the_next_key_frame_is_awaited(name: str) -> None:
     packets = encode(ENCODINGS[name])
     second = next(n for n, packet in enumerate(packets) if n and packet.keyframe)
     assert second > 2
-    for lose in (PictureParser.leave_out, lambda parser: refusal(parser.parse, b"\xff junk")):
-        parser = PictureParser(codec)
-        parser.parse(packets[0].data)
+    for lose in (StreamParser.leave_out, lambda parser: refusal(parser.picture, b"\xff junk")):
+        parser = CODECS[codec].parser()
+        parser.picture(packets[0].data)
         lose(parser)
         for packet in packets[1:second]:
-            assert "pictures before it" in refusal(parser.parse, packet.data)
-        assert parser.parse(packets[second].data).keyframe
+            assert "pictures before it" in refusal(parser.picture, packet.data)
+        assert parser.picture(packets[second].data).keyframe
 
 
 @pytest.mark.parametrize("codec", ["h264", "h265"])
@@ -174,17 +175,17 @@ def test_parameters_sent_apart(codec: str) -> None:
     """They are kept in mind; the packet that holds nothing else is no frame."""
     kinds = (7, 8) if codec == "h264" else (32, 33, 34)
     body = encode(ENCODINGS[codec], frames=1)[0].data
-    units = nal.split(body)[0]
+    units = split(body)[0]
     is_parameter = [UNITS[codec].unit_type(unit) in kinds for unit in units]
-    alone = nal.join_plain([u for u, chosen in zip(units, is_parameter, strict=True) if chosen])
-    parser = PictureParser(codec)
-    assert "parameter sets were not sent" in refusal(parser.parse, without(codec, body, *kinds))
+    alone = join_plain([u for u, chosen in zip(units, is_parameter, strict=True) if chosen])
+    parser = CODECS[codec].parser()
+    assert "parameter sets were not sent" in refusal(parser.picture, without(codec, body, *kinds))
     assert parser.parameters == b""
     with pytest.raises(NoPicture):
-        parser.parse(alone)
+        parser.picture(alone)
     assert parser.parameters == alone
-    assert parser.parse(without(codec, body, *kinds)).keyframe
-    assert parser.parse(body).keyframe
+    assert parser.picture(without(codec, body, *kinds)).keyframe
+    assert parser.picture(body).keyframe
 
 
 @pytest.mark.parametrize("codec", ["h264", "h265"])
@@ -192,7 +193,7 @@ def test_parameters_sent_apart(codec: str) -> None:
 def test_each_kind_of_parameters_is_needed(codec: str, kind: int) -> None:
     kinds = (7, 8, 8) if codec == "h264" else (32, 33, 34)
     body = encode(ENCODINGS[codec], frames=1)[0].data
-    reason = refusal(PictureParser(codec).parse, without(codec, body, kinds[kind]))
+    reason = refusal(CODECS[codec].parser().picture, without(codec, body, kinds[kind]))
     assert "parameter sets were not sent" in reason
 
 
@@ -200,64 +201,64 @@ def test_each_kind_of_parameters_is_needed(codec: str, kind: int) -> None:
 def test_remarks_and_filler_do_not_matter(codec: str) -> None:
     filler = b"\x0c\xff\xff\x80" if codec == "h264" else b"\x4c\x01\xff\xff\x80"
     packets = encode(ENCODINGS[codec], frames=3)
-    parser = PictureParser(codec)
+    parser = CODECS[codec].parser()
     for packet in packets:
         body = packet.data + b"\0\0\1" + filler + b"\0\0"
-        assert parser.parse(body).framing.endswith(" 3 +2")
+        assert parser.picture(body).framing.endswith(" 3 +2")
         with pytest.raises(NoPicture):
-            parser.parse(START + filler)  # which leaves no gap
+            parser.picture(START + filler)  # which leaves no gap
 
 
 @pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
 def test_two_pictures_in_one_packet(codec: str) -> None:
     packets = encode(ENCODINGS[codec], frames=3)
-    parser = PictureParser(codec)
-    parser.parse(packets[0].data)
+    parser = CODECS[codec].parser()
+    parser.picture(packets[0].data)
     both = packets[1].data + packets[2].data.removeprefix(av1.DELIMITER)
-    assert "more than one picture" in refusal(parser.parse, both)
+    assert "more than one picture" in refusal(parser.picture, both)
 
 
 def test_a_part_of_a_picture() -> None:
     packets = encode(ENCODINGS["h264-slices"], frames=2)
-    parser = PictureParser("h264")
-    parser.parse(packets[0].data)
-    slices = nal.split(packets[1].data)[0]
+    parser = CODECS["h264"].parser()
+    parser.picture(packets[0].data)
+    slices = split(packets[1].data)[0]
     assert len(slices) > 2
-    assert "part of one" in refusal(parser.parse, nal.join_plain(slices[-2:]))
+    assert "part of one" in refusal(parser.picture, join_plain(slices[-2:]))
 
 
 def test_fields_are_refused() -> None:
     interlaced = Encoding("h264", "libx264", {"bf": "0", "x264-params": "interlaced=1"})
     body = encode(interlaced, frames=1)[0].data
-    sps = next(u for u in nal.split(body)[0] if h264.unit_type(u) == h264.SPS)
+    sps = next(u for u in split(body)[0] if H264.unit_type(u) == h264.SPS)
     assert not h264.parse_sps(sps).frames_only
-    parser = PictureParser("h264")
-    assert parser.parse(body).height == 48  # a whole picture, although fields could be coded
-    units = nal.split(body)[0]
-    at = next(n for n, unit in enumerate(units) if h264.unit_type(unit) == h264.IDR)
+    parser = CODECS["h264"].parser()
+    assert parser.picture(body).height == 48  # a whole picture, although fields could be coded
+    units = split(body)[0]
+    at = next(n for n, unit in enumerate(units) if H264.unit_type(unit) == h264.IDR)
     bits = bin(int.from_bytes(b"\1" + units[at], "big"))[3:]
     # first_mb 0, slice type, PPS 0, then frame_num of four bits and the flag
     place = 8 + 1 + 7 + 1 + h264.parse_sps(sps).frame_num_bits
     assert bits[9 : 9 + 7] == "0001000"  # slice type 7: I
     field = bits[:place] + "1" + bits[place + 1 :]
     units[at] = int(field, 2).to_bytes(len(units[at]), "big")
-    assert "field" in refusal(PictureParser("h264").parse, nal.join_plain(units))
+    assert "field" in refusal(CODECS["h264"].parser().picture, join_plain(units))
 
 
 def test_a_picture_that_is_not_shown() -> None:
     packets = [packet.data for packet in encode(ENCODINGS["vp9"], frames=4, gop=9)]
-    parser = PictureParser("vp9")
-    parser.parse(packets[0])
+    parser = CODECS["vp9"].parser()
+    parser.picture(packets[0])
     with pytest.raises(NoPicture, match="shows no picture"):
-        parser.parse(hide(packets[1]))
+        parser.picture(hide(packets[1]))
     both = superframe(packets[1], packets[2])
-    assert list(vp9.split_superframe(memoryview(both))) == [hide(packets[1]), packets[2]]
-    assert not parser.parse(both).keyframe
-    assert parser.parse(packets[3]).width == 64
+    assert list(split_superframe(memoryview(both))) == [hide(packets[1]), packets[2]]
+    assert not parser.picture(both).keyframe
+    assert parser.picture(packets[3]).width == 64
     several = bytearray(both)
     several[0] |= 2
-    assert "more than one picture" in refusal(parser.parse, bytes(several))
-    assert "superframe" in refusal(parser.parse, b"\x86" + both)
+    assert "more than one picture" in refusal(parser.picture, bytes(several))
+    assert "superframe" in refusal(parser.picture, b"\x86" + both)
 
 
 # ---------------------------------------------------------------- AV1
@@ -295,19 +296,19 @@ UNIT = encode(ENCODINGS["av1"], frames=1)[0].data
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_what_no_mp4_keeps_of_av1(body: bytes, reason: str) -> None:
-    assert reason in refusal(PictureParser("av1").parse, body)
+    assert reason in refusal(CODECS["av1"].parser().picture, body)
 
 
 def test_a_key_frame_without_its_header() -> None:
     """Decoders cannot begin there, whatever the track says."""
     packets = [packet.data for packet in encode(ENCODINGS["av1"], frames=8)]
     bare = [packet.replace(av1.sequence_header(UNIT), b"") for packet in packets]
-    parser = PictureParser("av1")
-    assert refusal(parser.parse, bare[0])
-    assert refusal(parser.parse, av1.DELIMITER + av1.sequence_header(UNIT))
-    assert refusal(parser.parse, bare[0])
-    assert parser.parse(packets[0]).keyframe
-    assert not any(parser.parse(packet).keyframe for packet in bare[1:])
+    parser = CODECS["av1"].parser()
+    assert refusal(parser.picture, bare[0])
+    assert refusal(parser.picture, av1.DELIMITER + av1.sequence_header(UNIT))
+    assert refusal(parser.picture, bare[0])
+    assert parser.picture(packets[0]).keyframe
+    assert not any(parser.picture(packet).keyframe for packet in bare[1:])
 
 
 # ---------------------------------------------------------------- VP9
@@ -326,8 +327,8 @@ def test_a_key_frame_without_its_header() -> None:
 )
 def test_what_is_no_vp9(change: Callable[[bytes], bytes], reason: str) -> None:
     body = encode(ENCODINGS["vp9"], frames=1)[0].data
-    assert not refusal(PictureParser("vp9").parse, body)
-    refused = refusal(PictureParser("vp9").parse, change(body))
+    assert not refusal(CODECS["vp9"].parser().picture, body)
+    refused = refusal(CODECS["vp9"].parser().picture, change(body))
     assert reason in refused
     assert refused
 
@@ -337,20 +338,20 @@ def test_damage_is_refused_or_read(name: str) -> None:
     packets = encode(ENCODINGS[name], frames=2)
     for packet in packets:
         for damaged in mutations(packet.data, 300, head=120):
-            parser = PictureParser(ENCODINGS[name].codec)
-            refusal(parser.parse, packets[0].data)
-            refusal(parser.parse, damaged)  # and raises nothing else
+            parser = CODECS[ENCODINGS[name].codec].parser()
+            refusal(parser.picture, packets[0].data)
+            refusal(parser.picture, damaged)  # and raises nothing else
 
 
 @pytest.mark.parametrize("name", ["h264-hrd", "h264-matrix", "h264-10bit", "h265-gray12"])
 def test_every_cut_of_parameters_is_refused_or_read(name: str) -> None:
     codec = ENCODINGS[name].codec
-    units = nal.split(encode(ENCODINGS[name], frames=1)[0].data)[0]
+    units = split(encode(ENCODINGS[name], frames=1)[0].data)[0]
     sps = next(u for u in units if UNITS[codec].unit_type(u) in (h264.SPS, h265.SPS))
-    whole = UNITS[codec].parse_sps(sps)
+    whole = PARSE_SPS[codec](sps)
     assert (whole.width, whole.height) == (64, 48)
     assert whole.reorder == 0
     for length in range(1, 8):
-        assert refusal(UNITS[codec].parse_sps, sps[:length])
+        assert refusal(PARSE_SPS[codec], sps[:length])
     for damaged in mutations(sps, 400):
-        refusal(UNITS[codec].parse_sps, damaged)
+        refusal(PARSE_SPS[codec], damaged)

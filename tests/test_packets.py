@@ -26,10 +26,11 @@ from coded_tools import (
     superframe,
 )
 from mp4ds.errors import VideoError
-from mp4ds.messages.coded import CodedPicture
-from mp4ds.video import av1, h264, h265, nal
-from mp4ds.video.coded_messages import PictureParser, body_of
-from mp4ds.video.packets import PacketReader, PacketWriter, StandAlonePackets
+from mp4ds.video import av1
+from mp4ds.video.codecs import CODECS
+from mp4ds.video.coded import CodedPicture
+from mp4ds.video.h264 import join, join_plain, split
+from mp4ds.video.packets import PacketReader, PacketWriter
 
 STEP = 33_333
 SIZE = (WIDTH, HEIGHT)
@@ -41,8 +42,8 @@ def write(
     path: Path, codec: str, bodies: list[bytes], ticks: list[int] | None = None
 ) -> list[CodedPicture]:
     """Write bodies as a topic would be; returns what is known of them."""
-    parser = PictureParser(codec)
-    pictures = [parser.parse(body) for body in bodies]
+    parser = CODECS[codec].parser()
+    pictures = [parser.picture(body) for body in bodies]
     first = pictures[0]
     with PacketWriter(
         path, codec, width=first.width, height=first.height, parameters=parser.parameters, rate=30.0
@@ -57,7 +58,7 @@ def write(
 def read(path: Path, codec: str, pictures: list[CodedPicture]) -> list[bytes]:
     with PacketReader(path, codec=codec, frames=len(pictures)) as reader:
         return [
-            body_of(codec, packet, picture.framing)
+            CODECS[codec].parser.body(packet, picture.framing)
             for packet, picture in zip(reader.packets(), pictures, strict=True)
         ]
 
@@ -91,9 +92,7 @@ def test_packets_come_back(name: str, tmp_path: Path) -> None:
     packets = encode(ENCODINGS[name])
     check(tmp_path / "a.mp4", codec, [packet.data for packet in packets])
     with PacketReader(tmp_path / "a.mp4", codec=codec, coded_size=SIZE) as reader:
-        assert list(reader.keyframes) == [
-            packet.keyframe or codec in ("mjpeg", "png") for packet in packets
-        ]
+        assert list(reader.keyframes) == [packet.keyframe or codec == "mjpeg" for packet in packets]
         assert reader.ticks == array("q", [number * STEP for number in range(len(packets))])
         everything = list(reader.packets())
         for index in (5, 0, len(packets) - 1, 5):
@@ -129,13 +128,13 @@ def test_sizes_that_are_cropped(name: str, width: int, height: int, tmp_path: Pa
 
 def reframed(codec: str, body: bytes, framing: str) -> bytes:
     """A body with SEI and filler among its NAL units, behind other start codes."""
-    module = {"h264": h264, "h265": h265}[codec]
-    units = nal.split(body)[0]
-    is_slice = [module.unit_type(u) < (6 if codec == "h264" else 32) for u in units]
+    parser = CODECS[codec].parser
+    units = split(body)[0]
+    is_slice = [parser.unit_type(u) < (6 if codec == "h264" else 32) for u in units]
     units.insert(is_slice.index(True), SEI[codec])
     units.append(FILLER[codec])
     lengths = (framing.split() * len(units))[: len(units)]
-    return nal.join(units, " ".join([*lengths, "+2"] if framing == "6 3" else lengths))
+    return join(units, " ".join([*lengths, "+2"] if framing == "6 3" else lengths))
 
 
 @pytest.mark.parametrize("framing", ["3", "4", "4 3", "6 3"])
@@ -170,17 +169,15 @@ def test_a_vp9_superframe(tmp_path: Path) -> None:
 @pytest.mark.parametrize("codec", ["h264", "h265"])
 def test_parameters_that_were_sent_before(codec: str, tmp_path: Path) -> None:
     """The track's header holds them, so that the file plays."""
-    module, kinds = {"h264": (h264, (7, 8)), "h265": (h265, (32, 33, 34))}[codec]
+    parser = CODECS[codec].parser()
+    kinds = parser.parameter_kinds
     whole = [packet.data for packet in encode(ENCODINGS[codec], frames=8)]
-    units = [nal.split(body)[0] for body in whole]
-    alone = nal.join_plain([u for u in units[0] if module.unit_type(u) in kinds])
-    bodies = [
-        nal.join_plain([u for u in body if module.unit_type(u) not in kinds]) for body in units
-    ]
-    parser = PictureParser(codec)
-    assert refusal(parser.parse, bodies[0])
-    assert refusal(parser.parse, alone)
-    pictures = [parser.parse(body) for body in bodies]
+    units = [split(body)[0] for body in whole]
+    alone = join_plain([u for u in units[0] if parser.unit_type(u) in kinds])
+    bodies = [join_plain([u for u in body if parser.unit_type(u) not in kinds]) for body in units]
+    assert refusal(parser.picture, bodies[0])
+    assert refusal(parser.picture, alone)
+    pictures = [parser.picture(body) for body in bodies]
     path = tmp_path / "a.mp4"
     with PacketWriter(
         path, codec, width=WIDTH, height=HEIGHT, parameters=parser.parameters
@@ -318,8 +315,8 @@ def test_a_file_that_shrinks_while_it_is_read(video: Path) -> None:
 
 
 def standing_alone(path: Path, codec: str) -> list[bytes]:
-    with StandAlonePackets(path, codec=codec) as packets:
-        return list(packets.packets())
+    with PacketReader(path, codec=codec) as packets:
+        return [packets.stand_alone(index) for index in range(len(packets))]
 
 
 @pytest.mark.one_in(3)
@@ -332,9 +329,9 @@ def test_packets_stand_alone(name: str, tmp_path: Path) -> None:
     keys = [number for number, packet in enumerate(packets) if packet.keyframe]
     for key in keys:
         assert decodes(codec, given[key:]) == len(packets) - key
-    parser = PictureParser(codec)
-    assert [parser.parse(body).keyframe for body in given] == [
-        packet.keyframe or codec in ("mjpeg", "png") for packet in packets
+    parser = CODECS[codec].parser()
+    assert [parser.picture(body).keyframe for body in given] == [
+        packet.keyframe or codec == "mjpeg" for packet in packets
     ]
 
 

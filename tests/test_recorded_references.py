@@ -20,15 +20,13 @@ from mp4ds.dataset.topic import Topic
 from mp4ds.errors import FormatError, VideoError
 from mp4ds.format.models import References, video_facts
 from mp4ds.format.sidecars import load_stream
-from mp4ds.messages.coded import CodedFrame, UnknownStructure
-from mp4ds.video import references as structure
+from mp4ds.video import access, references
+from mp4ds.video.access import Chains
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.references import (
-    Chains,
     Structures,
     digest_video,
-    frame_bytes,
     packets_of_groups,
     read_structure,
 )
@@ -69,14 +67,14 @@ def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> N
     recipe = RECIPES[name]
     path = written(tmp_path, recipe)
     data = path.read_bytes()
-    found = digest_video(path, recipe.codec)
-    assert (found.size, found.sha256) == (len(data), hashlib.sha256(data).hexdigest())
-    assert (found.structures is not None) == CODECS[recipe.codec].is_free
-    if found.structures is not None:
+    *digest, found = digest_video(path, recipe.codec)
+    assert digest == [len(data), hashlib.sha256(data).hexdigest()]
+    assert (found is not None) == CODECS[recipe.codec].is_free
+    if found is not None:
         packets = packets_of_groups(index(path))
         assert packets.sum() == FRAMES
-        again = References.from_structures(found.structures).decode(packets)
-        assert list(again.texts) == list(found.structures.texts)
+        again = References.from_structures(found).decode(packets)
+        assert list(again.texts) == list(found.texts)
         again.check()
         expected = chains_of(path, recipe.codec, None)
         assert chains_of(path, recipe.codec, again) == expected
@@ -99,7 +97,7 @@ def test_groups_that_were_not_asked_for_long_are_forgotten(
     path = written(tmp_path, recipe)
     table, data = index(path), path.read_bytes()
     most = max(np.diff(np.append(np.flatnonzero(table.sync), len(table.sizes))))
-    monkeypatch.setattr(structure, "KEPT_FRAMES", 2 * most)
+    monkeypatch.setattr(access, "KEPT_FRAMES", 2 * most)
 
     def read(sample: int) -> bytes:
         return data[table.places[sample] :][: table.sizes[sample]]
@@ -116,25 +114,24 @@ def test_groups_that_were_not_asked_for_long_are_forgotten(
 @pytest.mark.parametrize("name", REFUSED)
 def test_unknown_structures_are_not_recorded(name: str, tmp_path: Path) -> None:
     path = written(tmp_path, REFUSED[name])
-    assert digest_video(path, REFUSED[name].codec).structures is None
+    assert digest_video(path, REFUSED[name].codec)[2] is None
 
 
 def test_what_is_no_video_is_hashed(tmp_path: Path) -> None:
     path = tmp_path / "v.mp4"
     path.write_bytes(b"\0\0\0\x08moov" * 3)
-    found = digest_video(path, "av1")
-    assert (found.size, found.structures) == (24, None)
-    assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert digest_video(path, "av1") == (24, sha256, None)
 
 
 def test_no_packet_is_read_but_those_of_the_chain(tmp_path: Path) -> None:
     path = written(tmp_path, HIERARCHICAL)
-    references = video_facts(path, "av1")["references"]
+    recorded = video_facts(path, "av1")["references"].decode
     chains = chains_of(path, "av1", None)
     maker: Any = Samples()
     for number in range(FRAMES):
         pictures = []
-        for told in (references, None):
+        for told in (recorded, None):
             access = Counting(path, codec="av1", frames=FRAMES, maker=maker, references=told)
             pictures.append(list(access.pictures_of([number])))
             if told is not None:
@@ -146,10 +143,6 @@ def test_no_packet_is_read_but_those_of_the_chain(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- structures
 
 
-def frame(*references: int, shown: bool = True) -> CodedFrame:
-    return CodedFrame(0, 1, references, shown=shown, existing=False)
-
-
 @pytest.mark.parametrize(
     ("bound", "most"), [("MAX_STRUCTURES", 1), ("MAX_STRUCTURE_CHARS", 40), ("MAX_CHARS", 90)]
 )
@@ -157,23 +150,9 @@ def test_too_many_structures_are_not_recorded(
     bound: str, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = written(tmp_path, HIERARCHICAL)
-    assert digest_video(path, "av1").structures is not None
-    monkeypatch.setattr(structure, bound, most)
-    assert digest_video(path, "av1").structures is None
-
-
-def test_a_packet_with_other_frames_than_told(tmp_path: Path) -> None:
-    path = written(tmp_path, HIERARCHICAL)
-    table = index(path)
-    second = path.read_bytes()[table.places[1] :][: table.sizes[1]]
-    count = len(read_structure(digest_video(path, "av1").structures.texts[0])[1])  # type: ignore[union-attr]
-    assert count > 1
-    pieces = [
-        frame_bytes("av1", second, part=part, parts=count, key=False) for part in range(count)
-    ]
-    assert b"".join(pieces) == second
-    with pytest.raises(UnknownStructure, match=f"holds {count} coded frames, 1 are due"):
-        frame_bytes("av1", second, part=0, parts=1, key=False)
+    assert digest_video(path, "av1")[2] is not None
+    monkeypatch.setattr(references, bound, most)
+    assert digest_video(path, "av1")[2] is None
 
 
 # ---------------------------------------------------------------- in sidecars

@@ -18,10 +18,9 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from coded_tools import mutations, refusal, scene
-from mp4ds.messages.coded import CodedFrame
 from mp4ds.video import av1
-from mp4ds.video.nal import parameter_units
-from mp4ds.video.references import ReferenceParser
+from mp4ds.video.codecs import CODECS
+from mp4ds.video.coded import CodedFrame, StreamParser
 
 WIDTH, HEIGHT, FRAMES, GOP = 128, 96, 45, 20
 DECODERS = {"h265": "hevc", "av1": "libdav1d"}
@@ -219,10 +218,14 @@ def samples(frame: Any) -> bytes:
     return b"".join((frame.format.name.encode(), *parts))
 
 
+def parser_of(clip: Clip) -> StreamParser:
+    return CODECS[clip.codec].parser(clip.configuration)
+
+
 def parsed(clip: Clip, first: int = 0) -> list[list[CodedFrame]]:
     """The coded frames of every packet from one on."""
-    parser = ReferenceParser(clip.codec, clip.configuration)
-    return [parser.packet(packet.data, key=packet.key) for packet in clip.packets[first:]]
+    parser = parser_of(clip)
+    return [parser.frames(packet.data, key=packet.key) for packet in clip.packets[first:]]
 
 
 def chains(frames: list[list[CodedFrame]]) -> list[list[tuple[int, CodedFrame]]]:
@@ -286,16 +289,16 @@ def test_a_parser_may_begin_at_any_key_packet(name: str) -> None:
         if packet.key:
             assert parsed(clip, number) == whole[number:]
         else:
-            parser = ReferenceParser(clip.codec, clip.configuration)
+            parser = parser_of(clip)
             for key in (False, True):
-                assert refusal(partial(parser.packet, packet.data, key=key))
+                assert refusal(partial(parser.frames, packet.data, key=key))
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_reaches_across_key_packets_is_refused(name: str) -> None:
     clip = encoded(REFUSED[name])
-    parser = ReferenceParser(clip.codec, clip.configuration)
-    reasons = [refusal(partial(parser.packet, p.data, key=p.key)) for p in clip.packets]
+    parser = parser_of(clip)
+    reasons = [refusal(partial(parser.frames, p.data, key=p.key)) for p in clip.packets]
     first = next(number for number, reason in enumerate(reasons) if reason)
     keys = [number for number, packet in enumerate(clip.packets) if packet.key]
     following = next((number for number in keys if number > first), FRAMES)
@@ -311,9 +314,9 @@ def with_length(unit: bytes) -> bytes:
 
 def after_key(clip: Clip, data: bytes) -> str:
     """Why a packet is refused that follows the first."""
-    parser = ReferenceParser(clip.codec, clip.configuration)
-    parser.packet(clip.packets[0].data, key=True)
-    return refusal(partial(parser.packet, data, key=False))
+    parser = parser_of(clip)
+    parser.frames(clip.packets[0].data, key=True)
+    return refusal(partial(parser.frames, data, key=False))
 
 
 @pytest.mark.parametrize("name", ["x264-b3-none-ref4-w2", "x265-b4-pyramid-off"])
@@ -322,7 +325,7 @@ def test_parameters_in_a_picture_that_none_refers_to(name: str) -> None:
     clip = encoded(RECIPES[name])
     frames = parsed(clip)
     number = next(n for n, found in enumerate(frames) if found[0].references == (2,))
-    sets = parameter_units(clip.codec, clip.configuration)
+    sets = CODECS[clip.codec].parser.units_of(clip.configuration)
     kind = {"h264": lambda unit: unit[0] & 31 == 8, "h265": lambda unit: unit[0] >> 1 == 34}
     first = with_length(next(filter(kind[clip.codec], sets)))
     packets = list(clip.packets)
@@ -336,7 +339,7 @@ def test_sub_layers_above() -> None:
     """A picture that none of its own sub-layer refers to may be needed by a higher one."""
     clip = encoded(RECIPES["x265-b4"])
     assert any(found[0].references == (2,) for found in parsed(clip))
-    sps = next(u for u in parameter_units("h265", clip.configuration) if u[0] >> 1 == 33)
+    sps = next(u for u in CODECS["h265"].parser.units_of(clip.configuration) if u[0] >> 1 == 33)
     above = sps[:2] + bytes([sps[2] | 1 << 1]) + sps[3:]  # sps_max_sub_layers_minus1
     changed = replace(clip, configuration=clip.configuration.replace(sps, above))
     assert {found[0].references for found in parsed(changed)} == {(), (1,)}
@@ -347,14 +350,14 @@ def test_a_picture_of_several_slices() -> None:
     data = clip.packets[3].data
     more = bytearray(data)
     more[6] &= 0x7F  # not its first slice
-    parser = ReferenceParser("h265", clip.configuration)
+    parser = parser_of(clip)
     for packet in clip.packets[:3]:
-        frames = parser.packet(packet.data, key=packet.key)
-    frames = parser.packet(data + bytes(more), key=False)
-    assert frames == [CodedFrame(0, 2 * len(data), (1,), shown=True, existing=False)]
-    assert "one picture" in refusal(partial(parser.packet, data + data, key=False))
-    assert "first key frame" in refusal(partial(parser.packet, data, key=False))
-    assert parser.packet(clip.packets[0].data, key=True)[0].references == ()
+        frames = parser.frames(packet.data, key=packet.key)
+    frames = parser.frames(data + bytes(more), key=False)
+    assert frames == [CodedFrame(0, 2 * len(data), (1,), shown=True)]
+    assert "one picture" in refusal(partial(parser.frames, data + data, key=False))
+    assert "first key frame" in refusal(partial(parser.frames, data, key=False))
+    assert parser.frames(clip.packets[0].data, key=True)[0].references == ()
 
 
 @pytest.mark.parametrize(
@@ -494,38 +497,38 @@ def test_av1_headers(name: str, configured: bool) -> None:
     """By the tables of the specification: frames fill slots and others name these."""
     head, told = SEQUENCES[name]
     frame = partial(inter, **told)
-    parser = ReferenceParser("av1", b"\x81\0\0\0" + head if configured else b"")
+    parser = CODECS["av1"].parser(b"\x81\0\0\0" + head if configured else b"")
     first = SHOWN_KEY if configured else head + unit(5, b"\4\1") + SHOWN_KEY
-    found = parser.packet(first, key=True)
-    assert found == [CodedFrame(0, len(first), (), shown=True, existing=False)]
+    found = parser.frames(first, key=True)
+    assert found == [CodedFrame(0, len(first), (), shown=True)]
     # frames 1 to 6 fill slots 1 to 6; slots 0 and 7 still hold the key frame
     for number in range(1, 7):
         body = frame([number - 1] * 7, 1 << number, shown=bool(number % 2))
-        (only,) = parser.packet(unit(2, b"") + body, key=False)
-        assert only == CodedFrame(2, 2 + len(body), (1,), bool(number % 2), existing=False)
+        (only,) = parser.frames(unit(2, b"") + body, key=False)
+        assert only == CodedFrame(2, 2 + len(body), (1,), bool(number % 2))
     slots = (6, 5, 5, 3, 1, 1, 7)  # the seventh frame's
     both = frame(slots, 0, resilient=True) + unit(3, packed((1, 1), (2, 3)))
-    seventh, existing = parser.packet(both, key=False)
+    seventh, existing = parser.frames(both, key=False)
     assert seventh.references == (1, 2, 4, 6, 7)
-    assert (existing.references, existing.shown, existing.existing) == ((6,), True, True)
+    assert (existing.references, existing.shown) == ((6,), True)
     assert (seventh.end, existing.end) == (existing.start, len(both))
-    (intra,) = parser.packet(frame((), 0x21, kind=2), key=False)
+    (intra,) = parser.frames(frame((), 0x21, kind=2), key=False)
     assert intra.references == (9,)  # the key frame: it is no place to begin
-    (after,) = parser.packet(frame([0, 1, 2, 3, 4, 5, 6], 0), key=False)
+    (after,) = parser.frames(frame([0, 1, 2, 3, 4, 5, 6], 0), key=False)
     assert after.references == (1, 4, 6, 7, 8, 9)
-    (switch,) = parser.packet(frame([7] * 7, 0, kind=3), key=False)
+    (switch,) = parser.frames(frame([7] * 7, 0, kind=3), key=False)
     assert switch.references == (11,)
-    (last,) = parser.packet(frame([0, 1, 2, 3, 4, 5, 7], 0), key=False)
+    (last,) = parser.frames(frame([0, 1, 2, 3, 4, 5, 7], 0), key=False)
     assert last.references == (1,)
 
 
 def test_av1_slots_chosen_by_order() -> None:
     """Such a frame looks at all slots, whichever it takes."""
-    parser = ReferenceParser("av1", b"")
-    parser.packet(sequence() + SHOWN_KEY, key=True)
+    parser = CODECS["av1"].parser()
+    parser.frames(sequence() + SHOWN_KEY, key=True)
     for number in range(1, 8):
-        parser.packet(inter([0] * 7, 1 << number), key=False)
-    (short,) = parser.packet(inter([0] * 7, 0, short=True), key=False)
+        parser.frames(inter([0] * 7, 1 << number), key=False)
+    (short,) = parser.frames(inter([0] * 7, 0, short=True), key=False)
     assert short.references == (1, 2, 3, 4, 5, 6, 7, 8)
 
 
@@ -553,25 +556,23 @@ def test_av1_slots_chosen_by_order() -> None:
     ],
 )
 def test_av1_refused(head: bytes, body: bytes, reason: str) -> None:
-    parser = ReferenceParser("av1", b"")
-    found = refusal(partial(parser.packet, head + SHOWN_KEY, key=True))
-    found = found or refusal(partial(parser.packet, body, key=False))
+    parser = CODECS["av1"].parser()
+    found = refusal(partial(parser.frames, head + SHOWN_KEY, key=True))
+    found = found or refusal(partial(parser.frames, body, key=False))
     assert reason in found
-    assert refusal(partial(parser.packet, inter([0] * 7, 0), key=False))
-    assert not refusal(partial(parser.packet, sequence() + SHOWN_KEY, key=True))
-    assert not refusal(partial(parser.packet, inter([0] * 7, 0), key=False))
+    assert refusal(partial(parser.frames, inter([0] * 7, 0), key=False))
+    assert not refusal(partial(parser.frames, sequence() + SHOWN_KEY, key=True))
+    assert not refusal(partial(parser.frames, inter([0] * 7, 0), key=False))
 
 
 def test_av1_key_packets_begin_with_a_key_frame() -> None:
     hidden = unit(6, packed((0, 4), (1, 1), (0, 60)))
     for body in (hidden, unit(3, b"\x88"), inter([0] * 7, 0)):
-        parser = ReferenceParser("av1", b"")
-        parser.packet(sequence() + SHOWN_KEY, key=True)
-        reason = refusal(partial(parser.packet, body + SHOWN_KEY, key=True))
+        parser = CODECS["av1"].parser()
+        parser.frames(sequence() + SHOWN_KEY, key=True)
+        reason = refusal(partial(parser.frames, body + SHOWN_KEY, key=True))
         assert "does not begin with one" in reason
-    assert "sequence header" in refusal(
-        partial(ReferenceParser("av1", b"").packet, SHOWN_KEY, key=True)
-    )
+    assert "sequence header" in refusal(partial(CODECS["av1"].parser().frames, SHOWN_KEY, key=True))
 
 
 def frame_of(packet: bytes) -> tuple[bytes, bytes, bytes]:
@@ -645,7 +646,6 @@ def test_av1_key_frames_shown_later() -> None:
     check(changed, range(len(packets)))
     frames = parsed(changed)
     assert [len(found) for found in frames[key - 1 : key + 1]] == [2, 1]
-    assert frames[key][0].existing
     needed = {at for at, _ in chains(frames)[key + 3]}
     assert {0, key - 1, key} <= needed <= {0, *range(key - 1, key + 4)}
 
@@ -660,9 +660,9 @@ def test_damage_is_refused_or_read(name: str) -> None:
     clip = encoded(RECIPES[name])
     for packet in clip.packets[:8]:
         for data in mutations(packet.data, 200, head=100):
-            parser = ReferenceParser(clip.codec, clip.configuration)
-            parser.packet(clip.packets[0].data, key=True)
-            refusal(partial(parser.packet, data, key=packet.key))  # and raises nothing else
-            refusal(partial(parser.packet, clip.packets[1].data, key=False))
+            parser = parser_of(clip)
+            parser.frames(clip.packets[0].data, key=True)
+            refusal(partial(parser.frames, data, key=packet.key))  # and raises nothing else
+            refusal(partial(parser.frames, clip.packets[1].data, key=False))
     for data in mutations(clip.configuration or b"\0", 500):
-        refusal(ReferenceParser, clip.codec, data)
+        refusal(CODECS[clip.codec].parser, data)

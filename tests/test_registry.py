@@ -21,8 +21,13 @@ from mp4ds.messages.protobuf import TYPES as FOXGLOVE_TYPES
 from mp4ds.messages.ros import LAYOUTS as ROS_TYPES
 from mp4ds.messages.serializations import WIRES
 from mp4ds.plan import VISUAL_TABLE
-from mp4ds.video.codecs import codecs_to_try, lossless_codecs, recipe_for
-from mp4ds.video.coded_messages import PACKET_CODECS, packet_codec
+from mp4ds.video.codecs import (
+    PACKET_CODECS,
+    codecs_to_try,
+    lossless_codecs,
+    packet_codec,
+    recipe_for,
+)
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "mp4ds"
@@ -337,7 +342,7 @@ REFUSALS = {"Refused", "NoPicture", "WireError", "EncoderRefusedError", "count_v
 ROOMS = ("messages", "dataset", "video", "packing")
 NO_CAMERA_MESSAGES = ("transforms.py", "mp4.py", "concat.py", "slicing.py")
 OF_READING = {
-    *("* is no framing of NAL units", "* is no framing of AV1", "* is no framing of *"),
+    *("* is no framing of NAL units", "* is no framing of AV1", "* is no framing of its codec"),
     "it has * NAL units where its framing has *",
     *("a NAL unit's length in the video is wrong", "no PNG holds such pixels"),
     "its NAL units do not have lengths of four bytes",

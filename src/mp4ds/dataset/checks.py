@@ -503,10 +503,10 @@ def wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[Format
         return
     if not deep or (video.sha256 is None and due is None):
         return
-    found = digest_video(path, video.codec)
-    if video.sha256 not in (None, found.sha256):
+    _, sha256, found = digest_video(path, video.codec)
+    if video.sha256 not in (None, sha256):
         yield VideoError("hash-mismatch", path, "does not match the SHA-256 in its sidecar")
-    elif due is not None and (problem := _difference(due, found.structures)):
+    elif due is not None and (problem := _difference(due, found)):
         yield _unfit(path, problem)
 
 

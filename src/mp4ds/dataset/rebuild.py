@@ -28,7 +28,7 @@ from mp4ds.messages.wire import (
     WireError,
 )
 from mp4ds.records import Channel, Message
-from mp4ds.video.coded_messages import body_of
+from mp4ds.video.codecs import CODECS
 from mp4ds.video.images import ImageFile
 
 
@@ -195,7 +195,7 @@ class MessageRebuilder:
         """
         framing = self._sidecar.headers[int(self.columns.variant[index])].framing
         try:
-            body = body_of(self._sidecar.video.codec, packet, framing)
+            body = CODECS[self._sidecar.video.codec].parser.body(packet, framing)
         except Refused as error:
             raise self._failure("decode-failed", index, f"cannot be rebuilt: {error}") from None
         return self._verified(index, self._around(index, body))

@@ -189,7 +189,8 @@ class Stream(Images):
 
     def open_reader(self) -> FrameReader:
         """A separate decoder for frames by number."""
-        references = self.sidecar.video.references
+        recorded = self.sidecar.video.references
+        references = recorded.decode if recorded else None
         return FrameReader(
             lambda: FrameAccess(self.video_path, **self._told(), references=references),
             lambda: self.open_video(sequential=False),

@@ -41,8 +41,7 @@ from mp4ds.messages.wire import CalibrationFields
 from mp4ds.plan import TOLERANCES, QualityTarget
 from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
-from mp4ds.video.codecs import CODECS
-from mp4ds.video.coded_messages import PACKET_CODECS
+from mp4ds.video.codecs import CODECS, PACKET_CODECS
 from mp4ds.video.pixels import shows_colours
 from mp4ds.video.references import (
     MAX_CHARS,
@@ -258,7 +257,7 @@ _BODY_ENCODINGS = {
     "rvl": frozenset({"16UC1"}),
     "png": frozenset(PNG_ENCODINGS.values()),
 }
-VIDEO_CODECS = tuple(name for name, codec in CODECS.items() if codec.entries)
+VIDEO_CODECS = tuple(CODECS)
 PIXEL_FORMATS = (
     *("gray", "gray10le", "gray12le", "gray14le", "gray16le"),
     *("rgb24", "bgr24", "bgr0", "bgra"),
@@ -481,7 +480,7 @@ class VideoModel(Model):
     def _check_references(self, references: References) -> None:
         if not CODECS[self.codec].is_free:
             raise ValueError(f"a video of codec {self.codec} has no references")
-        if references.split and not CODECS[self.codec].split:
+        if references.split and not CODECS[self.codec].is_split:
             raise ValueError(f"a packet of codec {self.codec} holds one frame")
 
 
@@ -670,8 +669,7 @@ def video_facts(path: Path, codec: str) -> dict[str, Any]:
     Raises:
         OSError: It cannot be read.
     """
-    found = digest_video(path, codec)
-    structures = found.structures
+    size, sha256, structures = digest_video(path, codec)
     useful = structures is not None and not structures.is_plain
     references = References.from_structures(structures) if structures and useful else None
-    return dict(zip(FACTS, (path.name, found.size, found.sha256, references), strict=True))
+    return dict(zip(FACTS, (path.name, size, sha256, references), strict=True))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import Refused
 from mp4ds.messages import png
-from mp4ds.messages.coded import MAX_IMAGE_BYTES, check_size
+from mp4ds.messages.encodings import MAX_IMAGE_BYTES, check_size
 
 _HEADER = struct.Struct("<II")
 _WORD_BYTES, _WORD_NIBBLES = 4, 8

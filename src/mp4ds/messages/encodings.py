@@ -11,8 +11,24 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.errors import Refused
+
 MAX_SIDE = 16384
 """Largest width and height of a picture in a video: what its codecs and decoders take."""
+
+MAX_IMAGE_BYTES = 2**28
+"""Maximum bytes of pixels unpacked from one coded picture."""
+
+
+def check_size(width: int, height: int) -> None:
+    """Refuse a size that no video can have.
+
+    Raises:
+        Refused: A side is zero or beyond `MAX_SIDE`.
+    """
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise Refused(f"its picture has {width}x{height} pixels")
+
 
 MAX_ROW_PADDING = 4096
 """Most bytes between two rows; bounds what a sidecar can make a reader allocate."""

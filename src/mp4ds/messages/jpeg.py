@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 
 from mp4ds.errors import Refused
-from mp4ds.messages.coded import check_size
+from mp4ds.messages.encodings import check_size
 
 _SOI, _EOI, _SOS, _DHT, _JPG, _DAC = 0xD8, 0xD9, 0xDA, 0xC4, 0xC8, 0xCC
 _RESTARTS = range(0xD0, 0xD8)

@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from mp4ds.errors import Refused
-from mp4ds.messages.coded import MAX_IMAGE_BYTES, check_size
+from mp4ds.messages.encodings import MAX_IMAGE_BYTES, check_size
 
 Bytes = NDArray[np.uint8]
 _Wide = NDArray[np.int16]

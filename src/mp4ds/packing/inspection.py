@@ -16,7 +16,8 @@ from mp4ds.messages.png import PNG_ENCODINGS
 from mp4ds.messages.serializations import MessageSplitter
 from mp4ds.messages.wire import CodedFields, Form, ImageFields, Parts
 from mp4ds.records import Channel, Message
-from mp4ds.video.coded_messages import PictureParser, packet_codec
+from mp4ds.video.codecs import CODECS, packet_codec
+from mp4ds.video.coded import StreamParser
 from mp4ds.video.decoder import jpeg_pixels
 
 _MAX_PNG_REFUSALS = 20  # in a row
@@ -98,7 +99,7 @@ class MessageInspector:
     def __init__(self, channel: Channel, *, transcode: bool = False) -> None:
         self._is_packets = _holds_packets(channel)
         self._forms = MessageSplitter(channel)
-        self._parsers: dict[str, PictureParser] = {}
+        self._parsers: dict[str, StreamParser] = {}
         self._png: png.PngRecipe | None = None
         self._png_refusals = 0
         self._transcode = transcode
@@ -137,9 +138,9 @@ class MessageInspector:
 
     def _packet(self, form: Form, parts: Parts, codec: str) -> CameraMessage:
         if codec not in self._parsers:
-            self._parsers[codec] = PictureParser(codec)
+            self._parsers[codec] = CODECS[codec].parser()
         parser = self._parsers[codec]
-        picture = parser.parse(parts.body)
+        picture = parser.picture(parts.body)
         return CameraMessage(
             _coded_key(form, "packet", codec, "rgb8", picture.width, picture.height),
             form,

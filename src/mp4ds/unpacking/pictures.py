@@ -33,7 +33,7 @@ from mp4ds.options import WHAT, Parsed, TopicOptions, option, parse_resize
 from mp4ds.times import intervals, usual_interval
 from mp4ds.unpacking.types import KINDS, VideoFields
 from mp4ds.video.images import ImageFile
-from mp4ds.video.packets import PacketReader, StandAlonePackets
+from mp4ds.video.packets import PacketReader
 
 _NS = 1_000_000_000
 
@@ -405,12 +405,12 @@ def _packets_of(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[
     if verify:
         _verify(stream)
     codec, image = stream.sidecar.video.codec, stream.sidecar.image
-    with StandAlonePackets(stream.video_path, codec=codec, frames=len(stream)) as packets:
+    with PacketReader(stream.video_path, codec=codec, frames=len(stream)) as packets:
         fields = VideoFields(codec, image.encoding, image.width, image.height, packets.pixel_format)
         wanted = choice(stream.columns)
         for index in stream.sound_of(unbroken(wanted, packets.key_numbers, from_key=True)):
             is_key = bool(packets.keyframes[index])
-            yield index, Given(fields, packets.packet(index), is_key=is_key)
+            yield index, Given(fields, packets.stand_alone(index), is_key=is_key)
 
 
 def _own_formats(sidecar: StreamSidecar, form: ImageForm) -> list[str]:

@@ -2,35 +2,208 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 import av
 import numpy as np
 from av.error import FFmpegError
+from numpy.typing import NDArray
 
 from mp4ds.errors import FormatError, Refused, VideoError, reason_of
 from mp4ds.files.ranges import expect
 from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.coded import UnknownStructure
 from mp4ds.messages.encodings import Pixels
 from mp4ds.video.codecs import CODECS
+from mp4ds.video.coded import StreamParser, UnknownStructure
 from mp4ds.video.decoder import JpegDecoder, VideoFile, maker_of
 from mp4ds.video.media import raise_if_scarce
 from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.pixels import PictureMaker, Scale
 from mp4ds.video.references import (
-    Chains,
-    Group,
-    Piece,
-    RecordedReferences,
     StructureError,
     Structures,
     packets_of_groups,
+    read_structure,
 )
+
+# ---------------------------------------------------------------- chains
+
+KEPT_FRAMES = 50_000  # coded frames whose references are kept in memory
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A coded frame: the part of a packet to pass to a decoder.
+
+    Attributes:
+        sample: Number of the packet.
+        part: Number of the coded frame in it.
+        needs: Numbers, within its group, of the pieces that it refers to.
+        span: Its first byte in the packet and the one after its last; None until it is read.
+    """
+
+    sample: int
+    part: int
+    needs: tuple[int, ...]
+    span: tuple[int, int] | None
+
+
+@dataclass(slots=True)
+class Group:
+    """The coded frames from one key frame to the next, as far as known.
+
+    Attributes:
+        first: Number of the key frame's packet.
+        end: Number of the next group's.
+        parser: Of its packets; None if nothing needs to be parsed.
+        pieces: In the order coded.
+        shows: For each known packet, the number of the piece that outputs its picture.
+    """
+
+    first: int
+    end: int
+    parser: StreamParser | None
+    pieces: list[Piece] = field(default_factory=list)
+    shows: list[int] = field(default_factory=list)
+
+    def chain(self, samples: Iterable[int]) -> list[int]:
+        """Numbers of the pieces that output the pictures of packets, and of what they depend on."""
+        pending = [self.shows[sample - self.first] for sample in samples]
+        found = set(pending)
+        while pending:
+            for number in self.pieces[pending.pop()].needs:
+                if number not in found:
+                    found.add(number)
+                    pending.append(number)
+        return sorted(found)
+
+
+class Chains:
+    """The groups of a video; each is analysed when it is first needed.
+
+    Args:
+        table: The video's index.
+        codec: Name in the registry.
+        read: Gives a packet by its number.
+        recorded: What the frames refer to, if that was recorded; it matches the index.
+
+    Raises:
+        UnknownStructure: The configuration in the index is malformed.
+    """
+
+    def __init__(
+        self,
+        table: SampleTable,
+        codec: str,
+        read: Callable[[int], bytes],
+        recorded: Structures | None = None,
+    ) -> None:
+        self._table = table
+        self._codec = codec
+        self._read = read
+        self._recorded = recorded
+        self._keys = np.flatnonzero(table.sync)
+        self._groups: OrderedDict[int, Group] = OrderedDict()
+        self._kept = 0  # coded frames of these
+        self._new_parser()  # which refuses a configuration that is malformed
+
+    def group(self, sample: int, last: int) -> Group:
+        """The group that a packet is in, known up to another one of it.
+
+        Raises:
+            UnknownStructure: What its frames refer to is not known.
+            StructureError: The recorded structure contradicts itself.
+        """
+        place = self._place(sample)
+        group = self._groups.pop(place, None)
+        if group is None:
+            group = self._begin(place)
+        else:
+            self._kept -= len(group.pieces)
+        if group.parser is not None:
+            self._parse(group, group.parser, last)
+        while self._groups and self._kept + len(group.pieces) > KEPT_FRAMES:
+            _, forgotten = self._groups.popitem(last=False)
+            self._kept -= len(forgotten.pieces)
+        self._groups[place] = group
+        self._kept += len(group.pieces)
+        return group
+
+    def cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
+        """Extract the bytes of a piece from its packet.
+
+        Raises:
+            Refused: It does not hold the coded frames recorded for it.
+        """
+        if piece.span is not None:
+            start, end = piece.span
+            return packet if (start, end) == (0, len(packet)) else packet[start:end]
+        last = group.pieces[group.shows[piece.sample - group.first]]
+        found = CODECS[self._codec].parser.spans(packet)
+        if len(found) != last.part + 1:
+            raise UnknownStructure(f"it holds {len(found)} coded frames, {last.part + 1} are due")
+        header, start, end = found[piece.part]
+        return packet[start if piece.needs else header : end]
+
+    def unknown(self, sample: int, last: int) -> range:
+        """Numbers of the packets that `group` would have to read."""
+        if self._recorded is not None:
+            return range(0)
+        place = self._place(sample)
+        group = self._groups.get(place)
+        first = self._first(place) if group is None else group.first + len(group.shows)
+        return range(first, last + 1)
+
+    def _place(self, sample: int) -> int:
+        return int(np.searchsorted(self._keys, sample, side="right")) - 1
+
+    def _first(self, place: int) -> int:
+        return int(self._keys[place]) if place >= 0 else 0
+
+    def split(self, samples: list[int]) -> Iterator[list[int]]:
+        """Packets by group; those of a group must be consecutive."""
+        places = np.searchsorted(self._keys, np.array(samples, np.int64), side="right")
+        bounds = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), len(samples)]
+        for start, end in pairwise(bounds):
+            yield samples[start:end]
+
+    def _new_parser(self) -> StreamParser:
+        return CODECS[self._codec].parser(self._table.configuration)
+
+    def _begin(self, place: int) -> Group:
+        count = len(self._table.sizes)
+        following = self._keys[place + 1] if place + 1 < len(self._keys) else count
+        group = Group(self._first(place), int(following), None)
+        if self._recorded is None:
+            group.parser = self._new_parser()
+            return group
+        text = self._recorded.texts[int(self._recorded.groups[place])]
+        for sample, frames in enumerate(read_structure(text), group.first):
+            for part, needs in enumerate(frames):
+                group.pieces.append(Piece(sample, part, needs, None))
+            group.shows.append(len(group.pieces) - 1)
+        return group
+
+    def _parse(self, group: Group, parser: StreamParser, last: int) -> None:
+        for sample in range(group.first + len(group.shows), last + 1):
+            frames = parser.frames(self._read(sample), key=sample == group.first)
+            shown = -1
+            for part, frame in enumerate(frames):
+                number = len(group.pieces)
+                needs = tuple(number - distance for distance in frame.references)
+                group.pieces.append(Piece(sample, part, needs, (frame.start, frame.end)))
+                if frame.shown:
+                    shown = number
+            group.shows.append(shown)
+
+
+# ---------------------------------------------------------------- access
 
 
 class FrameAccess:
@@ -44,7 +217,8 @@ class FrameAccess:
         frames: Expected number of frames; None to take it from the video.
         maker: Makes pictures of its frames.
         threads: Of the decoder. One takes the least CPU time; with more, one frame comes sooner.
-        references: What the sidecar says about them, which saves reading packets to find out.
+        references: Decodes what the sidecar says about them, which saves reading packets to find
+            out, from the number of packets of each group; ValueError if that is of another video.
         track: See `read_sample_table`.
 
     Raises:
@@ -61,7 +235,7 @@ class FrameAccess:
         frames: int | None,
         maker: PictureMaker,
         threads: int = 1,
-        references: RecordedReferences | None = None,
+        references: Callable[[NDArray[np.int64]], Structures] | None = None,
         track: int | None = None,
     ) -> None:
         self._path = path
@@ -104,9 +278,9 @@ class FrameAccess:
             )
         return table
 
-    def _recorded(self, references: RecordedReferences) -> Structures:
+    def _recorded(self, references: Callable[[NDArray[np.int64]], Structures]) -> Structures:
         try:
-            return references.decode(packets_of_groups(self.table))
+            return references(packets_of_groups(self.table))
         except ValueError as error:
             raise self._unfit(error) from None
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from mp4ds.errors import Refused
-from mp4ds.messages.coded import (
+from mp4ds.messages.encodings import check_size
+from mp4ds.video.coded import (
     BitReader,
     CodedFrame,
     CodedPicture,
     NoPicture,
+    StreamParser,
     UnknownStructure,
-    check_size,
 )
 
 DELIMITER = b"\x12\0"
@@ -83,25 +84,6 @@ def _leb128(data: memoryview, offset: int) -> tuple[int, int]:
         if byte < 0x80:
             return value, offset + index + 1
     raise Refused("its AV1 is cut short")
-
-
-def strip(data: bytes | memoryview) -> tuple[memoryview, str]:
-    """What an mp4 holds of a temporal unit, and its framing."""
-    data = memoryview(data)
-    if bytes(data[:2]) == DELIMITER:
-        return data[2:], DELIMITED
-    return data, ""
-
-
-def join(packet: bytes, framing: str) -> bytes:
-    """The temporal unit as it was before it was stored in an mp4.
-
-    Raises:
-        Refused: The framing is not valid.
-    """
-    if framing not in ("", DELIMITED):
-        raise Refused(f"{framing[:40]!r} is no framing of AV1")
-    return DELIMITER + packet if framing else packet
 
 
 def sequence_header(data: bytes | memoryview) -> bytes:
@@ -273,30 +255,32 @@ def _parse_header(data: memoryview, obu: Obu, sequence: _Sequence) -> _Header:
     return _Header(kind, shown, used, filled)
 
 
-# ---------------------------------------------------------------- pictures
+# ---------------------------------------------------------------- parser
 
 
-class Av1Pictures:
-    """The pictures of one stream, temporal unit by temporal unit."""
+class Av1(StreamParser):
+    """Temporal units."""
 
-    def __init__(self) -> None:
+    def __init__(self, configuration: bytes | None = None) -> None:
         self._parameters = b""
         self._sequence: _Sequence | None = None
+        self._sequence_bytes = b""  # of the one by which references are found
+        self._changed = False  # since the last key frame
+        self._number = 0  # of the next coded frame
+        self._start = 0  # number of the key frame where decoding began
+        self._slots: list[tuple[int, int | None]] = []  # number and kind; none before a key frame
+        super().__init__(configuration)
+
+    # -------- packets of messages
 
     @property
     def parameters(self) -> bytes:
         """The sequence header OBU seen last."""
         return self._parameters
 
-    def parse(self, body: memoryview) -> CodedPicture:
-        """The picture in a temporal unit.
-
-        Raises:
-            NoPicture: There is none.
-            Refused: There are several, an mp4 would lose a part of it, or it needs a sequence
-                header that was not sent.
-        """
-        data, framing = strip(body)
+    def _picture(self, body: memoryview) -> CodedPicture:
+        is_delimited = bytes(body[:2]) == DELIMITER
+        data = body[2:] if is_delimited else body
         shown = frames = 0
         keyframe = has_header = False
         for obu in obus(data):
@@ -320,53 +304,43 @@ class Av1Pictures:
             raise NoPicture("it holds no picture, only parameters or remarks")
         if shown != 1:
             raise Refused("it shows no picture" if not shown else "it holds more than one picture")
-        return CodedPicture(*self._sequence.size, keyframe, framing)
+        return CodedPicture(*self._sequence.size, keyframe, DELIMITED if is_delimited else "")
 
+    # -------- packets of an mp4
 
-# ---------------------------------------------------------------- references
+    @staticmethod
+    def units_of(configuration: bytes) -> list[bytes]:
+        """What stands in ``av1C`` (AV1 in ISOBMFF, 2.3)."""
+        return [configuration[4:]]
 
-
-class Av1References:
-    """The references of an AV1 stream; see `mp4ds.video.references.ReferenceParser`."""
-
-    def __init__(self, configuration: bytes) -> None:
-        self._sequence: _Sequence | None = None
-        self._sequence_bytes = b""
-        self._changed = False  # since the last key frame
-        self._number = 0  # of the next coded frame
-        self._start = 0  # number of the key frame where decoding began
-        self._slots: list[tuple[int, int | None]] = []  # number and kind; none before a key frame
-        for obu in obus(configuration[4:]):
+    def _take_unit(self, unit: bytes) -> None:
+        for obu in obus(unit):
             if obu.kind == _SEQUENCE_HEADER:
-                self._take_sequence(configuration[4 + obu.payload : 4 + obu.end])
+                self._take_sequence(unit[obu.payload : obu.end])
 
-    def forget(self) -> None:
-        """Wait for a key frame."""
+    def _forget(self) -> None:
         self._slots = []
 
-    def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        """The coded frames of a temporal unit."""
+    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
         frames: list[CodedFrame] = []
         begin = -1  # of the sequence header before the first frame
-        open_header = False
+        open_header = False  # whether the tiles of the last frame are yet to come
+        is_existing = False  # whether the last frame only shows another one
         for obu in obus(data):
             kind = obu.kind
             if kind in (_FRAME, _FRAME_HEADER):
                 if open_header:
                     raise UnknownStructure("its AV1 has a frame without tiles")
-                frame = self._frame(data, obu, key=key and not frames)
+                frame, is_existing = self._frame(data, obu, key=key and not frames)
                 if begin >= 0 and not frame.references:
-                    frame = CodedFrame(begin, frame.end, (), frame.shown, existing=False)
+                    frame = replace(frame, start=begin)
                 begin = -1
                 frames.append(frame)
-                open_header = kind == _FRAME_HEADER and not frame.existing
+                open_header = kind == _FRAME_HEADER and not is_existing
             elif kind == _TILE_GROUP:
-                if not frames or frames[-1].existing:
+                if not frames or is_existing:
                     raise UnknownStructure("its AV1 has tiles without a frame")
-                last = frames[-1]
-                frames[-1] = CodedFrame(
-                    last.start, obu.end, last.references, last.shown, existing=False
-                )
+                frames[-1] = replace(frames[-1], end=obu.end)
                 open_header = False
             elif kind == _SEQUENCE_HEADER:
                 self._take_sequence(bytes(data[obu.payload : obu.end]))
@@ -387,7 +361,8 @@ class Av1References:
             self._sequence_bytes = payload
             self._changed = True
 
-    def _frame(self, data: memoryview, obu: Obu, *, key: bool) -> CodedFrame:
+    def _frame(self, data: memoryview, obu: Obu, *, key: bool) -> tuple[CodedFrame, bool]:
+        """A frame up to its first tiles, and whether it only shows another one."""
         sequence = self._sequence
         if sequence is None:
             raise UnknownStructure("its sequence header was not sent before it")
@@ -408,7 +383,7 @@ class Av1References:
             raise UnknownStructure("its sequence header changes between key frames")
         self._number += 1
         references = () if begins else self._references(header, number)
-        return CodedFrame(obu.start, obu.end, references, header.shown, header.kind is None)
+        return CodedFrame(obu.start, obu.end, references, header.shown), header.kind is None
 
     def _references(self, header: _Header, number: int) -> tuple[int, ...]:
         """The distances of what a frame needs, after which it is in its slots."""
@@ -426,30 +401,47 @@ class Av1References:
                 self._slots[slot] = (number, kind)
         return tuple(number - n for n in sorted(needed, reverse=True))
 
+    @staticmethod
+    def spans(packet: bytes) -> list[tuple[int, int, int]]:
+        """Those of the frames of a temporal unit."""
+        frames: list[tuple[int, int, int]] = []
+        header = -1
+        for obu in obus(packet):
+            if obu.kind == _SEQUENCE_HEADER:
+                header = obu.start
+            elif obu.kind in (_FRAME, _FRAME_HEADER):
+                frames.append((obu.start if header < 0 else header, obu.start, obu.end))
+                header = -1
+            elif obu.kind == _TILE_GROUP:
+                if not frames:
+                    raise UnknownStructure("its AV1 has tiles without a frame")
+                frames[-1] = (*frames[-1][:2], obu.end)
+        return frames
 
-def split_temporal_unit(data: bytes | memoryview) -> list[tuple[int, int, int]]:
-    """Where the coded frames of a temporal unit are, of which `Av1References` knows what they need.
+    # -------- from one to the other
 
-    Returns:
-        For each frame the start of the sequence header before it, its own where there is none,
-        its own start, and its end. A key frame is decoded with its sequence header.
+    @staticmethod
+    def plain(body: bytes | memoryview) -> bytes:
+        """Without the delimiter, which no mp4 has."""
+        return bytes(body).removeprefix(DELIMITER)
 
-    Raises:
-        Refused: The OBUs do not add up, or begin with tiles.
-    """
-    frames: list[tuple[int, int, int]] = []
-    header = -1
-    for obu in obus(data):
-        if obu.kind == _SEQUENCE_HEADER:
-            header = obu.start
-        elif obu.kind in (_FRAME, _FRAME_HEADER):
-            frames.append((obu.start if header < 0 else header, obu.start, obu.end))
-            header = -1
-        elif obu.kind == _TILE_GROUP:
-            if not frames:
-                raise UnknownStructure("its AV1 has tiles without a frame")
-            frames[-1] = (*frames[-1][:2], obu.end)
-    return frames
+    @staticmethod
+    def body(packet: bytes, framing: str | None) -> bytes:
+        """With the delimiter, if it had one."""
+        if framing and framing != DELIMITED:
+            raise Refused(f"{framing[:40]!r} is no framing of AV1")
+        return DELIMITER + packet if framing else packet
+
+    @classmethod
+    def stand_alone(cls, packet: bytes, units: list[bytes]) -> bytes:
+        """With the delimiter and, before a key frame, the sequence header."""
+        needed = [] if units and sequence_header(packet) else units
+        return b"".join((DELIMITER, *needed, packet))
+
+    @classmethod
+    def has_parameters(cls, plain: bytes) -> bool:
+        """Whether it has a sequence header."""
+        return bool(sequence_header(plain))
 
 
 def _check_layer(extension: int, layers: int) -> None:

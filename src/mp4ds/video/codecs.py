@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from types import MappingProxyType
-from typing import Any
 
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, Refused
+from mp4ds.video.av1 import Av1
+from mp4ds.video.coded import Ffv1, Jpeg, StreamParser, Vp9
+from mp4ds.video.h264 import H264
+from mp4ds.video.h265 import H265
 
 TEN_BITS = "yuv420p10le"
 """The pixel format of 4:2:0 with 10 bits."""
@@ -23,61 +25,62 @@ class Codec:
 
     Attributes:
         ffmpeg: Its name in ffmpeg.
-        decoder: ffmpeg's name of the decoder for single frames; empty: it has no references.
-        names: In messages: of the codec, or of an encoder that makes it.
+        parser: Of its packets.
         entries: Four letters of the sample entries of an mp4.
-        pictures: The parser of message packets, as ``module:name``; empty: not supported.
-        framing: How packets are framed: ``units`` (NAL), ``obus`` (AV1), or not at all.
-        references: The parser of frame references, as ``module:name``.
+        decoder: ffmpeg's name of the decoder for single frames; empty: the one of `JpegDecoder`.
+        names: In messages: of the codec, or of an encoder that makes it; none: no message has it.
         is_free: Whether a frame may be independent of the one before it, which is worth recording.
-        split: What finds the coded frames of a packet, as ``module:name``; empty: it has one.
+        is_split: Whether a packet may hold several coded frames.
     """
 
     ffmpeg: str
-    references: str
+    parser: type[StreamParser]
+    entries: tuple[str, ...]
     decoder: str = ""
     names: tuple[str, ...] = ()
-    entries: tuple[str, ...] = ()
-    pictures: str = ""
-    framing: str = ""
     is_free: bool = False
-    split: str = ""
+    is_split: bool = False
 
 
 CODECS: Mapping[str, Codec] = {
     "h264": Codec(
-        "h264", "h264:H264References", "h264",
-        ("h264", "avc", "libx264", "libopenh264"), ("avc1", "avc3"),
-        "h264:H264Pictures", "units", is_free=True,
+        "h264", H264, ("avc1", "avc3"), "h264",
+        ("h264", "avc", "libx264", "libopenh264"), is_free=True,
     ),
     "h265": Codec(
-        "hevc", "h265:H265References", "hevc",
-        ("h265", "hevc", "libx265"), ("hvc1", "hev1"),
-        "h265:H265Pictures", "units", is_free=True,
+        "hevc", H265, ("hvc1", "hev1"), "hevc", ("h265", "hevc", "libx265"), is_free=True,
     ),
     "av1": Codec(
-        "av1", "av1:Av1References", "libdav1d",
-        ("av1", "libsvtav1", "libaom-av1", "librav1e"), ("av01",),
-        "av1:Av1Pictures", "obus", is_free=True, split="av1:split_temporal_unit",
+        "av1", Av1, ("av01",), "libdav1d",
+        ("av1", "libsvtav1", "libaom-av1", "librav1e"), is_free=True, is_split=True,
     ),
-    "vp9": Codec(
-        "vp9", "vp9:Vp9References", "vp9", ("vp9", "libvpx-vp9"), ("vp09",),
-        "vp9:Vp9Pictures",
-    ),
-    "ffv1": Codec("ffv1", "references:Ffv1References", "ffv1", entries=("FFV1",)),
-    "mjpeg": Codec(
-        "mjpeg", "references:Intra", names=("mjpeg", "jpeg", "jpg"), entries=("mp4v", "jpeg"),
-        pictures="coded_messages:Jpegs",
-    ),
-    "png": Codec("png", "references:Intra", pictures="coded_messages:Pngs"),
+    "vp9": Codec("vp9", Vp9, ("vp09",), "vp9", ("vp9", "libvpx-vp9")),
+    "ffv1": Codec("ffv1", Ffv1, ("FFV1",), "ffv1"),
+    "mjpeg": Codec("mjpeg", Jpeg, ("mp4v", "jpeg"), names=("mjpeg", "jpeg", "jpg")),
 }  # fmt: skip
-"""By the name in the registry; PNG only for packets that are inspected, never in an mp4."""
+"""By the name in the registry."""
+
+PACKET_CODECS = tuple(name for name, codec in CODECS.items() if codec.names)
+"""Codecs whose packets are stored in a video track as they are."""
 
 
-def part_of(place: str) -> Any:
-    """What a `Codec` names as ``module:name``, imported when needed: a video has one codec."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(f"mp4ds.video.{module}"), name)
+def packet_codec(message_format: str) -> str:
+    """The codec of the packets of a message.
+
+    Args:
+        message_format: `format` of Foxglove's CompressedVideo, or `encoding` of an
+            FFMPEGPacket, whose first part names the codec or its encoder
+            (``libx264``, ``hevc_nvenc``, ``h264;yuv420p;bgr8;bgr8``).
+
+    Raises:
+        Refused: No video here has that codec.
+    """
+    name = message_format.partition(";")[0].strip().lower()
+    for codec, found in CODECS.items():
+        # hardware encoders are called h264_nvenc, hevc_vaapi ...
+        if name in found.names or name.partition("_")[0] in found.names:
+            return codec
+    raise Refused(f"its codec {message_format[:40]!r} is not one that becomes a video")
 
 
 # ---------------------------------------------------------------- encoders

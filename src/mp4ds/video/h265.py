@@ -1,4 +1,4 @@
-"""H.265 access units: key frames, picture size, and whether pictures are sent in order.
+"""H.265 access units: key frames, size, order and references.
 
 Sections are those of ITU-T H.265 (08/2021).
 """
@@ -6,12 +6,19 @@ Sections are those of ITU-T H.265 (08/2021).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from mp4ds.errors import Refused
-from mp4ds.messages.coded import REORDERED, BitReader, CodedFrame, UnknownStructure, check_size
-from mp4ds.video.nal import UnitPictures, split_length_prefixed, unescape
-from mp4ds.video.references import UnitChain
+from mp4ds.messages.encodings import check_size
+from mp4ds.video.coded import REORDERED, BitReader, CodedFrame, UnknownStructure
+from mp4ds.video.h264 import (
+    SLICE_HEADER_BYTES,
+    Sps,
+    UnitParser,
+    check_configuration,
+    sized_units,
+    split_length_prefixed,
+    unescape,
+)
 
 VPS, SPS, PPS, AUD = 32, 33, 34, 35
 _SLICES = range(32)
@@ -19,57 +26,9 @@ _LEADING = range(6, 10)  # RADL and RASL: shown before the key frame that they f
 _IRAP = range(16, 24)
 _IDR = (19, 20)
 _RESTARTS_ORDER = range(16, 21)  # BLA and IDR
+_AFTER = range(8)  # refer to nothing before the last IDR picture: trailing ones and RADL
+_UNREFERRED = (0, 2, 4, 6)  # TRAIL_N, TSA_N, STSA_N, RADL_N
 _HEADER_BYTES = 1024
-_SLICE_HEADER_BYTES = 64
-
-
-def unit_type(unit: bytes | memoryview) -> int:
-    """Type of a NAL unit (7.4.2.2)."""
-    return (unit[0] >> 1) & 0x3F
-
-
-def _is_of_another_layer(unit: bytes | memoryview) -> bool:
-    """Whether it is of another view, or more detail, which decoders leave out.
-
-    Raises:
-        Refused: It is too short to tell.
-    """
-    if len(unit) < 2:
-        raise Refused("it holds a NAL unit without a header")
-    return bool((unit[0] & 1) << 5 | unit[1] >> 3)
-
-
-def has_parameters(units: Sequence[bytes | memoryview]) -> bool:
-    """Whether NAL units include all kinds of parameter sets."""
-    return {VPS, SPS, PPS} <= set(map(unit_type, units))
-
-
-@dataclass(frozen=True, slots=True)
-class Sps:
-    """The fields of a sequence parameter set that are needed.
-
-    Attributes:
-        number: Its id.
-        width: Columns shown.
-        height: Rows shown.
-        planes: Whether the colour planes are coded separately.
-        poc_bits: Bits of the picture order count.
-        reorder: Maximum number of pictures sent before one shown earlier.
-    """
-
-    number: int
-    width: int
-    height: int
-    planes: bool
-    poc_bits: int
-    reorder: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Pps:
-    sps: int
-    output_flag: bool
-    extra_bits: int
 
 
 def parse_sps(unit: bytes) -> Sps:
@@ -116,59 +75,87 @@ def _skip_profile(reader: BitReader, sub_layers: int) -> None:
         reader.bits(88 * profile + 8 * level)
 
 
-class H265Pictures(UnitPictures):
-    """The pictures of one stream, access unit by access unit."""
+def _is_of_another_layer(unit: bytes | memoryview) -> bool:
+    """Whether it is of another view, or more detail, which decoders leave out.
 
-    _kinds = frozenset((VPS, SPS, PPS))
+    Raises:
+        Refused: It is too short to tell.
+    """
+    if len(unit) < 2:
+        raise Refused("it holds a NAL unit without a header")
+    return bool((unit[0] & 1) << 5 | unit[1] >> 3)
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._sps: dict[int, Sps] = {}
-        self._pps: dict[int, _Pps] = {}
 
-    def _picture(self, units: Sequence[bytes]) -> tuple[tuple[int, int], bool]:
-        slices: list[bytes] = []
-        for unit in units:
-            if _is_of_another_layer(unit):
-                continue
-            kind = unit_type(unit)
-            if kind == VPS:
-                self._sets[VPS, unit[2] >> 4 if len(unit) > 2 else 0] = unit
-            elif kind == SPS:
-                sps = parse_sps(unit)
-                self._sps[sps.number] = sps
-                self._sets[SPS, sps.number] = unit
-            elif kind == PPS:
-                self._take_pps(unit)
-            elif kind in _SLICES:
-                slices.append(unit)
-        first = self._first(slices, header=2)
-        sps = self._check_order(first)
-        return (sps.width, sps.height), unit_type(first) in _IRAP
+class H265(UnitParser):
+    """Access units of H.265."""
+
+    parameter_kinds = frozenset((VPS, SPS, PPS))
+    delimiter = AUD
+    slice_at = 2
+
+    def __init__(self, configuration: bytes | None = None) -> None:
+        # by id: that of its sequence parameters, whether slices say if they are shown, extra bits
+        self._pps: dict[int, tuple[int, bool, int]] = {}
+        self._highest = 0  # TemporalId that there may be
+        super().__init__(configuration)
+
+    @staticmethod
+    def unit_type(unit: bytes | memoryview) -> int:
+        """Type of a NAL unit (7.4.2.2)."""
+        return (unit[0] >> 1) & 0x3F
+
+    @staticmethod
+    def units_of(configuration: bytes) -> list[bytes]:
+        """The parameter sets in ``hvcC``."""
+        check_configuration(configuration, lengths_at=21)
+        units: list[bytes] = []
+        at = 23
+        for _ in range(configuration[22]):
+            count = int.from_bytes(configuration[at + 1 : at + 3], "big")
+            found, at = sized_units(configuration, at + 3, count)
+            units += found
+        return units
+
+    def _is_slice(self, unit: bytes) -> bool:
+        if _is_of_another_layer(unit):
+            return False
+        kind = self.unit_type(unit)
+        if kind == VPS:
+            self._sets[VPS, unit[2] >> 4 if len(unit) > 2 else 0] = unit
+        elif kind == SPS:
+            sps = parse_sps(unit)
+            self._sps[sps.number] = sps
+            self._sets[SPS, sps.number] = unit
+        elif kind == PPS:
+            self._take_pps(unit)
+        return kind in _SLICES
 
     def _take_pps(self, unit: bytes) -> None:
-        reader = BitReader(unescape(unit[2:_SLICE_HEADER_BYTES]))
+        reader = BitReader(unescape(unit[2:SLICE_HEADER_BYTES]))
         number, sps = reader.ue(), reader.ue()
         reader.flag()
         if number > 63 or sps > 15:
             raise Refused("its H.265 parameters are malformed")
-        self._pps[number] = _Pps(sps, output_flag=reader.flag(), extra_bits=reader.bits(3))
+        self._pps[number] = sps, reader.flag(), reader.bits(3)
         self._sets[PPS, number] = unit
 
-    def _check_order(self, unit: bytes) -> Sps:
-        """Compare the picture's place in the order shown with the last one's (8.3.1)."""
-        kind = unit_type(unit)
-        reader = BitReader(unescape(unit[2:_SLICE_HEADER_BYTES]))
+    def _is_key(self, first: bytes, slices: Sequence[bytes]) -> bool:
+        return self.unit_type(first) in _IRAP
+
+    def _check_order(self, first: bytes, slices: Sequence[bytes]) -> Sps:
+        """By picture order counts (8.3.1)."""
+        kind = self.unit_type(first)
+        reader = BitReader(unescape(first[2:SLICE_HEADER_BYTES]))
         reader.flag()
         if kind in _IRAP:
             reader.flag()
-        pps = self._pps.get(reader.ue())
-        sps = self._sps.get(pps.sps) if pps else None
-        if pps is None or sps is None:
+        number, may_be_hidden, extra_bits = self._pps.get(reader.ue(), (-1, False, 0))
+        sps = self._sps.get(number)
+        if sps is None:
             raise Refused("its parameter sets were not sent before it")
-        reader.bits(pps.extra_bits)
+        reader.bits(extra_bits)
         reader.ue()
-        if pps.output_flag and not reader.flag():
+        if may_be_hidden and not reader.flag():
             raise Refused("its picture is not to be shown")
         if sps.planes:
             reader.bits(2)
@@ -183,22 +170,7 @@ class H265Pictures(UnitPictures):
             raise Refused(REORDERED)
         return sps
 
-
-# ---------------------------------------------------------------- references
-
-
-class H265References(UnitChain):
-    """What the coded frames of a stream refer to."""
-
-    _AFTER = range(8)  # refer to nothing before the last IDR picture: trailing ones and RADL
-    _UNREFERRED = (0, 2, 4, 6)  # TRAIL_N, TSA_N, STSA_N, RADL_N
-
-    def __init__(self, configuration: bytes) -> None:
-        self._highest = 0  # TemporalId that there may be
-        super().__init__("h265", configuration)
-
-    def packet(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        """The frame of a packet."""
+    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
         pictures = 0
         kinds: set[int] = set()
         kept = False
@@ -210,28 +182,27 @@ class H265References(UnitChain):
                 kinds.add(kind)
                 pictures += len(unit) > 2 and unit[2] >> 7  # its first slice
                 # of a lower TemporalId, pictures of a higher one may refer to it (7.4.2.2)
-                kept |= kind not in self._UNREFERRED or (unit[1] & 7) - 1 != self._highest
+                kept |= kind not in _UNREFERRED or (unit[1] & 7) - 1 != self._highest
             elif kind <= PPS:
-                self.take_parameters(bytes(unit))
+                self._take_unit(bytes(unit))
                 kept = True
-        kind = self.only(pictures, kinds)
-        if kind not in _IDR and kind not in self._AFTER:
+        kind = self._only(pictures, kinds)
+        if kind not in _IDR and kind not in _AFTER:
             raise UnknownStructure(
                 "its key frames may be followed by pictures that refer to what is before"
             )
-        return self.link(len(data), begins=kind in _IDR, kept=kept, key=key)
+        return self._link(len(data), begins=kind in _IDR, kept=kept, key=key)
 
-    def check_parameters(self, unit: bytes) -> None:
-        """Refuse pictures that are not shown."""
+    def _check_parameters(self, unit: bytes) -> None:
         if len(unit) < 3:
             raise UnknownStructure("its H.265 parameters are malformed")
-        kind = unit_type(unit)
+        kind = self.unit_type(unit)
         if kind == SPS:
             self._highest = max(self._highest, unit[2] >> 1 & 7)
         elif kind == PPS:
-            reader = BitReader(unescape(unit[2:_SLICE_HEADER_BYTES]))
+            reader = BitReader(unescape(unit[2:SLICE_HEADER_BYTES]))
             reader.ue()
             reader.ue()
             reader.flag()
             if reader.flag():
-                self.unfit = "it may hold pictures that are not shown"
+                self._unfit = "it may hold pictures that are not shown"

@@ -16,35 +16,28 @@ from av.error import FFmpegError
 
 from mp4ds.errors import Refused, SegmentsDifferError, VideoError
 from mp4ds.times import TIMESCALE
-from mp4ds.video import av1, h264, h265, nal
 from mp4ds.video.codecs import CODECS
-from mp4ds.video.coded_messages import PACKET_CODECS, plain_body
 from mp4ds.video.media import Media, new_mp4, open_input, pixel_format_of, raise_if_scarce
 from mp4ds.video.mp4 import SampleEntry, read_sample_entry
-from mp4ds.video.nal import parameter_units
 
 _TIME_BASE = Fraction(1, TIMESCALE)
 _LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz
-_UNITS = {"h264": h264, "h265": h265}
 _IVF = {"av1": b"AV01", "vp9": b"VP90"}
 
 
 class PacketWriter:
     """One mp4 of coded packets being written. A context manager; leaving it completes the file.
 
-    The first body must be a key frame that `mp4ds.video.coded_messages.PictureParser` accepts.
+    The first body must be a key frame that the codec's `StreamParser` accepts.
 
     Args:
         path: The file to make, by the first body.
-        codec: One of `mp4ds.video.coded_messages.PACKET_CODECS`.
+        codec: One of `mp4ds.video.codecs.PACKET_CODECS`.
         width: Columns of the pictures.
         height: Rows of the pictures.
-        parameters: Parameter sets or sequence header, as in `PictureParser.parameters`; used if the
+        parameters: Parameter sets or sequence header, as in `StreamParser.parameters`; used if the
             first body has none.
         rate: Frames per second, if known: it gives the last frame its duration.
-
-    Raises:
-        ValueError: The codec is another one; lists those.
     """
 
     def __init__(
@@ -57,9 +50,8 @@ class PacketWriter:
         parameters: bytes = b"",
         rate: float | None = None,
     ) -> None:
-        if codec not in PACKET_CODECS:
-            raise ValueError(f"codec {codec!r} is not one of {', '.join(PACKET_CODECS)}")
         self.codec = codec
+        self._parser = CODECS[codec].parser
         self.width, self.height = width, height
         self._path = path
         self._parameters = parameters
@@ -88,7 +80,7 @@ class PacketWriter:
             Refused: It is the first, and cannot be decoded or has another size.
             OSError: It cannot be written.
         """
-        plain = plain_body(self.codec, body)
+        plain = self._parser.plain(body)
         if self._container is None:
             self.begin(body)
         if not self._ticks:
@@ -109,8 +101,8 @@ class PacketWriter:
         Raises:
             Refused: It cannot be decoded, or has another size; no file was made.
         """
-        plain = plain_body(self.codec, body)
-        if self.codec in ("mjpeg", "png"):
+        plain = self._parser.plain(body)
+        if self.codec == "mjpeg":
             self._container = new_mp4(self._path)
             self._stream = self._container.add_mux_stream(
                 self.codec, rate=self._rate, width=self.width, height=self.height
@@ -139,10 +131,7 @@ class PacketWriter:
         with PacketReader(self._path, codec=self.codec, frames=self.frames) as reader:
             same = reader.ticks == self._ticks and reader.sizes == self._sizes
             for index, plain in ((0, self._first), (self.frames - 1, self._last)):
-                packet = reader.packet(index) if same else b""
-                if self.codec in _UNITS and same:
-                    packet = nal.join_plain(nal.split_length_prefixed(packet))
-                if packet != plain:
+                if not same or self._parser.body(reader.packet(index), None) != plain:
                     raise VideoError(
                         "decode-failed", self._path, "does not hold the packets as written"
                     )
@@ -168,11 +157,7 @@ class PacketWriter:
 
 def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
     """The first body opened as a video, for what an mp4 says about its track."""
-    if codec in _UNITS:
-        has_parameters = _UNITS[codec].has_parameters(nal.split(plain)[0])
-    else:
-        has_parameters = codec != "av1" or bool(av1.sequence_header(plain))
-    data = plain if has_parameters else parameters + plain
+    data = plain if CODECS[codec].parser.has_parameters(plain) else parameters + plain
     container = CODECS[codec].ffmpeg
     if codec in _IVF:
         container = "ivf"
@@ -231,6 +216,7 @@ class PacketReader:
         coded_size: tuple[int, int] | None = None,
     ) -> None:
         self.path = path
+        self._codec = codec
         with closing(Media(path)) as media:
             media.check(codec, coded_size)
             context = media.track.codec_context
@@ -302,6 +288,27 @@ class PacketReader:
         if len(packet) != size:
             raise VideoError("decode-failed", self.path, "is cut off", frame=index)
         return packet
+
+    def stand_alone(self, index: int) -> bytes:
+        """One packet in self-contained form, for decoding without the mp4.
+
+        H.264 and H.265 come as Annex B with start codes of four bytes, AV1 as temporal units that
+        begin with a delimiter; all with the parameters of the stream before each key frame. VP9
+        packets and images come as they are.
+
+        Args:
+            index: 0 <= index < len(self); of a video without B-frames, such as mp4ds writes.
+
+        Raises:
+            VideoError: As for `packet`, or it or the codec's parameters are damaged.
+        """
+        packet, parser = self.packet(index), CODECS[self._codec].parser
+        try:
+            units = parser.units_of(self.extradata) if self.keyframes[index] else []
+            return parser.stand_alone(packet, units)
+        except Refused as error:
+            problem = f"has a damaged packet: {error}"
+            raise VideoError("decode-failed", self.path, problem, frame=index) from None
 
     def packets(self) -> Iterator[bytes]:
         """All packets in order.
@@ -539,58 +546,3 @@ def _common_entry(segments: Sequence[Path]) -> SampleEntry:
         if difference := first.differences(read_sample_entry(segment)):
             raise SegmentsDifferError(segments[0], segment, difference)
     return first
-
-
-# ---------------------------------------------------------------- without the mp4
-
-
-class StandAlonePackets(PacketReader):
-    """The packets of a video in self-contained form, for decoding without the mp4.
-
-    H.264 and H.265 come as Annex B with start codes of four bytes, AV1 as temporal units that
-    begin with a delimiter; all with the parameters of the stream before each key frame. VP9
-    packets and images come as they are.
-
-    Args:
-        path: A video without B-frames, such as all that mp4ds writes.
-        codec: Name in the registry.
-        frames: Expected number of packets, if known.
-
-    Raises:
-        VideoError: As for `PacketReader`, or the codec's parameters are damaged.
-    """
-
-    def __init__(self, path: Path, *, codec: str, frames: int | None = None) -> None:
-        super().__init__(path, codec=codec, frames=frames)
-        self._codec = codec
-        try:
-            self._parameters = parameter_units(codec, self.extradata)
-        except Refused as error:
-            self.close()
-            raise self._damage(error) from None
-
-    def _damage(self, error: Refused) -> VideoError:
-        return VideoError("decode-failed", self.path, f"has a damaged packet: {error}")
-
-    def packet(self, index: int) -> bytes:
-        """One packet; see `PacketReader.packet`."""
-        packet = super().packet(index)
-        parameters = self._parameters if self.keyframes[index] else []
-        try:
-            if self._codec in _UNITS:
-                return _stand_alone(self._codec, packet, parameters)
-            if self._codec == "av1":
-                needed = [] if parameters and av1.sequence_header(packet) else parameters
-                return b"".join((av1.DELIMITER, *needed, packet))
-        except Refused as error:
-            raise self._damage(error) from None
-        return packet
-
-
-def _stand_alone(codec: str, packet: bytes, parameters: list[bytes]) -> bytes:
-    module = _UNITS[codec]
-    units: list[bytes | memoryview] = [*nal.split_length_prefixed(packet)]
-    if parameters and not module.has_parameters(units):
-        at = 1 if units and module.unit_type(units[0]) == module.AUD else 0
-        units[at:at] = parameters
-    return nal.join_plain(units)

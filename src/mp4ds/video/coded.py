@@ -1,0 +1,427 @@
+"""What packets of a codec tell without being decoded, and how an mp4 holds them.
+
+A `StreamParser` per codec. Here are those of JPEG, FFV1 and VP9, which need little of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mp4ds.errors import Refused
+from mp4ds.messages import jpeg
+from mp4ds.messages.encodings import check_size
+
+_MAX_UE_BITS = 32
+
+
+class BitReader:
+    """Reads fields of bits, most significant first.
+
+    Args:
+        data: The bytes; only a header's worth, since each read costs their length.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._value = int.from_bytes(data, "big")
+        self._left = 8 * len(data)
+
+    def bits(self, count: int) -> int:
+        """An unsigned integer of `count` bits.
+
+        Raises:
+            Refused: Fewer are left.
+        """
+        if count > self._left:
+            raise Refused("it ends inside of a header")
+        self._left -= count
+        return (self._value >> self._left) & ((1 << count) - 1)
+
+    def flag(self) -> bool:
+        """One bit."""
+        return bool(self.bits(1))
+
+    def ue(self) -> int:
+        """An unsigned Exp-Golomb code (H.264, 9.1)."""
+        zeros = 0
+        while not self.bits(1):
+            zeros += 1
+            if zeros > _MAX_UE_BITS:
+                raise Refused("a header holds a number beyond 32 bits")
+        return (1 << zeros) - 1 + self.bits(zeros)
+
+    def se(self) -> int:
+        """A signed Exp-Golomb code (H.264, 9.1.1)."""
+        code = self.ue()
+        return (code + 1) // 2 if code % 2 else -(code // 2)
+
+
+# ---------------------------------------------------------------- parsers
+
+REORDERED = "its stream shows pictures in another order than it sends them (B-frames)"
+_MAX_BODY = 2**30  # what an mp4 and its readers take for one packet
+
+
+class NoPicture(Refused):
+    """A packet without any picture, which cannot be a video frame."""
+
+
+class UnknownStructure(Refused):
+    """It is unknown what frames refer to: they are decoded from the key frame on."""
+
+
+@dataclass(frozen=True, slots=True)
+class CodedPicture:
+    """The one picture in a message's packet.
+
+    Attributes:
+        width: Columns shown.
+        height: Rows shown.
+        keyframe: Whether decoding can begin here, given the parameters of the stream.
+        framing: What an mp4 does not keep of the packet.
+    """
+
+    width: int
+    height: int
+    keyframe: bool
+    framing: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CodedFrame:
+    """One coded frame in an mp4's packet, and the frames a decoder needs before it.
+
+    Frames are counted as coded, including those that are not shown or only show another one.
+
+    Attributes:
+        start: Offset of its first byte in the packet.
+        end: Offset after its last byte.
+        references: How many coded frames back each frame it needs is, 1 being the previous one;
+            nearest first, without repetition. Empty for a key frame.
+        shown: Whether a picture comes out.
+    """
+
+    start: int
+    end: int
+    references: tuple[int, ...]
+    shown: bool
+
+
+class StreamParser:
+    """Parses the packets of one stream in order: a topic's by `picture`, an mp4's by `frames`.
+
+    What is not overridden is right for a codec that has neither parameters nor framing, and whose
+    frames refer to the last one that may be referred to.
+
+    Args:
+        configuration: Of the mp4's track: the payload of ``avcC``, ``hvcC`` or ``av1C``. None for
+            the packets of a topic.
+
+    Raises:
+        UnknownStructure: The configuration is malformed.
+    """
+
+    def __init__(self, configuration: bytes | None = None) -> None:
+        self._is_whole = False  # whether the pictures before the next one are in the video
+        self._back = 0  # from the next frame to the one it refers to; 0: decoding has not begun
+        if configuration is None:
+            return
+        try:
+            for unit in self.units_of(bytes(configuration)):
+                self._take_unit(unit)
+        except Refused as error:
+            raise UnknownStructure(str(error)) from None
+
+    # -------- packets of messages
+
+    @property
+    def parameters(self) -> bytes:
+        """What decoding needs first: parameter sets as Annex B, or an AV1 sequence header.
+
+        Empty until they were seen.
+        """
+        return b""
+
+    def picture(self, body: bytes | memoryview) -> CodedPicture:
+        """Check that an mp4 can carry a message's packet, and find what is needed to restore it.
+
+        A video that begins in the middle, or lacks a packet, decodes to garbage until the next key
+        frame. So bodies are refused up to the first key frame whose parameters are known, and again
+        after a refused picture.
+
+        Raises:
+            NoPicture: It holds none; parameters in it are kept in mind.
+            Refused: No mp4 can carry it; says why.
+        """
+        if len(body) > _MAX_BODY:
+            raise Refused(f"it has more than {_MAX_BODY} bytes")
+        try:
+            picture = self._picture(memoryview(body))
+        except NoPicture:
+            raise
+        except Refused:
+            self._is_whole = False
+            raise
+        if not self._is_whole and not picture.keyframe:
+            raise Refused("it needs pictures before it that are not in the video")
+        self._is_whole = True
+        return picture
+
+    def leave_out(self) -> None:
+        """Take back the last picture: it does not go into the video after all."""
+        self._is_whole = False
+
+    def _picture(self, body: memoryview) -> CodedPicture:
+        raise NotImplementedError  # of a codec that no message has
+
+    # -------- packets of an mp4
+
+    def frames(self, packet: bytes | memoryview, *, key: bool) -> list[CodedFrame]:
+        """The coded frames of the next packet, in the order coded.
+
+        It may begin at any key packet. After a refusal, packets are refused up to the next one.
+
+        Args:
+            packet: As the mp4 holds it.
+            key: Whether the file says that decoding can begin here.
+
+        Returns:
+            At least one frame. Their ranges do not overlap. Of AV1 each is of one frame, with the
+            sequence header just before a key frame, and what is in none (metadata, padding) is
+            not needed to decode; of other codecs there is one frame, the whole packet.
+
+        Raises:
+            UnknownStructure: The references cannot be determined, they reach across the key packet,
+                or decoding cannot begin where `key` says it can.
+        """
+        try:
+            return self._frames(memoryview(packet), key=key)
+        except Refused as error:
+            self._forget()
+            raise UnknownStructure(str(error)) from None
+
+    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        raise NotImplementedError
+
+    def _forget(self) -> None:
+        """Wait for a key frame."""
+        self._back = 0
+
+    def _link(self, size: int, *, begins: bool, kept: bool = True, key: bool) -> list[CodedFrame]:
+        """The only frame of a packet.
+
+        Args:
+            size: Of the packet.
+            begins: Whether nothing from here on refers to anything earlier.
+            kept: Whether later frames may need something of the packet.
+            key: Whether the file says that decoding can begin here.
+        """
+        if key and not begins:
+            raise UnknownStructure(
+                "it is marked as a key frame, and later pictures refer to earlier ones"
+            )
+        if not begins and not self._back:
+            raise UnknownStructure("it comes before the first key frame")
+        references = () if begins else (self._back,)
+        self._back = 1 if kept or begins else self._back + 1
+        return [CodedFrame(0, size, references, shown=True)]
+
+    @staticmethod
+    def units_of(configuration: bytes) -> list[bytes]:
+        """The parameter sets, or AV1 units, in a track's configuration.
+
+        Raises:
+            Refused: It is malformed.
+        """
+        return []
+
+    def _take_unit(self, unit: bytes) -> None:
+        """Look at one of `units_of`."""
+
+    @staticmethod
+    def spans(packet: bytes) -> list[tuple[int, int, int]]:
+        """Where the coded frames of a packet are, of which `frames` knows what they need.
+
+        Returns:
+            For each frame the start of the sequence header before it, its own where there is none,
+            its own start, and its end. A key frame is decoded with its sequence header.
+
+        Raises:
+            Refused: The packet is malformed.
+        """
+        return [(0, 0, len(packet))]
+
+    # -------- from one to the other
+
+    @staticmethod
+    def plain(body: bytes | memoryview) -> bytes:
+        """A message's packet as passed to a muxer, with the framing that every muxer understands.
+
+        Its length is that of the packet in the mp4: a start code of four bytes becomes a length of
+        four bytes.
+
+        Raises:
+            Refused: It is not of the codec.
+        """
+        return bytes(body)
+
+    @staticmethod
+    def body(packet: bytes, framing: str | None) -> bytes:
+        """The message's packet that an mp4 holds as a packet.
+
+        Args:
+            packet: As the mp4 holds it.
+            framing: As in `CodedPicture`; None for that of `plain`.
+
+        Raises:
+            Refused: The framing does not belong to the packet.
+        """
+        if framing:
+            raise Refused(f"{framing[:40]!r} is no framing of its codec")
+        return packet
+
+    @classmethod
+    def stand_alone(cls, packet: bytes, units: list[bytes]) -> bytes:
+        """A packet of an mp4 in the form that is decoded without the mp4.
+
+        Args:
+            packet: As the mp4 holds it.
+            units: The track's, before a key frame; else none.
+
+        Raises:
+            Refused: It is damaged.
+        """
+        return packet
+
+    @classmethod
+    def has_parameters(cls, plain: bytes) -> bool:
+        """Whether a key frame, as `plain` gives it, is decoded without `parameters` before it."""
+        return True
+
+
+class Jpeg(StreamParser):
+    """JPEG files: all are key frames."""
+
+    def _picture(self, body: memoryview) -> CodedPicture:
+        info = jpeg.parse(body)
+        return CodedPicture(info.width, info.height, keyframe=True)
+
+    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        return self._link(len(data), begins=True, key=key)
+
+
+# ---------------------------------------------------------------- FFV1
+
+_FFV1_KEY = 0x7F80
+
+
+class Ffv1(StreamParser):
+    """FFV1 keeps its context states from frame to frame."""
+
+    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        """Key frames are known by the first value that a frame codes, its `keyframe`.
+
+        That is RFC 9043, 4.3. A range coder of even odds (3.8.1.1) gives 1 where the first 16 bits
+        are in the upper half of its range, 0xFF00.
+        """
+        if len(data) < 2:
+            raise UnknownStructure("it is not FFV1: it is too short")
+        is_key = int.from_bytes(data[:2], "big") >= _FFV1_KEY
+        return self._link(len(data), begins=is_key, key=key)
+
+
+# ---------------------------------------------------------------- VP9
+
+_SYNC_CODE = 0x498342
+_RGB = 7
+_HEADER_BYTES = 32
+
+
+class Vp9(StreamParser):
+    """VP9 keeps motion vectors, probabilities and segments from frame to frame.
+
+    VP9 Bitstream & Decoding Process Specification 0.6: uncompressed header in 6.2, superframes in
+    annex B.
+    """
+
+    _size = (0, 0)
+
+    def _picture(self, body: memoryview) -> CodedPicture:
+        keyframe = False
+        shown = 0
+        for number, frame in enumerate(split_superframe(body)):
+            is_shown, is_key = self._header(bytes(frame[:_HEADER_BYTES]))
+            keyframe |= is_key and not number
+            shown += is_shown
+        if not shown:
+            # a muxer would join it with the next packet
+            raise NoPicture("it shows no picture")
+        if shown > 1:
+            raise Refused("it holds more than one picture")
+        if self._size == (0, 0):
+            raise Refused("it comes before the first key frame")
+        return CodedPicture(*self._size, keyframe)
+
+    def _header(self, header: bytes) -> tuple[bool, bool]:
+        """Whether a frame is shown, and a key frame."""
+        reader = BitReader(header)
+        if reader.bits(2) != 2:
+            raise Refused("it is not VP9: a frame does not begin with its marker")
+        profile = reader.bits(1) | reader.bits(1) << 1
+        if profile == 3 and reader.flag():
+            raise Refused("it is VP9 of an unknown profile")
+        if reader.flag():
+            return True, False
+        key = not reader.flag()
+        shown = reader.flag()
+        reader.flag()
+        if key:
+            self._size = _key_frame_size(reader, profile)
+        return shown, key
+
+    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        return self._link(len(data), begins=self._picture(data).keyframe, key=key)
+
+
+def split_superframe(data: memoryview) -> list[memoryview]:
+    """The VP9 frames of a packet, without the index of a superframe.
+
+    Raises:
+        Refused: The index does not fit the packet.
+    """
+    if not len(data):
+        raise Refused("it is empty")
+    marker = data[-1]
+    if marker & 0xE0 != 0xC0:
+        return [data]
+    count, size_bytes = (marker & 7) + 1, (marker >> 3 & 3) + 1
+    index = len(data) - 2 - count * size_bytes
+    if index < 0 or data[index] != marker:
+        return [data]
+    frames: list[memoryview] = []
+    start = 0
+    for number in range(count):
+        at = index + 1 + number * size_bytes
+        size = int.from_bytes(data[at : at + size_bytes], "little")
+        frames.append(data[start : start + size])
+        start += size
+    if start != index or not all(map(len, frames)):
+        raise Refused("the index of its VP9 superframe is wrong")
+    return frames
+
+
+def _key_frame_size(reader: BitReader, profile: int) -> tuple[int, int]:
+    if reader.bits(24) != _SYNC_CODE:
+        raise Refused("it is not VP9: a key frame has no sync code")
+    if profile >= 2:
+        reader.flag()
+    if reader.bits(3) != _RGB:
+        reader.flag()
+        if profile & 1:
+            reader.bits(3)
+    elif profile & 1:
+        reader.flag()
+    else:
+        raise Refused("its VP9 has colours that its profile does not have")
+    width, height = reader.bits(16) + 1, reader.bits(16) + 1
+    check_size(width, height)
+    return width, height
