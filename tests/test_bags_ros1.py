@@ -18,7 +18,8 @@ from rosbags.rosbag1 import Reader
 from conftest import DATA, real
 from mp4ds.bags import ros1
 from mp4ds.bags.formats import open_sources
-from mp4ds.bags.ros1 import Ros1Reader, Ros1Writer
+from mp4ds.bags.ros1 import Ros1Reader
+from mp4ds.bags.ros1_writer import Ros1Writer
 from mp4ds.errors import (
     ConversionError,
     OptionError,
@@ -250,18 +251,18 @@ def test_chunks_that_overlap_in_time_are_unpacked_once(
     path = make_bag(tmp_path / "a.bag", [plain()], chunks, compression="bz2")
     unpacked = []
 
-    def unpack(compression: str, size: int, data: bytes) -> bytes:
+    def unpack(compression: str, data: bytes, size: int) -> bytes:
         unpacked.append(size)
-        return real_unpack(compression, size, data)
+        return real_unpack(compression, data, size)
 
-    real_unpack = ros1.unpack_chunk
-    monkeypatch.setattr(ros1, "unpack_chunk", unpack)
+    real_unpack = ros1.unpack
+    monkeypatch.setattr(ros1, "unpack", unpack)
     with Ros1Reader(path) as reader:
         assert len(rows(reader)) == 200
     assert len(unpacked) == 4
     monkeypatch.setattr(ros1, "CACHED_BYTES", 1)
     with Ros1Reader(path) as reader:
-        assert max(len(reader._chunks) for _ in reader.records()) == 2
+        assert max(len(reader._unpacked) for _ in reader.records()) == 2
     assert len(unpacked) > 100
 
 

@@ -29,7 +29,7 @@ from mp4ds.bags import files
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.files import DamageError, unzstd
 from mp4ds.bags.mcap import McapReader, McapWriter
-from mp4ds.bags.ros1 import Ros1Writer
+from mp4ds.bags.ros1_writer import Ros1Writer
 from mp4ds.bags.rosbag2_metadata import parse_qos
 from mp4ds.errors import RemoteError
 from mp4ds.records import Channel, Message, Schema

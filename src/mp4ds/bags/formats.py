@@ -35,7 +35,7 @@ _SALVAGERS = {
 
 
 _WRITERS = {
-    "bag": "ros1:Ros1Writer",
+    "bag": "ros1_writer:Ros1Writer",
     "mcap": "mcap:McapWriter",
     "rosbag2": "rosbag2:Rosbag2Writer",
 }

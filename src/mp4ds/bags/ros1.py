@@ -1,4 +1,4 @@
-"""Reads and writes ROS 1 bags of format 2.0 (wiki.ros.org/Bags/Format/2.0).
+"""Reads ROS 1 bags of format 2.0 (wiki.ros.org/Bags/Format/2.0), and takes their records apart.
 
 Connection headers stay as recorded, the index is kept in arrays, and chunks are never decompressed
 beyond their declared size.
@@ -6,46 +6,301 @@ beyond their declared size.
 
 from __future__ import annotations
 
-import bz2
+import base64
+import re
 import struct
 from array import array
 from collections import OrderedDict, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from enum import IntEnum
 from functools import partial
-from io import BytesIO
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
-import lz4.frame
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.files import DamageError
-from mp4ds.bags.protocols import BagReader, BagWriter
-from mp4ds.bags.ros1_records import (
-    CHUNK_COUNT,
-    DAMAGE,
-    INDEX_ENTRY,
-    MAGIC,
-    MAX_TIME,
-    BagFile,
-    Fields,
-    Op,
-    check_bag,
-    check_between,
-    count_messages,
-    damaged,
-    join_header,
-    make_channel,
-    make_header,
-    payload,
-    split_header,
-    unpack_chunk,
+from mp4ds.bags.files import (
+    SALVAGE,
+    DamageError,
+    open_source,
+    other_begin,
+    unpack,
+    unreadable,
 )
-from mp4ds.errors import ConversionError, OptionError, TargetExistsError
+from mp4ds.bags.protocols import BagReader
+from mp4ds.errors import SourceError
 from mp4ds.files.ranges import expect
-from mp4ds.records import Channel, Excerpt, Message, Record
+from mp4ds.records import Channel, Excerpt, Message, Record, Schema
+
+MAGIC = b"#ROSBAG V2.0\n"
+MAX_TIME = 2**32 * 10**9
+"""A ROS 1 time is two uint32, seconds and nanoseconds: times must be below this."""
+UINT32 = struct.Struct("<I")
+CHUNK_COUNT = struct.Struct("<II")
+"""Of a chunk, in the index: a connection, and its messages."""
+INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
+"""Of a message, in the index of its chunk: log time, and its place in the content."""
+BASE64 = ";base64"
+"""Ending of the key of a connection header field that is not UTF-8, as metadata must be."""
+
+_COPY_AGAIN = f"Copy it again, repair it with `rosbag reindex`, or {SALVAGE}"
+_DAMAGE = (DamageError, OSError)  # raised while reading a damaged bag, or from a damaged disk
+
+# ---------------------------------------------------------------- records
+
+
+class Op(IntEnum):
+    """Kinds of records."""
+
+    MESSAGE = 2
+    BAG = 3
+    INDEX = 4
+    CHUNK = 5
+    CHUNK_INFO = 6
+    CONNECTION = 7
+
+
+_MESSAGE_OP = UINT32.pack(4) + b"op=" + bytes([Op.MESSAGE])
+
+
+class Fields(dict[bytes, bytes]):
+    """The fields of a record's header."""
+
+    def number(self, name: bytes, size: int = 4) -> int:
+        """A field that is an unsigned number.
+
+        Raises:
+            DamageError: It is missing, or has another size.
+        """
+        value = self.get(name, b"")
+        if len(value) != size:
+            raise DamageError(f"a record has no field {name.decode()!r} of {size} bytes")
+        return int.from_bytes(value, "little")
+
+    def time(self, name: bytes) -> int:
+        """A field that is a time, nanoseconds.
+
+        Raises:
+            DamageError: It is missing, or has another size.
+        """
+        nanoseconds, seconds = divmod(self.number(name, 8), 2**32)
+        return seconds * 10**9 + nanoseconds
+
+    @property
+    def op(self) -> int:
+        """The record's kind."""
+        return self.number(b"op", 1)
+
+
+class _BagFile:
+    """A bag being read record by record.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.stream: BinaryIO = open_source(path)
+        self.size = path.stat().st_size
+
+    def seek(self, place: int) -> None:
+        """Seek to a byte.
+
+        Raises:
+            DamageError: The file ends before.
+        """
+        if place > self.size:
+            raise DamageError(f"it has no byte {place}")
+        self.stream.seek(place)
+
+    def tell(self) -> int:
+        """The position of the next byte to read."""
+        return self.stream.tell()
+
+    def take(self, size: int) -> bytes:
+        """The next bytes.
+
+        Raises:
+            DamageError: There are fewer.
+        """
+        data = self.stream.read(size) if size <= self.size else b""
+        if len(data) != size:
+            raise DamageError("a record is cut short")
+        return data
+
+    def length(self) -> int:
+        """The length of what follows."""
+        return int.from_bytes(self.take(4), "little")
+
+    def header(self, op: Op | None = None) -> Fields:
+        """The header of the next record.
+
+        Args:
+            op: Expected kind; None for any.
+
+        Raises:
+            DamageError: It is of another kind, or cut short.
+        """
+        fields = Fields(split_header(self.take(self.length())))
+        if op is not None and fields.op != op:
+            raise DamageError(f"a record of kind {fields.op} is where {op.name} should be")
+        return fields
+
+
+def _number(data: bytes | memoryview, offset: int) -> int:
+    try:
+        return int(UINT32.unpack_from(data, offset)[0])
+    except struct.error:
+        raise DamageError("a record is cut short") from None
+
+
+def split_header(raw: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """The fields of a record's header, in order.
+
+    Raises:
+        DamageError: They do not fill the header.
+    """
+    offset = 0
+    while offset < len(raw):
+        size = _number(raw, offset)
+        offset += 4
+        name, equals, value = raw[offset : offset + size].partition(b"=")
+        offset += size
+        if not equals or offset > len(raw):
+            raise DamageError("a record's header is damaged")
+        yield name, value
+
+
+def _payload(chunk: memoryview, offset: int, number: int, time: int) -> memoryview:
+    """The message at an offset in a decompressed chunk.
+
+    Args:
+        chunk: The chunk.
+        offset: Where the index says that the message is.
+        number: Expected connection number.
+        time: Expected log time, nanoseconds.
+
+    Raises:
+        DamageError: There is another message, or none.
+    """
+    while True:
+        size = _number(chunk, offset)
+        fields = Fields(split_header(bytes(chunk[offset + 4 : offset + 4 + size])))
+        length = _number(chunk, offset + 4 + size)
+        start = offset + 8 + size
+        if fields.op != Op.CONNECTION:
+            break
+        offset = start + length  # some writers let the index point to the connection before it
+    if fields.op != Op.MESSAGE:
+        raise DamageError("the index does not point to a message")
+    if fields.number(b"conn") != number or fields.time(b"time") != time:
+        raise DamageError("the index points to another message")
+    if start + length > len(chunk):
+        raise DamageError("a message is longer than its chunk")
+    return chunk[start : start + length]
+
+
+def _count_messages(chunk: memoryview) -> int:
+    """Number of messages in a decompressed chunk, whatever the index says.
+
+    Raises:
+        DamageError: It ends within a record.
+    """
+    count = offset = 0
+    while offset < len(chunk):
+        size = _number(chunk, offset)
+        offset += 4 + size
+        count += _MESSAGE_OP in bytes(chunk[offset - size : offset])
+        offset += 4 + _number(chunk, offset)
+    return count
+
+
+def other_format(path: Path, start: bytes) -> SourceError:
+    """The error for a file that is not a bag of version 2.0.
+
+    Args:
+        path: The file.
+        start: Its first bytes.
+    """
+    version = re.match(rb"#ROS(?:BAG|RECORD|LOG) V(\d+\.\d+)", start)
+    if version and version[1] != b"2.0":
+        return SourceError(
+            path,
+            f"is a ROS 1 bag of version {version[1].decode()}; only version 2.0 is supported",
+            "Convert it first, with `rosbag filter OLD NEW True` of ROS 1.",
+        )
+    return other_begin(path, "a ROS 1 bag", MAGIC, start)
+
+
+def _damaged(path: Path, error: DamageError | OSError, place: str = "") -> SourceError:
+    """What to raise for an error of `_DAMAGE`.
+
+    Args:
+        path: The bag.
+        error: What was raised.
+        place: Where in it; comes after "is damaged".
+    """
+    if isinstance(error, OSError) and error.strerror:
+        error = DamageError(f"it cannot be read: {error.strerror}")
+    return unreadable(path, place, error, _COPY_AGAIN)
+
+
+def times_in(entries: NDArray[Any]) -> NDArray[np.int64]:
+    """The log times in an index, nanoseconds."""
+    times: NDArray[np.int64] = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
+    return times
+
+
+def connection_of(record: Fields, body: bytes) -> Channel:
+    """The channel that a connection record declares.
+
+    Args:
+        record: Its header.
+        body: The connection's own header.
+
+    Raises:
+        DamageError: It is not one.
+    """
+    header = dict(split_header(body))
+    topic = record.get(b"topic", header.get(b"topic", b""))
+    return make_channel(record.number(b"conn"), topic, header)
+
+
+def make_channel(number: int, topic: bytes, header: Mapping[bytes, bytes]) -> Channel:
+    """A connection as a channel.
+
+    Its metadata holds ``topic`` only if that differs from the record's: empty if the header has
+    none, as in bags of RealSense cameras.
+
+    Args:
+        number: The connection's number.
+        topic: Topic of the connection record.
+        header: The connection's own header, whose topic may differ.
+    """
+    metadata = {} if b"topic" in header else {"topic": ""}
+    for name, value in header.items():
+        key, text = text_of(name), text_of(value)
+        if name == b"message_definition":
+            continue
+        if text.encode() != value:
+            metadata[key + BASE64] = base64.b64encode(value).decode()
+        elif name != b"type" and (name, value) != (b"topic", topic):
+            metadata[key] = text
+    schema = None
+    if b"type" in header or b"message_definition" in header:
+        encoding = "ros1msg" if b"message_definition" in header else ""
+        definition = header.get(b"message_definition", b"")
+        schema = Schema(text_of(header.get(b"type", b"")), encoding, definition)
+    return Channel(number, text_of(topic), "ros1", schema, metadata)
+
+
+def text_of(raw: bytes) -> str:
+    """A field as text; what is not UTF-8 in it is escaped."""
+    return raw.decode(errors="backslashreplace")
+
+
+# ---------------------------------------------------------------- the reader
 
 CACHED_CHUNKS = 8
 CACHED_BYTES = 64 * 2**20
@@ -71,6 +326,26 @@ class _Index(NamedTuple):
         return _Index(self.times[start:end], self.chunks[start:end], self.offsets[start:end])
 
 
+class _Chunk(NamedTuple):
+    """A chunk, from the bag's index and its own header.
+
+    Attributes:
+        start: Byte where its record begins.
+        counts: Its messages by connection.
+        compression: Its name.
+        size: Bytes of its content.
+        place: Byte where its data begin.
+        packed: Bytes of these.
+    """
+
+    start: int
+    counts: Mapping[int, int]
+    compression: str = ""
+    size: int = 0
+    place: int = 0
+    packed: int = 0
+
+
 class Ros1Reader(BagReader):
     """Reads a ROS 1 bag.
 
@@ -92,25 +367,143 @@ class Ros1Reader(BagReader):
     def __init__(self, path: Path) -> None:
         self.path = path
         self.files = [path]
-        self._size = check_bag(path)
-        self._chunks: OrderedDict[int, memoryview] = OrderedDict()
+        self._file = _BagFile(path)
+        self._channels: dict[int, Channel] = {}  # by connection, in the order of the index
+        self._chunks: list[_Chunk] = []
+        self._unpacked: OrderedDict[int, memoryview] = OrderedDict()
         try:
-            self._bag = _Bag(path)
-        except DAMAGE as error:
-            raise damaged(path, error) from None
-        try:
-            self._index = self._bag.take_index()
-            for number, chunk in enumerate(self._bag.chunks):
+            self._index = self._read_index(self._read_header())
+            for number, chunk in enumerate(self._chunks):
                 if not any(chunk.counts.values()):
-                    self._chunk(number)  # otherwise nothing would check whether it holds messages
-        except DAMAGE as error:
+                    self._content(number)  # otherwise nothing would check whether it holds messages
+        except _DAMAGE as error:
             self.close()
-            raise damaged(path, error) from None
+            raise _damaged(path, error) from None
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def channels(self) -> Sequence[Channel]:
         """All connections, in the order of the bag's index."""
-        return list(self._bag.channels.values())
+        return list(self._channels.values())
+
+    def _read_header(self) -> Fields:
+        """The bag's header, if its index can be where that says.
+
+        Raises:
+            SourceError: It is not a bag, an old or encrypted one, or not indexed.
+        """
+        path, file = self.path, self._file
+        start = file.stream.read(32)
+        if not start.startswith(MAGIC):
+            raise other_format(path, start)
+        file.seek(len(MAGIC))
+        header = file.header(Op.BAG)
+        index = header.number(b"index_pos", 8)
+        if header.get(b"encryptor"):
+            raise SourceError(path, "is encrypted", "Decrypt it with `rosbag decrypt` first.")
+        if index == 0:
+            raise SourceError(
+                path,
+                "is not indexed: the recording was cut short",
+                f"Run `rosbag reindex` on it first, or {SALVAGE}",
+            )
+        if index > file.size:
+            problem = f"is cut short: its index should begin at byte {index}, and it has "
+            raise SourceError(path, f"{problem}{file.size} bytes", _COPY_AGAIN)
+        return header
+
+    def _read_index(self, header: Fields) -> dict[int, _Index]:
+        """The messages of each connection, from the index at the end and those of the chunks."""
+        file = self._file
+        first = file.length() + file.tell()
+        index = header.number(b"index_pos", 8)
+        file.seek(index)
+        for _ in range(header.number(b"conn_count")):
+            self._read_connection()
+        start = file.tell()
+        listed = [self._read_chunk_info() for _ in range(header.number(b"chunk_count"))]
+        if self._goes_on():
+            raise DamageError("its header declares fewer chunks than its index lists")
+        expect(file.stream, _index_ranges(listed, start))
+        # By connection: raw index entries; number of a chunk and of its entries, alternating.
+        entries: defaultdict[int, bytearray] = defaultdict(bytearray)
+        runs: defaultdict[int, array[int]] = defaultdict(partial(array, "I"))
+        ends = {}
+        for number, chunk in enumerate(listed):
+            self._chunks.append(self._read_chunk(chunk))
+            for _ in chunk.counts:
+                connection, found = self._read_entries(chunk)
+                entries[connection] += found
+                runs[connection].extend((number, len(found) // INDEX_ENTRY.itemsize))
+            ends[chunk.start] = file.tell()
+        if len(ends) < len(listed):
+            raise DamageError("its index lists a chunk twice")
+        # messages that the index does not list would be lost silently
+        for chunk_start in sorted(ends):
+            self._check_between(first, chunk_start)
+            first = ends[chunk_start]
+        # a bag without chunks is read to its end: there is no other way to find its index
+        self._check_between(first, index if listed else file.size)
+        return {
+            key: _sorted_index(entries.pop(key, b""), runs.pop(key, [])) for key in self._channels
+        }
+
+    def _goes_on(self) -> bool:
+        """Whether a record follows the last one of the index that was read."""
+        try:
+            return b"op" in self._file.header()
+        except _DAMAGE:
+            return False
+
+    def _read_connection(self) -> None:
+        record = self._file.header()
+        if record.get(b"op") != bytes([Op.CONNECTION]):
+            raise DamageError("a connection record is missing")
+        channel = connection_of(record, self._file.take(self._file.length()))
+        self._channels.setdefault(channel.id, channel)  # the first counts, as in ROS
+
+    def _read_chunk_info(self) -> _Chunk:
+        header = self._file.header(Op.CHUNK_INFO)
+        _check_version(header)
+        self._file.length()
+        counts = self._file.take(8 * header.number(b"count"))
+        return _Chunk(header.number(b"chunk_pos", 8), dict(CHUNK_COUNT.iter_unpack(counts)))
+
+    def _read_chunk(self, chunk: _Chunk) -> _Chunk:
+        """A chunk with its header's fields; it will be decompressed to that size."""
+        file = self._file
+        file.seek(chunk.start)
+        header = file.header(Op.CHUNK)
+        compression = header.get(b"compression", b"").decode(errors="replace")
+        packed, place = file.length(), file.tell()
+        file.seek(place + packed)
+        return _Chunk(chunk.start, chunk.counts, compression, header.number(b"size"), place, packed)
+
+    def _read_entries(self, chunk: _Chunk) -> tuple[int, bytes]:
+        """A connection, and its messages in a chunk, of which the next index is."""
+        header = self._file.header(Op.INDEX)
+        _check_version(header)
+        number, count = header.number(b"conn"), header.number(b"count")
+        entries = self._file.take(self._file.length())
+        if (
+            chunk.counts.get(number) != count
+            or len(entries) != count * INDEX_ENTRY.itemsize
+            or number not in self._channels
+        ):
+            problem = f"the index of the chunk at byte {chunk.start} contradicts the bag's index"
+            raise DamageError(problem)
+        return number, entries
+
+    def _check_between(self, place: int, end: int) -> None:
+        """Refuse messages in a range of bytes where the index lists none."""
+        file = self._file
+        while place < end:
+            file.seek(place)
+            if file.header().op in (Op.CHUNK, Op.MESSAGE):
+                raise DamageError(f"its index does not list what it holds at byte {place}")
+            place = file.length() + file.tell()
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Messages in log-time order, from the chunks that hold them."""
@@ -119,9 +512,9 @@ class Ros1Reader(BagReader):
         for channel, time, chunk, offset in self._entries(excerpt):
             if chunk not in visited:
                 visited.add(chunk)
-                self.position += self._bag.chunks[chunk].packed
+                self.position += self._chunks[chunk].packed
             yield self._message(channel, time, chunk, offset)
-        self.position = self._size
+        self.position = self._file.size
 
     def _entries(self, excerpt: Excerpt) -> Iterator[tuple[Channel, int, int, int]]:
         """Per message: channel, log time, chunk number, offset."""
@@ -132,7 +525,9 @@ class Ros1Reader(BagReader):
         times, chunks, offsets = (np.concatenate(column) for column in zip(*parts, strict=True))
         owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.times) for p in parts])
         order = np.lexsort((offsets, chunks, times))
-        self._bag.expect(_first_seen(chunks[order]))
+        first_seen = np.sort(np.unique(chunks[order], return_index=True)[1])
+        needed = (self._chunks[number] for number in chunks[order][first_seen].tolist())
+        expect(self._file.stream, ((one.place, one.place + one.packed) for one in needed))
         for start in range(0, len(order), 4096):
             rows = order[start : start + 4096]
             columns = (column[rows].tolist() for column in (owners, times, chunks, offsets))
@@ -141,22 +536,39 @@ class Ros1Reader(BagReader):
 
     def _message(self, channel: Channel, time: int, chunk: int, offset: int) -> Message:
         try:
-            data = payload(self._chunk(chunk), offset, channel.id, time)
-        except DAMAGE as error:
-            place = f": topic {channel.topic}, chunk at byte {self._bag.chunks[chunk].start}"
-            raise damaged(self.path, error, place) from None
+            data = _payload(self._content(chunk), offset, channel.id, time)
+        except _DAMAGE as error:
+            place = f": topic {channel.topic}, chunk at byte {self._chunks[chunk].start}"
+            raise _damaged(self.path, error, place) from None
         return Message(channel, time, time, 0, data)
 
-    def _chunk(self, number: int) -> memoryview:
-        """A decompressed chunk, from the cache if possible."""
-        if number in self._chunks:
-            self._chunks.move_to_end(number)
-            return self._chunks[number]
-        size = self._bag.chunks[number].size + sum(map(len, self._chunks.values()))
-        while len(self._chunks) > 1 and (len(self._chunks) >= CACHED_CHUNKS or size > CACHED_BYTES):
-            size -= len(self._chunks.popitem(last=False)[1])
-        unpacked = self._chunks[number] = self._bag.content(number)
-        return unpacked
+    def _content(self, number: int) -> memoryview:
+        """A decompressed chunk, from the cache if possible.
+
+        Raises:
+            DamageError: It is damaged, or its number of messages differs from the index.
+        """
+        if number in self._unpacked:
+            self._unpacked.move_to_end(number)
+            return self._unpacked[number]
+        chunk = self._chunks[number]
+        size = chunk.size + sum(map(len, self._unpacked.values()))
+        while len(self._unpacked) > 1 and (
+            len(self._unpacked) >= CACHED_CHUNKS or size > CACHED_BYTES
+        ):
+            size -= len(self._unpacked.popitem(last=False)[1])
+        self._file.seek(chunk.place)
+        data = self._file.take(chunk.packed)
+        if chunk.compression != "none":
+            data = unpack(chunk.compression, data, chunk.size)
+        elif len(data) != chunk.size:
+            raise DamageError(f"it holds {len(data)} bytes instead of {chunk.size}")
+        content = memoryview(data)
+        listed = sum(chunk.counts.values())
+        if (found := _count_messages(content)) != listed:
+            raise DamageError(f"its index lists {listed} messages of {found}")
+        self._unpacked[number] = content
+        return content
 
     def _times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times from the index."""
@@ -164,399 +576,37 @@ class Ros1Reader(BagReader):
 
     def close(self) -> None:
         """Close the file."""
-        self._chunks.clear()
-        self._bag.file.close()
+        self._unpacked.clear()
+        self._file.stream.close()
 
 
-def _first_seen(numbers: NDArray[np.int32]) -> list[int]:
-    """The distinct numbers, in order of first appearance."""
-    found, places = np.unique(numbers, return_index=True)
-    ordered: list[int] = found[np.argsort(places)].tolist()
-    return ordered
+def _index_ranges(chunks: Sequence[_Chunk], end: int) -> Iterator[tuple[int, int]]:
+    """The byte ranges of the index: between the data of the chunks."""
+    ends = [chunk.start for chunk in chunks[1:]] + [end]
+    for chunk, next_start in zip(chunks, ends, strict=True):
+        head = chunk.start + _CHUNK_HEAD
+        yield chunk.start, head
+        entries = (_INDEX_HEAD + INDEX_ENTRY.itemsize * n for n in chunk.counts.values())
+        if head < next_start:
+            yield max(head, next_start - sum(entries)), next_start
 
 
-class _Chunk(NamedTuple):
-    """A chunk, from the bag's index and its own header.
-
-    Attributes:
-        start: Byte where its record begins.
-        counts: Its messages by connection.
-        compression: Its name.
-        size: Bytes of its content.
-        place: Byte where its data begin.
-        packed: Bytes of these.
-    """
-
-    start: int
-    counts: Mapping[int, int]
-    compression: str = ""
-    size: int = 0
-    place: int = 0
-    packed: int = 0
-
-
-class _Bag:
-    """A bag and its index.
-
-    Attributes:
-        channels: By connection number, in the order of the bag's index.
-        chunks: In the order of the index.
-
-    Raises:
-        DamageError: The index is damaged or incomplete.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.file = BagFile(path)
-        self.channels: dict[int, Channel] = {}
-        self.chunks: list[_Chunk] = []
-        # By connection: raw index entries; number of a chunk and of its entries, alternating.
-        self._index_entries: defaultdict[int, bytearray] = defaultdict(bytearray)
-        self._index_runs: defaultdict[int, array[int]] = defaultdict(partial(array, "I"))
-        try:
-            self._read()
-        except BaseException:
-            self.file.close()
-            raise
-
-    def _read(self) -> None:
-        file = self.file
-        file.seek(len(MAGIC))
-        header = file.header(Op.BAG)
-        first = file.length() + file.tell()
-        index = header.number(b"index_pos", 8)
-        file.seek(index)
-        for _ in range(header.number(b"conn_count")):
-            self._read_connection()
-        start = file.tell()
-        listed = [self._read_chunk_info() for _ in range(header.number(b"chunk_count"))]
-        if self._goes_on():
-            raise DamageError("its header declares fewer chunks than its index lists")
-        expect(file.stream, self._index_ranges(listed, start))
-        ends = {}
-        for chunk in listed:
-            self.chunks.append(self._read_chunk(chunk))
-            for _ in chunk.counts:
-                self._read_index()
-            ends[chunk.start] = file.tell()
-        if len(ends) < len(listed):
-            raise DamageError("its index lists a chunk twice")
-        # messages that the index does not list would be lost silently
-        for chunk_start in sorted(ends):
-            check_between(file, first, chunk_start)
-            first = ends[chunk_start]
-        # a bag without chunks is read to its end: there is no other way to find its index
-        check_between(file, first, index if listed else file.size)
-
-    def _goes_on(self) -> bool:
-        """Whether a record follows the last one of the index that was read."""
-        try:
-            return b"op" in self.file.header()
-        except DAMAGE:
-            return False
-
-    def _read_connection(self) -> None:
-        record = self.file.header()
-        if record.get(b"op") != bytes([Op.CONNECTION]):
-            raise DamageError("a connection record is missing")
-        number = record.number(b"conn")
-        header = Fields(split_header(self.file.take(self.file.length())))
-        channel = make_channel(number, record.get(b"topic", header.get(b"topic", b"")), header)
-        self.channels.setdefault(number, channel)  # the first with a number counts, as in ROS
-
-    def _read_chunk_info(self) -> _Chunk:
-        header = self.file.header(Op.CHUNK_INFO)
-        _check_version(header)
-        self.file.length()
-        counts = self.file.take(8 * header.number(b"count"))
-        return _Chunk(header.number(b"chunk_pos", 8), dict(CHUNK_COUNT.iter_unpack(counts)))
-
-    def _read_chunk(self, chunk: _Chunk) -> _Chunk:
-        """A chunk with its header's fields; it will be decompressed to that size."""
-        self.file.seek(chunk.start)
-        header = self.file.header(Op.CHUNK)
-        compression = header.get(b"compression", b"").decode(errors="replace")
-        packed, place = self.file.length(), self.file.tell()
-        self.file.seek(place + packed)
-        return _Chunk(chunk.start, chunk.counts, compression, header.number(b"size"), place, packed)
-
-    def _read_index(self) -> None:
-        """Read the index of one connection in the last chunk."""
-        header = self.file.header(Op.INDEX)
-        _check_version(header)
-        number, count = header.number(b"conn"), header.number(b"count")
-        entries = self.file.take(self.file.length())
-        chunk = self.chunks[-1]
-        if (
-            chunk.counts.get(number) != count
-            or len(entries) != count * INDEX_ENTRY.itemsize
-            or number not in self.channels
-        ):
-            problem = f"the index of the chunk at byte {chunk.start} contradicts the bag's index"
-            raise DamageError(problem)
-        self._index_entries[number] += entries
-        self._index_runs[number].extend((len(self.chunks) - 1, count))
-
-    @staticmethod
-    def _index_ranges(chunks: Sequence[_Chunk], end: int) -> Iterator[tuple[int, int]]:
-        """The byte ranges of the index: between the data of the chunks."""
-        ends = [chunk.start for chunk in chunks[1:]] + [end]
-        for chunk, next_start in zip(chunks, ends, strict=True):
-            head = chunk.start + _CHUNK_HEAD
-            yield chunk.start, head
-            entries = (_INDEX_HEAD + INDEX_ENTRY.itemsize * n for n in chunk.counts.values())
-            if head < next_start:
-                yield max(head, next_start - sum(entries)), next_start
-
-    def expect(self, chunks: Iterable[int]) -> None:
-        """Announce which chunks will be read, by number, in order."""
-        found = map(self.chunks.__getitem__, chunks)
-        expect(self.file.stream, ((one.place, one.place + one.packed) for one in found))
-
-    def content(self, number: int) -> memoryview:
-        """A decompressed chunk.
-
-        Raises:
-            DamageError: It is damaged, or its number of messages differs from the index.
-        """
-        chunk = self.chunks[number]
-        self.file.seek(chunk.place)
-        packed = self.file.take(chunk.packed)
-        unpacked = memoryview(unpack_chunk(chunk.compression, chunk.size, packed))
-        listed = sum(chunk.counts.values())
-        if (found := count_messages(unpacked)) != listed:
-            raise DamageError(f"its index lists {listed} messages of {found}")
-        return unpacked
-
-    def take_index(self) -> dict[int, _Index]:
-        """The index by connection number; frees the raw entries."""
-        return {number: self._sorted_index(number) for number in self.channels}
-
-    def _sorted_index(self, number: int) -> _Index:
-        entries = np.frombuffer(self._index_entries.pop(number, b""), INDEX_ENTRY)
-        runs = np.array(self._index_runs.pop(number, []), np.int64).reshape(-1, 2)
-        chunks = np.repeat(runs[:, 0].astype(np.int32), runs[:, 1])
-        times = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
-        if times.max(initial=0) >= MAX_TIME:
-            raise DamageError(
-                "it has a message with a time past 2^32 seconds, which ROS cannot represent"
-            )
-        places = chunks.astype(np.int64) << 32 | entries["offset"]
-        if len(np.unique(places)) < len(places):
-            raise DamageError("its index lists a message twice")
-        order = np.lexsort((entries["offset"], chunks, times))
-        index = _Index(times[order], chunks[order], entries["offset"][order])
-        if np.logical_and.reduce([column[1:] == column[:-1] for column in index]).any():
-            raise DamageError("its index lists a message twice")
-        return index
+def _sorted_index(raw: bytes | bytearray, chunk_runs: Sequence[int]) -> _Index:
+    entries = np.frombuffer(raw, INDEX_ENTRY)
+    runs = np.array(chunk_runs, np.int64).reshape(-1, 2)
+    chunks = np.repeat(runs[:, 0].astype(np.int32), runs[:, 1])
+    times = times_in(entries)
+    if times.max(initial=0) >= MAX_TIME:
+        raise DamageError(
+            "it has a message with a time past 2^32 seconds, which ROS cannot represent"
+        )
+    places = chunks.astype(np.int64) << 32 | entries["offset"]
+    if len(np.unique(places)) < len(places):
+        raise DamageError("its index lists a message twice")
+    order = np.lexsort((entries["offset"], chunks, times))
+    return _Index(times[order], chunks[order], entries["offset"][order])
 
 
 def _check_version(header: Fields) -> None:
     if (version := header.number(b"ver")) != 1:
         raise DamageError(f"its index has the unknown version {version}")
-
-
-# ---------------------------------------------------------------- the writer
-
-_MAX_PAYLOAD = 2**32 - 2**24  # lengths are uint32; leaves room for the rest of the chunk
-_CHUNK_BYTES = 2**20
-_BAG_HEADER_BYTES = 4096  # padded, so that it can be rewritten at the end
-_PAIR = struct.Struct("<II")
-_ENTRY = struct.Struct("<III")  # seconds, nanoseconds, offset in the chunk
-_MESSAGE_HEAD = struct.Struct("<II3sBI5sII5sIII")  # op, conn, time, and the payload's length
-
-
-class Ros1Writer(BagWriter):
-    """Writes a ROS 1 bag.
-
-    Args:
-        path: The file, which must not exist.
-        compression: Of the chunks: ``none``, ``bz2`` or ``lz4``.
-
-    Raises:
-        OptionError: The compression is unknown.
-        TargetExistsError: The file exists.
-        OSError: It cannot be written.
-    """
-
-    format = "bag"
-
-    def __init__(self, path: Path, compression: Literal["none", "bz2", "lz4"] = "none") -> None:
-        if compression not in _COMPRESSORS:
-            raise OptionError(f"compression {compression!r} is not known. Use none, bz2 or lz4.")
-        if path.exists():
-            raise TargetExistsError(path)
-        super().__init__()
-        self._numbers: dict[int, int] = {}
-        self._bag = _BagFile(path, compression)
-
-    @staticmethod
-    def check_channel(channel: Channel) -> None:
-        """Refuse a channel that a bag cannot hold.
-
-        Raises:
-            ConversionError: It is not a ROS 1 channel.
-        """
-        if channel.message_encoding != "ros1":
-            raise ConversionError(
-                channel.topic,
-                f"its messages are {channel.message_encoding or 'in an unknown encoding'}, and a "
-                "ROS 1 bag can only hold ROS 1 messages",
-                "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is.",
-            )
-
-    @staticmethod
-    def check_message(message: Message) -> None:
-        """Refuse a message that a bag cannot hold.
-
-        Raises:
-            ConversionError: It is too long, or its time is outside the range of ROS 1.
-        """
-        topic = message.channel.topic
-        if not 0 <= message.log_time < MAX_TIME:
-            raise ConversionError(
-                topic,
-                f"has a log time of {message.log_time} ns, and ROS 1 can hold 0 to 2^32 seconds",
-                "Unpack to mcap, which keeps it as it is.",
-            )
-        if len(message.data) > _MAX_PAYLOAD:
-            raise ConversionError(topic, "has a message too large for a ROS 1 bag")
-
-    def add_channel(self, channel: Channel) -> None:
-        """Declare a channel, which gets a connection."""
-        self.check_channel(channel)
-        if channel.id not in self._numbers:
-            self._numbers[channel.id] = self._bag.connect(*make_header(channel))
-
-    def write(self, message: Message) -> None:
-        """Append a message, payload verbatim."""
-        self.check_message(message)
-        if message.publish_time != message.log_time:
-            self._omitted["publish times that differ from the log time"] += 1
-        if message.sequence:
-            self._omitted["sequence numbers of messages"] += 1
-        self._bag.append(self._numbers[message.channel.id], message.log_time, message.data)
-
-    def finish(self) -> None:
-        """Write the last chunk and the index, and close the file."""
-        self._bag.finish()
-
-    def abandon(self) -> None:
-        """Close the file as it is."""
-        with suppress(OSError):
-            self._bag.file.close()
-
-
-class _BagFile:
-    """A bag being written: chunks, each with its index, then all connections and chunk infos.
-
-    Args:
-        path: The file, which must not exist.
-        compression: A key of `_COMPRESSORS`.
-
-    Attributes:
-        file: What is written to.
-    """
-
-    def __init__(self, path: Path, compression: str) -> None:
-        self._compression = compression
-        self._connections: list[bytes] = []
-        self._chunk_infos: list[bytes] = []
-        self._chunk = BytesIO()
-        self._index: dict[int, list[tuple[int, int]]] = {}  # connection -> times and offsets
-        self.file = path.open("xb")
-        self.file.write(MAGIC)
-        self._write_bag_header(0)
-
-    def _write_bag_header(self, index_pos: int) -> None:
-        header = _header(
-            Op.BAG,
-            (b"index_pos", index_pos.to_bytes(8, "little")),
-            (b"conn_count", _uint32(len(self._connections))),
-            (b"chunk_count", _uint32(len(self._chunk_infos))),
-        )
-        padding = _BAG_HEADER_BYTES - 4 - len(header)
-        self.file.write(header + _uint32(padding) + b" " * padding)
-
-    def connect(self, topic: bytes, header: Iterable[tuple[bytes, bytes]]) -> int:
-        """Add a connection with its own header, and return its number."""
-        number = len(self._connections)
-        record = _header(Op.CONNECTION, (b"conn", _uint32(number)), (b"topic", topic))
-        self._connections.append(record + join_header(header))
-        self._chunk.write(self._connections[-1])
-        return number
-
-    def append(self, number: int, time: int, data: bytes | memoryview) -> None:
-        """Add a message of a connection, log time in nanoseconds."""
-        self._index.setdefault(number, []).append((time, self._chunk.tell()))
-        op, conn = (4, b"op=", Op.MESSAGE), (9, b"conn=", number)
-        stamp = (13, b"time=", *divmod(time, 10**9))
-        self._chunk.write(_MESSAGE_HEAD.pack(38, *op, *conn, *stamp, len(data)))
-        self._chunk.write(data)
-        if self._chunk.tell() > _CHUNK_BYTES:
-            self._end_chunk()
-
-    def _end_chunk(self) -> None:
-        content, self._chunk = self._chunk.getvalue(), BytesIO()
-        index, self._index = self._index, {}
-        if not content:
-            return
-        place = self.file.tell()
-        packed = _COMPRESSORS[self._compression](content)
-        compression = (b"compression", self._compression.encode())
-        self.file.write(_header(Op.CHUNK, compression, (b"size", _uint32(len(content)))))
-        self.file.write(_uint32(len(packed)))
-        self.file.write(packed)
-        for number, entries in index.items():
-            data = b"".join(_ENTRY.pack(*divmod(time, 10**9), offset) for time, offset in entries)
-            counted = ((b"conn", _uint32(number)), (b"count", _uint32(len(entries))))
-            self.file.write(_header(Op.INDEX, (b"ver", _uint32(1)), *counted))
-            self.file.write(_uint32(len(data)) + data)
-        times = [time for entries in index.values() for time, _ in entries] or [0]
-        header = _header(
-            Op.CHUNK_INFO,
-            (b"ver", _uint32(1)),
-            (b"chunk_pos", place.to_bytes(8, "little")),
-            (b"start_time", _PAIR.pack(*divmod(min(times), 10**9))),
-            (b"end_time", _PAIR.pack(*divmod(max(times), 10**9))),
-            (b"count", _uint32(len(index))),
-        )
-        counts = b"".join(_PAIR.pack(number, len(entries)) for number, entries in index.items())
-        self._chunk_infos.append(header + _uint32(len(counts)) + counts)
-
-    def finish(self) -> None:
-        """Write the last chunk and the index, and close the file."""
-        self._end_chunk()
-        place = self.file.tell()
-        self.file.writelines(self._connections)
-        self.file.writelines(self._chunk_infos)
-        self.file.seek(len(MAGIC))
-        self._write_bag_header(place)
-        self.file.close()
-
-
-def _header(op: Op, *fields: tuple[bytes, bytes]) -> bytes:
-    return join_header([(b"op", bytes([op])), *fields])
-
-
-def _uint32(number: int) -> bytes:
-    return number.to_bytes(4, "little")
-
-
-def _pack_lz4(data: bytes) -> bytes:
-    """LZ4 as ROS 1 reads it: independent blocks, a checksum of the content, no size (lz4s.c)."""
-    packed: bytes = lz4.frame.compress(
-        data,
-        block_size=lz4.frame.BLOCKSIZE_MAX1MB,
-        block_linked=False,
-        content_checksum=True,
-        store_size=False,
-    )
-    return packed
-
-
-_COMPRESSORS: Mapping[str, Callable[[bytes], bytes]] = {
-    "none": bytes,
-    "bz2": bz2.compress,
-    "lz4": _pack_lz4,
-}

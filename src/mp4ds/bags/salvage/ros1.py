@@ -11,7 +11,7 @@ import numpy as np
 
 from mp4ds.bags.files import DamageError, open_source, recover
 from mp4ds.bags.protocols import LaterStarts
-from mp4ds.bags.ros1_records import (
+from mp4ds.bags.ros1 import (
     CHUNK_COUNT,
     INDEX_ENTRY,
     MAGIC,
@@ -19,9 +19,9 @@ from mp4ds.bags.ros1_records import (
     UINT32,
     Fields,
     Op,
-    make_channel,
+    connection_of,
     other_format,
-    split_header,
+    times_in,
 )
 from mp4ds.bags.salvage.losses import FilePass, FileSalvage, LossLog
 from mp4ds.bags.salvage.scan import RecordFrame, Ros1Framing, Scan, Window
@@ -106,11 +106,9 @@ class BagIndex:
 def _connection(frame: RecordFrame, body: bytes) -> Channel | None:
     """The channel that a connection record declares; None if it is damaged."""
     try:
-        header = dict(split_header(body))
+        return connection_of(frame.fields, body)
     except DamageError:
         return None
-    topic = frame.fields.get(b"topic", header.get(b"topic", b""))
-    return make_channel(frame.fields.number(b"conn"), topic, header)
 
 
 def read_index(path: Path) -> BagIndex:
@@ -328,8 +326,7 @@ class _Pass(FilePass):
 
     def _listed(self, fields: Fields, body: bytes, offset: int) -> None:
         entries = np.frombuffer(body, INDEX_ENTRY, count=len(body) // INDEX_ENTRY.itemsize)
-        times = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
-        self._tally.listed(fields.number(b"conn"), times, offset)
+        self._tally.listed(fields.number(b"conn"), times_in(entries), offset)
 
     def _enter(self, offset: int, end: int) -> None:
         """Begin a chunk that should end at a byte."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.files import DamageError, open_source
 from mp4ds.bags.mcap_records import MAGIC, PRIVATE_OPCODE
-from mp4ds.bags.ros1_records import UINT32, Fields, Op, split_header
+from mp4ds.bags.ros1 import UINT32, Fields, Op, split_header
 from mp4ds.errors import SourceError
 
 BLOCK = 2**20

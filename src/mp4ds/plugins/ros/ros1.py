@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import is_ros1
-from mp4ds.bags.ros1_records import make_channel
+from mp4ds.bags.ros1 import make_channel
 from mp4ds.errors import ConversionError, OptionError, PublishError
 from mp4ds.plugins.ros.names import NodeNames
 from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions, Receive, Service
