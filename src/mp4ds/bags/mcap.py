@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -28,30 +29,17 @@ from mp4ds.bags.files import (
     open_source,
     unreadable,
 )
-from mp4ds.bags.mcap_index import (
-    Between,
-    ChunkEntry,
-    McapSummary,
-    look_between,
-    read_summary,
-)
+from mp4ds.bags.mcap_index import ChunkEntry, McapSummary, read_summary
 from mp4ds.bags.mcap_records import (
     MAX_RECORD_BYTES,
     PRIVATE_OPCODE,
     Declared,
-    MessageHead,
     RecordStream,
     chunk_records,
     parse,
-    parse_message,
     unpack_chunk,
 )
-from mp4ds.bags.protocols import (
-    BagReader,
-    BagWriter,
-    HoldBack,
-    sorted_times,
-)
+from mp4ds.bags.protocols import BagReader, BagWriter, HoldBack, sorted_times
 from mp4ds.errors import ConversionError, Mp4dsError, OptionError, SourceError
 from mp4ds.records import (
     EVERYTHING,
@@ -64,100 +52,6 @@ from mp4ds.records import (
     Record,
     Schema,
 )
-
-
-def _other_at(stream: RecordStream, place: int, declared: Declared) -> Attachment | MetadataRecord:
-    stream.seek(place)
-    try:
-        record = declared.other(*stream.next())
-    except DamageError as error:
-        raise stream.damaged(error) from None
-    if record is None:
-        raise stream.damaged(DamageError("it differs from the one read before"))
-    return record
-
-
-def read_chunks(
-    stream: RecordStream,
-    excerpt: Excerpt,
-    summary: McapSummary,
-    between: Between,
-    declared: Declared,
-) -> Iterator[Record]:
-    """Read an excerpt from the chunks that it needs, by their start times, in any file order.
-
-    Args:
-        stream: The file.
-        excerpt: What to read.
-        summary: The file's summary.
-        between: The records between its chunks.
-        declared: What the file declares, starting with its summary.
-
-    Yields:
-        Messages by log time, ties in file order, payloads as stored; attachments and metadata
-        records at their places among the chunks.
-
-    Raises:
-        SourceError: The file is damaged, or its messages differ from its index.
-    """
-    others = deque(between.others if excerpt.others else ())
-    if excerpt.others:
-        for opcode, count in between.private.items():
-            declared.skip(opcode, count)
-    known = summary.channels.keys()
-    unwanted = {key for key in known if not excerpt.has_topic(declared.channels[key].topic)}
-    held = HoldBack()
-    select = partial(summary.chunks.select, excerpt, unwanted)
-    chunks = select() if excerpt.has_messages else ()
-    stream.expect((chunk.offset, chunk.offset + chunk.length) for chunk, _ in select())
-    for chunk, following in chunks:
-        while others and others[0] < chunk.offset:
-            yield _other_at(stream, others.popleft(), declared)
-        counts_private = excerpt.has_time(chunk.start)  # by one of several spans
-        try:
-            for kind, part in _records(stream, chunk):
-                if kind == Opcode.MESSAGE:
-                    head = parse_message(part)
-                    _check(head, chunk, summary)
-                    if head.channel_id not in unwanted and excerpt.has_time(head.log_time):
-                        held.add(declared.message(head, "it"), chunk.offset)
-                elif kind < PRIVATE_OPCODE or counts_private:
-                    declared.take(kind, part)
-        except DamageError as error:
-            raise stream.damaged(error) from None
-        # Of messages at the very start of the next chunk, some may be before this one.
-        yield from held.release(None if following is None else following - 1)
-    for place in others:
-        yield _other_at(stream, place, declared)
-
-
-def _records(stream: RecordStream, chunk: ChunkEntry) -> Iterator[tuple[int, memoryview]]:
-    """Opcode and body of each record in a chunk."""
-    stream.seek(chunk.offset)
-    opcode, body = stream.next()
-    if opcode != Opcode.CHUNK or stream.tell() != chunk.offset + chunk.length:
-        raise DamageError("it is not the chunk that the index lists there")
-    content = unpack_chunk(body)
-    if len(content) > chunk.size:
-        raise DamageError(f"it unpacks to {len(content)} bytes, more than its index says")
-    for _, kind, part in chunk_records(content):
-        yield kind, part
-
-
-def _check(head: MessageHead, chunk: ChunkEntry, summary: McapSummary) -> None:
-    """Refuse a message that would be missing from an excerpt without this chunk."""
-    if not chunk.start <= head.log_time <= chunk.end:
-        problem = f"of log time {head.log_time}"
-    elif head.channel_id not in summary.channels or (
-        chunk.channels and head.channel_id not in chunk.channels
-    ):
-        problem = f"of channel {head.channel_id}"
-    else:
-        return
-    raise DamageError(f"it holds a message {problem} that its index does not list")
-
-
-# ---------------------------------------------------------------- the reader
 
 
 class McapReader(BagReader):
@@ -208,12 +102,7 @@ class McapReader(BagReader):
         self.library: str = header.library
         self._summary = read_summary(stream)
         if self._summary:
-            schemas = self._summary.schemas
-            for schema in schemas.values():
-                self._declared.add_schema(schema)
-            for channel in self._summary.channels.values():
-                if not channel.schema_id or channel.schema_id in schemas:
-                    self._declared.add_channel(channel)  # otherwise its schema is only in the data
+            self._declared.add_summary(self._summary.schemas, self._summary.channels)
 
     def _start_pass(self) -> RecordStream:
         file = open_source(self.path, self._shown)
@@ -263,33 +152,20 @@ class McapReader(BagReader):
 
     @property
     def is_indexed(self) -> bool:
-        """Whether the summary is complete and consistent."""
-        return self._between is not None
+        """Whether the summary is complete and consistent, and chunks can be read by their times."""
+        return (
+            self._summary is not None
+            and self._summary.chunks.held_in_time_order() <= protocols.HOLD_BYTES
+            and self.has_whole_index
+        )
 
     @cached_property
-    def _between(self) -> Between | None:
-        """The records between the chunks, if excerpts can be read from chunks alone."""
-        summary = self._summary
-        if summary is None:
-            return None
-        if summary.chunks.held_in_time_order() > protocols.HOLD_BYTES:
-            return None
-        return self._found_between
-
-    @cached_property
-    def _found_between(self) -> Between | None:
-        """The records between the chunks if everything is consistent, otherwise None."""
-        summary = self._summary
-        if summary is None or not summary.is_consistent:
-            return None
-        with closing(self._start_pass()) as stream:
-            found = look_between(stream, summary)
-        return found if found.is_sound else None
-
-    @property
     def has_whole_index(self) -> bool:
         """Whether the summary lists all channels, schemas and chunks, and how many messages."""
-        return self._found_between is not None
+        if self._summary is None or not self._summary.is_consistent:
+            return False
+        with closing(self._start_pass()) as stream:
+            return self._summary.look_between(stream)
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Read everything once, or a part of it."""
@@ -311,26 +187,64 @@ class McapReader(BagReader):
             stream.close()
 
     def _read(self, stream: RecordStream, excerpt: Excerpt) -> Iterator[Record]:
-        if self._between and self._summary and self._needs_chunks_alone(self._summary, excerpt):
-            yield from self._read_chunks(stream, excerpt, self._summary, self._between)
-        else:
-            yield from filter(excerpt.has, self._read_through(stream, self._hold_back()))
-
-    @staticmethod
-    def _needs_chunks_alone(summary: McapSummary, excerpt: Excerpt) -> bool:
+        summary = self._summary
         # The whole is read in file order, unless that is too far from log-time order.
-        return excerpt != EVERYTHING or summary.chunks.held_in_file_order() > protocols.HOLD_BYTES
+        if (
+            summary
+            and self.is_indexed
+            and (
+                excerpt != EVERYTHING or summary.chunks.held_in_file_order() > protocols.HOLD_BYTES
+            )
+        ):
+            yield from self._read_chunks(stream, excerpt, summary)
+            return
+        # a buffer that sorts messages, if the file states its chunks' times
+        held = HoldBack() if summary and summary.chunks.has_messages else None
+        yield from filter(excerpt.has, self._read_through(stream, held))
 
     def _read_chunks(
-        self, stream: RecordStream, excerpt: Excerpt, summary: McapSummary, between: Between
+        self, stream: RecordStream, excerpt: Excerpt, summary: McapSummary
     ) -> Iterator[Record]:
+        """Read an excerpt from the chunks that it needs, by their start times, in any file order.
+
+        Messages come by log time, ties in file order; attachments and metadata records at their
+        places among the chunks.
+        """
+        declared = self._declared
+        others = deque(summary.others if excerpt.others else ())
+        if excerpt.others:
+            for opcode, count in summary.private.items():
+                declared.skip(opcode, count)
+        unwanted = {
+            key for key in summary.channels if not excerpt.has_topic(declared.channels[key].topic)
+        }
+        held = HoldBack()
         count = 0
-        for record in read_chunks(stream, excerpt, summary, between, self._declared):
-            if isinstance(record, Message):
-                count += 1
-                yield self._unpacked(record)
-            else:
-                yield record
+        select = partial(summary.chunks.select, excerpt, unwanted)
+        stream.expect((chunk.offset, chunk.offset + chunk.length) for chunk, _ in select())
+        for chunk, following in select() if excerpt.has_messages else ():
+            while others and others[0] < chunk.offset:
+                yield self._other_at(stream, others.popleft())
+            counts_private = excerpt.has_time(chunk.start)  # by one of several spans
+            try:
+                for kind, part in _records_in(stream, chunk):
+                    if kind == Opcode.MESSAGE:
+                        message = declared.message(part)
+                        _check(message, chunk, summary)
+                        count += 1
+                        if message.channel.id not in unwanted and excerpt.has_time(
+                            message.log_time
+                        ):
+                            held.add(message, chunk.offset)
+                    elif kind < PRIVATE_OPCODE or counts_private:
+                        declared.take(kind, part)
+            except DamageError as error:
+                raise stream.damaged(error) from None
+            # Of messages at the very start of the next chunk, some may be before this one.
+            until = None if following is None else following - 1
+            yield from map(self._unpacked, held.release(until))
+        for place in others:
+            yield self._other_at(stream, place)
         if excerpt == EVERYTHING and not summary.covers(count):
             raise SourceError(
                 self._shown,
@@ -338,9 +252,15 @@ class McapReader(BagReader):
                 SALVAGE_REMEDY,
             )
 
-    def _hold_back(self) -> HoldBack | None:
-        """A buffer that sorts messages, if the file states its chunks' times."""
-        return HoldBack() if self._summary and self._summary.chunks.has_messages else None
+    def _other_at(self, stream: RecordStream, place: int) -> Attachment | MetadataRecord:
+        stream.seek(place)
+        try:
+            record = self._declared.other(*stream.next())
+        except DamageError as error:
+            raise stream.damaged(error) from None
+        if record is None:
+            raise stream.damaged(DamageError("it differs from the one read before"))
+        return record
 
     def _read_through(self, stream: RecordStream, held: HoldBack | None) -> Iterator[Record]:
         declared = self._declared
@@ -351,9 +271,9 @@ class McapReader(BagReader):
             if opcode == Opcode.FOOTER:
                 break
             try:
-                for head in self._messages(opcode, body):
+                for part in self._messages(opcode, body):
                     read += 1
-                    message = declared.message(head, f"message {read}")
+                    message = declared.message(part, f"message {read}")
                     if held is None:
                         yield self._unpacked(message)
                     else:
@@ -370,14 +290,14 @@ class McapReader(BagReader):
         if held is not None:
             yield from map(self._unpacked, held.release(None))
 
-    def _messages(self, opcode: int, body: bytes) -> Iterator[MessageHead]:
+    def _messages(self, opcode: int, body: bytes) -> Iterator[bytes | memoryview]:
         """The messages of a top-level record; schemas and channels are declared on the way."""
         if opcode == Opcode.MESSAGE:
-            yield parse_message(body)
+            yield body
         elif opcode == Opcode.CHUNK:
-            for _, kind, part in chunk_records(unpack_chunk(body)):
+            for kind, part in chunk_records(unpack_chunk(body)):
                 if kind == Opcode.MESSAGE:
-                    yield parse_message(part)
+                    yield part
                 else:
                     self._declared.take(kind, part)
 
@@ -390,25 +310,20 @@ class McapReader(BagReader):
         except DamageError as error:
             place = f": message of log time {message.log_time}, topic {message.channel.topic}"
             raise unreadable(self._shown, place, error, SALVAGE_REMEDY) from None
-        return Message(
-            message.channel, message.log_time, message.publish_time, message.sequence, data
-        )
+        return replace(message, data=data)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts from the statistics record, spans from the chunks that hold the channel."""
         return self._summary.stats() if self._summary else {}
 
     def _times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Log times by channel id. See `BagReader.times`.
-
-        Times past the year 2262 do not fit and are clamped.
-        """
+        """Log times by channel id; those past the year 2262 do not fit and are clamped."""
         pieces: dict[int, list[NDArray[np.uint64]]] = {}
         if self._summary and self._summary.chunks.has_messages:
             with closing(self._start_pass()) as stream:
                 try:
-                    for entries in self._summary.entries(stream):
-                        pieces.setdefault(entries.channel_id, []).append(entries.log_times)
+                    for channel_id, times in self._summary.log_times(stream):
+                        pieces.setdefault(channel_id, []).append(times)
                 except DamageError as error:
                     raise stream.damaged(error) from None
             indexed = sum(len(piece) for found in pieces.values() for piece in found)
@@ -420,6 +335,32 @@ class McapReader(BagReader):
         """Close the file."""
         if self._pass:
             self._pass.close()
+
+
+def _records_in(stream: RecordStream, chunk: ChunkEntry) -> Iterator[tuple[int, memoryview]]:
+    """Opcode and body of each record in a chunk."""
+    stream.seek(chunk.offset)
+    opcode, body = stream.next()
+    if opcode != Opcode.CHUNK or stream.tell() != chunk.offset + chunk.length:
+        raise DamageError("it is not the chunk that the index lists there")
+    content = unpack_chunk(body)
+    if len(content) > chunk.size:
+        raise DamageError(f"it unpacks to {len(content)} bytes, more than its index says")
+    return chunk_records(content)
+
+
+def _check(message: Message, chunk: ChunkEntry, summary: McapSummary) -> None:
+    """Refuse a message that would be missing from an excerpt without this chunk."""
+    channel_id = message.channel.id
+    if not chunk.start <= message.log_time <= chunk.end:
+        problem = f"of log time {message.log_time}"
+    elif channel_id not in summary.channels or (
+        chunk.channels and channel_id not in chunk.channels
+    ):
+        problem = f"of channel {channel_id}"
+    else:
+        return
+    raise DamageError(f"it holds a message {problem} that its index does not list")
 
 
 # ---------------------------------------------------------------- the writer
@@ -528,29 +469,9 @@ class McapWriter(BagWriter):
     def write(self, message: Message) -> None:
         """Append a message, payload verbatim."""
         self.check_message(message)
-        is_large = self._compresses and 2 * len(message.data) > most_unpacked(0)
-        if is_large and self._compresses_too_well(message.data):
-            with self._uncompressed():
-                self._add(message)
-        else:
-            self._add(message)
-
-    @staticmethod
-    def _compresses_too_well(data: bytes | memoryview) -> bool:
-        """Whether readers could suspect its chunk of claiming more than it holds."""
-        return 2 * len(data) > most_unpacked(compressed_size([data]))
-
-    @contextmanager
-    def _uncompressed(self) -> Iterator[None]:
-        """Turn compression off for the chunk that a message larger than a chunk completes."""
         before = getattr(self._writer, _COMPRESSION)
-        setattr(self._writer, _COMPRESSION, CompressionType.NONE)
-        try:
-            yield
-        finally:
-            setattr(self._writer, _COMPRESSION, before)
-
-    def _add(self, message: Message) -> None:
+        if self._compresses_too_well(message.data):
+            setattr(self._writer, _COMPRESSION, CompressionType.NONE)
         self._writer.add_message(
             self._channel_ids[message.channel.id],
             message.log_time,
@@ -558,6 +479,16 @@ class McapWriter(BagWriter):
             message.publish_time,
             message.sequence,
         )
+        setattr(self._writer, _COMPRESSION, before)
+
+    def _compresses_too_well(self, data: bytes | memoryview) -> bool:
+        """Whether readers could suspect its chunk of claiming more than it holds.
+
+        Such a message is larger than a chunk, and so completes the one that it is in.
+        """
+        size = 2 * len(data)
+        is_large = self._compresses and size > most_unpacked(0)
+        return is_large and size > most_unpacked(compressed_size([data]))
 
     def flush(self) -> None:
         """Give the system all that was written, so that a reader of damaged files has it."""

@@ -32,6 +32,7 @@ _HEAD = struct.Struct("<QQQQI")
 _CHANNEL = np.dtype([("id", "<u2"), ("offset", "<u8")])
 _LATEST = 2**64 - 1
 _MAX_OFFSET = 2**62  # sums of three do not wrap
+_OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
 
 
 class ChunkEntry(NamedTuple):
@@ -218,23 +219,7 @@ class ChunkTable:
         )
 
 
-# ---------------------------------------------------------------- the index
-
-
-class IndexEntries(NamedTuple):
-    """The messages of one channel in one chunk.
-
-    Attributes:
-        channel_id: Id of the channel in the file.
-        chunk: Byte offset of the chunk's record in the file.
-        log_times: uint64 array, nanoseconds.
-        offsets: uint64 array of byte offsets in the decompressed chunk.
-    """
-
-    channel_id: int
-    chunk: int
-    log_times: NDArray[np.uint64]
-    offsets: NDArray[np.uint64]
+# ---------------------------------------------------------------- the summary
 
 
 @dataclass
@@ -247,7 +232,9 @@ class McapSummary:
         channels: Channel records by id.
         statistics: The statistics record, if there is one.
         chunks: The chunks that it lists.
-        private: How many records of each private opcode it holds.
+        private: How many records of each private opcode it holds, and those between the chunks
+            once these were looked at.
+        others: Byte offsets of the attachments and metadata records, once these were looked at.
     """
 
     offset: int = 0
@@ -256,6 +243,7 @@ class McapSummary:
     statistics: mcap_records.Statistics | None = None
     chunks: ChunkTable = field(default_factory=ChunkTable)
     private: Counter[int] = field(default_factory=Counter)
+    others: array[int] = field(default_factory=lambda: array("Q"))
 
     def add(self, opcode: int, body: bytes) -> None:
         """Add a record.
@@ -318,33 +306,61 @@ class McapSummary:
             stats[channel_id] = ChannelStats(count, *span)
         return stats
 
-    def entries(self, stream: RecordStream) -> Iterator[IndexEntries]:
-        """Read the message indexes of all chunks, in the order of the file.
+    def log_times(self, stream: RecordStream) -> Iterator[tuple[int, NDArray[np.uint64]]]:
+        """Channel id and log times in ns, from each message index in the order of the file.
 
         Raises:
             DamageError: An index record is damaged.
         """
         stream.expect((first, end) for _, first, end in self.chunks.places())
-        for chunk, first, end in self.chunks.places():
+        for _, first, end in self.chunks.places():
             stream.seek(first)
             while stream.tell() < end:
                 opcode, body = stream.next()
                 if opcode != Opcode.MESSAGE_INDEX:
                     raise DamageError("it is in the place of a message index")
-                yield _parse_entries(chunk, body)
+                try:
+                    channel_id, length = struct.unpack_from("<HI", body)
+                    pairs = np.frombuffer(body, "<u8", count=length // 8, offset=6)
+                    yield channel_id, pairs.reshape(-1, 2)[:, 0]
+                except (struct.error, ValueError):
+                    raise DamageError("a message index is shorter than its fields") from None
+
+    def look_between(self, stream: RecordStream) -> bool:
+        """Look at the records between the chunks, which must be sound.
+
+        The stream's position is undefined afterwards.
+
+        Returns:
+            Whether the chunks are where they are listed, with no messages outside of them.
+        """
+        place = len(MAGIC)
+        gaps = []
+        for start, _, end in self.chunks.places():
+            gaps.append((place, start))
+            place = end
+        try:
+            return all(self._look(stream, *gap) for gap in [*gaps, (place, self.offset)])
+        except (DamageError, SourceError):
+            return False  # reading everything will show what is wrong
+
+    def _look(self, stream: RecordStream, place: int, end: int) -> bool:
+        if place < end:
+            stream.seek(place)
+        while place < end:
+            opcode = stream.skip_record()
+            if opcode in _OTHERS:
+                self.others.append(place)
+            elif opcode >= PRIVATE_OPCODE:
+                self.private[opcode] += 1
+            elif opcode in (Opcode.MESSAGE, Opcode.CHUNK, Opcode.FOOTER):
+                return False
+            place = stream.tell()
+        return place == end
 
     def covers(self, count: int) -> bool:
         """Whether this count is all messages of the file."""
         return self.statistics is not None and self.statistics.message_count == count
-
-
-def _parse_entries(chunk: int, body: bytes) -> IndexEntries:
-    try:
-        channel_id, length = struct.unpack_from("<HI", body)
-        pairs = np.frombuffer(body, "<u8", count=length // 8, offset=6).reshape(-1, 2)
-    except (struct.error, ValueError):
-        raise DamageError("a message index is shorter than its fields") from None
-    return IndexEntries(channel_id, chunk, pairs[:, 0], pairs[:, 1])
 
 
 def read_summary(stream: RecordStream) -> McapSummary | None:
@@ -379,74 +395,3 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
         summary.add(opcode, body)
     summary.chunks.finish()
     return summary
-
-
-# ---------------------------------------------------------------- between the chunks
-
-_FRAME = struct.Struct("<BQ")
-_OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
-
-
-@dataclass
-class Between:
-    """The records between the chunks that a summary lists.
-
-    Attributes:
-        is_sound: Whether the chunks are where the summary says, with no messages outside them.
-        others: Byte offsets of the attachments and metadata records.
-        private: How many records of each private opcode there are.
-    """
-
-    is_sound: bool = True
-    others: array[int] = field(default_factory=lambda: array("Q"))
-    private: Counter[int] = field(default_factory=Counter)
-
-
-def look_between(stream: RecordStream, summary: McapSummary) -> Between:
-    """Inspect the records between the chunks; the stream's position is undefined afterwards.
-
-    Args:
-        stream: The file.
-        summary: Its summary; its chunks must be sound.
-    """
-    found = Between(private=Counter(summary.private))
-    place = len(MAGIC)
-    for start, _, end in summary.chunks.places():
-        if start != place:
-            _look(stream, place, start, found)
-        if not found.is_sound:
-            return found
-        place = end
-    _look(stream, place, summary.offset, found)
-    return found
-
-
-def _look(stream: RecordStream, place: int, end: int, found: Between) -> None:
-    try:
-        while place < end and found.is_sound:
-            opcode, following = read_frame(stream, place)
-            if opcode in _OTHERS:
-                found.others.append(place)
-            elif opcode >= PRIVATE_OPCODE:
-                found.private[opcode] += 1
-            elif opcode in (Opcode.MESSAGE, Opcode.CHUNK, Opcode.FOOTER):
-                found.is_sound = False
-            place = following
-    except (DamageError, SourceError):
-        found.is_sound = False  # reading everything will show what is wrong
-    found.is_sound &= place == end
-
-
-def read_frame(stream: RecordStream, place: int) -> tuple[int, int]:
-    """The opcode of the record at a byte offset, and the offset of the next one.
-
-    Raises:
-        DamageError: There is no record.
-        SourceError: The file cannot be read.
-    """
-    stream.seek(place)
-    stream.start = place
-    opcode, length = _FRAME.unpack(stream.read(_FRAME.size))
-    if length > MAX_RECORD_BYTES:
-        raise DamageError(f"it says it has {length} bytes")
-    return opcode, place + _FRAME.size + length

@@ -6,9 +6,9 @@ import io
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
@@ -30,7 +30,6 @@ from mp4ds.records import Attachment, Channel, Loss, Message, MetadataRecord, Sc
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 4 * 2**30
-_RECORD_HEAD = struct.Struct("<BQ")  # kind, and bytes that follow
 FOOTER_BYTES = 9 + 20 + len(MAGIC)
 PRIVATE_OPCODE = 0x80
 OF_SUMMARY = frozenset(
@@ -45,26 +44,13 @@ OF_SUMMARY = frozenset(
     }
 )
 CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`, or {SALVAGE}"
-_FRAME = struct.Struct("<BQ")
+FRAME = struct.Struct("<BQ")
+"""Of a record: its opcode, and the length of its body."""
 _CHUNK_HEAD = struct.Struct("<QQQII")
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
+MESSAGE_HEAD = struct.Struct("<HIQQ")
+"""Of a message: id of its channel, sequence number, log time, publish time."""
 
-_RecordT = TypeVar("_RecordT", covariant=True)
-
-
-class MessageHead(NamedTuple):
-    """The fields of an MCAP message; times in nanoseconds; the payload is not copied."""
-
-    channel_id: int
-    sequence: int
-    log_time: int
-    publish_time: int
-    data: memoryview
-
-
-class _Parsed(Protocol[_RecordT]):
-    @staticmethod
-    def read(stream: ReadDataStream) -> _RecordT: ...
+_RecordT = TypeVar("_RecordT", bound=mcap_records.McapRecord)
 
 
 class RecordStream:
@@ -94,7 +80,7 @@ class RecordStream:
 
     def tell(self) -> int:
         """Bytes of the file consumed."""
-        return self._stream.tell()
+        return self._offset
 
     def seek(self, offset: int) -> None:
         """Continue at a byte offset that an index gave."""
@@ -135,8 +121,7 @@ class RecordStream:
         Returns:
             Its opcode and its body.
         """
-        self.start = self._offset
-        opcode, length = _FRAME.unpack(self.read(_FRAME.size))
+        opcode, length = self._frame()
         if length > MAX_RECORD_BYTES:
             raise SourceError(
                 self.path,
@@ -146,6 +131,23 @@ class RecordStream:
         if length > self._most:
             raise self.damaged(OversizeError(f"it declares {length} bytes", self._most))
         return opcode, self.read(length)
+
+    def skip_record(self) -> int:
+        """Go past one record, and return its opcode.
+
+        Raises:
+            DamageError: It is too long, or would end past the end of the file.
+        """
+        opcode, length = self._frame()
+        if length > MAX_RECORD_BYTES:
+            raise DamageError(f"it says it has {length} bytes")
+        self.seek(self._offset + length)
+        return opcode
+
+    def _frame(self) -> tuple[int, int]:
+        self.start = self._offset
+        opcode, length = FRAME.unpack(self.read(FRAME.size))
+        return opcode, length
 
     def cut_short(self) -> SourceError:
         """The error for a file that ends before it should."""
@@ -168,43 +170,26 @@ class _ExactStream(ReadDataStream):
         return data
 
 
-def parse(kind: type[_Parsed[_RecordT]], body: bytes | memoryview) -> _RecordT:
+def parse(kind: type[_RecordT], body: bytes | memoryview) -> _RecordT:
     """Parse a small record with the mcap library, never beyond its end.
 
     Raises:
-        DamageError: It lacks what its kind must hold.
+        DamageError: It lacks what its kind must hold, or does not match its checksum.
     """
-    return _parse(kind, body)[0]
-
-
-def _parse(kind: type[_Parsed[_RecordT]], body: bytes | memoryview) -> tuple[_RecordT, int]:
     stream = _ExactStream(io.BytesIO(body))
+    reader: Any = kind
     try:
-        return kind.read(stream), stream.count
+        record: _RecordT = reader.read(stream)
     except (EndOfFile, struct.error, OverflowError):
-        problem = "is shorter than its fields"
+        raise DamageError(f"a record of kind {kind.__name__} is shorter than its fields") from None
     except UnicodeDecodeError:
-        problem = "holds text that is not UTF-8"
-    raise DamageError(f"a record of kind {kind.__name__} {problem}")
-
-
-def parse_attachment(body: bytes | memoryview) -> mcap_records.Attachment:
-    """Parse an attachment and verify its checksum, if it has one."""
-    attachment: mcap_records.Attachment
-    attachment, length = _parse(mcap_records.Attachment, body)
-    (crc,) = struct.unpack_from("<I", body, length - 4)
-    if crc and crc != zlib.crc32(memoryview(body)[: length - 4]):
-        raise DamageError(f"the attachment {attachment.name!r} does not match its checksum")
-    return attachment
-
-
-def parse_message(body: bytes | memoryview) -> MessageHead:
-    """Split a message record without copying its payload."""
-    if len(body) < _MESSAGE_HEAD.size:
-        raise DamageError("a message is shorter than its fields")
-    channel_id, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
-    data = memoryview(body)[_MESSAGE_HEAD.size :]
-    return MessageHead(channel_id, sequence, log_time, publish_time, data)
+        problem = f"a record of kind {kind.__name__} holds text that is not UTF-8"
+        raise DamageError(problem) from None
+    if isinstance(record, mcap_records.Attachment):
+        (crc,) = struct.unpack_from("<I", body, stream.count - 4)
+        if crc and crc != zlib.crc32(memoryview(body)[: stream.count - 4]):
+            raise DamageError(f"the attachment {record.name!r} does not match its checksum")
+    return record
 
 
 def unpack_chunk(body: bytes | memoryview) -> bytes | memoryview:
@@ -234,33 +219,26 @@ def unpack_chunk(body: bytes | memoryview) -> bytes | memoryview:
     return content
 
 
-def chunk_records(content: bytes | memoryview) -> Iterator[tuple[int, int, memoryview]]:
+def chunk_records(content: bytes | memoryview) -> Iterator[tuple[int, memoryview]]:
     """Walk the records of a decompressed chunk.
 
     Yields:
-        Offset in the chunk, opcode and body of each; the bodies are views.
+        Opcode and body of each; the bodies are views.
+
+    Raises:
+        DamageError: It ends within a record.
     """
     view = memoryview(content)
     offset = 0
     while offset < len(view):
-        opcode, body, end = chunk_record(view, offset)
-        yield offset, opcode, body
-        offset = end
-
-
-def chunk_record(view: memoryview, offset: int) -> tuple[int, memoryview, int]:
-    """Read one record of a decompressed chunk.
-
-    Returns:
-        Its opcode, its body and the offset of the next one.
-    """
-    if offset + _FRAME.size > len(view):
-        raise DamageError("a chunk ends within a record")
-    opcode, length = _FRAME.unpack_from(view, offset)
-    offset += _FRAME.size
-    if length > len(view) - offset:
-        raise DamageError("a chunk ends within a record")
-    return opcode, view[offset : offset + length], offset + length
+        if offset + FRAME.size > len(view):
+            raise DamageError("a chunk ends within a record")
+        opcode, length = FRAME.unpack_from(view, offset)
+        offset += FRAME.size
+        if length > len(view) - offset:
+            raise DamageError("a chunk ends within a record")
+        yield opcode, view[offset : offset + length]
+        offset += length
 
 
 # ---------------------------------------------------------------- what was declared
@@ -321,24 +299,40 @@ class Declared:
                 record.metadata,
             )
 
+    def add_summary(
+        self,
+        schemas: Mapping[int, mcap_records.Schema],
+        channels: Mapping[int, mcap_records.Channel],
+    ) -> None:
+        """Add what a summary lists, except channels of which the data alone has the schema."""
+        for schema in schemas.values():
+            self.add_schema(schema)
+        for channel in channels.values():
+            if not channel.schema_id or channel.schema_id in schemas:
+                self.add_channel(channel)
+
     def skip(self, opcode: int, count: int = 1) -> None:
         """Count private records."""
         self.skipped[f"private MCAP records (opcode 0x{opcode:02x})"] += count
 
-    def message(self, head: MessageHead, place: str) -> Message:
-        """A message, with its payload as stored.
+    def message(self, body: bytes | memoryview, place: str = "it") -> Message:
+        """A message, with its payload as stored, which is not copied.
 
         Args:
-            head: What the file holds.
+            body: What the file holds.
             place: Which message it is, for errors.
 
         Raises:
-            DamageError: Its channel is not defined.
+            DamageError: It is shorter than its fields, or its channel is not defined.
         """
-        channel = self.channels.get(head.channel_id)
+        if len(body) < MESSAGE_HEAD.size:
+            raise DamageError("a message is shorter than its fields")
+        channel_id, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(body)
+        channel = self.channels.get(channel_id)
         if channel is None:
-            raise DamageError(f"{place} belongs to channel {head.channel_id}, which is not defined")
-        return Message(channel, head.log_time, head.publish_time, head.sequence, head.data)
+            raise DamageError(f"{place} belongs to channel {channel_id}, which is not defined")
+        data = memoryview(body)[MESSAGE_HEAD.size :]
+        return Message(channel, log_time, publish_time, sequence, data)
 
     def other(self, opcode: int, body: bytes | memoryview) -> Attachment | MetadataRecord | None:
         """A record that is not a message, to pass on; None if there is nothing to pass on.
@@ -347,7 +341,7 @@ class Declared:
             DamageError: It is damaged, or contradicts what was declared before.
         """
         if opcode == Opcode.ATTACHMENT:
-            found = parse_attachment(body)
+            found = parse(mcap_records.Attachment, body)
             return Attachment(
                 found.name, found.media_type, found.create_time, found.log_time, found.data
             )
@@ -379,9 +373,9 @@ def copy_verified(piece: Path, copy: Path) -> list[Loss]:
     end = piece.stat().st_size
     with piece.open("rb") as source, copy.open("wb") as target:
         target.write(source.read(len(MAGIC)))
-        while head := source.read(_RECORD_HEAD.size):
+        while head := source.read(FRAME.size):
             offset = source.tell() - len(head)
-            kind, size = _RECORD_HEAD.unpack(head.ljust(_RECORD_HEAD.size, b"\0"))
+            kind, size = FRAME.unpack(head.ljust(FRAME.size, b"\0"))
             is_whole = kind != 0 and size <= min(MAX_RECORD_BYTES, end - source.tell())
             body = source.read(size) if is_whole else b""
             if not is_whole:

@@ -6,7 +6,7 @@ import contextlib
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,11 +20,11 @@ from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
     MAGIC,
     MAX_RECORD_BYTES,
+    MESSAGE_HEAD,
     OF_SUMMARY,
     Declared,
     chunk_records,
     parse,
-    parse_message,
     unpack_chunk,
 )
 from mp4ds.bags.salvage.losses import Draft, FilePass, FileSalvage, LossLog, lost_by
@@ -119,7 +119,6 @@ def _read_from(path: Path, start: int, summary: SalvagedSummary) -> None:
 # ---------------------------------------------------------------- a pass
 
 _CHUNK_HEAD = struct.Struct("<QQQII")
-_TIME_END = 14  # of the log time in a message
 _MARGIN = 600 * 10**9  # ns; a damaged chunk may seem to end where the next one does
 Found = Message | Attachment | MetadataRecord | None
 
@@ -256,38 +255,37 @@ class McapPass(FilePass):
         Raises:
             DamageError: It is shorter than its fields.
         """
-        channel_id, time = _key(body)
+        channel_id = int.from_bytes(body[:2], "little")
         if is_doubtful and channel_id not in self._declared.channels:
             return
-        message = self._message(memoryview(body), offset)
+        message = self._message(channel_id, body, offset)
         if message and is_doubtful:
             self._tally.hold(channel_id, message)
         elif message:
-            self._tally.gave(channel_id, time)
+            self._tally.gave(channel_id, message.log_time)
             yield message
 
-    def _message(self, body: memoryview, offset: int) -> Message | None:
+    def _message(self, channel_id: int, body: bytes | memoryview, offset: int) -> Message | None:
         """A message; None if it is lost.
 
         Raises:
             DamageError: It is shorter than its fields.
         """
-        head = parse_message(body)
-        channel = self._channel(head.channel_id)
-        data: bytes | memoryview = head.data
-        if channel is None:
-            problem = f"messages of channel {head.channel_id}, whose record is missing"
-            self._lose_message(head.channel_id, offset, problem)
+        if self._channel(channel_id) is None and len(body) >= MESSAGE_HEAD.size:
+            problem = f"messages of channel {channel_id}, whose record is missing"
+            self._lose_message(channel_id, offset, problem)
             return None
+        message = self._declared.message(body)
         if self._decompress:
+            topic = message.channel.topic
             try:
-                data = self._decompress(head.data)
+                message = replace(message, data=self._decompress(memoryview(message.data)))
             except DamageError as error:
-                problem = f"messages of {channel.topic} {lost_by(error)}"
-                loss = self._lose_message(head.channel_id, offset, problem)
-                loss.topics[channel.topic] = None
+                problem = f"messages of {topic} {lost_by(error)}"
+                loss = self._lose_message(channel_id, offset, problem)
+                loss.topics[topic] = None
                 return None
-        return Message(channel, head.log_time, head.publish_time, head.sequence, data)
+        return message
 
     def _channel(self, channel_id: int) -> Channel | None:
         """The channel with an id; from a doubtful summary only as a last resort."""
@@ -402,7 +400,7 @@ class _Chunk:
         if crc:
             with contextlib.suppress(DamageError):
                 content = unpack_chunk(body)
-                found = [(kind, part) for _, kind, part in chunk_records(content)]
+                found = list(chunk_records(content))
                 used = records + 8 + length
                 span = (start, end)
                 return cls(content, is_plain, records + 8, used, "", False, span, found)
@@ -427,11 +425,6 @@ def _message_count(statistics: mcap_records.Statistics | None) -> int | None:
         return None
     counts, total = statistics.channel_message_counts, int(statistics.message_count)
     return total if total == sum(counts.values()) else None
-
-
-def _key(message: bytes | memoryview) -> tuple[int, int]:
-    """Channel id and log time of a message, ns."""
-    return int.from_bytes(message[:2], "little"), int.from_bytes(message[6:_TIME_END], "little")
 
 
 # ---------------------------------------------------------------- the reader
@@ -467,13 +460,8 @@ class McapSalvage(FileSalvage):
         self._declared = Declared()
         self._summary = read_summary(path)
         self._read_header()
-        if not self._summary.is_verified:
-            return
-        for schema in self._summary.schemas.values():
-            self._declared.add_schema(schema)
-        for channel in self._summary.channels.values():
-            if not channel.schema_id or channel.schema_id in self._summary.schemas:
-                self._declared.add_channel(channel)
+        if self._summary.is_verified:
+            self._declared.add_summary(self._summary.schemas, self._summary.channels)
 
     def _read_header(self) -> None:
         with Window.of_file(self.path) as window:
