@@ -20,8 +20,7 @@ from rosbags.rosbag1 import Reader as BagReader
 
 from conftest import real
 from mp4ds.bags import protocols
-from mp4ds.bags.combined import MultiReader
-from mp4ds.bags.formats import open_reader, open_sources
+from mp4ds.bags.formats import MultiReader, open_reader, open_sources
 from mp4ds.bags.mcap import McapReader
 from mp4ds.errors import SourceError
 from mp4ds.records import (

@@ -24,7 +24,6 @@ import zstandard
 from conftest import DATA, real
 from damage import INJURIES, Key, Piece, all_messages, pieces_of, sound_messages
 from mp4ds import SourceError
-from mp4ds.bags.combined import bounded
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.salvage.losses import LossLog
 from mp4ds.format.manifest import LossEntry
@@ -37,6 +36,7 @@ from mp4ds.records import (
     Loss,
     Message,
     Record,
+    bounded,
 )
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2, write_split_bags
 

@@ -6,7 +6,7 @@ A ROS 1 connection and a rosbag2 topic are channels too (spec/index.md, "Channel
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from mp4ds.errors import counted
@@ -205,6 +205,36 @@ class Loss:
     start: int | None = None
     end: int | None = None
     frames: tuple[int, int] | None = None
+
+
+_MORE_PLACES = " more places that could not be read"
+
+
+def more_places(number: int) -> str:
+    """The problem of a loss that sums up others, of so many places."""
+    return f"{number}{_MORE_PLACES}"
+
+
+def bounded(losses: Sequence[Loss]) -> list[Loss]:
+    """Losses of several files; the last one sums up those beyond the limit."""
+    if len(losses) <= MAX_LOSSES:
+        return list(losses)
+    rest = losses[MAX_LOSSES - 1 :]
+    number = sum(_places(loss) for loss in rest)
+    counts = [loss.messages for loss in rest if loss.messages is not None]
+    more = Loss(
+        rest[0].file,
+        None,
+        sum(loss.size or 0 for loss in rest),
+        more_places(number),
+        sum(counts) if len(counts) == len(rest) else None,
+    )
+    return [*losses[: MAX_LOSSES - 1], more]
+
+
+def _places(loss: Loss) -> int:
+    number = loss.problem.removesuffix(_MORE_PLACES)
+    return int(number) if loss.problem.endswith(_MORE_PLACES) and number.isdecimal() else 1
 
 
 @dataclass(frozen=True, slots=True)

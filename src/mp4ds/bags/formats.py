@@ -1,15 +1,21 @@
-"""The table of recording formats."""
+"""Opening recordings: the table of their formats, and several read as one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from mp4ds.bags.combined import MultiReader
-from mp4ds.bags.protocols import BagReader, BagWriter
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.bags.protocols import BagReader, BagWriter, merged
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, read_bag_info
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.outputs import begins_with
@@ -19,26 +25,25 @@ from mp4ds.files.sources import (
     video_at,
 )
 from mp4ds.files.urls import remote
-from mp4ds.records import Channel, Message
+from mp4ds.records import (
+    EVERYTHING,
+    Channel,
+    ChannelStats,
+    Excerpt,
+    Loss,
+    Message,
+    Record,
+    Schema,
+    bounded,
+)
 
 # by name: each imports its library, and a recording has one format
-_READERS = {
-    "bag": "ros1:Ros1Reader",
-    "mcap": "mcap:McapReader",
-    "rosbag2": "rosbag2:Rosbag2Reader",
+_CLASSES = {
+    "bag": ("ros1:Ros1Reader", "salvage.ros1:Ros1Salvage", "ros1_writer:Ros1Writer"),
+    "mcap": ("mcap:McapReader", "salvage.mcap:McapSalvage", "mcap:McapWriter"),
+    "rosbag2": ("rosbag2:Rosbag2Reader", "salvage.rosbag2:Rosbag2Salvage", "rosbag2:Rosbag2Writer"),
 }
-_SALVAGERS = {
-    "bag": "salvage.ros1:Ros1Salvage",
-    "mcap": "salvage.mcap:McapSalvage",
-    "rosbag2": "salvage.rosbag2:Rosbag2Salvage",
-}
-
-
-_WRITERS = {
-    "bag": "ros1_writer:Ros1Writer",
-    "mcap": "mcap:McapWriter",
-    "rosbag2": "rosbag2:Rosbag2Writer",
-}
+_READER, _SALVAGE, _WRITER = range(3)
 
 
 def _class(name: str) -> Any:
@@ -105,7 +110,7 @@ def open_reader(path: Path) -> BagReader:
     Raises:
         SourceError: It cannot be read; says why, and what to do.
     """
-    reader: BagReader = _class(_READERS[format_of(path)])(path)
+    reader: BagReader = _class(_CLASSES[format_of(path)][_READER])(path)
     return reader
 
 
@@ -139,7 +144,7 @@ def open_sources(
         formats = {path: format_of(path) for path in paths}
 
         def opener(path: Path) -> BagReader:
-            reader: BagReader = _class(_SALVAGERS[formats[path]])(path, is_alone=is_alone)
+            reader: BagReader = _class(_CLASSES[formats[path]][_SALVAGE])(path, is_alone=is_alone)
             return reader
 
     return opener(paths[0]) if is_alone else MultiReader([partial(opener, path) for path in paths])
@@ -158,7 +163,7 @@ def limits_of(
     name = (
         "rosbag2_sqlite:SqliteWriter"
         if is_sqlite
-        else _WRITERS["bag" if target == "bag" else "mcap"]
+        else _CLASSES["bag" if target == "bag" else "mcap"][_WRITER]
     )
     writer: type[BagWriter] = _class(name)
     return writer.check_channel, writer.check_message
@@ -188,5 +193,184 @@ def open_writer(
     }
     if target not in options:
         raise OptionError(f"`to` {target!r} is not known. Use bag, rosbag2, mcap or images.")
-    writer: BagWriter = _class(_WRITERS[target])(path, **options[target])
+    writer: BagWriter = _class(_CLASSES[target][_WRITER])(path, **options[target])
     return writer
+
+
+# ---------------------------------------------------------------- several as one
+
+_NO_STATS = ChannelStats(0, 0, 0)
+_NO_TIMES = np.empty(0, np.int64)
+
+
+class CombinedReader(BagReader):
+    """Parts read as one recording.
+
+    Parts that follow one another are read one after another, and those that overlap are merged by
+    log time. Equal channels of several parts are one channel; those of one part stay separate.
+    """
+
+    def __init__(self) -> None:
+        self._channels: dict[tuple[tuple[object, ...], int], Channel] = {}
+        self._shared: dict[tuple[int, int], Channel] = {}
+        self._seen: Counter[tuple[int, tuple[object, ...]]] = Counter()
+        self._schemas: dict[Schema, None] = {}
+        self._skipped: Counter[str] = Counter()
+        self._losses: dict[int, Sequence[Loss]] = {}
+        self._done = 0
+        self._active: list[BagReader] = []
+
+    @property
+    @abstractmethod
+    def spans(self) -> Sequence[tuple[int, int]]:
+        """Of each part, bounds of its log times, nanoseconds."""
+
+    @abstractmethod
+    def _opened(self, number: int) -> AbstractContextManager[BagReader]:
+        """The reader of a part, for one use."""
+
+    def _declare(self, number: int, part: BagReader) -> None:
+        """Add everything a part declares."""
+        for channel in part.channels:
+            self._share(number, channel)
+        self._schemas.update(dict.fromkeys(part.unused_schemas))
+
+    def _share(self, number: int, channel: Channel) -> Channel:
+        """The recording's channel for one of a part."""
+        known = self._shared.get((number, channel.id))
+        if known:
+            return known
+        place = number, channel.identity
+        key = channel.identity, self._seen[place]
+        self._seen[place] += 1
+        shared = self._channels.setdefault(key, replace(channel, id=len(self._channels)))
+        self._shared[number, channel.id] = shared
+        return shared
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """Those of all parts."""
+        return list(self._channels.values())
+
+    @property
+    def unused_schemas(self) -> Sequence[Schema]:
+        """Definitions that no channel of any part refers to."""
+        used = {channel.schema for channel in self._channels.values()}
+        return [schema for schema in self._schemas if schema not in used]
+
+    @property
+    def skipped(self) -> Mapping[str, int]:
+        """Those of all parts."""
+        return self._skipped
+
+    @property
+    def losses(self) -> Sequence[Loss]:
+        """Those of all parts, in their order."""
+        return bounded([loss for number in sorted(self._losses) for loss in self._losses[number]])
+
+    @property
+    def position(self) -> int:
+        """Bytes of the parts that were read, and of those being read."""
+        return self._done + sum(part.position for part in self._active)
+
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
+        """Those of all parts, merged; only the parts that an excerpt needs are opened."""
+        self._done = 0
+        self._skipped.clear()
+        self._losses.clear()
+        if self.is_indexed:
+            return self._merged(excerpt)
+        # Otherwise, out-of-order messages would be merged differently in an excerpt.
+        return filter(excerpt.has, self._merged(EVERYTHING if excerpt.has_messages else excerpt))
+
+    def _merged(self, excerpt: Excerpt) -> Iterator[Record]:
+        needed = [
+            number
+            for number, span in enumerate(self.spans)
+            if excerpt.others or excerpt.touches(*span)
+        ]
+        starts = [self.spans[number][0] for number in needed]
+        return merged(starts, lambda place: self._records_of(needed[place], excerpt))
+
+    def _records_of(self, number: int, excerpt: Excerpt) -> Iterator[Record]:
+        with self._opened(number) as part:
+            self._declare(number, part)
+            self._active.append(part)
+            try:
+                for record in self._part_records(number, part, excerpt):
+                    if isinstance(record, Message):
+                        yield record.of_channel(self._share(number, record.channel))
+                    else:
+                        yield record
+            finally:
+                self._active.remove(part)
+            self._declare(number, part)
+            self._skipped.update(part.skipped)
+            self._losses[number] = part.losses
+            self._done += sum(file.stat().st_size for file in part.files)
+
+    def _part_records(self, number: int, part: BagReader, excerpt: Excerpt) -> Iterator[Record]:
+        del number
+        return part.records(excerpt)
+
+    def _stats(self) -> Mapping[int, ChannelStats]:
+        """Those of all parts; empty if they are unknown for one of them."""
+        total = {channel.id: _NO_STATS for channel in self.channels}
+        for number in range(len(self.spans)):
+            with self._opened(number) as part:
+                stats = part.stats()
+                if not stats and (part.channels or not part.is_indexed):
+                    return {}
+                for channel in part.channels:
+                    shared = self._share(number, channel).id
+                    total[shared] = total[shared].plus(stats.get(channel.id, _NO_STATS))
+        return total
+
+    def _times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Those of all parts."""
+        found: dict[int, list[NDArray[np.int64]]] = {}
+        for number in range(len(self.spans)):
+            with self._opened(number) as part:
+                times = part.times()
+                for channel in part.channels:
+                    shared = self._share(number, channel).id
+                    found.setdefault(shared, []).append(times.get(channel.id, _NO_TIMES))
+        return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
+
+    def close(self) -> None:
+        """Close the parts that are being read."""
+        for part in self._active:
+            part.close()
+
+
+class MultiReader(CombinedReader):
+    """A split recording, or recordings made side by side.
+
+    Args:
+        openers: Each opens one part; a part is open only while it is read.
+    """
+
+    is_indexed: bool = True
+    spans: Sequence[tuple[int, int]] = ()
+
+    def __init__(self, openers: Sequence[Callable[[], BagReader]]) -> None:
+        super().__init__()
+        self._openers = openers
+        spans, files = [], []
+        for number in range(len(openers)):
+            with self._opened(number) as part:
+                if number == 0:
+                    self.path, self.format = part.path, part.format
+                    self.profile, self.library = part.profile, part.library
+                elif part.profile != self.profile:
+                    self.profile = ""
+                self.is_indexed &= part.is_indexed
+                files.append(part.files)
+                self._declare(number, part)
+                spans.append(part.span or (0, 2**63))
+        self.spans = spans
+        in_time = sorted(range(len(spans)), key=lambda number: spans[number][0])
+        self.files = [file for number in in_time for file in files[number]]
+
+    def _opened(self, number: int) -> BagReader:
+        return self._openers[number]()

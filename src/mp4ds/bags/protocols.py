@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,7 +157,12 @@ class BagReader(ABC):
 
     def first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None."""
-        return self._first(channel) if self.slice is _WHOLE else BagReader._first(self, channel)
+        if not self.is_indexed:
+            return self._first_messages.get(channel.id)
+        for record in self.records(Excerpt(topics=frozenset([channel.topic]), others=False)):
+            if isinstance(record, Message) and record.channel.id == channel.id:
+                return with_own_payload(record)
+        return None
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -177,24 +182,15 @@ class BagReader(ABC):
         """`stats` of the whole recording."""
         return stats_of(self.times()) if self.is_indexed else {}
 
-    def _first(self, channel: Channel) -> Message | None:
-        """`first` of the whole recording."""
-        if not self.is_indexed:
-            return self._first_messages.get(channel.id)
-        start = self._first_times.get(channel.id)
-        if start is None:
-            return None
-        end = start + 1 if start < _INT64_MAX else None  # it may be later: it was clamped
-        only = Excerpt(start, end, frozenset([channel.topic]), others=False)
-        return first_of(self.records(only)).get(channel.id)
-
-    @cached_property
-    def _first_times(self) -> Mapping[int, int]:
-        return {key: int(times[0]) for key, times in self.times().items() if len(times)}
-
     @cached_property
     def _first_messages(self) -> Mapping[int, Message]:
-        return first_of(self.records())
+        first: dict[int, Message] = {}
+        for record in self.records():
+            if isinstance(record, Message):
+                known = first.get(record.channel.id)
+                if known is None or record.log_time < known.log_time:
+                    first[record.channel.id] = with_own_payload(record)
+        return first
 
     @cached_property
     def _sliced_times(self) -> Mapping[int, NDArray[np.int64]]:
@@ -387,40 +383,30 @@ class LaterStarts:
         return self._starts[place] if place < len(self._starts) else None
 
 
-class SourcePart(NamedTuple):
-    """One of several sources read as one.
-
-    Attributes:
-        start: A lower bound of its messages' log times, nanoseconds.
-        records: Starts reading it.
-    """
-
-    start: int
-    records: Callable[[], Iterator[Record]]
-
-
-def merged(parts: Sequence[SourcePart]) -> Iterator[Record]:
+def merged(
+    starts: Sequence[int], records_of: Callable[[int], Iterator[Record]]
+) -> Iterator[Record]:
     """Several sources merged in log-time order, each opened when it is needed.
 
-    Ties come in the order of `parts`. Attachments and metadata records do not wait.
+    Ties come in the order of the sources. Attachments and metadata records do not wait.
 
     Args:
-        parts: Each in log-time order; a part that is not is passed on in its own order.
+        starts: Of each source, a lower bound of its log times, nanoseconds.
+        records_of: Reads the source of a number, in log-time order; one that is not is passed on
+            in its own order.
     """
-    waiting = sorted(
-        range(len(parts)), key=lambda number: (parts[number].start, number), reverse=True
-    )
+    waiting = sorted(range(len(starts)), key=lambda number: (starts[number], number), reverse=True)
     heads: list[tuple[int, int, Message, Iterator[Record]]] = []
 
     def is_next(time: int, number: int) -> bool:
-        if waiting and parts[waiting[-1]].start <= time:
+        if waiting and starts[waiting[-1]] <= time:
             return False
         return not heads or (time, number) < heads[0][:2]
 
     while waiting or heads:
-        if waiting and (not heads or parts[waiting[-1]].start <= heads[0][0]):
+        if waiting and (not heads or starts[waiting[-1]] <= heads[0][0]):
             number = waiting.pop()
-            records = parts[number].records()
+            records = records_of(number)
         else:
             _, number, message, records = heapq.heappop(heads)
             yield message
@@ -456,17 +442,6 @@ def stats_of(times: Mapping[int, NDArray[np.int64]]) -> dict[int, ChannelStats]:
         key: ChannelStats(len(found), *(map(int, found[[0, -1]]) if len(found) else (0, 0)))
         for key, found in times.items()
     }
-
-
-def first_of(records: Iterable[Record]) -> dict[int, Message]:
-    """The first message of each channel by log time, by channel id."""
-    first: dict[int, Message] = {}
-    for record in records:
-        if isinstance(record, Message):
-            known = first.get(record.channel.id)
-            if known is None or record.log_time < known.log_time:
-                first[record.channel.id] = with_own_payload(record)
-    return first
 
 
 def with_own_payload(message: Message) -> Message:

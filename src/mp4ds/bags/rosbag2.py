@@ -11,7 +11,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from mp4ds.bags.combined import CombinedReader
 from mp4ds.bags.files import (
     SALVAGE,
     ZSTD_MAGIC,
@@ -20,6 +19,7 @@ from mp4ds.bags.files import (
     open_source,
     unzstd,
 )
+from mp4ds.bags.formats import CombinedReader
 from mp4ds.bags.mcap import McapReader, McapWriter
 from mp4ds.bags.mcap_records import MAGIC as MCAP_MAGIC
 from mp4ds.bags.protocols import BagReader, BagWriter

@@ -455,15 +455,6 @@ class SqliteReader(BagReader):
                 times.setdefault(topic_id, array("q")).append(timestamp)
         return {key: np.sort(np.array(values, np.int64)) for key, values in times.items()}
 
-    def _first(self, channel: Channel) -> Message | None:
-        """The channel's first message by log time, or None."""
-        with self._opened() as tables:
-            row = tables.select(
-                "SELECT id FROM messages WHERE topic_id = ? ORDER BY timestamp, id LIMIT 1",
-                (channel.id,),
-            ).fetchone()
-            return self._message(tables, row[0], "the first message") if row else None
-
 
 def _conditions(excerpt: Excerpt) -> Iterator[tuple[str, list[int]]]:
     """The condition of each query for an excerpt's span, and its parameters.

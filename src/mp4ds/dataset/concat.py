@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.combined import bounded
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import in_span, write_record
 from mp4ds.dataset.channels import by_time
@@ -54,6 +53,7 @@ from mp4ds.records import (
     Channel,
     Excerpt,
     Message,
+    bounded,
 )
 
 Integers = NDArray[np.int64]

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mp4ds._version import __version__
-from mp4ds.bags.combined import bounded
 from mp4ds.bags.protocols import BagReader, BagWriter, Format
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, SourceError, advising
@@ -39,7 +38,7 @@ from mp4ds.messages.png import zlib_build
 from mp4ds.messages.transforms import Transform
 from mp4ds.packing.options import PackSummary, TopicSummary
 from mp4ds.plan import LOSSLESS
-from mp4ds.records import EVERYTHING, Channel, Excerpt, Loss
+from mp4ds.records import EVERYTHING, Channel, Excerpt, Loss, bounded
 from mp4ds.video.encoder import tool_versions
 
 

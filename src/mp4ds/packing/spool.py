@@ -16,7 +16,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import IO, Literal
 
-from mp4ds.bags.combined import bounded
 from mp4ds.bags.mcap_records import copy_verified
 from mp4ds.bags.protocols import Format
 from mp4ds.dataset.checks import validate
@@ -30,7 +29,7 @@ from mp4ds.format.manifest import About, LossEntry
 from mp4ds.packing.manifest import dataset_files, summary_of
 from mp4ds.packing.options import PackOptions, PackSummary
 from mp4ds.plan import SPEED
-from mp4ds.records import Loss
+from mp4ds.records import Loss, bounded
 
 _NAME = re.compile(r"([0-9]{6})(\.mcap)?")
 _ONE_PASS = 10_000_000  # frames of a window: a piece is not divided again

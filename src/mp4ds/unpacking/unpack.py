@@ -11,7 +11,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from mp4ds.bags.combined import bounded
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.protocols import BagWriter, begun_by, in_span
@@ -41,6 +40,7 @@ from mp4ds.records import (
     Loss,
     Message,
     MetadataRecord,
+    bounded,
 )
 from mp4ds.unpacking.image_folders import TopicImages, image_names, topic_images
 from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary

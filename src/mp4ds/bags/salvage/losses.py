@@ -11,12 +11,20 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from mp4ds.bags.combined import MORE_LOSSES
 from mp4ds.bags.files import DECOMPRESSED, DamageError, OversizeError
 from mp4ds.bags.protocols import BagReader, HoldBack
 from mp4ds.bags.salvage.scan import MAX_UNPROVEN, Framing, RecordFrame, Scan, Window
 from mp4ds.errors import SourceError
-from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Channel, Excerpt, Loss, Message, Record
+from mp4ds.records import (
+    MAX_LOSSES,
+    MAX_LOST_TOPICS,
+    Channel,
+    Excerpt,
+    Loss,
+    Message,
+    Record,
+    more_places,
+)
 
 
 @dataclass(eq=False)
@@ -121,7 +129,7 @@ class LossLog:
         if not self._more:
             self._more.append(Draft(None, 0, ""))
         more = self._more[0]
-        more.problem = f"{self._number_more}{MORE_LOSSES}"
+        more.problem = more_places(self._number_more)
         more.size = (more.size or 0) + (draft.size or 0)
         return more
 

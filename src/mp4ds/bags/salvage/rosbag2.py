@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.combined import bounded
 from mp4ds.bags.files import (
     ZSTD_MAGIC,
     DamageError,
@@ -26,7 +25,7 @@ from mp4ds.bags.rosbag2_sqlite import SqliteReader, Tables, open_tables
 from mp4ds.bags.salvage.losses import FileSalvage, LossLog, lost_by
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.errors import Refused, SourceError, SourceNotFoundError
-from mp4ds.records import Channel, Excerpt, Loss, Message, Record, Schema
+from mp4ds.records import Channel, Excerpt, Loss, Message, Record, Schema, bounded
 
 _RECOVER = (
     "Its tables may be found page by page: `sqlite3 FILE .recover | sqlite3 NEW.db3`, then give "
@@ -227,9 +226,7 @@ class Rosbag2Salvage(Rosbag2Reader):
     """
 
     is_indexed = False
-    # by reading everything, which no damage stops
-    _times = BagReader._times
-    _first = BagReader._first
+    _times = BagReader._times  # by reading everything, which no damage stops
 
     def __init__(self, path: Path, *, is_alone: bool = True) -> None:
         self._is_alone = is_alone
