@@ -6,9 +6,9 @@ import gc
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -46,84 +46,22 @@ if hasattr(os, "register_at_fork"):
 
 
 @dataclass(frozen=True, slots=True)
-class TensorView:
-    """How a camera's frames are wanted.
-
-    Attributes:
-        format: One of `mp4ds.dataset.views.FORMATS`.
-        resize: Factor, or width and height, pixels.
-        crop: x, y, width, height, pixels, applied before it.
-    """
-
-    format: str = "rgb"
-    resize: Resize | None = None
-    crop: Crop | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Pictures:
     """How the frames of all cameras become tensors.
 
     Attributes:
-        views: The view of each camera, in the order of the topics.
+        views: Format, size and crop of each camera, as `Topic.read` takes them.
         dtype: ``native``, ``uint8`` or ``float32``.
         channels_first: (C, H, W) instead of (H, W, C).
         backend: The decoding backend.
         device: Where the tensors are.
     """
 
-    views: tuple[TensorView, ...]
+    views: tuple[dict[str, Any], ...]
     dtype: str
     channels_first: bool
     backend: str
     device: str
-
-    def tensor(self, pixels: Tensor, topic: str, format_name: str) -> Tensor:
-        """The tensor of frames: a view if no computation is needed.
-
-        Args:
-            pixels: Shape (N, H, W) or (N, H, W, C).
-            topic: For errors.
-            format_name: Format of the pixels.
-
-        Returns:
-            Shape (N, C, H, W), or (N, H, W, C).
-
-        Raises:
-            OptionError: They are not bytes, but ``uint8`` was requested.
-        """
-        if pixels.ndim == 3:
-            pixels = pixels.unsqueeze(-1)
-        self.check(pixels.dtype, topic)
-        if self.dtype == "float32":
-            pixels = _floats(pixels, scaled=format_name != "native")
-        return self.arranged(pixels)
-
-    def check(self, dtype: torch.dtype, topic: str) -> None:
-        """Refuse pixels that are not bytes, if ``uint8`` was requested.
-
-        Raises:
-            OptionError: They are not.
-        """
-        if self.dtype == "uint8" and dtype != torch.uint8:
-            kind = str(dtype).removeprefix("torch.")
-            raise OptionError(
-                f"topic {topic}: has frames of {kind}, not uint8. Give dtype='native' to get them "
-                "as stored, or dtype='float32'."
-            )
-
-    def arranged(self, pixels: Tensor) -> Tensor:
-        """Pixels of shape (..., H, W, C) with the channels in the requested place; a view."""
-        return pixels.movedim(-1, -3) if self.channels_first else pixels
-
-
-def _floats(pixels: Tensor, *, scaled: bool, out: Tensor | None = None) -> Tensor:
-    """Pixels as float32, in a new tensor or in `out`."""
-    if out is None:
-        out = torch.empty(pixels.shape, dtype=torch.float32)
-    if not scaled or pixels.dtype.is_floating_point:
-        return out.copy_(pixels)
-    return torch.div(pixels, torch.iinfo(pixels.dtype).max, out=out)
 
 
 def pictures_from(
@@ -153,15 +91,17 @@ def pictures_from(
     for topic, size in zip(topics, sizes, strict=True):
         if size is not None:  # now, rather than in a worker
             size_after(topic, (1, 1), size)
-    views = tuple(map(TensorView, formats, sizes, crops))
+    views = tuple(
+        {"format": one, "resize": size, "crop": area}
+        for one, size, area in zip(formats, sizes, crops, strict=True)
+    )
     if backend == "mp4ds" and device != "cpu":
         raise OptionError(f"device={device!r} needs backend='torchcodec'.")
-    if backend == "torchcodec":
-        for view in views:
-            if view.format != "rgb" or view.resize is not None:
-                raise OptionError(
-                    "backend='torchcodec' only gives format='rgb' without resize; use a transform."
-                )
+    is_changed = any(view["format"] != "rgb" or view["resize"] is not None for view in views)
+    if backend == "torchcodec" and is_changed:
+        raise OptionError(
+            "backend='torchcodec' only gives format='rgb' without resize; use a transform."
+        )
     return Pictures(views, dtype, channels_first, backend, device)
 
 
@@ -236,7 +176,9 @@ class Recording:
         return rows if self.matches is None else self.matches[rows, camera]
 
 
-class Collection:
+def recordings_of(
+    paths: Paths, topics: Sequence[str] | None, tolerance_ns: int
+) -> tuple[tuple[str, ...], list[Recording]]:
     """The samples of several datasets, one after another.
 
     For a dataset with one camera only the manifest is read; to match several cameras, also their
@@ -245,65 +187,53 @@ class Collection:
     Args:
         paths: The datasets, or folders of them.
         topics: Topics or names of streams; None: those of the first dataset. All must have them.
-        sync_tolerance_ns: Maximum distance of the header stamps of a match, nanoseconds.
+        tolerance_ns: Maximum distance of the header stamps of a match, nanoseconds.
+
+    Returns:
+        The topics, and the datasets.
 
     Raises:
         OptionError: A topic does not exist, or there are no samples.
         FormatError: A manifest or sidecar breaks a rule of the format.
         SourceError: A path is not a dataset.
     """
+    if not isinstance(paths, (str, Path)) and not list(paths):
+        raise OptionError("There are no datasets: the list of paths is empty.")
+    if isinstance(topics, str):
+        raise OptionError(f"topics is a list of topics, such as [{topics!r}].")
+    if tolerance_ns < 0:
+        raise OptionError(f"sync_tolerance_ns is {tolerance_ns}, but must not be negative.")
+    if topics is not None and not topics:
+        raise OptionError("topics is empty; use None for all cameras of the first dataset.")
+    given = datasets_in(paths)
+    known = _sources(given[0])
+    chosen = tuple(topics) if topics is not None else tuple(source.topic for source in known)
+    _check_topics(chosen, given[0])
+    recordings = [
+        _recording(path, known if number == 0 else _sources(path), chosen, tolerance_ns)
+        for number, path in enumerate(given)
+    ]
+    if not any(recording.rows for recording in recordings):
+        raise OptionError(
+            f"{given[0]}: no frames of {', '.join(chosen)} have header stamps within "
+            f"{tolerance_ns} ns of each other. Use a larger sync_tolerance_ns, or one "
+            f"camera: topics=[{chosen[0]!r}]."
+        )
+    return chosen, recordings
 
-    def __init__(
-        self, paths: Paths, *, topics: Sequence[str] | None, sync_tolerance_ns: int
-    ) -> None:
-        if not isinstance(paths, (str, Path)) and not list(paths):
-            raise OptionError("There are no datasets: the list of paths is empty.")
-        if isinstance(topics, str):
-            raise OptionError(f"topics is a list of topics, such as [{topics!r}].")
-        if sync_tolerance_ns < 0:
-            raise OptionError(
-                f"sync_tolerance_ns is {sync_tolerance_ns}, but must not be negative."
-            )
-        if topics is not None and not topics:
-            raise OptionError("topics is empty; use None for all cameras of the first dataset.")
-        given = datasets_in(paths)
-        known = _sources(given[0])
-        self.topics = tuple(topics) if topics is not None else tuple(s.topic for s in known)
-        _check_topics(self.topics, given[0])
-        self.recordings = [
-            self._recording(path, known if number == 0 else _sources(path), sync_tolerance_ns)
-            for number, path in enumerate(given)
-        ]
-        if not self.starts[-1]:
-            raise OptionError(
-                f"{given[0]}: no frames of {', '.join(self.topics)} have header stamps within "
-                f"{sync_tolerance_ns} ns of each other. Use a larger sync_tolerance_ns, or one "
-                f"camera: topics=[{self.topics[0]!r}]."
-            )
 
-    @cached_property
-    def starts(self) -> NDArray[np.int64]:
-        """Number of the first sample of each recording, and of the end; int64."""
-        return np.cumsum([0, *(recording.rows for recording in self.recordings)], dtype=np.int64)
-
-    def locate(self, samples: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Recording and row of each sample number, 0 <= number < ``starts[-1]``."""
-        recordings = np.searchsorted(self.starts, samples, side="right") - 1
-        return recordings.astype(np.int64), samples - self.starts[recordings]
-
-    def _recording(
-        self, path: Path | str, sources: list[CameraSource], tolerance_ns: int
-    ) -> Recording:
-        chosen = tuple(_choose(sources, topic, path) for topic in self.topics)
-        if len(chosen) == 1:
-            return Recording(str(path), chosen, None, {chosen[0].topic: np.empty(0, np.int64)})
-        stamps = {}
-        for topic, source in zip(self.topics, chosen, strict=True):
-            stream = open_source(source)
+def _recording(
+    path: Path, known: list[CameraSource], topics: Sequence[str], tolerance_ns: int
+) -> Recording:
+    sources = tuple(_choose(known, topic, path) for topic in topics)
+    if len(sources) == 1:
+        return Recording(str(path), sources, None, {sources[0].topic: np.empty(0, np.int64)})
+    stamps = {}
+    for topic, source in zip(topics, sources, strict=True):
+        with closing(open_source(source)) as stream:
             stamps[topic] = stream.stamps
-            stream.close()
-        sync = synchronize(stamps, tolerance_ns=tolerance_ns)
-        return Recording(str(path), chosen, sync.indices, sync.unmatched)
+    sync = synchronize(stamps, tolerance_ns=tolerance_ns)
+    return Recording(str(path), sources, sync.indices, sync.unmatched)
 
 
 def open_source(source: CameraSource) -> Topic:
@@ -376,37 +306,29 @@ class OpenCamera:
 
     Args:
         source: Which.
-        view: How its frames are wanted.
+        view: How its frames are wanted, as in `Pictures.views`.
         pictures: How they become tensors.
 
     Raises:
         FormatError: The stream breaks a rule of the format.
     """
 
-    def __init__(self, source: CameraSource, view: TensorView, pictures: Pictures) -> None:
-        self.source = source
+    def __init__(self, source: CameraSource, view: dict[str, Any], pictures: Pictures) -> None:
+        self._source = source
         self._view = view
         self._pictures = pictures
-        self.topic = open_source(source)
-        if len(self.topic) != source.frames:
-            raise FormatError(
-                "frame-count",
-                source.place,
-                f"has {len(self.topic)} frames, not {source.frames}",
-            )
+        self._topic = open_source(source)
+        if len(self._topic) != source.frames:
+            problem = f"has {len(self._topic)} frames, not {source.frames}"
+            raise FormatError("frame-count", source.place, problem)
         self._torchcodec = None
         if pictures.backend == "torchcodec":
-            self._torchcodec = TorchcodecReader(self.topic, view.crop, pictures.device)
-        self._options: dict[str, Any] = {
-            "format": view.format,
-            "resize": view.resize,
-            "crop": view.crop,
-        }
+            self._torchcodec = TorchcodecReader(self._topic, view["crop"], pictures.device)
 
     @property
     def stamps(self) -> NDArray[np.int64]:
         """Header stamps, nanoseconds, by frame."""
-        return self.topic.stamps
+        return self._topic.stamps
 
     @cached_property
     def _order(self) -> NDArray[np.intp]:
@@ -430,110 +352,90 @@ class OpenCamera:
         Raises:
             VideoError: The video's index is damaged.
         """
-        path = self.topic.parts[0].video_path
+        path = self._topic.parts[0].video_path
         try:
             with path.open("rb") as file:
                 table = read_sample_table(file, path.stat().st_size, str(path))
         except Refused:
-            return np.arange(len(self.topic), dtype=np.int64)
+            return np.arange(len(self._topic), dtype=np.int64)
         except OSError as error:
             raise VideoError("file-missing", path, f"cannot be read: {error.strerror}") from None
         keys = np.flatnonzero(table.sync[table.order])
         return np.union1d(0, keys).astype(np.int64)  # a slice may begin between two
 
-    def read(self, frames: NDArray[np.int64]) -> Tensor:
-        """Frames as a tensor, decoded in one pass.
+    def empty(self, *shape: int) -> Tensor:
+        """A tensor for frames.
 
         Args:
-            frames: Numbers, shape (N,), in any order.
+            *shape: Leading dimensions.
 
         Returns:
-            Shape (N, C, H, W) or (N, H, W, C); its own memory.
+            Shape (*shape, H, W, C).
+
+        Raises:
+            OptionError: The frames cannot be returned as requested.
+        """
+        like = self._pixels([])
+        if self._pictures.dtype == "uint8" and like.dtype != torch.uint8:
+            kind = str(like.dtype).removeprefix("torch.")
+            raise OptionError(
+                f"topic {self._source.topic}: has frames of {kind}, not uint8. Give "
+                "dtype='native' to get them as stored, or dtype='float32'."
+            )
+        dtype = torch.float32 if self._pictures.dtype == "float32" else like.dtype
+        return like.new_empty((*shape, *like.shape[1:3], *(like.shape[3:] or (1,))), dtype=dtype)
+
+    def read(self, frames: Sequence[int], outs: Sequence[Tensor]) -> None:
+        """Decode frames in one pass.
+
+        Args:
+            frames: Numbers, in any order.
+            outs: For each frame a row of a tensor from `empty`, shape (H, W, C).
 
         Raises:
             SampleError: One of them cannot be decoded.
             OptionError: They cannot be returned as requested.
         """
-        numbers: list[int] = frames.tolist()
-        pixels = self._decoded(numbers, lambda: self._read(numbers))
-        return self._pictures.tensor(pixels, self.source.topic, self._view.format)
-
-    def _read(self, numbers: list[int]) -> Tensor:
-        """Pixels of frames, shape (N, H, W) or (N, H, W, C)."""
-        if self._torchcodec is not None:
-            return self._torchcodec.read(numbers)
-        return torch.from_numpy(self.topic.read(numbers, **self._options))  # shares the memory
-
-    def empty(self, shape: tuple[int, ...]) -> Tensor | None:
-        """A tensor for frames, such as `read_into` takes.
-
-        Args:
-            shape: Leading dimensions.
-
-        Returns:
-            Shape (*shape, H, W, C); None if frames cannot be decoded into existing tensors.
-
-        Raises:
-            OptionError: The frames cannot be returned as requested.
-        """
-        if self._torchcodec is not None:
-            return None
-        row = self._read([])
-        self._pictures.check(row.dtype, self.source.topic)
-        dtype = torch.float32 if self._pictures.dtype == "float32" else row.dtype
-        channels = row.shape[3:] or (1,)
-        return torch.empty((*shape, *row.shape[1:3], *channels), dtype=dtype)
-
-    def read_into(self, frames: NDArray[np.int64], outs: Sequence[Tensor]) -> None:
-        """Decode frames into existing tensors in one pass.
-
-        Args:
-            frames: Numbers, shape (N,), in any order.
-            outs: For each frame a row of a tensor from `empty`, shape (H, W, C).
-
-        Raises:
-            SampleError: One of them cannot be decoded.
-        """
-        numbers: list[int] = frames.tolist()
-        if self._pictures.dtype == "float32":
-            pixels = self._decoded(numbers, lambda: self._read(numbers))
-            for row, out in zip(pixels, outs, strict=True):
-                _floats(row.view(out.shape), scaled=self._view.format != "native", out=out)
-            return
-        is_grey = outs[0].shape[-1] == 1
-        # arrays share the memory of tensors
-        rows = [(out.squeeze(-1) if is_grey else out).numpy() for out in outs]
-        self._decoded(numbers, lambda: self.topic.read_into(numbers, rows, **self._options))
-
-    def _decoded(self, numbers: list[int], decode: Callable[[], _T]) -> _T:
         try:
-            return decode()
+            self._read(frames, outs)
         except OptionError:
             raise
         except Mp4dsError as error:
-            raise self._first_failure(numbers, error) from None
+            raise self._first_failure(frames, error) from None
 
-    def _first_failure(self, numbers: list[int], error: Mp4dsError) -> Mp4dsError:
+    def _read(self, frames: Sequence[int], outs: Sequence[Tensor]) -> None:
+        if self._torchcodec is None and self._pictures.dtype != "float32":
+            # arrays share the memory of tensors; those of grey images have no channels
+            rows = [(out.squeeze(-1) if out.shape[-1] == 1 else out).numpy() for out in outs]
+            self._topic.read_into(frames, rows, **self._view)
+            return
+        for pixels, out in zip(self._pixels(frames), outs, strict=True):
+            shaped = pixels.view(out.shape)
+            is_scaled = self._pictures.dtype == "float32" and self._view["format"] != "native"
+            if pixels.dtype.is_floating_point or not is_scaled:
+                out.copy_(shaped)
+            else:
+                torch.div(shaped, torch.iinfo(pixels.dtype).max, out=out)
+
+    def _pixels(self, frames: Sequence[int]) -> Tensor:
+        """Frames as decoded, shape (N, H, W) or (N, H, W, C)."""
+        if self._torchcodec is not None:
+            return self._torchcodec.read(frames)
+        return torch.from_numpy(self._topic.read(frames, **self._view))  # shares the memory
+
+    def _first_failure(self, frames: Sequence[int], error: Mp4dsError) -> SampleError:
         """Which frame failed, since an error about many does not always say."""
-        for number in sorted(set(numbers)):
+        for number in sorted(set(frames)):
             try:
-                self._read([number])
+                self._pixels([number])
             except Mp4dsError as its:
                 return SampleError(f"frame {number}: {its}")
-        return SampleError(f"one of {len(numbers)} frames: {error}")
+        return SampleError(f"one of {len(frames)} frames: {error}")
 
     def close(self) -> None:
         """Close the video."""
         self._torchcodec = None
-        self.topic.close()
-
-
-@dataclass(slots=True)
-class _Cameras:
-    """The open cameras of one process by place, used by one thread at a time."""
-
-    lock: threading.RLock = field(default_factory=threading.RLock)
-    by_place: OrderedDict[str, OpenCamera] = field(default_factory=OrderedDict)
+        self._topic.close()
 
 
 class OpenCameras:
@@ -553,18 +455,11 @@ class OpenCameras:
     def __init__(self, most: int, pictures: Pictures) -> None:
         self._most = most
         self._pictures = pictures
-        # what a parent opened is kept as it is: closing or freeing its decoders could hang
-        self._processes: dict[int, _Cameras] = {}
+        # by process: what a parent opened is kept as it is, since closing or freeing its decoders
+        # could hang, and its lock may be held by a thread that a fork did not copy
+        self._opened: dict[int, tuple[threading.RLock, OrderedDict[str, OpenCamera]]] = {}
         if most < 1:
             raise OptionError(f"cache_files is {most}, but must be at least 1.")
-
-    @property
-    def _own(self) -> _Cameras:
-        process = os.getpid()
-        return self._processes.get(process) or self._processes.setdefault(process, _Cameras())
-
-    def __len__(self) -> int:
-        return len(self._own.by_place)
 
     @contextmanager
     def using(self, recording: Recording, camera: int) -> Iterator[OpenCamera]:
@@ -573,28 +468,28 @@ class OpenCameras:
         Raises:
             FormatError: It breaks a rule of the format.
         """
-        own = self._own
-        with own.lock:
+        lock, opened = self._opened.setdefault(os.getpid(), (threading.RLock(), OrderedDict()))
+        with lock:
             source = recording.sources[camera]
-            found = own.by_place.pop(source.place, None)
+            found = opened.pop(source.place, None)
             if found is None:
-                while len(own.by_place) >= self._most:
-                    own.by_place.popitem(last=False)[1].close()
+                while len(opened) >= self._most:
+                    opened.popitem(last=False)[1].close()
                 found = OpenCamera(source, self._pictures.views[camera], self._pictures)
-            own.by_place[source.place] = found
+            opened[source.place] = found
             yield found
 
     def close(self) -> None:
         """Close the cameras of this process."""
-        own = self._processes.get(os.getpid())
-        if own is not None:
-            with own.lock:
-                while own.by_place:
-                    own.by_place.popitem()[1].close()
+        if os.getpid() in self._opened:
+            lock, opened = self._opened[os.getpid()]
+            with lock:
+                while opened:
+                    opened.popitem()[1].close()
 
     def __del__(self) -> None:
         # a decoder left to the garbage collector may be collected in a forked process
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_processes": {}}
+        return {**self.__dict__, "_opened": {}}

@@ -15,19 +15,18 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
-from mp4ds.errors import Mp4dsError, OptionError, SampleError, absent
+from mp4ds.errors import Mp4dsError, OptionError, SampleError, absent, counted
 from mp4ds.torch.cameras import (
     Backend,
-    Collection,
     Crop,
     Dtype,
     OpenCamera,
     OpenCameras,
     Paths,
-    Pictures,
     Recording,
     Resize,
     pictures_from,
+    recordings_of,
 )
 
 Unit = Literal["frames", "seconds"]
@@ -111,44 +110,6 @@ Sample = dict[str, Any]
 Transform = Callable[[Sample], Any]
 
 
-class Batch:
-    """Tensors whose rows are the samples of a batch, so that collating copies nothing.
-
-    Args:
-        samples: Number of samples.
-        frames: Frames per sample.
-        shared: Whether other processes need access.
-    """
-
-    def __init__(self, samples: int, frames: int, *, shared: bool) -> None:
-        self._shape = (samples, frames)
-        self._shared = shared
-        self._tensors: dict[int, torch.Tensor] = {}
-
-    def tensor_for(self, camera: OpenCamera, number: int) -> torch.Tensor | None:
-        """The tensor of a camera, by its number, of shape (samples, frames, H, W, C).
-
-        Returns:
-            None if frames of this recording cannot be decoded into one.
-        """
-        found = camera.empty((0, 0))
-        if found is None:
-            return None
-        if number not in self._tensors:
-            self._tensors[number] = self._empty(found)
-        known = self._tensors[number]
-        alike = (known.shape[2:], known.dtype) == (found.shape[2:], found.dtype)
-        return known if alike else None
-
-    def _empty(self, like: torch.Tensor) -> torch.Tensor:
-        shape = (*self._shape, *like.shape[2:])
-        if not self._shared:
-            return like.new_empty(shape)
-        # as torch's own collate does in a worker
-        storage = torch.UntypedStorage._new_shared(prod(shape) * like.itemsize)
-        return like.new_empty(0).set_(storage, 0, shape)
-
-
 def _whole(rows: Sequence[Any]) -> Any:
     """The tensor whose rows these are, in order; a new one if they are not."""
     first = rows[0]
@@ -170,33 +131,57 @@ def _kind(row: torch.Tensor) -> tuple[object, ...]:
     return row.untyped_storage().data_ptr(), row.dtype, row.device, row.shape, row.stride()
 
 
-class SampleReader:
-    """Reads the samples of a collection.
+class Samples:
+    """The samples of several datasets, one after another.
 
     Args:
-        collection: The samples.
-        pictures: How their frames become tensors.
+        paths: The datasets, or folders of them.
+        topics: The cameras; None: those of the first dataset.
+        sync_tolerance_ns: Maximum distance of the header stamps of a match, nanoseconds.
         offsets: Which frames a sample has.
         transform: Applied to each sample; None for nothing.
         cache_files: Maximum number of open videos.
+        **view: How frames become tensors: the arguments of `pictures_from`.
 
     Raises:
-        OptionError: `cache_files` is less than one.
+        OptionError: An option is wrong, a topic does not exist, or there are no samples.
+        FormatError: A manifest or sidecar breaks a rule of the format.
+        SourceError: A path is not a dataset.
     """
 
     def __init__(
         self,
-        collection: Collection,
-        pictures: Pictures,
+        paths: Paths,
+        topics: Sequence[str] | None,
+        *,
+        sync_tolerance_ns: int,
         offsets: Offsets,
         transform: Transform | None,
         cache_files: int,
+        **view: Any,
     ) -> None:
-        self._collection = collection
+        self.topics, self.recordings = recordings_of(paths, topics, sync_tolerance_ns)
+        starts = np.cumsum([0, *(recording.rows for recording in self.recordings)])
+        self._starts: NDArray[np.int64] = starts.astype(np.int64)
         self._offsets = offsets
         self._transform = transform
-        self._pictures = pictures
-        self.cameras = OpenCameras(cache_files, pictures)
+        self._pictures = pictures_from(self.topics, **view)
+        self._cameras = OpenCameras(cache_files, self._pictures)
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    def describe(self, owner: object) -> str:
+        """Its line for the `repr` of an owner."""
+        count = len(self.recordings)
+        return (
+            f"<{type(owner).__name__}: {len(self)} samples of {counted(count, 'dataset')}, "
+            f"{', '.join(self.topics)}>"
+        )
+
+    def number(self, recording: int, row: int) -> int:
+        """Number of a sample by its recording and row."""
+        return int(self._starts[recording]) + row
 
     def key_frames(self, number: int) -> NDArray[np.int64]:
         """Numbers of the key frames of a recording's first camera, in order.
@@ -204,97 +189,101 @@ class SampleReader:
         Raises:
             SampleError: Its video cannot be read.
         """
-        recording = self._collection.recordings[number]
-        first = self._collection.topics[0]
-        with _named(recording.path, first), self.cameras.using(recording, 0) as camera:
+        with self._camera(self.recordings[number], 0) as camera:
             return camera.key_frames
 
-    def batch(self, samples: int, *, shared: bool) -> Batch:
-        """A batch of that many samples; see `Batch`."""
-        return Batch(samples, len(self._offsets.steps), shared=shared)
+    def read(self, numbers: Sequence[int], *, shared: bool = False) -> list[Any]:
+        """Samples; the frames of each camera of a recording are decoded in one pass.
 
-    def read(
-        self,
-        number: int,
-        rows: NDArray[np.int64],
-        batch: Batch | None = None,
-        places: Sequence[int] = (),
-    ) -> list[Any]:
-        """Samples of one recording; the frames of each camera are decoded in one pass.
+        Their tensors are rows of one tensor for each camera, so that collating copies nothing.
 
         Args:
-            number: Of the recording.
-            rows: The samples, shape (N,), in any order.
-            batch: The batch they belong to; None for none.
-            places: Their positions in it.
+            numbers: 0 or more, less than the length; in any order.
+            shared: Whether other processes need access.
 
         Raises:
             SampleError: A frame cannot be read.
         """
-        first = int(self._collection.starts[number])
-        samples: list[Sample] = [{} for _ in rows]
-        masks: list[Sample] = [{} for _ in rows]
-        stamps: list[int] = []
-        for camera_number, topic in enumerate(self._collection.topics):
-            recording = self._collection.recordings[number]
-            using = self.cameras.using(recording, camera_number)
-            with _named(recording.path, topic), using as camera:
-                frames, padded = self._offsets.frames(recording, camera_number, camera, rows)
-                whole = None if batch is None else batch.tensor_for(camera, camera_number)
-                if whole is None:
-                    tensors = self._windows(camera, frames)
-                else:
-                    tensors = self._rows(camera, frames, [whole[place] for place in places])
-                if camera_number == 0:
-                    stamps = camera.stamps[recording.frames(rows, 0)].tolist()
-            flags = torch.from_numpy(padded)
-            for place, sample in enumerate(samples):
-                sample[topic] = tensors[place]
-                masks[place][f"{topic}_is_pad"] = flags[place]
-        for place, row in enumerate(rows.tolist()):
-            samples[place] |= masks[place]
-            samples[place] |= {"stamp_ns": stamps[place], "index": first + row, "dataset": number}
+        wanted = np.array(numbers, np.int64)
+        owners = np.searchsorted(self._starts, wanted, side="right") - 1
+        samples: list[Sample] = [{} for _ in numbers]
+        tensors: dict[str, torch.Tensor] = {}
+        for owner in np.unique(owners).tolist():
+            recording = self.recordings[owner]
+            places = np.flatnonzero(owners == owner).tolist()
+            rows = wanted[places] - self._starts[owner]
+            flags: dict[str, torch.Tensor] = {}
+            stamps: list[int] = []
+            for number, topic in enumerate(self.topics):
+                with self._camera(recording, number) as camera:
+                    frames, padded = self._offsets.frames(recording, number, camera, rows)
+                    outs = self._rows(camera, topic, tensors, places, (len(numbers), shared))
+                    camera.read(frames.ravel().tolist(), [frame for row in outs for frame in row])
+                    if number == 0:
+                        stamps = camera.stamps[recording.frames(rows, 0)].tolist()
+                flags[f"{topic}_is_pad"] = torch.from_numpy(padded)
+                for place, out in zip(places, outs, strict=True):
+                    shown = out.movedim(-1, -3) if self._pictures.channels_first else out
+                    samples[place][topic] = shown[0] if self._offsets == Offsets() else shown
+            for n, place in enumerate(places):
+                samples[place] |= {name: padded[n] for name, padded in flags.items()}
+                index = int(wanted[place])
+                samples[place] |= {"stamp_ns": stamps[n], "index": index, "dataset": owner}
         return samples if self._transform is None else [self._transform(s) for s in samples]
 
-    def _windows(self, camera: OpenCamera, frames: NDArray[np.int64]) -> torch.Tensor:
-        """Frames of shape (N, T) as a tensor of shape (N, T, ...), without T if it is 1."""
-        tensors = camera.read(frames.ravel())
-        if self._offsets == Offsets():
-            return tensors
-        return tensors.unflatten(0, frames.shape)
-
     def _rows(
-        self, camera: OpenCamera, frames: NDArray[np.int64], rows: Sequence[torch.Tensor]
-    ) -> list[torch.Tensor]:
-        """Like `_windows`, but read into rows of a batch's tensor, each of shape (T, H, W, C)."""
-        camera.read_into(frames.ravel(), [frame for row in rows for frame in row])
-        arranged = [self._pictures.arranged(row) for row in rows]
-        return [row[0] for row in arranged] if self._offsets == Offsets() else arranged
+        self,
+        camera: OpenCamera,
+        topic: str,
+        tensors: dict[str, torch.Tensor],
+        places: Sequence[int],
+        batch: tuple[int, bool],
+    ) -> Sequence[torch.Tensor]:
+        """A row of a tensor of shape (samples, offsets, H, W, C) for each of some samples.
 
+        Args:
+            camera: Whose frames it is for.
+            topic: Its topic.
+            tensors: The tensors of the batch, by topic.
+            places: Numbers of the samples in the batch.
+            batch: Number of its samples, and whether other processes need access.
+        """
+        count, shared = batch
+        steps = len(self._offsets.steps)
+        like = camera.empty(0, 0)
+        if topic not in tensors:
+            shape = (count, steps, *like.shape[2:])
+            if shared and like.device.type == "cpu":
+                # as torch's own collate does in a worker
+                storage = torch.UntypedStorage._new_shared(prod(shape) * like.itemsize)
+                tensors[topic] = like.new_empty(0).set_(storage, 0, shape)
+            else:
+                tensors[topic] = like.new_empty(shape)
+        whole = tensors[topic]
+        if (whole.shape[2:], whole.dtype) != (like.shape[2:], like.dtype):
+            return list(camera.empty(len(places), steps))  # of a recording with other images
+        return [whole[place] for place in places]
 
-@contextmanager
-def _named(path: str, topic: str) -> Iterator[None]:
-    """Add the dataset and topic to errors."""
-    try:
-        yield
-    except OptionError:
-        raise
-    except SampleError as error:
-        raise SampleError(f"{path}, topic {topic}, {error}") from None
-    except Mp4dsError as error:
-        raise SampleError(f"{path}, topic {topic}: {error}") from None
+    @contextmanager
+    def _camera(self, recording: Recording, number: int) -> Iterator[OpenCamera]:
+        """A camera, in whose errors are the dataset and topic."""
+        where = f"{recording.path}, topic {self.topics[number]}"
+        try:
+            with self._cameras.using(recording, number) as camera:
+                yield camera
+        except OptionError:
+            raise
+        except SampleError as error:
+            raise SampleError(f"{where}, {error}") from None
+        except Mp4dsError as error:
+            raise SampleError(f"{where}: {error}") from None
+
+    def close(self) -> None:
+        """Close the videos of this process."""
+        self._cameras.close()
 
 
 # ---------------------------------------------------------------- dataset
-
-
-def described(samples: object, collection: Collection) -> str:
-    """The samples of a collection, in a line."""
-    count, several = len(collection.recordings), len(collection.recordings) != 1
-    return (
-        f"<{type(samples).__name__}: {int(collection.starts[-1])} samples of {count} "
-        f"dataset{'s' * several}, {', '.join(collection.topics)}>"
-    )
 
 
 SYNC_TOLERANCE_NS = 20_000_000
@@ -371,9 +360,13 @@ class FrameDataset(Dataset):
         for name in others:  # of other libraries, too
             raise TypeError(absent(self, name))
         chosen = offsets_from(offsets, offsets_in, tolerance_ns)
-        self._collection = Collection(paths, topics=topics, sync_tolerance_ns=sync_tolerance_ns)
-        pictures = pictures_from(
-            self.topics,
+        self._samples = Samples(
+            paths,
+            topics,
+            sync_tolerance_ns=sync_tolerance_ns,
+            offsets=chosen,
+            transform=transform,
+            cache_files=cache_files,
             format_=format,
             resize=resize,
             crop=crop,
@@ -382,34 +375,33 @@ class FrameDataset(Dataset):
             backend=backend,
             device=device,
         )
-        self._reader = SampleReader(self._collection, pictures, chosen, transform, cache_files)
         self._collates = False
 
     @property
     def topics(self) -> tuple[str, ...]:
         """The cameras of a sample."""
-        return self._collection.topics
+        return self._samples.topics
 
     @property
     def paths(self) -> list[str]:
         """The datasets; a sample's ``dataset`` is an index into these."""
-        return [recording.path for recording in self._collection.recordings]
+        return [recording.path for recording in self._samples.recordings]
 
     @property
     def lengths(self) -> list[int]:
         """Number of samples of each dataset."""
-        return [recording.rows for recording in self._collection.recordings]
+        return [recording.rows for recording in self._samples.recordings]
 
     @property
     def unmatched(self) -> list[dict[str, NDArray[np.int64]]]:
         """For each dataset, the numbers of the frames that are not in any sample, by topic."""
-        return [recording.unmatched for recording in self._collection.recordings]
+        return [recording.unmatched for recording in self._samples.recordings]
 
     def __repr__(self) -> str:
-        return described(self, self._collection)
+        return self._samples.describe(self)
 
     def __len__(self) -> int:
-        return int(self._collection.starts[-1])
+        return len(self._samples)
 
     def __getitem__(self, index: SupportsIndex) -> Any:
         return self.__getitems__([index])[0]
@@ -423,17 +415,8 @@ class FrameDataset(Dataset):
             IndexError: There is no sample with a number.
             SampleError: A frame cannot be read.
         """
-        wanted = np.array([self._number(index) for index in indices], np.int64)
-        recordings, rows = self._collection.locate(wanted)
-        samples: list[Any] = [None] * len(wanted)
-        shared = self._collates and get_worker_info() is not None
-        batch = self._reader.batch(len(wanted), shared=shared)
-        for number in np.unique(recordings).tolist():
-            places = np.flatnonzero(recordings == number).tolist()
-            found = self._reader.read(number, rows[places], batch, places)
-            for place, sample in zip(places, found, strict=True):
-                samples[place] = sample
-        return samples
+        wanted = [self._number(index) for index in indices]
+        return self._samples.read(wanted, shared=self._collates and get_worker_info() is not None)
 
     def collate(self, samples: Sequence[Any]) -> Any:
         """Like `torch.utils.data.default_collate`, without copying frames.
@@ -465,4 +448,4 @@ class FrameDataset(Dataset):
 
     def close(self) -> None:
         """Close this process's videos; they are reopened when needed."""
-        self._reader.cameras.close()
+        self._samples.close()

@@ -13,20 +13,17 @@ from torch.utils.data import IterableDataset, get_worker_info
 from mp4ds.errors import OptionError
 from mp4ds.torch.cameras import (
     Backend,
-    Collection,
     Crop,
     Dtype,
     Paths,
     Recording,
     Resize,
-    pictures_from,
 )
 from mp4ds.torch.datasets import (
     SYNC_TOLERANCE_NS,
     Offsets,
-    SampleReader,
+    Samples,
     Transform,
-    described,
 )
 
 _T = TypeVar("_T")
@@ -163,14 +160,13 @@ class FrameStream(IterableDataset):
         device: str = "cpu",
     ) -> None:
         _check(window=window, seed=seed, buffer=buffer, rank=rank, world_size=world_size)
-        self._collection = Collection(paths, topics=topics, sync_tolerance_ns=sync_tolerance_ns)
-        if cache_files < len(self.topics):
-            raise OptionError(
-                f"cache_files is {cache_files}, but must be at least {len(self.topics)}: one per "
-                "camera."
-            )
-        pictures = pictures_from(
-            self.topics,
+        self._samples = Samples(
+            paths,
+            topics,
+            sync_tolerance_ns=sync_tolerance_ns,
+            offsets=Offsets(),
+            transform=transform,
+            cache_files=cache_files,
             format_=format,
             resize=resize,
             crop=crop,
@@ -179,7 +175,11 @@ class FrameStream(IterableDataset):
             backend=backend,
             device=device,
         )
-        self._reader = SampleReader(self._collection, pictures, Offsets(), transform, cache_files)
+        if cache_files < len(self.topics):
+            raise OptionError(
+                f"cache_files is {cache_files}, but must be at least {len(self.topics)}: one per "
+                "camera."
+            )
         self._window = window
         self._shuffle = shuffle
         self._seed = seed
@@ -194,15 +194,15 @@ class FrameStream(IterableDataset):
     @property
     def topics(self) -> tuple[str, ...]:
         """The cameras of a sample."""
-        return self._collection.topics
+        return self._samples.topics
 
     @property
     def samples(self) -> int:
         """Number of samples per epoch, over all processes."""
-        return int(self._collection.starts[-1])
+        return len(self._samples)
 
     def __repr__(self) -> str:
-        return described(self, self._collection)
+        return self._samples.describe(self)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the order of the next epoch; the same number gives the same order.
@@ -282,12 +282,11 @@ class FrameStream(IterableDataset):
             yield sample
 
     def _read(self, place: tuple[int, int]) -> Any:
-        number, row = place
-        return self._reader.read(number, np.array([row], np.int64))[0]
+        return self._samples.read([self._samples.number(*place)])[0]
 
     def _rows(self, order: tuple[int, int], share: int, shares: int) -> Iterator[tuple[int, int]]:
         """The samples of a share, in order: recording and row of each."""
-        recordings = self._collection.recordings
+        recordings = self._samples.recordings
         windows = [
             (number, window)
             for number, recording in enumerate(recordings)
@@ -311,15 +310,15 @@ class FrameStream(IterableDataset):
 
     def _window_rows(self, number: int, window: int) -> range:
         if number not in self._starts:
-            keys = self._reader.key_frames(number)
-            recording = self._collection.recordings[number]
+            keys = self._samples.key_frames(number)
+            recording = self._samples.recordings[number]
             self._starts[number] = window_starts(recording, self._window, keys)
         first, end = self._starts[number][window : window + 2].tolist()
         return range(first, end)
 
     def close(self) -> None:
         """Close the videos that this process has open; they are opened again when needed."""
-        self._reader.cameras.close()
+        self._samples.close()
 
 
 def _check(**numbers: int) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from mp4ds.dataset.stream import Stream
@@ -97,14 +99,16 @@ class TorchcodecReader:
         reason = " ".join(str(error).split()[:40])
         return VideoError("decode-failed", self._path, f"torchcodec cannot decode it: {reason}")
 
-    def read(self, frames: list[int]) -> Tensor:
+    def read(self, frames: Sequence[int]) -> Tensor:
         """Frames in the requested order, with repetitions; shape (N, H, W, 3), uint8.
 
         Raises:
             VideoError: One cannot be decoded.
         """
         try:
-            pixels: Tensor = self._decoder.get_frames_at(frames).data
+            pixels: Tensor = self._decoder.get_frames_at(
+                torch.tensor(frames, dtype=torch.int64)
+            ).data
         except (RuntimeError, IndexError, ValueError) as error:
             raise self._refused(error) from None
         return pixels[:, self._rows, self._columns]
