@@ -38,7 +38,7 @@ class Sent:
 class RecordingPublisher:
     """Keeps everything; counts as having a subscriber everywhere."""
 
-    world: str | None = None
+    world: str = "ros1"
     address: str = "nowhere"
     wants_clock: bool = False
     is_alive: bool = True

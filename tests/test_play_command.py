@@ -207,14 +207,14 @@ def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_sourced(
     version: str, modules: list[str], kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mp4ds.plugins.ros.node import sourced
+    from mp4ds.plugins.ros.node import chosen_world
 
     monkeypatch.setenv("ROS_VERSION", version)
     monkeypatch.setattr(
         "mp4ds.plugins.ros.node.find_spec",
         lambda name: object() if name in modules else None,
     )
-    assert sourced("play") == kind
+    assert chosen_world("play", None) == kind
 
 
 def test_the_library_plays_as_the_command_does(drive: Path) -> None:

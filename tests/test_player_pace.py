@@ -17,7 +17,7 @@ from mp4ds.bags.formats import open_writer
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import PublishError
 from mp4ds.plugins.playing import pace
-from mp4ds.plugins.playing.options import PlayOptions
+from mp4ds.plugins.playing.options import PlayOptions, Wanted
 from mp4ds.plugins.playing.pace import Lateness, Pace, Ticks
 from mp4ds.plugins.playing.play import open_player
 from mp4ds.plugins.playing.player import Player, PlaySummary
@@ -195,7 +195,8 @@ def stalled(drive: Path, seconds: float) -> tuple[list[int], PlaySummary]:
 
     publisher.on_sent = on_sent
     with Dataset(drive) as dataset:
-        timeline = Timeline([dataset], PlayOptions(), None)
+        options = PlayOptions()
+        timeline = Timeline([dataset], options, Wanted(options), "ros2")
         player = Player(timeline, publisher, steady=machine)
         machine.drive(player)
         summary = player.run()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from mp4ds.errors import OptionError
@@ -35,6 +36,11 @@ def _number(value: str | float, is_valid: Callable[[float], bool], what: str) ->
     if not (math.isfinite(number) and is_valid(number)):
         raise OptionError(f"{value} is not {what}.")
     return number
+
+
+def rooted(topic: str) -> str:
+    """The name of a topic with its leading slash, which users may leave out."""
+    return "/" + topic.strip().lstrip("/")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,6 +212,7 @@ class PlayOptions(ReductionOptions):
     def __post_init__(self) -> None:
         """Refuse options that are invalid or contradict each other."""
         super().__post_init__()
+        _ = self.rules
         if self.clock is not None and not 0 < self.clock <= 10_000:
             raise OptionError(f"`clock` {self.clock:g} is not a rate above 0 and up to 10000 Hz.")
         if self.until_sec is not None and not math.isfinite(self.until_sec):
@@ -235,53 +242,29 @@ class PlayOptions(ReductionOptions):
         """Whether it publishes /clock."""
         return self.clock is not None or bool(self.clock_topics) or self.clock_topics_all
 
-
-# ---------------------------------------------------------------- topics
-
-
-def rooted(topic: str) -> str:
-    """The name of a topic with its leading slash, which users may leave out."""
-    return "/" + topic.strip().lstrip("/")
-
-
-class Names:
-    """Renames topics: by `remap` or else `prefix`, then by the node's remappings.
-
-    Those of the node may name topics that are not played.
-
-    Raises:
-        OptionError: A rule is not valid.
-    """
-
-    def __init__(self, options: PlayOptions) -> None:
-        self._node = options.names
-        self._rules: dict[str, str] = {}
-        for rule in options.remap:
+    @cached_property
+    def rules(self) -> Mapping[str, str]:
+        """What `remap` says: old names, from the root on, and new ones."""
+        rules = {}
+        for rule in self.remap:
             old, found, new = rule.partition(":=")
             if not (found and old.strip("/ ") and new.strip("/ ")):
                 raise OptionError(
                     f"`remap` {rule!r} is not a remapping; write it as /old/topic:=/new/topic."
                 )
-            self._rules[rooted(old)] = new
-        self._prefix = options.prefix.rstrip("/")
+            rules[rooted(old)] = new
+        return rules
 
-    def check(self, topics: Iterable[str]) -> None:
-        """Refuse rules for topics that do not exist.
+    def renamed(self, topic: str) -> str:
+        """The name that a topic is published under: by `remap` or else `prefix`, then by `names`.
 
-        Raises:
-            OptionError: Names the topic.
+        Rules of `names` may be for topics that are not played.
         """
-        known = {rooted(topic) for topic in topics}
-        for old in self._rules:
-            if old not in known:
-                raise OptionError(f"`remap` {old!r}: there is no such topic to play.")
-
-    def __call__(self, topic: str) -> str:
-        """The name that a topic is published under."""
-        new = self._rules.get(rooted(topic))
+        new = self.rules.get(rooted(topic))
         if new is None:
-            new = f"{self._prefix}/{topic.lstrip('/')}" if self._prefix else topic
-        return self._node.renamed(new)
+            prefix = self.prefix.rstrip("/")
+            new = f"{prefix}/{topic.lstrip('/')}" if prefix else topic
+        return self.names.renamed(new)
 
 
 class Wanted:

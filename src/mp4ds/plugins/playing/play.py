@@ -14,7 +14,7 @@ from mp4ds.errors import advising
 from mp4ds.plugins.playing.options import PlayOptions, Wanted
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary
 from mp4ds.plugins.playing.timeline import Timeline
-from mp4ds.plugins.ros.node import Node, NodeOptions, open_node, sourced
+from mp4ds.plugins.ros.node import Node, NodeOptions, World, chosen_world, open_node
 from mp4ds.plugins.ros.qos import load_overrides
 
 _IMMEDIATE_WAIT_S = 2.0
@@ -65,8 +65,7 @@ def open_player(
         progress: As for `play`.
     """
     chosen = options or PlayOptions()
-    kind = chosen.to or ("" if node else sourced("play"))
-    world = node.world if node else kind
+    world = node.world if node else chosen_world("play", chosen.to)
     chosen = replace(chosen, names=chosen.names.in_world(world))
     with ExitStack() as stack:
         stack.enter_context(advising(HOW_TO_SALVAGE))
@@ -75,8 +74,8 @@ def open_player(
             stack.enter_context(open_selected(place, wanted, jpeg_quality=chosen.jpeg_quality))
             for place in datasets_in(datasets)
         ]
-        timeline = Timeline(opened, chosen, world)
-        node = node or stack.enter_context(_opened(kind, chosen))
+        timeline = Timeline(opened, chosen, wanted, world)
+        node = node or stack.enter_context(_opened(world, chosen))
         follow = chosen.follow_clock
         if follow is None:
             follow = not (chosen.leads or chosen.immediate) and node.wants_clock
@@ -84,15 +83,15 @@ def open_player(
         yield Player(timeline, node, chosen, progress=progress)
 
 
-def _opened(kind: str, chosen: PlayOptions) -> Node:
-    chosen.check_for(kind)
+def _opened(world: World, chosen: PlayOptions) -> Node:
+    chosen.check_for(world)
     patience = chosen.wait_for_all_acked
     options = NodeOptions(
-        _NODES.get(kind, ""),
+        _NODES[world],
         chosen.names,
         overrides=load_overrides(chosen.qos_overrides),
         parting_s=None if patience is None else patience / 1000 or math.inf,
         queue_size=chosen.queue,
         wait_s=_IMMEDIATE_WAIT_S if chosen.immediate else 0.0,
     )
-    return open_node(kind, options)
+    return open_node(world, options)

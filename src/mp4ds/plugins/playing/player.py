@@ -15,10 +15,9 @@ from typing import Any
 from mp4ds.errors import OptionError, PublishError, Refused
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Lateness, Pace, Ticks
-from mp4ds.plugins.playing.stamps import Restamper
-from mp4ds.plugins.playing.timeline import Due, Playback, Timeline
+from mp4ds.plugins.playing.timeline import ReadAhead, Restamper, Timeline
 from mp4ds.plugins.ros.node import Node, Service, action, quick_switches
-from mp4ds.records import Channel
+from mp4ds.records import Channel, Message
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,7 @@ class Player:
         self._clock_topics = timeline.named("clock_topics", options.clock_topics)
         self._pause_topics = timeline.named("pause_topics", options.pause_topics)
         self._changed = threading.Condition(threading.RLock())
-        self._playback: Playback | None = None
+        self._playback: ReadAhead[Message] | None = None
         self._read_ns: int | None = None  # where the playback starts, until it is used
         self._is_paused = self._options.paused
         self._is_stopped = False
@@ -136,13 +135,14 @@ class Player:
         self._replies = 1  # on the lock-step topic
         self._controlled: int = self._start  # the last stamp on the rate-control topic
         self._pauses_for_topics = True
-        self._paused_at: Due | None = None  # the message before which it paused
+        self._paused_at: Message | None = None  # the message before which it paused
         self._last_frame: int | None = None  # log time of the last frame published
         self._history: deque[int] = deque(maxlen=10_000)
         self._reached = self._start  # log time of the last message published
         self._ticks = Ticks(self._options.clock)
         self._next_report = 0.0
-        self._missing: dict[int, Channel] = {}  # by id()
+        self._advertised: dict[int, Channel] = {}  # by id()
+        self._missing: dict[int, Channel] = {}  # those whose type is not installed
         self._done = PlaySummary()
         self._restamper = Restamper() if self._options.restamp else None
 
@@ -301,7 +301,7 @@ class Player:
         return self._done
 
     def _begin(self) -> None:
-        self._advertise()
+        self._advertise(self._timeline.channels)
         self._node.serve(player_services(self))
         if self._options.lock_step:
             self._node.listen(self._options.lock_step, self._on_reply)
@@ -320,20 +320,22 @@ class Player:
                 break
             self._wait(0.1, "waiting for subscribers")
 
-    def _advertise(self) -> None:
-        for channel in self._timeline.channels:
+    def _advertise(self, channels: Sequence[Channel]) -> None:
+        missing: list[Channel] = []
+        for channel in channels:
+            self._advertised[id(channel)] = channel
             try:
                 self._node.advertise(channel)
             except Refused:  # the message type is not installed
-                self._missing[id(channel)] = channel
+                missing.append(channel)
                 self._done.not_installed.setdefault(channel.topic, 0)
             else:
                 self._done.messages.setdefault(channel.topic, 0)
-        if not self._missing:
+        if not missing:
             return
-        missing = self._missing.values()
+        self._missing |= {id(channel): channel for channel in missing}
         named = ", ".join(sorted({f"{one.topic} ({one.type_name})" for one in missing}))
-        if len(self._missing) == len(self._timeline.channels):
+        if len(self._missing) == len(self._advertised):
             problem = f"no message type of the recording is installed: {named}"
             raise PublishError(self._node.address, problem)
         warnings.warn(
@@ -365,7 +367,7 @@ class Player:
                 due = self._playback.head() if self._playback else None
             except StopIteration:
                 return self._at_end()
-            if due is not None and due.time_ns > self._end:
+            if due is not None and due.log_time > self._end:
                 return self._at_end()
             seconds, state = self._seconds_until(due)
             if seconds > 0 or due is None:
@@ -388,7 +390,7 @@ class Player:
                     self._changed.notify_all()
         return True
 
-    def _seconds_until(self, due: Due | None) -> tuple[float, str]:
+    def _seconds_until(self, due: Message | None) -> tuple[float, str]:
         """How long to wait, and the state meanwhile; 0: publish the message now."""
         if due is not None and id(due.channel) in self._missing:
             return 0.0, "playing"
@@ -399,7 +401,7 @@ class Player:
         if due is None:
             self._was_awaited = self._pace.is_running
             return math.inf, "reading ahead"
-        if due.is_frame and self._replies < 1 and due.time_ns != self._last_frame:
+        if self._timeline.is_frame(due) and self._replies < 1 and due.log_time != self._last_frame:
             return self._hold(due, self._options.lock_step)
         if self._is_ahead():
             return self._hold(due, self._options.rate_control_topic)
@@ -407,20 +409,20 @@ class Player:
             return 0.0, "playing"
         if self.follows_clock:
             state = "waiting for" if self._followed.time_ns is None else "following"
-            return self._followed.seconds_until(due.time_ns), f"{state} /clock"
+            return self._followed.seconds_until(due.log_time), f"{state} /clock"
         return self._until_due(due), "playing"
 
-    def _pause_before(self, due: Due | None) -> None:
+    def _pause_before(self, due: Message | None) -> None:
         pauses = due is not None and due.channel.topic in self._pause_topics
         if pauses and self._pauses_for_topics and due is not self._paused_at:
             self._paused_at = due
             if not self._is_paused:
                 self._set_paused(True)
 
-    def _hold(self, due: Due, topic: str) -> tuple[float, str]:
+    def _hold(self, due: Message, topic: str) -> tuple[float, str]:
         """Stop the clock at a message that has to wait for a message on another topic."""
-        if self._pace.now() >= due.time_ns or topic == self._options.rate_control_topic:
-            now = min(self._pace.now(), due.time_ns)
+        if self._pace.now() >= due.log_time or topic == self._options.rate_control_topic:
+            now = min(self._pace.now(), due.log_time)
             self._pace.pause()
             self._pace.jump(now)
             self._lateness.clear()
@@ -432,13 +434,13 @@ class Player:
             self._options.rate_control_max_delay * NS
         )
 
-    def _until_due(self, due: Due) -> float:
+    def _until_due(self, due: Message) -> float:
         if not self._pace.is_running:
             self._pace.resume()
         skip = self._options.skip_empty
-        if skip is not None and due.time_ns - self._pace.now() > skip * NS:
-            self._pace.jump(due.time_ns)
-        seconds = self._pace.seconds_until(due.time_ns)
+        if skip is not None and due.log_time - self._pace.now() > skip * NS:
+            self._pace.jump(due.log_time)
+        seconds = self._pace.seconds_until(due.log_time)
         if not self._options.drop:
             waited = self._lateness.record(-round(seconds * NS), was_awaited=self._was_awaited)
             self._done.slowed_s += waited / NS
@@ -461,7 +463,7 @@ class Player:
             head = self._playback.head() if self._playback else None
         except Exception:  # the end, or an error that is raised when the message is due
             return min(now, self._end)
-        return min(now, head.time_ns if head is not None else self._reached)
+        return min(now, head.log_time if head is not None else self._reached)
 
     # ------------------------------------------------------------ publishing
 
@@ -514,47 +516,49 @@ class Player:
             self._changed.wait(min(_WAKE_S, self._ticks.seconds_left))
         return True
 
-    def _publish(self, due: Due, burst: _Burst | None) -> None:
+    def _publish(self, due: Message, burst: _Burst | None) -> None:
         with self._changed:
             if self._target is not None:
                 return
         if self._playback is not None:
-            self._playback.take()
+            next(self._playback)
+        if id(due.channel) not in self._advertised:  # of an image that could not be converted
+            self._advertise([due.channel])
         if id(due.channel) in self._missing:
             self._done.not_installed[due.channel.topic] += 1
-        elif not (due.is_frame and self._is_late(due.time_ns)):
+        elif not (self._timeline.is_frame(due) and self._is_late(due.log_time)):
             if self._has_clock(due):
-                self._node.clock(due.time_ns)
-            self._send(due, due.time_ns)
+                self._node.clock(due.log_time)
+            self._send(due, due.log_time)
             self._sent(due, burst)
         self._report("paused" if self._is_paused else "playing")
 
-    def _has_clock(self, due: Due) -> bool:
+    def _has_clock(self, due: Message) -> bool:
         """Whether to publish /clock before a message: as requested, or when not paced by time."""
         is_chosen = self._options.clock_topics_all or due.channel.topic in self._clock_topics
         return is_chosen or (self._options.clock is not None and self._options.immediate)
 
-    def _sent(self, due: Due, burst: _Burst | None) -> None:
+    def _sent(self, due: Message, burst: _Burst | None) -> None:
         with self._changed:
-            self._history.append(due.time_ns)
-            self._reached = max(self._reached, due.time_ns)
+            self._history.append(due.log_time)
+            self._reached = max(self._reached, due.log_time)
             if self._is_paused:
-                self._pace.jump(due.time_ns)
+                self._pace.jump(due.log_time)
             if burst is not None:
                 burst.done += 1
                 burst.left -= 1
                 if burst.left <= 0 and burst is self._burst:
                     self._burst = None
                     self._changed.notify_all()
-            if due.is_frame:
-                if self._options.lock_step and due.time_ns != self._last_frame:
+            if self._timeline.is_frame(due):
+                if self._options.lock_step and due.log_time != self._last_frame:
                     self._replies -= 1
-                self._last_frame = due.time_ns
+                self._last_frame = due.log_time
 
-    def _send(self, due: Due, time_ns: int) -> None:
+    def _send(self, due: Message, time_ns: int) -> None:
         if id(due.channel) in self._missing:
             return
-        payload = due.payload
+        payload = due.data
         if self._restamper is not None:
             payload = self._restamper.restamped(due.channel, payload, self._pace.wall_of)
         self._node.publish(due.channel, payload, time_ns)

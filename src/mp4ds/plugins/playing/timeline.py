@@ -1,23 +1,36 @@
-"""The messages of several datasets, merged, as they are published, from any time on."""
+"""The messages of several datasets, merged, as they are published, from any time on; stamps."""
 
 from __future__ import annotations
 
 import heapq
+import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import LatchedMessages, has_late, latched_depth
+from mp4ds.bags.types import (
+    HEADER,
+    FieldShape,
+    field_shape,
+    fields_of,
+    name_of,
+    ros1_version,
+    ros2_version,
+    types_of,
+)
 from mp4ds.dataset.columns import DecodedColumns, everything
 from mp4ds.dataset.dataset import Ahead, Dataset
-from mp4ds.errors import OptionError
-from mp4ds.plugins.playing.options import KINDS, Names, PlayOptions, Wanted, rooted
+from mp4ds.errors import ConversionError, OptionError, Refused
+from mp4ds.plugins.playing.options import KINDS, PlayOptions, Wanted, rooted
+from mp4ds.plugins.playing.pace import NS
+from mp4ds.plugins.ros.node import World
 from mp4ds.records import Channel, Message
 from mp4ds.unpacking.pictures import Reduction
 from mp4ds.unpacking.republish import Republisher
@@ -35,6 +48,7 @@ class ReadAhead(Generic[T]):
         room: Total size of the items that may wait; at least one always may.
         size_of: The size of an item.
         on_ready: Called by the thread when an item becomes available after there was none.
+        sources: Others that it reads from, closed with it; the thread may add to them.
     """
 
     def __init__(
@@ -43,32 +57,32 @@ class ReadAhead(Generic[T]):
         room: int,
         *,
         size_of: Callable[[T], int] = lambda _: 1,
-        on_ready: Callable[[], None] | None = None,
+        on_ready: Callable[[], None] = lambda: None,
+        sources: Sequence[ReadAhead[Any]] = (),
     ) -> None:
         self._items = items
         self._room = room
         self._size_of = size_of
         self._on_ready = on_ready
+        self._sources = sources
         self._changed = threading.Condition()
         self._waiting: deque[T] = deque()
-        self._is_closed = False
-        self._is_done = False
+        self._is_over = False  # nothing more comes
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
-
-    def __len__(self) -> int:
-        """Number of items waiting."""
-        return len(self._waiting)
 
     def __iter__(self) -> Iterator[T]:
         return self
 
     def __next__(self) -> T:
         with self._changed:
-            while not self._waiting and not self._is_done and not self._is_closed:
-                self._changed.wait()
-            return self._take()
+            self._changed.wait_for(lambda: self._waiting or self._is_over)
+            self.head()
+            item = self._waiting.popleft()
+            self._room += self._size_of(item)
+            self._changed.notify_all()
+            return item
 
     def head(self) -> T | None:
         """The next item, without taking it; None while it is not ready.
@@ -80,19 +94,11 @@ class ReadAhead(Generic[T]):
         with self._changed:
             if self._waiting:
                 return self._waiting[0]
-            if self._is_done or self._is_closed:
-                return self._take()
+            if self._error is not None:
+                raise self._error
+            if self._is_over:
+                raise StopIteration
             return None
-
-    def _take(self) -> T:
-        if self._waiting:
-            item = self._waiting.popleft()
-            self._room += self._size_of(item)
-            self._changed.notify_all()
-            return item
-        if self._error is not None:
-            raise self._error
-        raise StopIteration
 
     def _work(self) -> None:
         try:
@@ -105,40 +111,38 @@ class ReadAhead(Generic[T]):
             close = getattr(self._items, "close", None)
             if close is not None:  # a generator may have open files
                 close()
-            with self._changed:
-                self._is_done = True
-                self._changed.notify_all()
-            self._notify()
+            self._end()
+            self._on_ready()
 
     def _put(self, item: T) -> bool:
         with self._changed:
             size = self._size_of(item)
-            while self._waiting and size > self._room and not self._is_closed:
-                self._changed.wait()
-            if self._is_closed:
+            self._changed.wait_for(lambda: size <= self._room or not self._waiting or self._is_over)
+            if self._is_over:
                 return False
             is_first = not self._waiting
             self._room -= size
             self._waiting.append(item)
             self._changed.notify_all()
         if is_first:
-            self._notify()
+            self._on_ready()
         return True
 
-    def _notify(self) -> None:
-        if self._on_ready is not None:
-            self._on_ready()
-
-    def stop(self) -> None:
-        """Tell the thread to end after the current item."""
+    def _end(self) -> None:
         with self._changed:
-            self._is_closed = True
-            self._waiting.clear()
+            self._is_over = True
             self._changed.notify_all()
 
-    def join(self) -> None:
-        """Wait until the thread has ended and closed its source."""
+    def close(self) -> None:
+        """End the thread after the current item, and wait until it has closed its source."""
+        with self._changed:
+            self._waiting.clear()
+        self._end()
+        for source in [*self._sources]:  # for one of which the thread may be waiting
+            source._end()
         self._thread.join()
+        for source in self._sources:
+            source.close()
 
 
 # ---------------------------------------------------------------- timeline
@@ -154,33 +158,18 @@ _LEAST_SIZE = 64 << 10
 """Minimum size counted for a message: a thousand small ones wait, as with `ros2 bag play`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Due:
-    """A message to be published.
-
-    Attributes:
-        time_ns: When, in recording time.
-        channel: The channel to publish it on, one of `Timeline.channels`.
-        payload: The serialized message.
-        is_frame: Whether it is an image.
-    """
-
-    time_ns: int
-    channel: Channel
-    payload: bytes | memoryview
-    is_frame: bool
-
-
 class Timeline:
-    """The messages to play, merged by log time.
+    """The messages to play, of several datasets, merged by log time.
 
     Args:
         datasets: Open datasets; not closed here.
         options: How to play them.
-        world: Convert messages to this: ``ros1`` or ``ros2``; None: as recorded.
+        wanted: Which topics to play.
+        world: Convert messages to this.
 
     Attributes:
-        channels: All channels that are published.
+        channels: All channels that are published, as far as that is known beforehand.
+        republishers: What converts or reduces images, of each dataset, if anything does.
         start_ns: Log time of the first message, nanoseconds.
         end_ns: Log time of the last message, nanoseconds.
 
@@ -190,42 +179,51 @@ class Timeline:
     """
 
     def __init__(
-        self, datasets: Sequence[Dataset], options: PlayOptions, world: str | None
+        self, datasets: Sequence[Dataset], options: PlayOptions, wanted: Wanted, world: World
     ) -> None:
-        wanted, names = Wanted(options), Names(options)
         topics = [topic for dataset in datasets for topic in dataset.all_topics]
         wanted.check(topics)
-        names.check(topic for topic in topics if wanted(topic))
-        self._read_ahead = options.read_ahead
-        self._names = {rooted(topic): names(topic) for topic in topics if wanted(topic)}
-        self._parts = [_Part(dataset, options, wanted, names, world) for dataset in datasets]
-        self.channels = [channel for part in self._parts for channel in part.published]
+        self._topics = {rooted(topic): topic for topic in topics if wanted(topic)}
+        for topic in options.rules:
+            if topic not in self._topics:
+                raise OptionError(f"`remap` {topic!r}: there is no such topic to play.")
+        self._options = options
+        self._parts = [_Part(dataset, options, wanted, world) for dataset in datasets]
+        self.channels = [channel for part in self._parts for channel in part.channels]
+        self.republishers = [part.republisher for part in self._parts if part.republisher]
         spans = [part.span for part in self._parts if part.span]
         if not spans:
             raise OptionError("There is no message to play.")
         self.start_ns = min(first for first, _ in spans)
         self.end_ns = max(last for _, last in spans)
 
-    @property
-    def republishers(self) -> list[Republisher]:
-        """What converts or reduces images, of each dataset, if anything does."""
-        return [part.republisher for part in self._parts if part.republisher]
-
     def play(
-        self,
-        start_ns: int,
-        *,
-        is_late: IsLate,
-        on_ready: Callable[[], None],
-    ) -> Playback:
-        """Start reading from a time on, in threads.
+        self, start_ns: int, *, is_late: IsLate, on_ready: Callable[[], None]
+    ) -> ReadAhead[Message]:
+        """The messages from a time on, on channels that are published; read by threads.
 
         Args:
             start_ns: The earliest log time to read.
             is_late: Called before a frame is decoded.
             on_ready: Called, from another thread, when a message becomes available.
         """
-        return Playback(self._parts, start_ns, self._read_ahead, is_late, on_ready)
+        sources: list[ReadAhead[Any]] = []
+
+        def ahead(items: Iterator[T]) -> Iterator[T]:
+            sources.append(ReadAhead(items, self._options.read_ahead))
+            return sources[-1]
+
+        merged = heapq.merge(
+            *(part.messages(start_ns, is_late, ahead) for part in self._parts),
+            key=lambda message: message.log_time,
+        )
+        return ReadAhead(
+            merged, _MERGED_AHEAD, size_of=_size_of, on_ready=on_ready, sources=sources
+        )
+
+    def is_frame(self, message: Message) -> bool:
+        """Whether a message that is published is an image."""
+        return any(id(message.channel) in part.frames for part in self._parts)
 
     def named(self, option: str, topics: Sequence[str]) -> frozenset[str]:
         """The names that topics are published under.
@@ -238,108 +236,69 @@ class Timeline:
             OptionError: No such topic is played.
         """
         for topic in topics:
-            if rooted(topic) not in self._names:
+            if rooted(topic) not in self._topics:
                 raise OptionError(f"`{option}` {topic!r}: there is no such topic to play.")
-        return frozenset(self._names[rooted(topic)] for topic in topics)
+        return frozenset(self._options.renamed(self._topics[rooted(topic)]) for topic in topics)
 
-    def latched(self, time_ns: int) -> list[Due]:
+    def latched(self, time_ns: int) -> list[Message]:
         """The latched messages that a late subscriber would have got by a time."""
-        return [due for part in self._parts for due in part.latched(time_ns)]
+        return [message for part in self._parts for message in part.latched(time_ns)]
 
 
-class Playback:
-    """Messages from a time on, read ahead by threads."""
-
-    def __init__(
-        self,
-        parts: Sequence[_Part],
-        start_ns: int,
-        depth: int,
-        is_late: IsLate,
-        on_ready: Callable[[], None],
-    ) -> None:
-        self._sources: list[ReadAhead[object]] = []
-        self._is_closing = False
-
-        def ahead(items: Iterator[T]) -> Iterator[T]:
-            made = ReadAhead(items, depth)
-            self._sources.append(made)  # type: ignore[arg-type]
-            if self._is_closing:
-                made.stop()
-            return made
-
-        merged = heapq.merge(
-            *(part.messages(start_ns, is_late, ahead) for part in parts),
-            key=lambda due: due.time_ns,
-        )
-        self._merged = ReadAhead(merged, _MERGED_AHEAD, size_of=_size_of, on_ready=on_ready)
-
-    def head(self) -> Due | None:
-        """The next message, without taking it; None while it is not ready.
-
-        Raises:
-            StopIteration: There are no more messages.
-            Mp4dsError: A dataset is damaged.
-        """
-        return self._merged.head()
-
-    def take(self) -> None:
-        """Take the next message."""
-        next(self._merged)
-
-    def close(self) -> None:
-        """End the threads."""
-        self._is_closing = True
-        self._merged.stop()
-        for source in [*self._sources]:
-            source.stop()
-        self._merged.join()
-        for source in self._sources:
-            source.join()
-
-
-def _size_of(due: Due) -> int:
-    return max(len(due.payload), _LEAST_SIZE)
+def _size_of(message: Message) -> int:
+    return max(len(message.data), _LEAST_SIZE)
 
 
 class _Part:
     """A dataset, and its channels as they are published."""
 
     def __init__(
-        self,
-        dataset: Dataset,
-        options: PlayOptions,
-        wanted: Wanted,
-        names: Names,
-        world: str | None,
+        self, dataset: Dataset, options: PlayOptions, wanted: Wanted, world: World
     ) -> None:
         self._dataset = dataset
         self._converter = Converter(world)
-        self._names = names
+        self._options = options
         self.republisher: Republisher | None = None
         if options.publish_as is not None or options.reduction != Reduction():
             self.republisher = Republisher(
                 dataset,
                 KINDS[options.publish_as] if options.publish_as else None,
-                encoding="ros1" if (world or dataset.profile) == "ros1" else "cdr",
+                encoding="ros1" if world == "ros1" else "cdr",
                 selected=wanted,
                 jpeg_quality=options.jpeg_quality,
                 reduction=options.reduction,
             )
-        self._wanted = wanted
         self._topics = {item.topic for item in dataset.channels if wanted(item.topic)}
-        self.span = self._span()
-        self._channels: dict[int, Channel] = {}
-        self._frames = {item.channel.id for item in dataset.image_channels()}
+        self._published: dict[int, Channel] = {}  # by id of the dataset's channel
+        self.frames: set[int] = set()
+        """`id()` of published channels with images."""
+        with_frames = {item.channel.id for item in dataset.image_channels()}
         for channel in dataset.channels:
             is_emptied = self.republisher is not None and self.republisher.empties(channel)
-            if wanted(channel.topic) and not is_emptied:
-                self._add(channel, self._converter.channel(channel))
+            if channel.topic in self._topics and not is_emptied:
+                self._publish(channel, is_frame=channel.id in with_frames)
         for channel in self.republisher.channels if self.republisher else ():
-            self._frames.add(channel.id)
-            self._add(channel, channel)
+            self._publish(channel, is_frame=True)
 
-    def _span(self) -> tuple[int, int] | None:
+    def _publish(self, source: Channel, *, is_frame: bool) -> Channel:
+        """The channel that a channel of the dataset or the republisher is published as."""
+        channel = source if self._is_made(source) else self._converter.channel(source)
+        channel = replace(channel, topic=self._options.renamed(channel.topic))
+        self._published[source.id] = channel
+        if is_frame:
+            self.frames.add(id(channel))
+        return channel
+
+    def _is_made(self, channel: Channel) -> bool:
+        return self.republisher is not None and self.republisher.makes(channel)
+
+    @property
+    def channels(self) -> list[Channel]:
+        """The channels that are published."""
+        return list(self._published.values())
+
+    @property
+    def span(self) -> tuple[int, int] | None:
         """Log times of the first and the last message of the topics played."""
         times = [one for one in self._dataset.times(self._topics).values() if len(one)]
         if not times:
@@ -348,16 +307,7 @@ class _Part:
         begin = self._dataset.slice_start  # latched messages from before it are sent at first
         return (first if begin is None else min(max(first, begin), last)), last
 
-    @property
-    def published(self) -> list[Channel]:
-        """The channels that are published."""
-        return list(self._channels.values())
-
-    def _add(self, source: Channel, channel: Channel) -> Channel:
-        self._channels[source.id] = replace(channel, topic=self._names(channel.topic))
-        return self._channels[source.id]
-
-    def messages(self, start_ns: int, is_late: IsLate, ahead: Ahead) -> Iterator[Due]:
+    def messages(self, start_ns: int, is_late: IsLate, ahead: Ahead) -> Iterator[Message]:
         """Messages from a time on."""
         streams = [item for item in self._dataset.streams if item.topic in self._topics]
         frames = [stream.columns for stream in streams]
@@ -376,23 +326,17 @@ class _Part:
             topics=self._topics,
             ahead=ahead,
         )
-        for record in records:
-            if isinstance(record, Message) and (due := self._due(record)):
-                yield due
+        return (self._as_published(record) for record in records if isinstance(record, Message))
 
-    def _due(self, message: Message) -> Due | None:
-        source = message.channel
-        channel = self._channels.get(source.id)
-        if channel is None:
-            if not self._wanted(source.topic):
-                return None
-            channel = self._add(source, self._converter.channel(source))
-        payload = message.data
-        if self.republisher is None or not self.republisher.makes(source):
-            payload = self._converter.payload(source, payload)
-        return Due(message.log_time, channel, payload, source.id in self._frames)
+    def _as_published(self, message: Message) -> Message:
+        source, data = message.channel, message.data
+        # images that could not be converted stay on their channel
+        channel = self._published.get(source.id) or self._publish(source, is_frame=True)
+        if not self._is_made(source):
+            data = self._converter.payload(source, data)
+        return replace(message, channel=channel, data=data)
 
-    def latched(self, time_ns: int) -> Iterator[Due]:
+    def latched(self, time_ns: int) -> Iterator[Message]:
         """The latched messages of each channel at a time."""
         channels = [item for item in self._dataset.channels if item.topic in self._topics]
         kept = {item.id: LatchedMessages[Message](item) for item in filter(has_late, channels)}
@@ -402,6 +346,97 @@ class _Part:
             if message.channel.id in kept:
                 kept[message.channel.id].add(message.data, message)
         messages = sorted(chain.from_iterable(kept.values()), key=lambda item: item.log_time)
-        for message in messages:
-            if due := self._due(message):
-                yield due
+        return map(self._as_published, messages)
+
+
+# ---------------------------------------------------------------- stamps
+
+_DISTRIBUTION = "humble"
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_POSE = 7 * 8  # bytes: a translation and a quaternion of doubles
+_ENCAPSULATION = 4
+_Places = Callable[[bytearray, str, bool], Iterator[int]]
+
+
+class Restamper:
+    """Replaces the stamps in messages: of their header, or of their transforms' headers.
+
+    Equal stamps stay equal, and zero stays zero.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[Channel, _Places | None]] = {}
+
+    def restamped(
+        self, channel: Channel, payload: bytes | memoryview, wall_of: Callable[[int], int]
+    ) -> bytes | memoryview:
+        """A message with new stamps; unchanged if it has none.
+
+        Args:
+            channel: Channel of the message.
+            payload: The serialized message.
+            wall_of: Maps recording time to wall-clock time, both in nanoseconds.
+
+        Raises:
+            ConversionError: The message is not of the channel's type, or a stamp is out of range.
+        """
+        if id(channel) not in self._known:
+            self._known[id(channel)] = channel, _places_in(channel)
+        places = self._known[id(channel)][1]
+        if places is None:
+            return payload
+        is_ros1 = channel.message_encoding == "ros1"
+        made = bytearray(payload)
+        order = "<" if is_ros1 or made[1:2] != b"\0" else ">"
+        stamp = struct.Struct(f"{order}{'I' if is_ros1 else 'i'}I")
+        try:
+            for place in places(made, order, is_ros1):
+                seconds, nanoseconds = stamp.unpack_from(made, place)
+                if seconds or nanoseconds:
+                    time = wall_of(seconds * NS + nanoseconds)
+                    stamp.pack_into(made, place, *divmod(time, NS))
+        except struct.error as error:
+            problem = f"cannot replace the stamp of a message: {error}"
+            raise ConversionError(channel.topic, problem) from None
+        return memoryview(made)
+
+
+def _places_in(channel: Channel) -> _Places | None:
+    """Where the stamps are in a channel's messages; None if they have none, or are not of ROS."""
+    schema = channel.schema
+    if channel.message_encoding not in ("ros1", "cdr") or schema is None or not schema.name:
+        return None
+    name = name_of(schema)
+    if name in _TRANSFORMS:
+        return _of_transforms
+    is_ros1 = channel.message_encoding == "ros1"
+    version = ros1_version() if is_ros1 else ros2_version(_DISTRIBUTION)
+    try:
+        fields = fields_of(types_of(schema, version), name)
+    except Refused:
+        return None
+    has_header = fields and field_shape(fields[0][1]) == FieldShape("", HEADER, 0, None, None)
+    return _of_header if has_header else None
+
+
+def _of_header(_: bytearray, __: str, ___: bool) -> Iterator[int]:
+    yield 4  # after the sequence number of ROS 1, or the encapsulation of CDR
+
+
+def _of_transforms(data: bytearray, order: str, is_ros1: bool) -> Iterator[int]:
+    number = struct.Struct(f"{order}I")
+
+    def aligned(place: int, size: int) -> int:
+        return place if is_ros1 else place + -(place - _ENCAPSULATION) % size
+
+    place = 0 if is_ros1 else _ENCAPSULATION
+    (count,) = number.unpack_from(data, place)
+    place += 4
+    for _ in range(count):
+        place = aligned(place, 4) + (4 if is_ros1 else 0)
+        yield place
+        place += 8
+        for _name in ("frame_id", "child_frame_id"):
+            place = aligned(place, 4)
+            place += 4 + number.unpack_from(data, place)[0]
+        place = aligned(place, 8) + _POSE

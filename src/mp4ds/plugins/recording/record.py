@@ -29,9 +29,9 @@ from mp4ds.plugins.ros.node import (
     NodeOptions,
     Service,
     action,
+    chosen_world,
     open_node,
     quick_switches,
-    sourced,
 )
 from mp4ds.plugins.ros.qos import load_overrides
 from mp4ds.records import Channel, Message, MetadataRecord
@@ -166,7 +166,7 @@ def open_recorder(
         progress: Called a few times a second.
     """
     chosen = options or RecordOptions()
-    world = node.world if node else chosen.to or sourced("record")
+    world = node.world if node else chosen_world("record", chosen.to)
     chosen = replace(chosen, names=chosen.names.in_world(world))
     wanted = Wanted(topics, chosen)
     _check(chosen)
@@ -174,7 +174,7 @@ def open_recorder(
     made = dataset if dataset is not None else f"{datetime.now():mp4ds_%Y_%m_%d-%H_%M_%S}"
     if node is None:
         node_options = NodeOptions(
-            chosen.node or _NODES.get(world, ""),
+            chosen.node or _NODES[world],
             chosen.names,
             overrides=load_overrides(chosen.qos_overrides),
             unpublished=chosen.unpublished,

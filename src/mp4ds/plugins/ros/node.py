@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast, get_args
 
 from mp4ds.errors import OptionError, PublishError
 from mp4ds.plugins.ros.names import PLAIN, NodeNames
@@ -230,36 +230,39 @@ class Node(ABC):
 
 # ---------------------------------------------------------------- opening
 
-_NODES: Mapping[str, tuple[str, str]] = {
-    "ros1": ("ros1", "Ros1Node"),
-    "rclpy": ("rclpy_node", "RclpyNode"),
-    "dds": ("dds_node", "DdsNode"),
+_NODES = {
+    "ros1": (
+        "ros1",
+        "Ros1Node",
+        "source the setup.bash of ROS 1, or install python3-rospy and use a virtual environment "
+        "made with python3 -m venv --system-site-packages",
+    ),
+    "rclpy": ("rclpy_node", "RclpyNode", "source ROS 2 again: its rclpy is not whole"),
+    "dds": ("dds_node", "DdsNode", "source ROS 2, or run: pip install 'mp4ds[dds]'"),
 }
-"""Module and class of each library."""
-
-_MISSING = {
-    "ros1": "source the setup.bash of ROS 1, or install python3-rospy and use a virtual "
-    "environment made with python3 -m venv --system-site-packages",
-    "rclpy": "source ROS 2 again: its rclpy is not whole",
-    "dds": "source ROS 2, or run: pip install 'mp4ds[dds]'",
-}
+"""Module and class of each library, and what to do if it is missing."""
 
 
-def sourced(command: str) -> str:
-    """Which ROS is sourced: ``ros1`` or ``ros2``.
+def chosen_world(command: str, asked: str | None) -> World:
+    """The ROS that was asked for, or else the one that is sourced.
 
     Args:
         command: The command, for the error.
+        asked: ``ros1`` or ``ros2``, if any.
 
     Raises:
-        PublishError: Neither is.
+        OptionError: There is no such ROS.
+        PublishError: Neither is sourced.
     """
-    version = os.environ.get("ROS_VERSION")
-    if version in ("1", "2"):
-        return f"ros{version}"
-    for module, kind in (("rclpy", "ros2"), ("rospy", "ros1"), ("cyclonedds", "ros2")):
+    version = asked or f"ros{os.environ.get('ROS_VERSION', '')}"
+    if version in get_args(World):
+        return cast(World, version)
+    if asked:
+        raise OptionError(f"there is no ROS {asked!r}. Use ros1 or ros2.")
+    libraries: Mapping[str, World] = {"rclpy": "ros2", "rospy": "ros1", "cyclonedds": "ros2"}
+    for module, world in libraries.items():
         if find_spec(module) is not None:
-            return kind
+            return world
     raise PublishError(
         command,
         "no ROS is sourced: source its setup file, or choose `ros1`, `ros2` (works without ROS "
@@ -267,26 +270,23 @@ def sourced(command: str) -> str:
     )
 
 
-def open_node(kind: str, options: NodeOptions) -> Node:
+def open_node(world: World, options: NodeOptions) -> Node:
     """Open a node.
 
     Args:
-        kind: ``ros1`` or ``ros2``; ROS 2 is rclpy if a ROS 2 is sourced, else Cyclone DDS.
+        world: For ROS 2, rclpy is used if it is installed, else Cyclone DDS.
         options: How it takes part.
 
     Raises:
-        OptionError: There is no such kind, or an option is not valid.
+        OptionError: An option is not valid.
         PublishError: Something is missing: a library, a network or a master.
     """
-    if kind not in ("ros1", "ros2"):
-        raise OptionError(f"there is no ROS {kind!r}. Use ros1 or ros2.")
-    if kind == "ros2":
-        kind = "rclpy" if find_spec("rclpy") is not None else "dds"
-    module, name = _NODES[kind]
+    kind = world if world == "ros1" else "rclpy" if find_spec("rclpy") is not None else "dds"
+    module, name, remedy = _NODES[kind]
     try:
         opened: Node = getattr(import_module(f"mp4ds.plugins.ros.{module}"), name)(options)
     except ImportError as error:
-        raise PublishError(kind, f"{error}; {_MISSING[kind]}") from None
+        raise PublishError(kind, f"{error}; {remedy}") from None
     return opened
 
 
