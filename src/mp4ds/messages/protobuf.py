@@ -3,167 +3,57 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from mp4ds.messages.wire import (
     MAX_BLANK,
+    MAX_DISTORTION,
     NS,
     CalibrationFields,
     CodedFields,
     Fields,
+    Form,
     ImageFields,
-    Parts,
+    Reading,
     Slots,
+    Span,
     WireError,
-    check_floats,
     join_stamp,
+    make_fields,
     text,
 )
 
 Kind = Literal["time", "text", "u32", "doubles", "data"]
-Span = tuple[int, int]
 
 _HEADER: dict[str, Kind] = {"timestamp": "time", "frame_id": "text"}
 _SIZE: dict[str, Kind] = {"width": "u32", "height": "u32"}
 _CODED: dict[str, Kind] = {**_HEADER, "data": "data", "format": "text"}
-_MATRIX_SIZES = {"K": 9, "R": 9, "P": 12}
-_MAX_DISTORTION = 1024
-_INT64 = 1 << 63
+_LENGTHS = {"K": 9, "R": 9, "P": 12}
 
-TYPES: Mapping[str, Mapping[str, Kind]] = {
-    "foxglove.RawImage": {**_HEADER, **_SIZE, "encoding": "text", "step": "u32", "data": "data"},
-    "foxglove.CompressedImage": _CODED,
-    "foxglove.CompressedVideo": _CODED,
-    "foxglove.CameraCalibration": {
-        **_HEADER,
-        **_SIZE,
-        "distortion_model": "text",
-        "D": "doubles",
-        "K": "doubles",
-        "R": "doubles",
-        "P": "doubles",
-    },
+FOXGLOVE_TYPES: Mapping[str, tuple[type[Fields], Mapping[str, Kind]]] = {
+    "foxglove.RawImage": (
+        ImageFields,
+        {**_HEADER, **_SIZE, "encoding": "text", "step": "u32", "data": "data"},
+    ),
+    "foxglove.CompressedImage": (CodedFields, _CODED),
+    "foxglove.CompressedVideo": (CodedFields, _CODED),
+    "foxglove.CameraCalibration": (
+        CalibrationFields,
+        {
+            **_HEADER,
+            **_SIZE,
+            "distortion_model": "text",
+            **dict.fromkeys("DKRP", "doubles"),
+        },
+    ),
 }
 """The fields of each type and what they hold (spec/registry.md, "Message types")."""
 
-
-def fields_of_type(type_name: str) -> Mapping[str, Kind]:
-    """Names and kinds of the fields of a message type.
-
-    Raises:
-        WireError: It is not one of `TYPES`.
-    """
-    if type_name not in TYPES:
-        raise WireError(f"type {type_name!r} is not modelled")
-    return TYPES[type_name]
-
-
-def join_fields(type_name: str, values: Mapping[str, Any]) -> Fields:
-    """A message's fields besides its header and body.
-
-    Args:
-        type_name: One of `TYPES`.
-        values: All its text, number and number-list fields, by name.
-
-    Raises:
-        WireError: A calibration cannot be modelled.
-    """
-    if type_name == "foxglove.RawImage":
-        return ImageFields(
-            encoding=values["encoding"],
-            width=values["width"],
-            height=values["height"],
-            step=values["step"],
-            is_bigendian=0,
-        )
-    if type_name != "foxglove.CameraCalibration":
-        return CodedFields(values["format"])
-    for name, size in _MATRIX_SIZES.items():
-        if len(values[name]) != size:
-            raise WireError(f"it has {len(values[name])} values in {name}, not {size}")
-    if len(values["D"]) > _MAX_DISTORTION:
-        raise WireError(f"it has {len(values['D'])} distortion parameters")
-    check_floats((*values["D"], *values["K"], *values["R"], *values["P"]))
-    return CalibrationFields(
-        height=values["height"],
-        width=values["width"],
-        distortion_model=values["distortion_model"],
-        d=tuple(values["D"]),
-        k=tuple(values["K"]),
-        r=tuple(values["R"]),
-        p=tuple(values["P"]),
-    )
-
-
-def join_wide_stamp(sec: int, nanosec: int) -> int:
-    """Nanoseconds, where seconds may be out of a column's range.
-
-    Raises:
-        WireError: The stamp cannot be restored from them, or needs more than 64 bits.
-    """
-    stamp = join_stamp(sec, nanosec)
-    if not -_INT64 <= stamp < _INT64:
-        raise WireError("its stamp is beyond 64-bit nanoseconds")
-    return stamp
-
-
-@dataclass(frozen=True, slots=True)
-class Pieces:
-    """A message cut at its slots.
-
-    Attributes:
-        between: The bytes before, between and after the slots.
-        names: The slots in order; ``body`` is the last before the body.
-    """
-
-    between: tuple[bytes, ...]
-    names: tuple[str, ...]
-
-    @classmethod
-    def cut(cls, data: memoryview, spans: Mapping[str, Span]) -> Pieces:
-        """Cut a message.
-
-        Args:
-            data: The message.
-            spans: Start and end of each slot, in order.
-        """
-        ends = (0, *(end for _, end in spans.values()))
-        starts = (*(start for start, _ in spans.values()), len(data))
-        between = tuple(bytes(data[end:start]) for end, start in zip(ends, starts, strict=True))
-        return cls(between, tuple(spans))
-
-    def fill(self, values: Mapping[str, bytes]) -> tuple[bytes, bytes]:
-        """The bytes before and after the body, with slots filled."""
-        head, parts = b"", [self.between[0]]
-        for name, piece in zip(self.names, self.between[1:], strict=True):
-            parts.append(values[name])
-            if name == "body":
-                head, parts = b"".join(parts), []
-            parts.append(piece)
-        rest = b"".join(parts)
-        return (head, rest) if "body" in self.names else (rest, b"")
-
-
-def check_around(size: int) -> None:
-    """Refuse a message that holds too much besides its data.
-
-    Args:
-        size: Bytes around its data.
-
-    Raises:
-        WireError: They are more than a blank may have.
-    """
-    if size > MAX_BLANK:
-        raise WireError(f"it has {size} bytes besides its data")
-
-
-# ---------------------------------------------------------------- protobuf
-
 _VARINT, _I64, _LEN, _I32 = 0, 1, 2, 5  # wire types
 _UINT64 = (1 << 64) - 1
-_BLANK = {"stamp": b"\0", "body": b"\0"}
+_INT64 = 1 << 63
 _SLOTS: Mapping[Kind, str] = {"time": "stamp", "data": "body"}
 _EMPTY: Mapping[Kind, Any] = {"text": "", "u32": 0}  # fields with this value are omitted
 
@@ -200,65 +90,27 @@ class _Field:
     end: int
 
 
-@dataclass(frozen=True, slots=True)
-class _Read:
-    """The contents of a message, and the positions of its slots."""
-
-    stamp: int
-    frame_id: str
-    fields: Fields
-    body: Span
-    spans: Mapping[str, Span]
-
-
-class ProtobufForm:
-    """One of Foxglove's message types in protobuf. See `mp4ds.messages.wire.Form`.
+class ProtobufForm(Form):
+    """One of Foxglove's message types.
 
     Args:
-        type_name: One of `mp4ds.messages.protobuf.TYPES`.
+        type_name: One of `FOXGLOVE_TYPES`.
         schema: A serialized FileDescriptorSet that declares it.
 
     Raises:
         WireError: The type differs, or the schema does not declare it with its fields.
     """
 
+    wire = "protobuf"
+
     def __init__(self, type_name: str, schema: bytes) -> None:
-        self._type_name = type_name
-        self._kinds = fields_of_type(type_name)
+        if type_name not in FOXGLOVE_TYPES:
+            raise WireError(f"type {type_name!r} is not modelled")
+        self._kind, self._kinds = FOXGLOVE_TYPES[type_name]
         self._declared = _declared(type_name, schema, self._kinds)
 
-    @property
-    def wire(self) -> str:
-        """See `Form.wire`."""
-        return "protobuf"
-
-    def split(self, data: memoryview) -> Parts:
-        """See `Form.split`."""
-        read = self._read(data)
-        start, end = read.body
-        return Parts(
-            stamp=read.stamp,
-            seq=None,
-            pts=None,
-            frame_id=read.frame_id,
-            fields=read.fields,
-            body=data[start:end],
-            blank=b"".join(Pieces.cut(data, read.spans).fill(_BLANK)),
-        )
-
-    def template(self, blank: bytes) -> ProtobufTemplate:
-        """See `Form.template`."""
-        view = memoryview(blank)
-        read = self._read(view)
-        if any(view[at:end] != _BLANK[name] for name, (at, end) in read.spans.items()):
-            raise WireError("a blank message has a timestamp or data")
-        return ProtobufTemplate(Pieces.cut(view, read.spans))
-
-    def plain(self, frame_id: str, fields: Fields) -> bytes | None:
-        """See `Form.plain`."""
-        return None
-
-    def _read(self, data: memoryview) -> _Read:
+    def read(self, data: memoryview) -> Reading:
+        """Read a message."""
         values: dict[str, Any] = {
             name: [] if kind == "doubles" else _EMPTY.get(kind)
             for name, kind in self._kinds.items()
@@ -272,7 +124,9 @@ class ProtobufForm:
                 raise WireError(f"it has its {declared.name} twice")
             if slot == "body":
                 body = field.start, field.end
-            check_around(field.end - (body[1] - body[0]))  # also bounds the number of fields
+            if (around := field.end - (body[1] - body[0])) > MAX_BLANK:
+                # before all were read: this bounds the number of fields
+                raise WireError(f"it has {around} bytes besides its data")
             if declared is None:
                 continue
             if field.wire_type not in declared.wire_types:
@@ -283,30 +137,31 @@ class ProtobufForm:
         for name, kind in self._kinds.items():
             if kind in _SLOTS and _SLOTS[kind] not in spans:
                 raise WireError(f"it has no {name}")
-        return _Read(
-            stamp=values["timestamp"],
-            frame_id=values["frame_id"],
-            fields=join_fields(self._type_name, values),
-            body=body,
-            spans=spans,
-        )
+        parts = {
+            "stamp": values["timestamp"],
+            "seq": None,
+            "pts": None,
+            "frame_id": values["frame_id"],
+            "fields": make_fields(self._kind, _checked(values)),
+        }
+        return Reading(parts, spans, body)
 
-
-class ProtobufTemplate:
-    """A blank in protobuf. See `mp4ds.messages.wire.Template`."""
-
-    def __init__(self, pieces: Pieces) -> None:
-        self._pieces = pieces
-
-    def around(self, slots: Slots, body_size: int) -> tuple[bytes, bytes]:
-        """See `Template.around`."""
+    def slot(self, name: str, slots: Slots, body_size: int) -> bytes:
+        """The bytes of a slot, with its length."""
+        if name == "body":
+            return _varint_bytes(body_size)
         timestamp = _timestamp(slots.stamp)
-        stamp = _varint_bytes(len(timestamp)) + timestamp
-        return self._pieces.fill({"stamp": stamp, "body": _varint_bytes(body_size)})
+        return _varint_bytes(len(timestamp)) + timestamp
 
-    def padding(self, body_size: int) -> int:
-        """See `Template.padding`: never."""
-        return 0
+
+def _checked(values: dict[str, Any]) -> dict[str, Any]:
+    """Values by their names in ROS, where lists have the right lengths."""
+    for name, size in _LENGTHS.items():
+        if name in values and len(values[name]) != size:
+            raise WireError(f"it has {len(values[name])} values in {name}, not {size}")
+    if len(values.get("D", ())) > MAX_DISTORTION:
+        raise WireError(f"it has {len(values['D'])} distortion parameters")
+    return {name.lower(): value for name, value in values.items()}
 
 
 def _declared(type_name: str, schema: bytes, kinds: Mapping[str, Kind]) -> Mapping[int, _Declared]:
@@ -423,7 +278,10 @@ def _stamp(raw: memoryview) -> int:
                 raise WireError("its timestamp is not of the declared type")
             value = _varint(raw, field.start)[0]
             values[field.number] = value - (value >> 63 << 64)
-    return join_wide_stamp(values[1], values[2])
+    stamp = join_stamp(values[1], values[2])
+    if not -_INT64 <= stamp < _INT64:  # what a column holds
+        raise WireError("its stamp is beyond 64-bit nanoseconds")
+    return stamp
 
 
 def _timestamp(stamp: int) -> bytes:
@@ -433,3 +291,39 @@ def _timestamp(stamp: int) -> bytes:
         raise WireError("a time is beyond what its message has bits for")
     out = b"\x08" + _varint_bytes(sec & _UINT64) if sec else b""
     return out + (b"\x10" + _varint_bytes(nanos) if nanos else b"")
+
+
+# ---------------------------------------------------------------- other messages
+
+
+def decoder_of_schema(type_name: str, schema: bytes) -> Callable[[memoryview], Any]:
+    """A decoder of messages of any type; it raises WireError for invalid ones.
+
+    Args:
+        type_name: Full name of the messages' type.
+        schema: A serialized FileDescriptorSet that declares it and everything it refers to.
+
+    Raises:
+        WireError: It does not.
+    """
+    # only recordings with protobuf need it
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message import DecodeError
+    from google.protobuf.message_factory import GetMessageClass, GetMessages
+
+    try:
+        pool = DescriptorPool()
+        GetMessages(FileDescriptorSet.FromString(schema).file, pool)
+        # by name, as a type may be declared inside another one
+        message_class = GetMessageClass(pool.FindMessageTypeByName(type_name))
+    except (DecodeError, LookupError, ValueError, TypeError, RecursionError):
+        raise WireError(f"its schema does not declare {type_name}") from None
+
+    def decode(data: memoryview) -> Any:
+        try:
+            return message_class.FromString(bytes(data))
+        except (DecodeError, ValueError):  # the latter by protobuf's pure Python
+            raise WireError(f"it is not a {type_name}") from None
+
+    return decode

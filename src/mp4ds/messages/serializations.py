@@ -1,51 +1,225 @@
-"""The tables of serializations and their message types."""
+"""The serializations of camera messages; that of ROS 1 and ROS 2's CDR are here.
+
+The two differ in order, alignment and header. ROS 1: little-endian, unaligned, header with seq,
+strings without NUL (wiki.ros.org/msg, "Fields"). CDR: a four-byte encapsulation, primitives
+aligned to their size from there, strings with NUL (OMG DDSI-RTPS 2.5, 10; plain CDR only).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+import struct
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 from mp4ds.errors import Refused
-from mp4ds.messages.ros import LAYOUTS, RosForm, RosWire
+from mp4ds.messages.protobuf import FOXGLOVE_TYPES, ProtobufForm
 from mp4ds.messages.wire import (
+    MAX_DISTORTION,
+    NS,
     CalibrationFields,
     CodedFields,
     Fields,
     Form,
     ImageFields,
     Parts,
+    PrimitiveReader,
+    PrimitiveWriter,
+    Reading,
     Slots,
+    Span,
     WireError,
+    join_stamp,
+    make_fields,
 )
 from mp4ds.records import Channel, Message
 
-_ROS = {
-    wire.name: wire
-    for wire in (
-        RosWire("ros1", b"", "<", ros2=False),
-        RosWire("cdr-le", b"\x00\x01\x00\x00", "<", ros2=True),
-        RosWire("cdr-be", b"\x00\x00\x00\x00", ">", ros2=True),
-    )
+
+class _RosWire(NamedTuple):
+    """One of the three plain serializations of ROS.
+
+    Attributes:
+        prefix: The encapsulation at the start of a payload.
+        order: Byte order, in struct's notation.
+        ros2: Whether it is CDR: aligned, NUL-terminated, without seq.
+    """
+
+    prefix: bytes
+    order: str
+    ros2: bool
+
+
+_ROS_WIRES = {
+    "ros1": _RosWire(b"", "<", ros2=False),
+    "cdr-le": _RosWire(b"\x00\x01\x00\x00", "<", ros2=True),
+    "cdr-be": _RosWire(b"\x00\x00\x00\x00", ">", ros2=True),
 }
+_PROTOBUF = "protobuf"
 _ZSTD = b"\x28\xb5\x2f\xfd"  # magic of zstd
-_FOXGLOVE: Mapping[str, type[Fields]] = {
-    "foxglove.RawImage": ImageFields,
-    "foxglove.CompressedImage": CodedFields,
-    "foxglove.CompressedVideo": CodedFields,
-    "foxglove.CameraCalibration": CalibrationFields,
-}
 
-
-def _protobuf(type_name: str, schema: bytes) -> Form:
-    from mp4ds.messages.protobuf import ProtobufForm
-
-    return ProtobufForm(type_name, schema)
-
-
-_OTHERS: Mapping[str, Callable[[str, bytes], Form]] = {"protobuf": _protobuf}
-
-WIRES = (*_ROS, *_OTHERS)
+WIRES = (*_ROS_WIRES, _PROTOBUF)
 """Serializations, by the names that sidecars use (spec/registry.md, "Wires")."""
+
+
+# ---------------------------------------------------------------- ROS
+
+# (name, code): struct codes, s for a string, d* for a length-prefixed array of doubles
+_HEADER = (("header", ""),)
+_TIME = (("time", ""), ("frame_id", "s"))
+_BODY = ("body", "")
+_SIZE = (("width", "I"), ("height", "I"))
+_MATRICES = (("distortion_model", "s"), ("d", "d*"), ("k", "9d"), ("r", "9d"), ("p", "12d"))
+_BINNING = (("binning_x", "I"), ("binning_y", "I"))
+_ROI = (("roi", "4I"), ("roi_do_rectify", "B"))  # x_offset, y_offset, height, width
+
+_Layout = tuple[tuple[str, str], ...]
+
+ROS_TYPES: Mapping[str, tuple[type[Fields], _Layout]] = {
+    "sensor_msgs/Image": (
+        ImageFields,
+        (*_HEADER, *_SIZE[::-1], ("encoding", "s"), ("is_bigendian", "B"), ("step", "I"), _BODY),
+    ),
+    "sensor_msgs/CompressedImage": (CodedFields, (*_HEADER, ("format", "s"), _BODY)),
+    "sensor_msgs/CameraInfo": (
+        CalibrationFields,
+        (*_HEADER, *_SIZE[::-1], *_MATRICES, *_BINNING, *_ROI),
+    ),
+    "ffmpeg_image_transport_msgs/FFMPEGPacket": (
+        CodedFields,
+        (
+            *_HEADER,
+            *(("width", "i"), ("height", "i"), ("format", "s"), ("pts", "Q")),
+            *(("flags", "B"), ("is_bigendian", "B"), _BODY),
+        ),
+    ),
+    "foxglove_msgs/RawImage": (
+        ImageFields,
+        (*_TIME, *_SIZE, ("encoding", "s"), ("step", "I"), _BODY),
+    ),
+    "foxglove_msgs/CompressedImage": (CodedFields, (*_TIME, _BODY, ("format", "s"))),
+    "foxglove_msgs/CompressedVideo": (CodedFields, (*_TIME, _BODY, ("format", "s"))),
+    "foxglove_msgs/CameraCalibration": (CalibrationFields, (*_TIME, *_SIZE, *_MATRICES)),
+}
+"""The fields of each type, in the order of its definition (spec/registry.md, "Message types")."""
+
+
+class RosForm(Form):
+    """A message type in a ROS serialization.
+
+    Args:
+        wire: ``ros1``, ``cdr-le`` or ``cdr-be``.
+        type_name: One of `ROS_TYPES`.
+    """
+
+    def __init__(self, wire: str, type_name: str) -> None:
+        self.wire = wire
+        self._prefix, self._order, self._ros2 = _ROS_WIRES[wire]
+        self._kind, self._layout = ROS_TYPES[type_name]
+        self._sec_code = "i" if self._ros2 else "I"
+        names = [name for name, _ in self._layout]
+        has_tail = "body" in names and names[-1] != "body"
+        if self._ros2 and has_tail:
+            self.body_alignment = 4  # of strings
+        self._is_plain = "pts" not in names and not has_tail
+
+    def read(self, data: memoryview) -> Reading:
+        """Read a message."""
+        if bytes(data[: len(self._prefix)]) != self._prefix:
+            raise WireError("it does not begin like a plain serialization of its kind")
+        reader = PrimitiveReader(data, len(self._prefix), self._order, aligned=self._ros2)
+        values: dict[str, Any] = {}
+        spans: dict[str, Span] = {}
+        body = len(data), len(data)
+        for name, code in self._layout:
+            if name in ("header", "time"):
+                if name == "header" and not self._ros2:
+                    values["seq"] = reader.integer("I")
+                    spans["seq"] = reader.offset - 4, reader.offset
+                start = reader.align(4)
+                spans["stamp"] = start, start + 8
+                values["stamp"] = reader.integer(self._sec_code), reader.integer("I")
+                if name == "header":
+                    values["frame_id"] = reader.string(terminated=self._ros2)
+            elif name == "body":
+                size = reader.integer("I")
+                body = reader.offset, reader.offset + size
+                spans["body"] = reader.offset - 4, body[1]
+                reader.raw(size)
+            else:
+                values[name] = _take(reader, code, terminated=self._ros2)
+                if name == "pts":
+                    spans["pts"] = reader.offset - 8, reader.offset
+        parts = {
+            "stamp": join_stamp(*values["stamp"]),
+            "seq": values.get("seq"),
+            "pts": values.get("pts"),
+            "frame_id": values["frame_id"],
+            "fields": make_fields(self._kind, values),
+        }
+        return Reading(parts, spans, body)
+
+    def slot(self, name: str, slots: Slots, body_size: int) -> bytes:
+        """The bytes of a slot."""
+        try:
+            if name == "stamp":
+                return struct.pack(f"{self._order}{self._sec_code}I", *divmod(slots.stamp, NS))
+            if name == "pts":
+                return struct.pack(f"{self._order}Q", slots.pts or 0)
+            value = body_size if name == "body" else slots.seq
+            return struct.pack(f"{self._order}I", value or 0)
+        except struct.error:
+            raise WireError("a time or number is beyond what its message has bits for") from None
+
+    def plain(self, frame_id: str, fields: Fields) -> bytes | None:
+        """The blank as ROS writes it; None for types whose other fields are not modelled."""
+        if not self._is_plain:
+            return None
+        writer = PrimitiveWriter(self._prefix, self._order, aligned=self._ros2)
+        for name, code in self._layout:
+            if name in ("header", "time"):
+                if name == "header" and not self._ros2:
+                    writer.put("I", 0)
+                writer.put("I", 0, 0)
+                if name == "header":
+                    writer.string(frame_id, terminated=self._ros2)
+            elif name == "body":
+                writer.put("I", 0)
+            elif name == "frame_id":
+                writer.string(frame_id, terminated=self._ros2)
+            else:
+                _put(writer, code, getattr(fields, name), terminated=self._ros2)
+        return writer.getvalue()
+
+
+def _take(reader: PrimitiveReader, code: str, *, terminated: bool) -> Any:
+    if code == "s":
+        return reader.string(terminated=terminated)
+    if code == "d*":
+        count = reader.integer("I")
+        if count > MAX_DISTORTION:
+            raise WireError(f"it has {count} distortion parameters")
+        return reader.take("d", count)
+    if len(code) > 1:
+        return reader.take(code[-1], int(code[:-1]))
+    return reader.integer(code)
+
+
+def _put(writer: PrimitiveWriter, code: str, value: Any, *, terminated: bool) -> None:
+    if code == "s":
+        writer.string(value, terminated=terminated)
+    elif code == "d*":
+        writer.put("I", len(value))
+        writer.put("d", *value)
+    elif len(code) > 1:
+        writer.put(code[-1], *value)
+    else:
+        writer.put(code, value)
+
+
+def _ros_type(name: str) -> str:
+    return name.replace("/msg/", "/")
+
+
+# ---------------------------------------------------------------- all
 
 
 def kind_of(channel: Channel) -> type[Fields] | None:
@@ -54,9 +228,9 @@ def kind_of(channel: Channel) -> type[Fields] | None:
     Returns:
         The class of their fields; None for a channel that is not a camera's.
     """
-    if channel.message_encoding not in ("ros1", "cdr"):
-        return _FOXGLOVE.get(channel.type_name)
-    entry = LAYOUTS.get(_ros_type(channel.type_name))
+    is_ros = channel.message_encoding in ("ros1", "cdr")
+    types = ROS_TYPES if is_ros else FOXGLOVE_TYPES
+    entry = types.get(_ros_type(channel.type_name) if is_ros else channel.type_name)
     return entry[0] if entry else None
 
 
@@ -80,12 +254,12 @@ def wire_of(message_encoding: str, data: memoryview) -> str:
     Raises:
         WireError: No wire has this serialization.
     """
-    if message_encoding == "ros1" or message_encoding in _OTHERS:
+    if message_encoding in ("ros1", _PROTOBUF):
         return message_encoding
     if message_encoding == "cdr":
-        for wire in _ROS.values():
+        for name, wire in _ROS_WIRES.items():
             if wire.ros2 and data[:4] == wire.prefix:
-                return wire.name
+                return name
         if data[:4] == _ZSTD:
             raise WireError(
                 "it is compressed by zstd, as rosbag2 does in its compression mode MESSAGE: pack "
@@ -108,12 +282,12 @@ def form_of(wire: str, type_name: str, schema: bytes) -> Form:
     Raises:
         WireError: The type is not modelled in that serialization.
     """
-    if wire in _OTHERS:
-        return _OTHERS[wire](type_name, schema)
+    if wire == _PROTOBUF:
+        return ProtobufForm(type_name, schema)
     name = _ros_type(type_name)
-    if wire not in _ROS or name not in LAYOUTS:
+    if wire not in _ROS_WIRES or name not in ROS_TYPES:
         raise WireError(f"type {type_name!r} is not modelled")
-    return RosForm(_ROS[wire], name)
+    return RosForm(wire, name)
 
 
 def plain_message(
@@ -140,10 +314,6 @@ def plain_message(
     return b"".join((head, body, tail))
 
 
-def _ros_type(name: str) -> str:
-    return name.replace("/msg/", "/")
-
-
 class MessageSplitter:
     """Splits the messages of one channel; its serialization may change between messages."""
 
@@ -168,36 +338,3 @@ class MessageSplitter:
             return form, form.split(data)
         except WireError as error:
             raise Refused(f"it does not parse: {error}") from None
-
-
-def decoder_of_schema(type_name: str, schema: bytes) -> Callable[[memoryview], Any]:
-    """A decoder of messages of any type; it raises WireError for invalid ones.
-
-    Args:
-        type_name: Full name of the messages' type.
-        schema: A serialized FileDescriptorSet that declares it and everything it refers to.
-
-    Raises:
-        WireError: It does not.
-    """
-    # only recordings with protobuf need it
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-    from google.protobuf.descriptor_pool import DescriptorPool
-    from google.protobuf.message import DecodeError
-    from google.protobuf.message_factory import GetMessageClass, GetMessages
-
-    try:
-        pool = DescriptorPool()
-        GetMessages(FileDescriptorSet.FromString(schema).file, pool)
-        # by name, as a type may be declared inside another one
-        message_class = GetMessageClass(pool.FindMessageTypeByName(type_name))
-    except (DecodeError, LookupError, ValueError, TypeError, RecursionError):
-        raise WireError(f"its schema does not declare {type_name}") from None
-
-    def decode(data: memoryview) -> Any:
-        try:
-            return message_class.FromString(bytes(data))
-        except (DecodeError, ValueError):  # the latter by protobuf's pure Python
-            raise WireError(f"it is not a {type_name}") from None
-
-    return decode

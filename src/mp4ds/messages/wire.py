@@ -1,16 +1,17 @@
-"""The neutral parts of camera messages, and the interface of serializations.
+"""The neutral parts of camera messages, and what serializations have in common.
 
 A form handles one message type in one serialization. It splits a message into its body, its times
-and a blank, and refills a blank; the caller compares the result with the original, so nothing here
-needs to be trusted (spec/index.md, "Exactness").
+and a blank, and a template of the blank makes the message again; the caller compares the result
+with the original, so nothing here needs to be trusted (spec/index.md, "Exactness").
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, NamedTuple
 
 NS = 10**9
 MAX_BLANK = 1 << 16
@@ -121,8 +122,107 @@ class Slots:
     pts: int | None = None
 
 
-class Template(Protocol):
-    """A blank with located slots."""
+Span = tuple[int, int]
+
+
+class Reading(NamedTuple):
+    """What a message holds, and where.
+
+    Attributes:
+        values: Its `Parts` other than body and blank.
+        spans: Start and end of each slot that it has, in order: ``stamp``, ``seq``, ``pts``, and
+            ``body``, which includes the body's length.
+        body: Start and end of the body; empty at the end of a message without one.
+    """
+
+    values: Mapping[str, Any]
+    spans: Mapping[str, Span]
+    body: Span
+
+
+class Form(ABC):
+    """One message type in one serialization.
+
+    Attributes:
+        wire: Name of the serialization in sidecars.
+        body_alignment: Of what follows the body, which so depends on the body's length.
+    """
+
+    wire: str
+    body_alignment = 1
+
+    @abstractmethod
+    def read(self, data: memoryview) -> Reading:
+        """Read a message.
+
+        Raises:
+            WireError: The payload does not parse, or cannot be modelled; says why.
+        """
+
+    @abstractmethod
+    def slot(self, name: str, slots: Slots, body_size: int) -> bytes:
+        """The bytes of a slot; of ``body``, its length.
+
+        Raises:
+            WireError: This serialization cannot represent a value.
+        """
+
+    def plain(self, frame_id: str, fields: Fields) -> bytes | None:
+        """The blank as written by a plain serializer; None if that is not modelled."""
+        return None
+
+    def split(self, data: memoryview) -> Parts:
+        """Split a message.
+
+        Raises:
+            WireError: The payload does not parse, or cannot be modelled; says why.
+        """
+        values, spans, (start, end) = self.read(data)
+        if (around := len(data) - (end - start)) > MAX_BLANK:
+            raise WireError(f"it has {around} bytes besides its data")
+        # a blank keeps the body's length as far as what follows depends on it
+        kept = (end - start) % self.body_alignment
+        head, tail = Template(self, data, spans, kept).around(_BLANK, kept)
+        return Parts(**values, body=data[start:end], blank=b"".join((head, bytes(kept), tail)))
+
+    def template(self, blank: bytes) -> Template:
+        """The template of a blank.
+
+        Raises:
+            WireError: It is not a blank message of this form.
+        """
+        _, spans, (start, end) = self.read(memoryview(blank))
+        kept = end - start
+        for name, (first, last) in spans.items():
+            size = last - first - (kept if name == "body" else 0)
+            if kept >= self.body_alignment or size != len(self.slot(name, _BLANK, kept)):
+                raise WireError("a blank message has times or data")
+        return Template(self, memoryview(blank), spans, kept)
+
+
+_BLANK = Slots(0)
+
+
+class Template:
+    """A blank with located slots.
+
+    Args:
+        form: Of the message.
+        blank: The blank, or a message whose slots are not looked at.
+        spans: As in `Reading`.
+        kept: Length of the body in the blank.
+    """
+
+    def __init__(self, form: Form, blank: memoryview, spans: Mapping[str, Span], kept: int) -> None:
+        self._form = form
+        self._kept = kept
+        end = 0
+        # what is before each slot
+        self._before: list[tuple[bytes, str]] = []
+        for name, (start, after) in spans.items():
+            self._before.append((bytes(blank[end:start]), name))
+            end = after
+        self._rest = bytes(blank[end:])
 
     def around(self, slots: Slots, body_size: int) -> tuple[bytes, bytes]:
         """The bytes before and after the body.
@@ -134,43 +234,18 @@ class Template(Protocol):
         Raises:
             WireError: This serialization cannot represent a value.
         """
-        ...
+        head = b""
+        parts: list[bytes] = []
+        for before, name in self._before:
+            parts += (before, self._form.slot(name, slots, body_size))
+            if name == "body":
+                head, parts = b"".join(parts), []
+        rest = b"".join((*parts, self._rest))
+        return (head, rest) if head else (rest, b"")
 
     def padding(self, body_size: int) -> int:
-        """Zero bytes needed after a body whose length differs from the recorded one.
-
-        The alignment of what follows a body may depend on its length.
-        """
-        ...
-
-
-class Form(Protocol):
-    """One message type in one serialization."""
-
-    @property
-    def wire(self) -> str:
-        """Name of the serialization in sidecars."""
-        ...
-
-    def split(self, data: memoryview) -> Parts:
-        """Split a message.
-
-        Raises:
-            WireError: The payload does not parse, or cannot be modelled; says why.
-        """
-        ...
-
-    def template(self, blank: bytes) -> Template:
-        """The template of a blank.
-
-        Raises:
-            WireError: It is not a blank message of this form.
-        """
-        ...
-
-    def plain(self, frame_id: str, fields: Fields) -> bytes | None:
-        """The blank as written by a plain serializer; None if that is not modelled."""
-        ...
+        """Zero bytes needed after a body whose length differs from the recorded one."""
+        return (self._kept - body_size) % self._form.body_alignment
 
 
 def prove(template: Template, parts: Parts, data: memoryview) -> bool:
@@ -178,6 +253,45 @@ def prove(template: Template, parts: Parts, data: memoryview) -> bool:
     head, tail = template.around(Slots(parts.stamp, parts.seq, parts.pts), len(parts.body))
     end = len(data) - len(tail)  # the body itself is a view of the message
     return len(head) + len(parts.body) == end and data[: len(head)] == head and data[end:] == tail
+
+
+# ---------------------------------------------------------------- values
+
+MAX_DISTORTION = 1024
+
+
+def make_fields(kind: type[Fields], values: Mapping[str, Any]) -> Fields:
+    """The fields of a message besides its header and body.
+
+    Args:
+        kind: Of the message.
+        values: By name; those that a type does not have may be absent.
+
+    Raises:
+        WireError: A value of a calibration is infinite or not a number, which YAML cannot hold.
+    """
+    if kind is CodedFields:
+        return CodedFields(values["format"], values.get("width", 0), values.get("height", 0))
+    width, height = values["width"], values["height"]
+    if kind is ImageFields:
+        bigendian = values.get("is_bigendian", 0)
+        return ImageFields(values["encoding"], width, height, values["step"], bigendian)
+    d, k, r, p = (tuple(values[name]) for name in "dkrp")
+    if any(value - value != 0 for value in (*d, *k, *r, *p)):
+        raise WireError("a calibration value is not finite")
+    return CalibrationFields(
+        height=height,
+        width=width,
+        distortion_model=values["distortion_model"],
+        d=d,
+        k=k,
+        r=r,
+        p=p,
+        binning_x=values.get("binning_x", 0),
+        binning_y=values.get("binning_y", 0),
+        roi=values.get("roi", (0, 0, 0, 0)),
+        roi_do_rectify=values.get("roi_do_rectify", 0),
+    )
 
 
 def join_stamp(sec: int, nanosec: int) -> int:
@@ -201,16 +315,6 @@ def text(raw: memoryview) -> str:
         return str(raw, "utf-8")
     except UnicodeDecodeError:
         raise WireError("a string is not UTF-8") from None
-
-
-def check_floats(values: Sequence[float]) -> None:
-    """Refuse values that YAML cannot hold; such a message is stored verbatim.
-
-    Raises:
-        WireError: A value is infinite or not a number.
-    """
-    if any(value - value != 0 for value in values):
-        raise WireError("a calibration value is not finite")
 
 
 # ---------------------------------------------------------------- primitive types

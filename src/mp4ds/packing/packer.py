@@ -462,12 +462,12 @@ class Packer:
         topic.messages += 1
         topic.raw_bytes += len(record.data)
         part.saw([record.log_time])
-        self._transforms.add(channel, record.data)
         if is_camera(channel):
             self._cameras.take(record, threads)
         elif is_calibration(channel):
             self._calibrations.take(record)
         else:
+            self._transforms.add(channel, record.data)
             self._keep(record)
 
     def _keep(self, message: Message) -> None:
