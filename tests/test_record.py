@@ -24,7 +24,7 @@ from mp4ds.bags.formats import open_sources
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.dataset.collections import datasets_in
-from mp4ds.errors import OptionError, RecordError, SourceError, TargetExistsError
+from mp4ds.errors import OptionError, SourceError, TargetExistsError, WriteError
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.processes import ProcessExecutor
@@ -373,7 +373,7 @@ def test_packing_that_fails(
     """The recording goes on, what was recorded stays, and the command that packs it is named."""
     paths = write(tmp_path)
     fail_to_pack(1, "the encoder is out of order", monkeypatch)
-    with pytest.raises(RecordError, match=r"out of order.*--salvage .*live\.recording"):
+    with pytest.raises(WriteError, match=r"out of order.*--salvage .*live\.recording"):
         recorded(PlayedNode(paths), tmp_path / "live")
     assert not (tmp_path / "live").exists()
     names = {path.name for path in (tmp_path / "live.recording").iterdir()}
@@ -391,7 +391,7 @@ def test_a_packing_process_that_dies(
     python.write_text("#!/bin/sh\nexit 7\n")
     python.chmod(0o755)
     monkeypatch.setattr("sys.executable", str(python))
-    with pytest.raises(RecordError, match="exited with code 7"):
+    with pytest.raises(WriteError, match="exited with code 7"):
         recorded(PlayedNode(paths), tmp_path / "live")
     mp4ds.pack(tmp_path / "live.recording", tmp_path / "live", SALVAGE)
     assert compare(paths, again(tmp_path / "live", tmp_path)) == []
@@ -463,7 +463,7 @@ def test_a_disk_that_is_full(
 
     write_message = McapWriter.write
     monkeypatch.setattr(McapWriter, "write", refuse)
-    with pytest.raises(RecordError, match=r"No space left.*--salvage .*live\.recording"):
+    with pytest.raises(WriteError, match=r"No space left.*--salvage .*live\.recording"):
         recorded(PlayedNode(paths), tmp_path / "live")
     monkeypatch.undo()
     assert not (tmp_path / "live").exists()

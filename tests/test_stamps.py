@@ -15,7 +15,6 @@ from mp4ds.times import (
     INT64_MIN,
     MAX_GAP_NS,
     TIMESCALE,
-    Int64Column,
     PresentationClock,
     decode_column,
     encode_column,
@@ -145,17 +144,6 @@ def test_random_text_is_read_by_the_grammar_or_refused(text: str, count: int) ->
     assert VALUES.fullmatch(text)
     assert found == decode_by_the_spec(0, 0, text)
     assert len(found) == count
-
-
-def test_a_growing_column() -> None:
-    column = Int64Column()
-    assert len(column) == 0
-    assert column.to_numpy().dtype == np.int64
-    for value in (INT64_MIN, 0, INT64_MAX):
-        column.append(value)
-    assert column.to_numpy().tolist() == [INT64_MIN, 0, INT64_MAX]
-    with pytest.raises(OverflowError):
-        Int64Column().append(2**63)
 
 
 # ---------------------------------------------------------------- presentation times

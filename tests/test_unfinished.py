@@ -14,7 +14,7 @@ import pytest
 
 import mp4ds
 from commands import Result, call, tree
-from mp4ds.errors import RecordError
+from mp4ds.errors import WriteError
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.plugins.recording import spool
 from record_scenes import PlayedNode, fail_to_pack, recorded
@@ -37,7 +37,7 @@ def left(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as tired:
         tired.setattr(spool, "WINDOW_NS", 100_000_000)
         fail_to_pack(2, "the disk is tired", tired)
-        with pytest.raises(RecordError, match="the disk is tired"):
+        with pytest.raises(WriteError, match="the disk is tired"):
             recorded(PlayedNode(paths), folder / "robot" / "drives" / "drive")
     return folder
 

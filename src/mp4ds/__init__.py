@@ -30,14 +30,11 @@ from mp4ds.errors import (
     FrameNotFoundError,
     Mp4dsError,
     OptionError,
-    OutOfReachError,
     PartsFailedError,
     PublishError,
-    RecordError,
     RemoteError,
     SampleError,
     ScoringError,
-    SegmentsDifferError,
     SourceError,
     SourceNotFoundError,
     TargetError,
@@ -75,42 +72,29 @@ if TYPE_CHECKING:
     from mp4ds.unpacking.unpack import unpack
 
 _HOMES = {
-    "Dataset": "dataset.dataset",
-    "EvaluateOptions": "plugins.evaluating.evaluate",
-    "Evaluation": "plugins.evaluating.results",
-    "ExportOptions": "plugins.exporting.job",
-    "ExportSummary": "plugins.exporting.job",
-    "Frame": "dataset.topic",
-    "ImageFolder": "packing.options",
-    "PackOptions": "packing.options",
-    "PackSummary": "packing.options",
-    "PlayOptions": "plugins.playing.options",
-    "PlaySummary": "plugins.playing.player",
-    "Problem": "dataset.checks",
-    "RecordOptions": "plugins.recording.options",
-    "RecordSummary": "plugins.recording.record",
-    "RecordedMessage": "dataset.messages",
-    "ReportOptions": "plugins.reporting.report",
-    "ReportSummary": "plugins.reporting.report",
-    "Stream": "dataset.stream",
-    "Sync": "times",
-    "Topic": "dataset.topic",
-    "UnpackOptions": "unpacking.options",
-    "UnpackSummary": "unpacking.options",
-    "evaluate": "plugins.evaluating.evaluate",
-    "export": "plugins.exporting.export",
-    "import_ros_mp4": "plugins.importing.ros_mp4",
-    "open": "dataset.dataset:open_dataset",
-    "pack": "packing.pack",
-    "pack_each": "packing.pack",
-    "pack_share": "packing.pack",
-    "play": "plugins.playing.play",
-    "record": "plugins.recording.record",
-    "report": "plugins.reporting.report",
-    "unpack": "unpacking.unpack",
-    "validate": "dataset.checks",
+    "dataset.checks": "Problem validate",
+    "dataset.dataset": "Dataset open",
+    "dataset.messages": "RecordedMessage",
+    "dataset.stream": "Stream",
+    "dataset.topic": "Frame Topic",
+    "packing.options": "ImageFolder PackOptions PackSummary",
+    "packing.pack": "pack pack_each pack_share",
+    "plugins.evaluating.evaluate": "EvaluateOptions evaluate",
+    "plugins.evaluating.results": "Evaluation",
+    "plugins.exporting.export": "export",
+    "plugins.exporting.job": "ExportOptions ExportSummary",
+    "plugins.importing.ros_mp4": "import_ros_mp4",
+    "plugins.playing.options": "PlayOptions",
+    "plugins.playing.play": "play",
+    "plugins.playing.player": "PlaySummary",
+    "plugins.recording.options": "RecordOptions",
+    "plugins.recording.record": "RecordSummary record",
+    "plugins.reporting.report": "ReportOptions ReportSummary report",
+    "times": "Sync",
+    "unpacking.options": "UnpackOptions UnpackSummary",
+    "unpacking.unpack": "unpack",
 }
-"""Names that are imported when they are first used -> their modules."""
+"""Modules that are imported when one of their names is first used -> the names."""
 
 __all__ = [
     "ClusterError",
@@ -127,7 +111,6 @@ __all__ = [
     "ImageFolder",
     "Mp4dsError",
     "OptionError",
-    "OutOfReachError",
     "PackOptions",
     "PackSummary",
     "PartsFailedError",
@@ -135,7 +118,6 @@ __all__ = [
     "PlaySummary",
     "Problem",
     "PublishError",
-    "RecordError",
     "RecordOptions",
     "RecordSummary",
     "RecordedMessage",
@@ -144,7 +126,6 @@ __all__ = [
     "ReportSummary",
     "SampleError",
     "ScoringError",
-    "SegmentsDifferError",
     "SourceError",
     "SourceNotFoundError",
     "Stream",
@@ -174,10 +155,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'mp4ds' has no attribute {name!r}")
-    module, _, own_name = _HOMES[name].partition(":")
-    return getattr(import_module(f"mp4ds.{module}"), own_name or name)
+    for module, names in _HOMES.items():
+        if name in names.split():
+            own_name = "open_dataset" if name == "open" else name
+            return getattr(import_module(f"mp4ds.{module}"), own_name)
+    raise AttributeError(f"module 'mp4ds' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

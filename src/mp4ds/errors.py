@@ -14,11 +14,8 @@
     │   └── VideoError                 1  a video that cannot be decoded as its sidecar says
     ├── ConversionError (ValueError)   1  a message that the target cannot hold
     ├── WriteError (OSError)           1  an output could not be written
-    ├── RecordError (OSError)          1  a live recording could not be written, what came is kept
     ├── PartsFailedError               1  parts of a pack failed, the others are kept
     ├── EncoderRefusedError            1  pictures that an encoder does not support
-    ├── OutOfReachError                1  a score that a stream cannot reach
-    ├── SegmentsDifferError            1  videos that cannot be joined
     ├── ScoringError                   1  an ffmpeg with libvmaf that is missing or failed
     ├── SampleError (RuntimeError)     1  a sample of a data loader that cannot be read
     ├── ClusterError (ConnectionError) 1  a cluster that does not respond, or was lost
@@ -33,7 +30,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -64,10 +60,6 @@ class Refused(ValueError):  # noqa: N818 - no failure: another way is taken
     Anyone who catches it tries the next approach, and reports the reason where it helps the user: a
     message is stored verbatim, a video is read in order, a camera is left out.
     """
-
-
-def _as_path(path: Path | str) -> Path:
-    return Path(path) if isinstance(path, str) else path
 
 
 def path_text(path: object) -> str:
@@ -116,21 +108,25 @@ def interrupted(error: KeyboardInterrupt | SystemExit, text: str) -> BaseExcepti
     return told
 
 
-class SourceError(Mp4dsError, ValueError):
-    """A recording cannot be read.
+class _PathError(Mp4dsError):
+    """Something is wrong with a file or folder.
 
     Args:
-        path: The recording.
+        path: Which.
         problem: What is wrong, without a full stop.
         remedy: What the user can do, if anything.
     """
 
-    exit_code = 2
-
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
-        self.path = _as_path(path)
+        self.path = Path(path) if isinstance(path, str) else path
         self.problem = problem
         super().__init__(f"{path_text(path)}: {problem}." + (f" {remedy}" if remedy else ""))
+
+
+class SourceError(_PathError, ValueError):
+    """A recording cannot be read."""
+
+    exit_code = 2
 
 
 class SourceNotFoundError(SourceError, FileNotFoundError):
@@ -140,14 +136,10 @@ class SourceNotFoundError(SourceError, FileNotFoundError):
         super().__init__(path, "no such file or folder", "Check the path.")
 
 
-class TargetError(Mp4dsError, OSError):
+class TargetError(_PathError, OSError):
     """An output cannot be written to the requested place."""
 
     exit_code = 2
-
-    def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
-        self.path = _as_path(path)
-        super().__init__(f"{path_text(path)}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
 class TargetExistsError(TargetError, FileExistsError):
@@ -257,26 +249,19 @@ class ConversionError(Mp4dsError, ValueError):
         super().__init__(f"topic {topic}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
-class WriteError(Mp4dsError, OSError):
-    """An output could not be written; nothing remains under its final name."""
+class WriteError(_PathError, OSError):
+    """An output could not be written, since the disk is full, for example.
 
-    def __init__(self, path: Path | str, cause: BaseException) -> None:
-        self.path = _as_path(path)
-        super().__init__(
-            f"{path_text(path)}: could not be written: {reason_of(cause)}. The partial output was "
-            "removed."
-        )
+    Args:
+        path: The output.
+        cause: Why.
+        left: What is left of it, a sentence.
+    """
 
-
-class RecordError(Mp4dsError, OSError):
-    """The disk is full, or failed, during a recording; what was recorded before is kept."""
-
-    def __init__(self, folder: Path, target: Path, cause: BaseException) -> None:
-        super().__init__(
-            f"{path_text(folder)}: the recording could not be completed: {reason_of(cause)}. It "
-            "holds what was recorded. When that is solved, run: mp4ds pack --salvage "
-            f"{shlex.quote(path_text(folder))} -o {shlex.quote(path_text(target))}"
-        )
+    def __init__(
+        self, path: Path | str, cause: BaseException, left: str = "The partial output was removed."
+    ) -> None:
+        super().__init__(path, f"could not be written: {reason_of(cause)}", left)
 
 
 class PartsFailedError(Mp4dsError):
@@ -319,21 +304,12 @@ class ClusterError(Mp4dsError, ConnectionError):
         super().__init__(f"{address}: {problem}. {remedy}")
 
 
-class RemoteError(Mp4dsError):
+class RemoteError(_PathError):
     """A store or web server did not answer, or the network failed, while reading or uploading.
 
     It is neither a `ValueError` nor an `OSError` on purpose: handlers of a damaged recording or a
     full disk must not catch it.
-
-    Args:
-        path: What was read or uploaded.
-        problem: What is wrong, without a full stop.
-        remedy: What the user can do, if anything.
     """
-
-    def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
-        self.path = _as_path(path)
-        super().__init__(f"{path_text(path)}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
 class PublishError(Mp4dsError, OSError):
@@ -359,39 +335,6 @@ class SampleError(Mp4dsError, RuntimeError):
     A DataLoader re-creates a worker's error in the main process from its text alone. So this error
     has only a text, and is the same with and without workers.
     """
-
-
-class OutOfReachError(Mp4dsError):
-    """A stream that was started cannot reach the requested score.
-
-    Args:
-        topic: Of its messages.
-        stream: Identifies it among the streams of a pack.
-        reason: What was tried.
-    """
-
-    def __init__(self, topic: str, stream: Any, reason: str) -> None:
-        self.stream, self.reason = stream, reason
-        super().__init__(
-            f"{topic}: {reason}. Lower the target, or pack it with `quality` lossless."
-        )
-
-
-class SegmentsDifferError(Mp4dsError):
-    """Videos that cannot be joined: one track could not describe the packets of both.
-
-    Args:
-        first: The segment that the others are compared with.
-        other: The segment that differs from it.
-        differences: What differs, and how.
-    """
-
-    def __init__(self, first: Path, other: Path, differences: str) -> None:
-        self.first, self.other = first, other
-        super().__init__(
-            f"{path_text(other)}: cannot be joined to {path_text(first)}: they differ in "
-            f"{differences}. Encode both with the same options, or keep them as two streams."
-        )
 
 
 class EncoderRefusedError(Mp4dsError):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import warnings
-from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import index as as_integer
@@ -170,30 +169,6 @@ class PresentationClock:
         # clamping up counts as elapsed, so that a burst does not delay later frames twice
         self._elapsed = max(self._elapsed, self._tick * NS_PER_TICK)
         return self._tick
-
-
-class Int64Column:
-    """A growing column that uses eight bytes per value."""
-
-    def __init__(self) -> None:
-        self._values = array("q")
-
-    def append(self, value: int) -> None:
-        """Append a value.
-
-        Raises:
-            OverflowError: It does not fit into 64 bits.
-        """
-        self._values.append(value)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def to_numpy(self) -> NDArray[np.int64]:
-        """A view of the values; do not append while it is in use."""
-        return (
-            np.frombuffer(self._values, dtype=np.int64) if self._values else np.empty(0, np.int64)
-        )
 
 
 # ---------------------------------------------------------------- intervals

@@ -79,7 +79,6 @@ def _pack_in_one_pass(parted: PartedPack, exact: Exact) -> PackSummary:
 
     Raises:
         SourceError: The recording is damaged, or changed while it was being read.
-        OutOfReachError: A stream cannot reach the requested score.
         WriteError: It cannot be written.
     """
     target = parted.target

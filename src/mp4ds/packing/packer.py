@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import BagReader
-from mp4ds.errors import OutOfReachError, Refused
+from mp4ds.errors import Refused
 from mp4ds.format.models import CameraInfo
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
@@ -31,7 +31,7 @@ from mp4ds.packing.survey import (
     rate_of,
 )
 from mp4ds.packing.tracks import TrackPlan
-from mp4ds.packing.writer import StreamWriter
+from mp4ds.packing.writer import OutOfReach, StreamWriter
 from mp4ds.plan import FileNames
 from mp4ds.records import Attachment, Channel, Message, Record
 
@@ -354,7 +354,7 @@ def until_in_reach(make: Callable[[Exact], _Made]) -> _Made:
     while True:
         try:
             return make(exact)
-        except OutOfReachError as error:
+        except OutOfReach as error:
             if error.stream in exact:
                 raise
             exact = {**exact, error.stream: error.reason}
@@ -416,7 +416,7 @@ class Packer:
 
         Raises:
             SourceError: The recording is damaged.
-            OutOfReachError: A stream cannot have the score that was asked for.
+            OutOfReach: A stream cannot have the score that was asked for.
             OSError: It cannot be written.
         """
         part = self._part

@@ -9,10 +9,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Generic, TypeVar
 
+import numpy as np
 import xxhash
 
 from mp4ds.dataset.columns import columns_model, digests_model
-from mp4ds.errors import OutOfReachError, Refused
+from mp4ds.errors import Refused
 from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, MAX_VARIANTS, Columns, exceeds_padding
 from mp4ds.format.models import (
     CameraInfo,
@@ -27,19 +28,32 @@ from mp4ds.format.models import (
 from mp4ds.format.sidecars import dump_document
 from mp4ds.messages.png import PngRecipe, zlib_fingerprint
 from mp4ds.messages.wire import CodedFields, Form, Parts, Template, WireError, prove
-from mp4ds.packing.inspection import CameraMessage
+from mp4ds.packing.inspection import CameraMessage, StreamKey
 from mp4ds.packing.tracks import TrackPlan, open_track
 from mp4ds.records import Channel, Message
-from mp4ds.times import INT64_MAX, INT64_MIN, Int64Column, PresentationClock
+from mp4ds.times import INT64_MAX, INT64_MIN, PresentationClock
 
 _ModelT = TypeVar("_ModelT")
+
+
+class OutOfReach(Exception):  # noqa: N818 - no failure: packing starts anew without that score
+    """A stream that was started cannot reach the requested score.
+
+    Args:
+        stream: Identifies it among the streams of a pack.
+        reason: What was tried.
+    """
+
+    def __init__(self, stream: tuple[int, StreamKey], reason: str) -> None:
+        super().__init__(stream, reason)
+        self.stream, self.reason = stream, reason
 
 
 class ColumnsWriter:
     """The growing columns of one stream or of its camera_info."""
 
     def __init__(self) -> None:
-        self._columns = {name: Int64Column() for name in Columns.model_fields}
+        self._columns = {name: array("q") for name in Columns.model_fields}
 
     def __len__(self) -> int:
         return len(self._columns["log_time"])
@@ -73,8 +87,8 @@ class ColumnsWriter:
 
     def to_model(self) -> Columns:
         """The columns as the sidecar holds them."""
-        found = {name: column.to_numpy() for name, column in self._columns.items() if len(column)}
-        return columns_model(found)
+        found = self._columns.items()
+        return columns_model({name: np.frombuffer(own, np.int64) for name, own in found if own})
 
 
 class HeaderTable(Generic[_ModelT]):
@@ -230,7 +244,7 @@ class StreamWriter:
             The sidecar.
 
         Raises:
-            OutOfReachError: The video cannot have the score that was asked for.
+            OutOfReach: The video cannot have the score that was asked for.
             OSError: It cannot be written.
         """
         try:
@@ -263,9 +277,8 @@ class StreamWriter:
         self.sidecar_path.write_bytes(dump_document(sidecar))
         return sidecar
 
-    def _out_of_reach(self, reason: Refused) -> OutOfReachError:
-        stream = (self.channel.id, self._key)
-        return OutOfReachError(self.channel.topic, stream, str(reason))
+    def _out_of_reach(self, reason: Refused) -> OutOfReach:
+        return OutOfReach((self.channel.id, self._key), str(reason))
 
     def _header(self, seen: CameraMessage, template: str | None) -> Header:
         """The model of a message's header.

@@ -14,7 +14,7 @@ from typing import Any
 import av
 from av.error import FFmpegError
 
-from mp4ds.errors import Refused, SegmentsDifferError, VideoError
+from mp4ds.errors import Mp4dsError, Refused, VideoError, path_text
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.media import Media, new_mp4, open_input, pixel_format_of, raise_if_scarce
@@ -371,7 +371,7 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
         The number of packets written.
 
     Raises:
-        SegmentsDifferError: A segment has another codec, size, colour or parameter sets than the
+        Mp4dsError: A segment has another codec, size, colour or parameter sets than the
             first.
         VideoError: A segment cannot be read, there are not as many ticks as frames, or the
             result does not hold every packet as it was.
@@ -544,5 +544,8 @@ def _common_entry(segments: Sequence[Path]) -> SampleEntry:
     first = read_sample_entry(segments[0])
     for segment in segments[1:]:
         if difference := first.differences(read_sample_entry(segment)):
-            raise SegmentsDifferError(segments[0], segment, difference)
+            raise Mp4dsError(
+                f"{path_text(segment)}: cannot be joined to {path_text(segments[0])}: they differ "
+                f"in {difference}. Encode both with the same options, or keep them as two streams."
+            )
     return first

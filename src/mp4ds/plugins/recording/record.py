@@ -140,7 +140,7 @@ def record(
         OptionError: An option is wrong.
         PublishError: There is no ROS, or it cannot be reached.
         TargetError: The dataset cannot be written there.
-        RecordError: The disk is full, or failed. What was recorded before is in the folder
+        WriteError: The disk is full, or failed. What was recorded before is in the folder
             ``NAME.recording``; `mp4ds.pack` with `salvage` makes a dataset of it.
     """
     with open_recorder(topics, dataset, options, progress=progress) as recorder:

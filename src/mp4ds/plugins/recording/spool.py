@@ -6,6 +6,7 @@ part of each complete piece by the code of `pack`, and at the end the dataset of
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
@@ -16,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from mp4ds.bags.mcap import McapWriter
-from mp4ds.errors import Mp4dsError, RecordError, TargetError, WriteError
+from mp4ds.errors import Mp4dsError, TargetError, WriteError, path_text
 from mp4ds.files.outputs import check_target
 from mp4ds.files.sources import UNFINISHED, salvage_command
 from mp4ds.format.sidecars import load_about
@@ -280,7 +281,9 @@ class Split:
         """What to raise because of an error; what was recorded stays where it is."""
         if isinstance(error, Mp4dsError):
             return error
-        return RecordError(self.folder.path, self.target, error)
+        path, target = (shlex.quote(path_text(path)) for path in (self.folder.path, self.target))
+        left = f"It holds what was recorded. Then run: mp4ds pack --salvage {path} -o {target}"
+        return WriteError(self.folder.path, error, left)
 
 
 # ---------------------------------------------------------------- in the process
