@@ -17,8 +17,7 @@ from typing import Any
 
 from mp4ds.bags.formats import open_reader
 from mp4ds.errors import Mp4dsError
-from mp4ds.plugins.ros.node import NodeOptions, Service, action
-from mp4ds.plugins.ros.ros1 import Ros1Node, Sender
+from mp4ds.plugins.ros.node import NodeOptions, Service, action, open_node
 from mp4ds.records import Channel, Message
 
 
@@ -56,15 +55,16 @@ class Driver:
             if not any(message.channel is channel for channel in self.channels):
                 self.channels.append(message.channel)
         self.player = Standing()
-        self.publisher = Ros1Node(NodeOptions(**{"node": "mp4ds_play", **options}))
+        self.publisher = open_node("ros1", NodeOptions(**{"node": "mp4ds_play", **options}))
         self.waited = 0
-        wait = Sender._wait_for_room
+        ros1: Any = sys.modules["mp4ds.plugins.ros.ros1"]  # since the node is open
+        wait = ros1.Sender._wait_for_room
 
-        def counted(sender: Sender, more: int, wait_s: float) -> None:
+        def counted(sender: Any, more: int, wait_s: float) -> None:
             wait(sender, more, wait_s)
             self.waited += sender._is_behind
 
-        Sender._wait_for_room = counted  # type: ignore[method-assign]
+        ros1.Sender._wait_for_room = counted
 
     def node(self) -> str:
         import rospy

@@ -6,33 +6,19 @@ import re
 import subprocess
 from pathlib import Path
 
+import click
 import pytest
 
 from commands import call
-from mp4ds.cli.play import DIALECT, play_command
+from mp4ds.cli.play import play_command
 from mp4ds.errors import OptionError
 from mp4ds.plugins.ros.names import PLAIN, NodeNames, node_arguments
 from roscore import PLAY
 from test_examples import ROOT
 
-VALUED = {
-    "--clock",
-    "--hz",
-    "--rate",
-    "-r",
-    "--topics",
-    "-t",
-    "--remap",
-    "-m",
-    "--exclude-regex",
-    "-s",
-    "--prefix",
-}
-
 
 def words(typed: str) -> str:
-    others, _ = node_arguments(typed.split(), rules_of=tuple(DIALECT.remaps))
-    return " ".join(DIALECT.translated(others, VALUED))
+    return " ".join(play_command.translated(click.Context(play_command), typed.split()))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from commands import call, refused
-from mp4ds.cli.record import DIALECT, record_command
+from mp4ds.cli.record import record_command
 from mp4ds.errors import OptionError
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.ros.names import NodeNames
@@ -124,7 +124,10 @@ def test_the_page_lists_the_options_of_both_recorders() -> None:
     """Those of rosbag record as it tells them, those of rosbag2 by name."""
     table = (ROOT / "docs/recording.md").read_text().partition("## Options")[2]
     listed = set(re.findall(r"(?<![\w-])--?[a-zA-Z][\w-]*", table))
-    theirs = {*DIALECT.lists, *(flag for item in record_command.params for flag in item.opts)}
+    theirs = {
+        *record_command.lists,
+        *(flag for item in record_command.params for flag in item.opts),
+    }
     assert theirs & JAZZY <= listed | {"--compression-mode"}
     assert JAZZY - listed == set()
     if not Path(RECORD).exists():

@@ -5,23 +5,26 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import click
 
+from mp4ds.cli.keyboard import Keyboard
 from mp4ds.cli.options import Command, option
-from mp4ds.cli.output import be_quiet
-from mp4ds.cli.process import DEBUG
+from mp4ds.cli.output import be_quiet, complain
+from mp4ds.cli.process import DEBUG, caught_signals
+from mp4ds.cli.progress import Row, display
 from mp4ds.errors import OptionError
 from mp4ds.options import HOW, WHERE, Options
 from mp4ds.options import option as field_option
-from mp4ds.plugins.ros.names import PLAIN, NodeNames, node_arguments
+from mp4ds.plugins.ros.names import LOG_LEVELS, PLAIN, NodeNames, node_arguments
 
 _NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?")
 _NAMES = "mp4ds.names"  # key of the ROS arguments in click's context
-_LEVELS = ("", "debug", "info", "warn", "error", "fatal")
+_State = TypeVar("_State")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +41,8 @@ class RosOptions(Options):
         super().__post_init__()
         if self.ros1 and self.ros2:
             raise OptionError("--ros1 contradicts --ros2.")
-        if self.log_level not in _LEVELS:
-            raise OptionError(f"`log_level` {self.log_level!r} is not {', '.join(_LEVELS[1:])}.")
+        if self.log_level not in ("", *LOG_LEVELS):
+            raise OptionError(f"`log_level` {self.log_level!r} is not {', '.join(LOG_LEVELS)}.")
 
     @property
     def to(self) -> str | None:
@@ -60,11 +63,48 @@ def node_names(options: RosOptions) -> NodeNames:
     return names
 
 
-@dataclass(frozen=True)
-class Dialect:
-    """How the arguments of ROS's own tools differ from those of others.
+@contextmanager
+def node_progress(
+    rows_of: Callable[[_State], Sequence[Row]],
+    warnings_of: Callable[[_State], Iterable[str]],
+    *,
+    is_shown: bool,
+) -> Iterator[Callable[[_State], None]]:
+    """Show how far a node is, and what there is to warn of, once.
 
-    Attributes:
+    Args:
+        rows_of: What to show of its state.
+        warnings_of: What to warn of in this state.
+        is_shown: Show more than warnings.
+    """
+    warned: set[str] = set()
+
+    with display(timed=False) if is_shown else nullcontext(lambda _: None) as show:
+
+        def report(state: _State) -> None:
+            for text in warnings_of(state):
+                if text not in warned:
+                    warned.add(text)
+                    complain(text)
+            show(rows_of(state))
+
+        yield report
+
+
+@contextmanager
+def node_controls(
+    options: RosOptions, stop: Callable[[], None], keys: Mapping[str, Callable[[], object]]
+) -> Iterator[Sequence[int]]:
+    """Stop a node on signals, which are returned, and run actions when keys are pressed."""
+    keyboard = nullcontext() if options.disable_keyboard_controls else Keyboard(keys)
+    with caught_signals(stop) as caught, keyboard:
+        yield caught
+
+
+class NodeCommand(Command):
+    """A command that is a node; it takes what ROS's own tool for the same purpose takes.
+
+    Args:
         lists: Options that take several values -> the option that takes each of them here, empty
             for an argument, and what each value ends with.
         letters: ROS version -> short options that mean something else in it -> what they mean.
@@ -73,26 +113,41 @@ class Dialect:
         takes_paths: Whether its arguments are paths: without one, a list ends before a file.
     """
 
-    lists: Mapping[str, tuple[str, str]]
-    letters: Mapping[str, Mapping[str, str]]
-    defaults: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    remaps: Collection[str] = ()
-    takes_paths: bool = False
+    def __init__(
+        self,
+        *args: Any,
+        lists: Mapping[str, tuple[str, str]],
+        letters: Mapping[str, Mapping[str, str]],
+        defaults: Mapping[str, Mapping[str, str]] = {},
+        remaps: Sequence[str] = (),
+        takes_paths: bool = False,
+        **values: Any,
+    ) -> None:
+        super().__init__(*args, **values)
+        self.lists = lists
+        self._letters = letters
+        self._defaults = defaults
+        self._remaps = remaps
+        self._takes_paths = takes_paths
 
-    def translated(self, words: Sequence[str], valued: Collection[str]) -> list[str]:
-        """Arguments as this command takes them.
+    @property
+    def known(self) -> set[str]:
+        """All options that are accepted, shown in the help or not."""
+        own = {flag for item in self.params for flag in (*item.opts, *item.secondary_opts)}
+        letters = {letter for found in self._letters.values() for letter in found}
+        return {*own, *self.lists, *letters, "--ros-args", "-r"}
 
-        Args:
-            words: As users type them, without ROS arguments.
-            valued: Options of this command that take a value.
+    def translated(self, ctx: click.Context, words: list[str]) -> list[str]:
+        """The arguments other than ROS arguments, as this command has them.
 
         Raises:
             OptionError: An option has no value.
         """
+        words, ctx.meta[_NAMES] = node_arguments(words, rules_of=self._remaps)
         version = next((name for name in ("ros1", "ros2") if f"--{name}" in words), "")
-        letters = self.letters.get(version, {})
-        defaults = {name: by.get(version, by[""]) for name, by in self.defaults.items()}
-        return [*self._translate([*self._split(words, letters)][::-1], valued, defaults)]
+        letters = self._letters.get(version, {})
+        defaults = {name: by.get(version, by[""]) for name, by in self._defaults.items()}
+        return [*self._translate([*self._split(words, letters)][::-1], defaults)]
 
     def _split(self, words: Sequence[str], letters: Mapping[str, str]) -> Iterator[str]:
         """Values split off from options of several, and letters as the options they mean."""
@@ -107,9 +162,10 @@ class Dialect:
             else:
                 yield word
 
-    def _translate(
-        self, left: list[str], valued: Collection[str], defaults: Mapping[str, str]
-    ) -> Iterator[str]:
+    def _translate(self, left: list[str], defaults: Mapping[str, str]) -> Iterator[str]:
+        """Lists and missing numbers spelled out; `left` is in reverse order."""
+        options = [item for item in self.params if isinstance(item, click.Option)]
+        valued = {flag for item in options if not item.is_flag for flag in item.opts}
         has_arguments = False
         while left:
             word = left.pop()
@@ -121,9 +177,8 @@ class Dialect:
                 has_arguments |= not name
                 if not left or left[-1].startswith("-"):
                     raise OptionError(f"{word} requires an argument.")
-                is_first = True
-                while left and (is_first or self._goes_on(name, left[-1], has_arguments)):
-                    is_first = False
+                yield from filter(None, (name, left.pop().removesuffix(ending) + ending))
+                while left and self._goes_on(name, left[-1], has_arguments):
                     yield from filter(None, (name, left.pop().removesuffix(ending) + ending))
                 continue
             yield word
@@ -138,44 +193,10 @@ class Dialect:
         """Whether a word is one more value of a list, and not an option or argument."""
         if word.startswith("-") and len(word) > 1:
             return False
-        if name in self.remaps:
+        if name in self._remaps:
             return ":=" in word
         is_path = "://" in word or os.path.exists(word)  # noqa: PTH110 - is no argument yet
-        return not (self.takes_paths and is_path and not has_arguments)
-
-
-class NodeCommand(Command):
-    """A command that is a node.
-
-    Args:
-        dialect: That of ROS's own tool for the same purpose.
-    """
-
-    def __init__(self, *args: Any, dialect: Dialect, **values: Any) -> None:
-        super().__init__(*args, **values)
-        self.dialect = dialect
-
-    def translated(self, ctx: click.Context, words: list[str]) -> list[str]:
-        """The arguments other than ROS arguments, as this command has them."""
-        words, ctx.meta[_NAMES] = node_arguments(words, rules_of=tuple(self.dialect.remaps))
-        return self.dialect.translated(words, self.valued)
-
-    @property
-    def valued(self) -> set[str]:
-        """Options that take a value."""
-        return {
-            flag
-            for item in self.params
-            if isinstance(item, click.Option) and not item.is_flag
-            for flag in item.opts
-        }
-
-    @property
-    def known(self) -> set[str]:
-        """All options that are accepted, shown in the help or not."""
-        own = {flag for item in self.params for flag in (*item.opts, *item.secondary_opts)}
-        letters = {letter for found in self.dialect.letters.values() for letter in found}
-        return {*own, *self.dialect.lists, *letters, "--ros-args", "-r"}
+        return not (self._takes_paths and is_path and not has_arguments)
 
 
 def accepted(*flags: str, values: int = 0) -> Callable[[Any], Any]:

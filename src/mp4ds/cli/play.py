@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 
 import click
 
-from mp4ds.cli.keyboard import Keyboard
-from mp4ds.cli.nodes import Dialect, NodeCommand, RosOptions, accepted, node_names
+from mp4ds.cli.nodes import (
+    NodeCommand,
+    RosOptions,
+    accepted,
+    node_controls,
+    node_names,
+    node_progress,
+)
 from mp4ds.cli.options import argument, command, option, takes
-from mp4ds.cli.output import complain, is_json, is_quiet, say, show, shown
-from mp4ds.cli.process import caught_signals
-from mp4ds.cli.progress import Row, display
+from mp4ds.cli.output import complain, is_quiet, say, show, shown
+from mp4ds.cli.progress import Row
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.play import open_player
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary
@@ -23,10 +28,27 @@ from mp4ds.plugins.ros.names import SERVICE_EVENTS
 _FASTER = 1.1
 _NS = 1_000_000_000
 _SLOW_S = 0.5  # warned about at once; less is only mentioned in the summary
-_SLOWING = "slowing down: messages are not ready in time (--drop drops late frames instead)"
-_DROPPING = "dropping late frames: they are not decoded in time"
 
-DIALECT = Dialect(
+
+def _check_order(_: click.Context, __: click.Parameter, value: str | None) -> None:
+    if value not in (None, "received"):
+        raise click.UsageError(
+            f"--message-order {value} is not supported: messages are played in the order in which "
+            "they were received."
+        )
+
+
+def _refuse(_: click.Context, parameter: click.Parameter, value: object) -> None:
+    if value:
+        raise click.UsageError(
+            f"{parameter.opts[0]} is not supported: services are not called; recorded service "
+            "events are played as topics."
+        )
+
+
+@command(
+    cls=NodeCommand,
+    # what `rosbag play` and `ros2 bag play` write in another way
     lists={
         "--topics": ("--topics", ""),
         "--exclude-topics": ("--exclude-topics", ""),
@@ -47,26 +69,6 @@ DIALECT = Dialect(
     remaps=("--remap", "-m"),
     takes_paths=True,
 )
-"""What `rosbag play` and `ros2 bag play` write in another way."""
-
-
-def _check_order(_: click.Context, __: click.Parameter, value: str | None) -> None:
-    if value not in (None, "received"):
-        raise click.UsageError(
-            f"--message-order {value} is not supported: messages are played in the order in which "
-            "they were received."
-        )
-
-
-def _refuse(_: click.Context, parameter: click.Parameter, value: object) -> None:
-    if value:
-        raise click.UsageError(
-            f"{parameter.opts[0]} is not supported: services are not called; recorded service "
-            "events are played as topics."
-        )
-
-
-@command(cls=NodeCommand, dialect=DIALECT)
 @argument(
     "datasets", "DATASET...", "Datasets; several are merged by time.", nargs=-1, required=True
 )
@@ -100,16 +102,15 @@ def play_command(
     means --prefix.
     """
     options = replace(options, to=ros.to, names=node_names(ros))
-    is_shown = ros.progress and bar_rate != 0 and not is_json()
+    is_shown = ros.progress and bar_rate != 0
     with ExitStack() as stack:
-        report = stack.enter_context(_progress(is_shown=is_shown))
+        report = stack.enter_context(node_progress(_rows, _warnings, is_shown=is_shown))
         player = stack.enter_context(open_player(datasets, options, progress=report))
-        _note(f"publishing to {player.address}")
-        if player.follows_clock:
-            _note("following another player's /clock (--no-follow-clock: play independently)")
-        caught = stack.enter_context(caught_signals(player.stop))
-        if not ros.disable_keyboard_controls:
-            stack.enter_context(Keyboard(player_keys(player)))
+        if not is_quiet():
+            complain(f"publishing to {player.address}")
+            if player.follows_clock:
+                complain("following another player's /clock (--no-follow-clock: do not follow)")
+        caught = stack.enter_context(node_controls(ros, player.stop, player_keys(player)))
         summary = player.run()
     show(summary, _print)
     if caught and caught[0] != signal.SIGINT:  # Ctrl-C is how players are ended, and no failure
@@ -139,25 +140,14 @@ def _rounded(rate: float) -> float:
     return float(f"{rate:.9g}")
 
 
-@contextmanager
-def _progress(*, is_shown: bool) -> Iterator[Callable[[PlayProgress], None]]:
-    """Show the position, and warn if playback cannot keep up."""
-    silent = is_quiet()  # asked here: other threads do not know the command
-    warned: set[str] = set()
-
-    with display(timed=False) if is_shown else nullcontext(lambda _: None) as show_rows:
-
-        def report(state: PlayProgress) -> None:
-            for is_due, text in ((state.slowed_s >= _SLOW_S, _SLOWING), (state.dropped, _DROPPING)):
-                if is_due and not silent and text not in warned:
-                    warned.add(text)
-                    complain(text)
-            show_rows([_row(state)])
-
-        yield report
+def _warnings(state: PlayProgress) -> Iterator[str]:
+    if state.slowed_s >= _SLOW_S and not is_quiet():
+        yield "slowing down: messages are not ready in time (--drop drops late frames instead)"
+    if state.dropped and not is_quiet():
+        yield "dropping late frames: they are not decoded in time"
 
 
-def _row(state: PlayProgress) -> Row:
+def _rows(state: PlayProgress) -> list[Row]:
     now, length = state.time_ns - state.start_ns, max(1, state.end_ns - state.start_ns)
     texts = [
         f"{now / _NS:.1f} of {length / _NS:.1f} s",
@@ -166,12 +156,7 @@ def _row(state: PlayProgress) -> Row:
         f"slowed by {state.slowed_s:.1f} s" if state.slowed_s >= _SLOW_S else "",
         f"{state.dropped} late frames dropped" if state.dropped else "",
     ]
-    return Row("playing", "  ".join(filter(None, texts)), min(1.0, now / length))
-
-
-def _note(text: str) -> None:
-    if not is_quiet():
-        complain(text)
+    return [Row("playing", "  ".join(filter(None, texts)), min(1.0, now / length))]
 
 
 def _print(summary: PlaySummary) -> None:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 
 import click
-from rich.console import Console
-from rich.live import Live
-from rich.table import Table
-from rich.text import Text
 
-from mp4ds.cli.keyboard import Keyboard
-from mp4ds.cli.nodes import Dialect, NodeCommand, RosOptions, accepted, node_names
+from mp4ds.cli.nodes import (
+    NodeCommand,
+    RosOptions,
+    accepted,
+    node_controls,
+    node_names,
+    node_progress,
+)
 from mp4ds.cli.options import argument, command, option, takes
-from mp4ds.cli.output import complain, is_json, is_quiet, say, show
+from mp4ds.cli.output import complain, is_quiet, say, show
 from mp4ds.cli.pack import print_pack
-from mp4ds.cli.process import caught_signals
+from mp4ds.cli.progress import Row
 from mp4ds.errors import counted, path_text
 from mp4ds.files.sources import salvage_command
 from mp4ds.options import WHERE
@@ -25,12 +27,14 @@ from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.record import RecordProgress, RecordSummary, open_recorder
 from mp4ds.plugins.ros.names import SERVICE_EVENTS
 
-_LOG_S = 10.0
 _SHOWN = 20  # topics
 _UNTIMED = "their log time is negative or too large"
 _MB = 10**6
 
-DIALECT = Dialect(
+
+@command(
+    cls=NodeCommand,
+    # what `rosbag record` and `ros2 bag record` write in another way
     lists={
         "--topics": ("", ""),
         "--topic": ("", ""),
@@ -47,10 +51,6 @@ DIALECT = Dialect(
         "ros2": {"-b": "--max-size", "-s": "--storage"},
     },
 )
-"""What `rosbag record` and `ros2 bag record` write in another way."""
-
-
-@command(cls=NodeCommand, dialect=DIALECT)
 @argument("topics", "TOPIC...", "Topic names, or globs in quotes; -a records all.", nargs=-1)
 @option(
     "--output",
@@ -98,17 +98,15 @@ def record_command(
         options = replace(options, max_size=f"{size}M")
     if cache is not None:
         options = replace(options, buffer=max(1, cache // _MB))
-    is_shown = ros.progress and not is_json() and not is_quiet()
     with ExitStack() as stack:
-        report = stack.enter_context(_progress(is_shown=is_shown))
+        report = stack.enter_context(node_progress(_rows, _warnings, is_shown=ros.progress))
         # a launch file cannot leave out an argument: an empty one is none
         opened = open_recorder(topics, output or None, options, progress=report)
         recorder = stack.enter_context(opened)
         if not is_quiet():
             complain(f"recording from {recorder.address}")
-        stack.enter_context(caught_signals(recorder.stop))
-        if not ros.disable_keyboard_controls:
-            stack.enter_context(Keyboard({" ": recorder.toggle_paused, "q": recorder.stop}))
+        keys = {" ": recorder.toggle_paused, "q": recorder.stop}
+        stack.enter_context(node_controls(ros, recorder.stop, keys))
         try:
             summary = recorder.run()
         except KeyboardInterrupt:  # asked twice, as launch files do when their time is over
@@ -127,85 +125,43 @@ def _whole(patterns: Sequence[str]) -> str:
     return f"^(?:{'|'.join(patterns)})$"
 
 
-@contextmanager
-def _progress(*, is_shown: bool) -> Iterator[Callable[[RecordProgress], None]]:
-    """On a terminal, a table of the topics; in a log, a line every 10 s; warnings in both."""
-    console = Console(stderr=True)
-    warned: set[str] = set()
-    next_line = 0.0
-
-    def warn(state: RecordProgress) -> None:
-        for warning in state.warnings:
-            if warning not in warned:
-                warned.add(warning)
-                complain(warning)
-        if state.state.startswith("waiting") and state.state not in warned:
-            warned.add(state.state)
-            complain(f"{state.state}: recording starts when it publishes a time")
-        for topic, item in state.topics.items():
-            for count, what in (
-                (item.dropped, "dropping messages: the buffer is full (--buffsize enlarges it)"),
-                (item.lost, "the middleware is losing messages"),
-                (item.untimed, f"leaving out messages: {_UNTIMED}"),
-            ):
-                if count and (line := f"{topic}: {what}") not in warned:
-                    warned.add(line)
-                    complain(line)
-
-    def log(state: RecordProgress) -> None:
-        nonlocal next_line
-        warn(state)
-        if state.seconds >= next_line and is_shown:
-            next_line = state.seconds + _LOG_S
-            complain(_line(state))
-
-    if not is_shown or not console.is_terminal:
-        yield log
-        return
-    with Live(console=console, auto_refresh=False, transient=True) as live:
-
-        def show(state: RecordProgress) -> None:
-            warn(state)
-            live.update(_table(state), refresh=True)
-
-        yield show
+def _warnings(state: RecordProgress) -> Iterator[str]:
+    yield from state.warnings
+    if state.state.startswith("waiting"):
+        yield f"{state.state}: recording starts when it publishes a time"
+    for topic, item in state.topics.items():
+        if item.dropped:
+            yield f"{topic}: dropping messages: the buffer is full (--buffsize enlarges it)"
+        if item.lost:
+            yield f"{topic}: the middleware is losing messages"
+        if item.untimed:
+            yield f"{topic}: leaving out messages: {_UNTIMED}"
 
 
-def _line(state: RecordProgress) -> str:
+def _rows(state: RecordProgress) -> list[Row]:
+    """All of it, and the busiest topics; a bar shows which part of the data rate is theirs."""
     count = sum(item.messages for item in state.topics.values())
     rate = sum(item.bytes_per_s for item in state.topics.values())
-    parts = [
-        f"{state.state} {state.seconds:.0f} s",
+    texts = [
+        f"{state.seconds:.0f} s",
         counted(count, "message"),
         f"{rate / 1e6:.1f} MB/s received",
         f"{state.bytes_written / 1e6:.1f} MB written",
     ]
     if state.spool_bytes >= 1e6:
-        parts.append(f"{state.spool_bytes / 1e6:.0f} MB to pack")
+        texts.append(f"{state.spool_bytes / 1e6:.0f} MB to pack")
     if state.waiting_bytes >= 1e6:
-        parts.append(f"{state.waiting_bytes / 1e6:.0f} MB buffered")
-    return " · ".join(parts)
-
-
-def _table(state: RecordProgress) -> Table:
-    table = Table(title=_line(state), title_justify="left", box=None, pad_edge=False)
-    for name in ("topic", "messages", "Hz", "MB/s", "lost"):
-        table.add_column(
-            name, justify="left" if name == "topic" else "right", no_wrap=True, overflow="ellipsis"
-        )
+        texts.append(f"{state.waiting_bytes / 1e6:.0f} MB buffered")
+    rows = [Row(state.state, "  ".join(texts))]
     busiest = sorted(state.topics.items(), key=lambda item: -item[1].bytes_per_s)
     for topic, item in busiest[:_SHOWN]:
-        gone = item.dropped + item.lost + item.untimed
-        table.add_row(
-            Text(topic),
-            str(item.messages),
-            f"{item.hz:.1f}",
-            f"{item.bytes_per_s / 1e6:.2f}",
-            str(gone) if gone else "",
-        )
+        text = f"{item.messages:8}  {item.hz:7.1f} Hz  {item.bytes_per_s / 1e6:8.2f} MB/s"
+        if gone := item.dropped + item.lost + item.untimed:
+            text += f"  {gone} lost"
+        rows.append(Row(topic, text, item.bytes_per_s / rate if rate else 0.0))
     if len(busiest) > _SHOWN:
-        table.add_row(Text(f"and {len(busiest) - _SHOWN} more"))
-    return table
+        rows.append(Row(f"and {len(busiest) - _SHOWN} more"))
+    return rows
 
 
 def _print(summary: RecordSummary) -> None:

@@ -50,13 +50,11 @@ from mp4ds.plugins.ros.dds_types import (
     ros_type,
     service_types,
 )
-from mp4ds.plugins.ros.node import NodeOptions, Receive, Service
-from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, asked_qos
+from mp4ds.plugins.ros.node import NodeOptions, Service
+from mp4ds.plugins.ros.qos import Qos
 from mp4ds.plugins.ros.ros2 import (
-    CLOCK_TYPE,
     RECEIVED,
     Ros2Node,
-    clock_time,
     described_definition,
     finite,
     standard_definition,
@@ -327,7 +325,6 @@ class DdsNode(Ros2Node):
         self._found: dict[str, _Found] = {}
         self._describing: dict[Any, list[str]] = defaultdict(list)  # nodes, by participant
         self._readers: list[tuple[Any, Callable[[Any], None]]] = []
-        self._received: dict[str, Any] = {}  # readers of topics subscribed to
         self._sought: list[tuple[str, Callable[[Any], None], set[str]]] = []
         self._services: list[_Server] = []
         self._ended = threading.Event()
@@ -342,19 +339,6 @@ class DdsNode(Ros2Node):
         return _DdsWriter(self._participant, channel.topic, message_type(channel), qos)
 
     # ------------------------------------------------------------ receiving
-
-    def follow_clock(self, on_time: Callable[[int], None]) -> None:
-        """Subscribe to /clock."""
-        channel = Channel(0, self._clock_topic, "cdr", Schema(CLOCK_TYPE, "", b""), {})
-        kind = message_type(channel)
-        name = dds_topic(self._clock_topic)
-        self._read(
-            name,
-            kind.writes,
-            CLOCK_QOS,
-            kind.type_hash,
-            lambda sample: on_time(clock_time(sample.payload)),
-        )
 
     def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
         """Subscribe to a topic as soon as it has a publisher, whatever its type."""
@@ -374,10 +358,29 @@ class DdsNode(Ros2Node):
                 kind = publisher_type(self._participant, publisher)
                 qos = Qos(depth=RECEIVED, reliability=_offered_by(publisher.qos).reliability)
                 with suppress(DDSException):  # a second type: a participant can have only one
-                    self._read(name, kind, qos, _user_data(publisher, _HASH), on_sample)
+                    self._reader(name, kind, qos, _user_data(publisher, _HASH), on_sample)
 
     def _read(
-        self, name: str | None, kind: Any, qos: Qos, type_hash: str, on_sample: Callable[..., None]
+        self, topic: str, kind: str, qos: Qos, on_message: Callable[[bytes, int], object]
+    ) -> Any:
+        name = _PREFIX + topic.lstrip("/")
+        found = self._found.get(name)
+        if found is not None and found.kind is not None:
+            message_class, type_hash = found.kind, _user_data(_publisher_of(found, kind), _HASH)
+        else:
+            made = message_type(Channel(0, topic, "cdr", Schema(kind, "", b""), {}))
+            message_class, type_hash = made.writes, made.type_hash
+
+        def on_sample(sample: Any) -> None:
+            on_message(sample.payload, sample.sample_info.source_timestamp)
+
+        try:
+            return self._reader(name, message_class, qos, type_hash, on_sample)
+        except DDSException as error:
+            raise Refused(f"DDS refuses the subscription: {error.msg}") from None
+
+    def _reader(
+        self, name: str, kind: Any, qos: Qos, type_hash: str, on_sample: Callable[[Any], None]
     ) -> Any:
         """Call back with each valid sample on a topic; returns the reader."""
         topic = Topic(self._participant, name, kind)
@@ -481,23 +484,10 @@ class DdsNode(Ros2Node):
                         self._participant, node, kind, type_hash, self._ended
                     )
 
-    def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> Channel:
-        """Subscribe with the QoS that the publishers offer."""
-        dds_name = _PREFIX + topic.lstrip("/")
-        found = self._found[dds_name]
+    def _announced(self, topic: str, kind: str) -> tuple[list[Qos], str, str]:
+        found = self._found[_PREFIX + topic.lstrip("/")]
         offered = [_offered_by(one.qos) for one in found.publishers.values()]
-        type_hash = _user_data(_publisher_of(found, kind), _HASH)
-        channel = self._channel(name, kind, found.definition, type_hash, offered)
-        qos = self._overrides.get(topic) or asked_qos(offered, RECEIVED)
-
-        def on_sample(sample: Any) -> None:
-            receive(channel, sample.payload, sample.sample_info.source_timestamp)
-
-        try:
-            self._received[topic] = self._read(dds_name, found.kind, qos, type_hash, on_sample)
-        except DDSException as error:
-            raise Refused(f"DDS refuses the subscription: {error.msg}") from None
-        return channel
+        return offered, _user_data(_publisher_of(found, kind), _HASH), found.definition
 
     def _count_lost(self) -> None:
         for topic, reader in self._received.items():

@@ -38,7 +38,7 @@ _VALUED = {
 
 _SIM_TIME = "use_sim_time"
 _FLAG = re.compile(r"--(?:enable|disable)-[\w-]+-logs")
-_LEVELS = ("debug", "info", "warn", "error", "fatal")
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 _MAX_BYTES = 2**20
 _Loader: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -143,7 +143,7 @@ def _ros2(words: Iterator[str], names: NodeNames, parameters: list[tuple[str, st
         if _VALUED[name] == "remap":
             names = _with_rule(names, value)
         elif _VALUED[name] == "log_level":
-            names = replace(names, log_level=value if value in _LEVELS else "")
+            names = replace(names, log_level=value if value in LOG_LEVELS else "")
         elif _VALUED[name]:
             parameters.append((_VALUED[name], value))
     return names

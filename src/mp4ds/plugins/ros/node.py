@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from abc import ABC, abstractmethod
@@ -92,6 +93,9 @@ class NodeOptions:
 class Node(ABC):
     """A node. A context manager; one thread publishes, callbacks come from any thread.
 
+    Args:
+        options: How it takes part.
+
     Attributes:
         world: Its ROS.
         discovery_s: How long `topics` takes to find all topics that there are.
@@ -103,7 +107,8 @@ class Node(ABC):
     discovery_s = 0.0
     poll_s = 0.01
 
-    def __init__(self) -> None:
+    def __init__(self, options: NodeOptions) -> None:
+        self._options = options
         self.lost: Counter[str] = Counter()
 
     @property
@@ -283,11 +288,14 @@ def open_node(world: World, options: NodeOptions) -> Node:
     """
     kind = world if world == "ros1" else "rclpy" if find_spec("rclpy") is not None else "dds"
     module, name, remedy = _NODES[kind]
+    before = logging.getLoggerClass()
     try:
-        opened: Node = getattr(import_module(f"mp4ds.plugins.ros.{module}"), name)(options)
+        node: type[Node] = getattr(import_module(f"mp4ds.plugins.ros.{module}"), name)
     except ImportError as error:
         raise PublishError(kind, f"{error}; {remedy}") from None
-    return opened
+    finally:
+        logging.setLoggerClass(before)  # rosgraph sets its own for the whole process
+    return node(options)
 
 
 # ---------------------------------------------------------------- threads

@@ -29,13 +29,11 @@ from rclpy.qos import (
 from rosidl_runtime_py.utilities import get_message, get_service
 
 from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
-from mp4ds.plugins.ros.node import NodeOptions, Receive, Service
-from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, asked_qos
+from mp4ds.plugins.ros.node import NodeOptions, Service
+from mp4ds.plugins.ros.qos import Qos, asked_qos
 from mp4ds.plugins.ros.ros2 import (
-    CLOCK_TYPE,
     RECEIVED,
     Ros2Node,
-    clock_time,
     finite,
     installed_definition,
     is_topic,
@@ -78,7 +76,6 @@ class RclpyNode(Ros2Node):
 
     def __init__(self, options: NodeOptions) -> None:
         super().__init__(options)
-        self._has_unpublished = options.unpublished
         self._context = Context()
         rclpy.init(args=[], context=self._context)
         names = options.names
@@ -138,11 +135,17 @@ class RclpyNode(Ros2Node):
 
     # ------------------------------------------------------------ receiving
 
-    def follow_clock(self, on_time: Callable[[int], None]) -> None:
-        """Subscribe to /clock."""
-        topic = self._clock_topic
-        kind = _installed_class(topic, CLOCK_TYPE)
-        self._create(kind, topic, CLOCK_QOS, lambda raw: on_time(clock_time(raw)))
+    def _read(
+        self, topic: str, kind: str, qos: Qos, on_message: Callable[[bytes, int], object]
+    ) -> Any:
+        # rclpy passes the source timestamp only to callbacks of exactly two arguments
+        def callback(raw: bytes, info: Any) -> None:
+            on_message(raw, info["source_timestamp"])
+
+        message_class = _installed_class(topic, kind)
+        return self._node.create_subscription(
+            message_class, topic, callback, _profile(qos), raw=True
+        )
 
     def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
         """Subscribe to a topic as soon as it has a publisher."""
@@ -160,15 +163,11 @@ class RclpyNode(Ros2Node):
             if others:
                 asked = asked_qos([_offered_by(one.qos_profile) for one in others], RECEIVED)
                 try:
-                    kind = _installed_class(topic, others[0].topic_type)
                     qos = replace(asked, durability="volatile")  # no message of the past
-                    self._create(kind, topic, qos, lambda _: on_message(None))
+                    self._read(topic, others[0].topic_type, qos, lambda *_: on_message(None))
                 except (Refused, ConversionError) as error:
                     self._node.get_logger().error(f"{topic}: {error}")
                 return
-
-    def _create(self, kind: Any, topic: str, qos: Qos, callback: Callable[..., None]) -> None:
-        self._node.create_subscription(kind, topic, callback, _profile(qos), raw=True)
 
     def topics(self, is_wanted: Callable[[str, str], bool]) -> Mapping[str, Sequence[str]]:
         """Topics that are published; on request, also the others."""
@@ -176,7 +175,7 @@ class RclpyNode(Ros2Node):
             topic: wanted
             for topic, kinds in self._node.get_topic_names_and_types()
             if (wanted := [kind for kind in kinds if is_wanted(topic, kind)])
-            and (self._has_unpublished or self._node.get_publishers_info_by_topic(topic))
+            and (self._options.unpublished or self._node.get_publishers_info_by_topic(topic))
         }
 
     def subscribed_topics(self) -> set[str]:
@@ -184,26 +183,13 @@ class RclpyNode(Ros2Node):
         found = self._node.get_topic_names_and_types()
         return {topic for topic, _ in found if self._node.count_subscribers(topic)}
 
-    def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> Channel:
-        """Subscribe with the QoS that the publishers offer."""
+    def _announced(self, topic: str, kind: str) -> tuple[list[Qos], str, str]:
         publishers = self._node.get_publishers_info_by_topic(topic)
-        offered = [_offered_by(one.qos_profile) for one in publishers]
         hashes = [_hash_text(getattr(one, "topic_type_hash", None)) for one in publishers]
         type_hash = hashes[0] if hashes else ""
         share = [Path(p, "share") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
         definition = installed_definition(kind, share) or standard_definition(kind, type_hash)
-        channel = self._channel(name, kind, definition, type_hash, offered)
-
-        # rclpy passes the source timestamp only to callbacks of exactly two arguments
-        def on_message(raw: bytes, info: Any) -> None:
-            receive(channel, raw, info["source_timestamp"])
-
-        qos = self._overrides.get(topic) or asked_qos(offered, RECEIVED)
-        try:
-            self._create(_installed_class(topic, kind), topic, qos, on_message)
-        except ConversionError as error:
-            raise Refused(error.problem) from None
-        return channel
+        return [_offered_by(one.qos_profile) for one in publishers], type_hash, definition
 
     def serve(self, services: Sequence[Service]) -> None:
         """Offer services, if rosbag2_interfaces is installed."""

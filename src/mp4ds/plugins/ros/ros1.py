@@ -1,8 +1,10 @@
-"""A node of ROS 1, by rospy."""
+"""A node of ROS 1, by rospy.
+
+Imported only if rospy is installed.
+"""
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import socket
@@ -16,9 +18,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as TimedOut
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
+
+import genpy
+import rosgraph
+import rosgraph.names
+import rospy
+import rospy.core
+from rospy.impl.tcpros_base import init_tcpros_server
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import is_ros1
@@ -32,21 +41,6 @@ MAX_BYTES = 128 << 20
 """Queue limit per subscriber and topic: nearly a second of a 5 MB camera at 30 Hz."""
 
 _LENGTH = struct.Struct("<I")
-
-
-@dataclass(frozen=True, slots=True)
-class RosType:
-    """A message type as ROS 1 describes it.
-
-    Attributes:
-        name: Name, such as ``sensor_msgs/Image``.
-        md5sum: Checksum by which publishers and subscribers make sure that their types match.
-        definition: The definition, followed by those of the types it refers to; may be empty.
-    """
-
-    name: str
-    md5sum: str
-    definition: bytes
 
 
 class Sender:
@@ -151,28 +145,21 @@ class AdvertisedTopic:
 
     Args:
         name: The name.
-        kind: The message type.
-        make_publisher: Creates a rospy publisher without a queue; called with the name, the type
-            and a listener for subscribers.
+        kind: The class of its messages.
         messages: Queue size per subscriber.
     """
 
-    def __init__(
-        self,
-        name: str,
-        kind: RosType,
-        make_publisher: Callable[[str, RosType, Any], Any],
-        *,
-        messages: int,
-    ) -> None:
+    def __init__(self, name: str, kind: Any, *, messages: int) -> None:
         self.kind = kind
         self._messages = messages
         self._lock = threading.Lock()
         self._senders: dict[Any, Sender] = {}
         self._latched: dict[str, bytes] = {}  # by who published it
         self._dropped = 0
-        with self._lock:  # a subscriber may connect before rospy returns
-            self._publisher = make_publisher(name, kind, self)
+        # a subscriber may connect before rospy returns
+        with self._lock, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # rospy's advice to use its queues
+            self._publisher = rospy.Publisher(name, kind, subscriber_listener=self)
             self._greet()
 
     @property
@@ -259,24 +246,17 @@ _BACKLOG = 1024
 _LOGGING = "version: 1\nincremental: true\n"
 
 
-def _start_node(node: str, names: NodeNames) -> tuple[Any, str]:
-    """Make this process a node; returns rospy, and the address of the master.
+def _start_node(node: str, names: NodeNames) -> str:
+    """Make this process a node; returns the address of the master.
 
     Args:
         node: Its name, to which a number is appended, unless `names` has a name.
         names: Name and namespace of the node.
 
     Raises:
-        ImportError: rospy is missing.
         OptionError: The address of the master is not valid.
         PublishError: No master answers.
     """
-    before = logging.getLoggerClass()
-    try:
-        import rosgraph
-        import rospy
-    finally:
-        logging.setLoggerClass(before)  # rosgraph sets its own for the whole process
     try:
         master = str(rosgraph.get_master_uri())
         # init_node() would wait for it forever
@@ -304,13 +284,11 @@ def _start_node(node: str, names: NodeNames) -> tuple[Any, str]:
             _receive_many()
     except (rospy.ROSException, ValueError, OSError) as error:
         raise PublishError(master, f"cannot start a node ({error})") from None
-    return rospy, master
+    return master
 
 
 def _receive_many() -> None:
     """Let many subscribers connect at once: beyond rospy's 5, they retry only after seconds."""
-    from rospy.impl.tcpros_base import init_tcpros_server
-
     server = init_tcpros_server().tcp_ros_server
     if server is not None:
         server.server_sock.listen(_BACKLOG)
@@ -351,14 +329,11 @@ def _answer(call: Callable[[], _T], seconds: float) -> _T | None:
 
 def _is_name(name: str) -> bool:
     """Whether a topic name is valid."""
-    import rosgraph.names
-
     return bool(name.strip("/")) and bool(rosgraph.names.is_legal_name(name))
 
 
-def _raw_class(kind: RosType) -> Any:
+def _raw_class(name: str, md5sum: str, definition: bytes) -> Any:
     """A message class whose only field is the serialized message."""
-    import genpy
 
     def serialize(self: Any, buff: Any) -> None:
         buff.write(self.payload)
@@ -370,14 +345,14 @@ def _raw_class(kind: RosType) -> Any:
     members = {
         "__slots__": ["payload"],
         "_slot_types": ["uint8[]"],
-        "_type": kind.name,
-        "_md5sum": kind.md5sum,
-        "_full_text": kind.definition,
+        "_type": name,
+        "_md5sum": md5sum,
+        "_full_text": definition,
         "_has_header": False,
         "serialize": serialize,
         "deserialize": deserialize,
     }
-    return type(kind.name.rpartition("/")[2], (genpy.Message,), members)
+    return type(name.rpartition("/")[2], (genpy.Message,), members)
 
 
 def _set_bool_class() -> Any:
@@ -387,8 +362,8 @@ def _set_bool_class() -> Any:
     members = {
         "_type": "std_srvs/SetBool",
         "_md5sum": "09fb03525b03e7ea1fd3992bafd87e16",
-        "_request_class": _raw_class(RosType("std_srvs/SetBoolRequest", *request)),
-        "_response_class": _raw_class(RosType("std_srvs/SetBoolResponse", *response)),
+        "_request_class": _raw_class("std_srvs/SetBoolRequest", *request),
+        "_response_class": _raw_class("std_srvs/SetBoolResponse", *response),
     }
     return type("SetBool", (), members)
 
@@ -399,7 +374,7 @@ _FLUSH_S = 3.0  # to send what is queued
 _FAREWELL_S = 0.5  # for subscribers to read it: rospy's drop unread data at a disconnect
 _TIME = struct.Struct("<II")
 _NS = 1_000_000_000
-_CLOCK = RosType("rosgraph_msgs/Clock", "a9c97c1d230cfc112e270351a944ee47", b"time clock\n")
+_CLOCK = _raw_class("rosgraph_msgs/Clock", "a9c97c1d230cfc112e270351a944ee47", b"time clock\n")
 _CLOCK_QUEUE = 10  # old times are of no use, but one of the last few may belong to a message
 _RENAME = "Leave the topic out with `exclude`, or rename it with `remap`."
 _REMEDY = "Leave the topic out with `exclude`."
@@ -427,9 +402,8 @@ class Ros1Node(Node):
     poll_s = 0.5  # the master is asked over the network
 
     def __init__(self, options: NodeOptions) -> None:
-        super().__init__()
-        self._options = options
-        self._rospy, self._master = _start_node(options.node, options.names)
+        super().__init__(options)
+        self._master = _start_node(options.node, options.names)
         self._clock_topic = options.names.renamed(CLOCK)
         self._topics: dict[str, AdvertisedTopic] = {}
         self._channels: dict[int, tuple[Channel, AdvertisedTopic, str | None]] = {}  # by id()
@@ -484,7 +458,7 @@ class Ros1Node(Node):
         if not self.is_alive:
             raise PublishError(self._master, "the node was shut down from outside; play again")
 
-    def _kind(self, channel: Channel) -> RosType:
+    def _kind(self, channel: Channel) -> Any:
         if channel.message_encoding != "ros1":
             encoding = channel.message_encoding or "unknown"
             problem = f"its message encoding is {encoding}, not ros1"
@@ -497,41 +471,35 @@ class Ros1Node(Node):
         if schema is None or not schema.name or not md5sum:
             problem = f"the definition of its type {channel.type_name!r} is unknown"
             raise ConversionError(channel.topic, problem, _REMEDY)
-        return RosType(schema.name.replace("/msg/", "/"), md5sum, schema.data)
+        return _raw_class(schema.name.replace("/msg/", "/"), md5sum, schema.data)
 
-    def _topic(self, name: str, kind: RosType, queue_size: int) -> AdvertisedTopic:
+    def _topic(self, name: str, kind: Any, queue_size: int) -> AdvertisedTopic:
         """The topic of that name, advertised; channels of one topic share it."""
         if not _is_name(name):
             raise ConversionError(name, "its name is not valid in ROS 1", _RENAME)
-        resolved = self._rospy.resolve_name(name)
+        resolved = rospy.resolve_name(name)
         topic = self._topics.get(resolved)
         if topic is None:
-            make = self._make_publisher
-            topic = self._topics[resolved] = AdvertisedTopic(name, kind, make, messages=queue_size)
-        if topic.kind.md5sum != kind.md5sum:
+            topic = self._topics[resolved] = AdvertisedTopic(name, kind, messages=queue_size)
+        if topic.kind._md5sum != kind._md5sum:
             problem = (
-                f"it has messages of different types, {topic.kind.name} ({topic.kind.md5sum}) "
-                f"and {kind.name} ({kind.md5sum}), and a ROS 1 topic has one type"
+                f"it has messages of different types, {topic.kind._type} ({topic.kind._md5sum}) "
+                f"and {kind._type} ({kind._md5sum}), and a ROS 1 topic has one type"
             )
             raise ConversionError(name, problem, "Leave it out, or play the recordings separately.")
         return topic
-
-    def _make_publisher(self, name: str, kind: RosType, listener: Any) -> Any:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # rospy's advice to use its queues
-            return self._rospy.Publisher(name, _raw_class(kind), subscriber_listener=listener)
 
     # ------------------------------------------------------------ receiving
 
     @property
     def wants_clock(self) -> bool:
         """Whether /use_sim_time is set."""
-        return bool(self._of_master(lambda: self._rospy.get_param("/use_sim_time", False)))
+        return bool(self._of_master(lambda: rospy.get_param("/use_sim_time", False)))
 
     def _of_master(self, call: Callable[[], _T]) -> _T:
         try:
             found = _answer(call, _ANSWER_S)
-        except (OSError, self._rospy.ROSException) as error:
+        except (OSError, rospy.ROSException) as error:
             raise PublishError(self._master, f"lost the ROS master ({error})") from None
         if found is None:
             raise PublishError(self._master, "the ROS master does not respond")
@@ -555,7 +523,7 @@ class Ros1Node(Node):
 
     def topics(self, is_wanted: Callable[[str, str], bool]) -> Mapping[str, Sequence[str]]:
         """Topics that the master knows."""
-        found = self._of_master(self._rospy.get_published_topics)
+        found = self._of_master(rospy.get_published_topics)
         return {topic: [kind] for topic, kind in found if is_wanted(topic, kind)}
 
     def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> None:
@@ -568,9 +536,9 @@ class Ros1Node(Node):
 
     def _subscribe(self, topic: str, on_message: Callable[[Any], None]) -> None:
         self._subscribers.append(
-            self._rospy.Subscriber(
+            rospy.Subscriber(
                 topic,
-                self._rospy.AnyMsg,
+                rospy.AnyMsg,
                 on_message,
                 buff_size=_RECEIVED_BYTES,
                 tcp_nodelay=True,
@@ -601,14 +569,14 @@ class Ros1Node(Node):
             return kind._response_class(struct.pack("<BI", is_change, len(text)) + text)
 
         kind = _set_bool_class()
-        self._rospy.Service("~pause_playback", kind, handle)
+        rospy.Service("~pause_playback", kind, handle)
 
     # ------------------------------------------------------------ the end
 
     @property
     def is_alive(self) -> bool:
         """Whether the node has not been shut down."""
-        return not self._rospy.is_shutdown()
+        return not rospy.is_shutdown()
 
     def close(self) -> None:
         """Send what is still waiting, for a limited time, and shut down the node."""
@@ -623,7 +591,7 @@ class Ros1Node(Node):
         if self.is_alive and any(topic.subscribers for topic in self._topics.values()):
             time.sleep(_FAREWELL_S)
         # The master may be gone.
-        _answer(lambda: self._rospy.signal_shutdown("the node is closed"), _ANSWER_S)
+        _answer(lambda: rospy.signal_shutdown("the node is closed"), _ANSWER_S)
         for topic in self._topics.values():
             topic.end()
 

@@ -7,9 +7,8 @@ import struct
 import time
 import warnings
 from abc import abstractmethod
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from functools import cache
-from itertools import count
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,8 +22,8 @@ from mp4ds.bags.types import (
 )
 from mp4ds.errors import ConversionError, Refused
 from mp4ds.plugins.ros.names import SERVICE_EVENTS
-from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions
-from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, offered_qos, qos_text
+from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions, Receive
+from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, asked_qos, offered_qos, qos_text
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
@@ -68,14 +67,12 @@ class Ros2Node(Node):
     world = "ros2"
 
     def __init__(self, options: NodeOptions) -> None:
-        super().__init__()
-        self._parting_s = options.parting_s
-        self._overrides = options.overrides
+        super().__init__(options)
         self._clock_topic = options.names.renamed(CLOCK)
         self._clock: Writer | None = None
         self._channels: dict[int, tuple[Channel, Writer]] = {}  # by id()
         self._shared: dict[tuple[str, Hashable, Qos], Writer] = {}
-        self._numbers = count()  # of channels received
+        self._received: dict[str, Any] = {}  # subscriptions of the library, by topic
 
     @abstractmethod
     def _make_writer(self, channel: Channel, qos: Qos) -> Writer:
@@ -86,6 +83,23 @@ class Ros2Node(Node):
             ConversionError: The name of the topic or the type is not valid.
         """
 
+    @abstractmethod
+    def _read(
+        self, topic: str, kind: str, qos: Qos, on_message: Callable[[bytes, int], object]
+    ) -> Any:
+        """Subscribe; calls back with each message and when it was sent. Returns the subscription.
+
+        Raises:
+            Refused: It cannot be received.
+            ConversionError: There is no such type.
+        """
+
+    @abstractmethod
+    def _announced(self, topic: str, kind: str) -> tuple[list[Qos], str, str]:
+        """What publishers offer, and the hash and definition of their type, empty if unknown."""
+
+    # ------------------------------------------------------------ publishing
+
     def advertise(self, channel: Channel) -> None:
         """Announce a channel."""
         if id(channel) in self._channels:
@@ -93,7 +107,7 @@ class Ros2Node(Node):
         if channel.message_encoding != "cdr":
             encoding = channel.message_encoding or "unknown"
             raise ConversionError(channel.topic, f"its message encoding is {encoding}, not cdr")
-        qos = offered_qos(channel, self._overrides)
+        qos = offered_qos(channel, self._options.overrides)
         key = (channel.topic, channel.schema, qos)
         writer = None if qos.is_latched else self._shared.get(key)
         if writer is None:
@@ -119,12 +133,13 @@ class Ros2Node(Node):
 
     def _part(self) -> None:
         """Wait until subscribers have what was sent, as long as they may take."""
-        end = time.monotonic() + (_PARTING_S if self._parting_s is None else self._parting_s)
+        patience = self._options.parting_s
+        end = time.monotonic() + (_PARTING_S if patience is None else patience)
         late: set[str] = set()
         for channel, writer in self._channels.values():
             if channel.topic not in late and not writer.wait(max(0.0, end - time.monotonic())):
                 late.add(channel.topic)
-        if late and self._parting_s is not None:
+        if late and patience is not None:
             topics = ", ".join(sorted(late))
             warnings.warn(
                 f"{topics}: subscribers have not acknowledged every message in time",
@@ -134,21 +149,28 @@ class Ros2Node(Node):
         self._shared.clear()
         self._clock = None
 
-    def _channel(
-        self, name: str, type_name: str, definition: str, type_hash: str, qos: Sequence[Qos]
-    ) -> Channel:
-        """A channel as rosbag2 records it.
+    # ------------------------------------------------------------ receiving
 
-        Args:
-            name: Its topic.
-            type_name: Such as ``sensor_msgs/msg/Image``.
-            definition: Its definition, with those of its parts; empty if unknown.
-            type_hash: ``RIHS01_...``; empty if unknown.
-            qos: What its publishers offer.
-        """
-        schema = Schema(type_name, _ENCODING if definition else "", definition.encode())
-        metadata = {QOS_KEY: qos_text(qos), **({HASH_KEY: type_hash} if type_hash else {})}
-        return Channel(next(self._numbers), name, "cdr", schema, metadata)
+    def follow_clock(self, on_time: Callable[[int], None]) -> None:
+        """Subscribe to /clock."""
+
+        def on_message(data: bytes, _: int) -> None:
+            on_time(clock_time(data))
+
+        self._read(self._clock_topic, CLOCK_TYPE, CLOCK_QOS, on_message)
+
+    def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> Channel:
+        """Subscribe with the QoS that the publishers offer, on a channel as rosbag2 records it."""
+        offered, type_hash, definition = self._announced(topic, kind)
+        schema = Schema(kind, _ENCODING if definition else "", definition.encode())
+        metadata = {QOS_KEY: qos_text(offered), **({HASH_KEY: type_hash} if type_hash else {})}
+        channel = Channel(len(self._received), name, "cdr", schema, metadata)
+        qos = self._options.overrides.get(topic) or asked_qos(offered, RECEIVED)
+        try:
+            self._received[topic] = self._read(topic, kind, qos, partial(receive, channel))
+        except ConversionError as error:
+            raise Refused(error.problem) from None
+        return channel
 
 
 def is_topic(name: str) -> bool:
