@@ -313,7 +313,6 @@ class FilePass(ABC):
     """One reading of a damaged file.
 
     Args:
-        path: The file.
         window: At its start.
         log: Where losses are recorded.
         framing: Of its records.
@@ -333,14 +332,12 @@ class FilePass(ABC):
 
     def __init__(
         self,
-        path: Path,
         window: Window,
         log: LossLog,
         framing: Framing,
         channels: Mapping[int, Channel],
         index: int | None,
     ) -> None:
-        self._path = path
         self._window = window
         self._log = log
         self._tally = Tally(log, self._topic_of)
@@ -385,7 +382,7 @@ class FilePass(ABC):
     ) -> Iterator[tuple[RecordFrame, bytes]]:
         """The records of a decompressed chunk; what is wrong with it is added to `problems`."""
         scan = Scan(
-            Window.of_content(bytes(content), self._path),
+            Window.of_content(bytes(content)),
             self._framing,
             lambda _offset, _size, problem: problems.append(f"in a chunk, {problem}"),
         )

@@ -5,31 +5,195 @@ from __future__ import annotations
 import contextlib
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from mcap import records as mcap_records
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from mp4ds.bags.files import DamageError, most_held, open_source, recover
 from mp4ds.bags.mcap_index import ChunkTable, McapSummary
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
+    FRAME,
     MAGIC,
     MAX_RECORD_BYTES,
     MESSAGE_HEAD,
     OF_SUMMARY,
+    PRIVATE_OPCODE,
     Declared,
     chunk_records,
     parse,
     unpack_chunk,
 )
 from mp4ds.bags.salvage.losses import Draft, FilePass, FileSalvage, LossLog, lost_by
-from mp4ds.bags.salvage.scan import MAX_LENGTH, McapFraming, RecordFrame, Scan, Window
+from mp4ds.bags.salvage.scan import Framing, RecordFrame, Scan, Window
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
+
+# ---------------------------------------------------------------- finding records
+
+_HEAD = FRAME.size
+_MAX_LENGTH = 2**40
+_COMPRESSIONS = (b"", b"lz4", b"zstd")
+
+# Bytes of the fields in the bodies of records, a string or map as the format of its length.
+_LAYOUTS: Mapping[int, tuple[int | str, ...]] = {
+    Opcode.SCHEMA: (2, "<I", "<I", "<I"),
+    Opcode.CHANNEL: (4, "<I", "<I", "<I"),
+    Opcode.CHUNK: (28, "<I", "<Q"),
+    Opcode.MESSAGE_INDEX: (2, "<I"),
+    Opcode.ATTACHMENT: (16, "<I", "<I", "<Q", 4),
+    Opcode.METADATA: ("<I", "<I"),
+}
+_SHORTEST = {
+    Opcode.FOOTER: 20,
+    Opcode.MESSAGE: 22,
+    Opcode.DATA_END: 4,
+    **{
+        kind: sum(struct.calcsize(part) if isinstance(part, str) else part for part in layout)
+        for kind, layout in _LAYOUTS.items()
+    },
+}
+
+
+def _table(known: Mapping[int, int], other: int) -> NDArray[np.int64]:
+    table = np.full(256, other, np.int64)
+    for opcode, value in known.items():
+        table[opcode] = value
+    return table
+
+
+# Records that are not searched for have no possible length.
+_SHORTEST_OF = _table(_SHORTEST, _MAX_LENGTH)
+_LONGEST_OF = _table(
+    {**dict.fromkeys(_SHORTEST, _MAX_LENGTH), Opcode.DATA_END: 4, Opcode.FOOTER: 20}, 0
+)
+
+
+def _fields_end(kind: int, body: memoryview) -> int | None:
+    """Bytes of a record's body by its fields; None if they are not those of its kind."""
+    at = 0
+    ends = []
+    try:
+        for part in _LAYOUTS[kind]:
+            at += part if isinstance(part, int) else 0
+            if isinstance(part, str):
+                at += struct.calcsize(part) + int(struct.unpack_from(part, body, at)[0])
+            ends.append(at)
+    except (KeyError, struct.error):
+        return None
+    if kind == Opcode.MESSAGE_INDEX and (at - _SHORTEST[kind]) % 16:
+        return None
+    if kind == Opcode.CHUNK and bytes(body[32 : ends[1]]) not in _COMPRESSIONS:
+        return None
+    return at
+
+
+class McapFraming(Framing):
+    """Finds records by opcode and length; MCAP has no sync markers.
+
+    In sequence, anything the format allows is a record. After damage, it must be of a kind whose
+    fields match the length of its frame, or a message of a known channel followed by another
+    record.
+
+    Args:
+        channels: Ids of the known channels; may grow.
+        longest: Bytes of a record are fewer.
+    """
+
+    lookahead = 2**16
+    outer: Collection[int] = frozenset(
+        {
+            Opcode.CHUNK,
+            Opcode.MESSAGE_INDEX,
+            Opcode.ATTACHMENT,
+            Opcode.METADATA,
+            Opcode.DATA_END,
+            Opcode.FOOTER,
+        }
+    )
+
+    def __init__(self, channels: Collection[int], longest: int = _MAX_LENGTH) -> None:
+        self._channels = channels
+        self._longest = longest
+
+    def frame(self, view: memoryview) -> RecordFrame | None:
+        """The record at the start of these bytes: any that the format allows."""
+        if len(view) < _HEAD:
+            return None
+        opcode, length = FRAME.unpack_from(view)
+        if length >= self._longest or length < _SHORTEST.get(opcode, 0):
+            return None
+        if not 1 <= opcode <= Opcode.DATA_END and opcode < PRIVATE_OPCODE:
+            return None
+        if opcode == Opcode.CHUNK:
+            needed = _fields_end(opcode, view[_HEAD:])
+            if needed is None or needed > length:
+                return None
+        return RecordFrame(opcode, _HEAD, _HEAD + length)
+
+    def find(
+        self,
+        view: memoryview,
+        end: int,
+        is_followed: Callable[[int], bool],
+        kinds: Collection[int] | None = None,
+    ) -> int | None:
+        """The start of the first certain record."""
+        for start in self._candidates(view, end):
+            if kinds is not None and view[start] not in kinds:
+                continue
+            size = self._sure_size(view[start:])
+            if size == 0 or (size and is_followed(start + size)):
+                return start
+        return None
+
+    def _candidates(self, view: memoryview, end: int) -> list[int]:
+        """Places of an opcode followed by a plausible length."""
+        data = np.frombuffer(view, np.uint8)[: end + _HEAD]
+        if len(data) < _HEAD:
+            return []
+        kinds = data[: -_HEAD + 1]
+        mask = (data[7 : len(data) - 1] == 0) & (data[8:] == 0)
+        mask &= (kinds - np.uint8(Opcode.FOOTER)) <= Opcode.DATA_END - Opcode.FOOTER
+        places = np.flatnonzero(mask)
+        if not len(places):
+            return []
+        lengths = np.zeros(len(places), np.int64)
+        for byte in range(6):
+            lengths |= data[places + 1 + byte].astype(np.int64) << (8 * byte)
+        found = kinds[places]
+        keep = (lengths >= _SHORTEST_OF[found]) & (lengths <= _LONGEST_OF[found])
+        keep[found == Opcode.MESSAGE] &= self._is_known(data, places[found == Opcode.MESSAGE])
+        result: list[int] = places[keep & (places < end)].tolist()
+        return result
+
+    def _is_known(self, data: NDArray[np.uint8], places: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Whether messages at these places are of known channels."""
+        low = np.minimum(places + _HEAD, len(data) - 1)
+        high = np.minimum(places + _HEAD + 1, len(data) - 1)
+        ids = data[low].astype(np.int64) | data[high].astype(np.int64) << 8
+        # the last few may extend beyond the view: the strict check decides
+        return np.isin(ids, list(self._channels)) | (places + _HEAD + 1 >= len(data))
+
+    def _sure_size(self, view: memoryview) -> int | None:
+        """0 for a certain record, its size if another must follow, None for no record."""
+        frame = self.frame(view)
+        if frame is None:
+            return None
+        body, length = view[_HEAD:], frame.size - _HEAD
+        if frame.kind == Opcode.MESSAGE:
+            is_known = int.from_bytes(body[:2], "little") in self._channels
+            return frame.size if is_known else None
+        if frame.kind == Opcode.FOOTER:
+            return 0 if bytes(body[20 : 20 + len(MAGIC)]) == MAGIC else None
+        if frame.kind == Opcode.DATA_END:
+            return frame.size
+        return 0 if _fields_end(frame.kind, body) == length else None
+
 
 # ---------------------------------------------------------------- the summary
 
@@ -69,51 +233,44 @@ def read_summary(path: Path) -> SalvagedSummary:
     """
     summary = SalvagedSummary()
     with Window.of_file(path) as window:
-        size = window.size or 0
+        size = window.size
         tail = window.look(size - FOOTER_BYTES, FOOTER_BYTES) if size > FOOTER_BYTES else None
     if tail and tail[0] == Opcode.FOOTER and tail[-len(MAGIC) :] == MAGIC:
         (start,) = struct.unpack_from("<Q", tail, 9)
         if len(MAGIC) < start < size - FOOTER_BYTES:
-            summary.is_verified = _matches(path, start, size - len(MAGIC) - 4)
-            _read_from(path, start, summary)
+            with Window.of_file(path, start) as window:
+                covered = size - len(MAGIC) - 4 - start  # by the checksum in the footer
+                if covered <= _MAX_SEARCHED:  # otherwise, checking would take long
+                    (told,) = struct.unpack("<I", tail[-len(MAGIC) - 4 : -len(MAGIC)])
+                    summary.is_verified = told in (0, zlib.crc32(window.peek(covered)))
+                _read_from(window, start, summary)
     summary.finish()
     return summary
 
 
-def _matches(path: Path, start: int, end: int) -> bool:
-    """Whether the bytes of a summary, up to its checksum, match that."""
-    if end - start > _MAX_SEARCHED:
-        return True  # checking would take long
-    with Window.of_file(path, start) as window:
-        covered = window.peek(end - start)
-        (told,) = struct.unpack("<I", window.look(end - start, 4) or bytes(4))
-        return told in (0, zlib.crc32(covered))
-
-
-def _read_from(path: Path, start: int, summary: SalvagedSummary) -> None:
+def _read_from(window: Window, start: int, summary: SalvagedSummary) -> None:
     framing = McapFraming({})
-    with Window.of_file(path, start) as window:
-        is_there = framing.frame(window.peek(framing.lookahead)) is not None
-        if not is_there and (window.left or 0) > _MAX_SEARCHED:
-            return  # the rest may be anything
-        summary.offset = start
+    is_there = framing.frame(window.peek(framing.lookahead)) is not None
+    if not is_there and window.left > _MAX_SEARCHED:
+        return  # the rest may be anything
+    summary.offset = start
 
-        def lose(*_: object) -> None:
-            summary.is_whole = False
-
-        scan = Scan(window, framing, lose)
-        while frame := scan.next():
-            if frame.kind == Opcode.FOOTER:
-                return
-            if frame.kind not in OF_SUMMARY:
-                break
-            body = scan.body(frame)
-            if body is not None:
-                try:
-                    summary.add(frame.kind, body)
-                except DamageError:
-                    summary.is_whole = False
+    def lose(*_: object) -> None:
         summary.is_whole = False
+
+    scan = Scan(window, framing, lose)
+    while frame := scan.next():
+        if frame.kind == Opcode.FOOTER:
+            return
+        if frame.kind not in OF_SUMMARY:
+            break
+        body = scan.body(frame)
+        if body is not None:
+            try:
+                summary.add(frame.kind, body)
+            except DamageError:
+                summary.is_whole = False
+    summary.is_whole = False
 
 
 # ---------------------------------------------------------------- a pass
@@ -127,7 +284,6 @@ class McapPass(FilePass):
     """One reading of an MCAP file.
 
     Args:
-        path: Its name.
         window: At its start.
         log: Where losses are recorded.
         framing: Of its records.
@@ -141,7 +297,6 @@ class McapPass(FilePass):
 
     def __init__(
         self,
-        path: Path,
         window: Window,
         log: LossLog,
         framing: McapFraming,
@@ -149,7 +304,7 @@ class McapPass(FilePass):
         summary: SalvagedSummary,
         decompress: Callable[[memoryview], bytes] | None,
     ) -> None:
-        super().__init__(path, window, log, framing, declared.channels, summary.offset or None)
+        super().__init__(window, log, framing, declared.channels, summary.offset or None)
         self._declared = declared
         self._summary = summary
         self._decompress = decompress
@@ -157,7 +312,8 @@ class McapPass(FilePass):
         if summary.is_verified:
             self._schemas.update(summary.schemas)
         self._undefined: dict[int, int] = {}
-        self._plain: _Plain | None = None
+        # a damaged uncompressed chunk: where it begins and ends, and what is wrong
+        self._plain: tuple[int, int, str] | None = None
         self.count = _message_count(summary.statistics)
 
     def records(self) -> Iterator[Found]:
@@ -314,7 +470,7 @@ class McapPass(FilePass):
         if chunk.is_plain and chunk.problem:
             # Its records are in the file like any other: damage to one does not hide the others.
             if chunk.is_doubtful:
-                self._plain = _Plain(offset, offset + frame.size, chunk.problem)
+                self._plain = offset, offset + frame.size, chunk.problem
             self._window.skip(frame.head + chunk.head)
             return
         problems = [chunk.problem] if chunk.problem else []
@@ -351,14 +507,6 @@ class McapPass(FilePass):
         channel_id, length = struct.unpack_from("<HI", body)
         pairs = np.frombuffer(body, "<u8", count=min(length, len(body) - 6) // 8, offset=6)
         self._tally.listed(channel_id, pairs[::2], offset)
-
-
-class _Plain(NamedTuple):
-    """A damaged uncompressed chunk: where it begins and ends, and what is wrong."""
-
-    start: int
-    end: int
-    problem: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -507,10 +655,10 @@ class McapSalvage(FileSalvage):
         self._declared.skipped.clear()
         with Window.of_file(self.path) as window:
             # a small compressed file may hold what claims to be large
-            longest = MAX_LENGTH if self.path == self._shown else most_held()
+            longest = _MAX_LENGTH if self.path == self._shown else most_held()
             framing = McapFraming(self._declared.channels, longest)
             reading = McapPass(
-                self.path, window, log, framing, self._declared, self._summary, self._decompress
+                window, log, framing, self._declared, self._summary, self._decompress
             )
             is_indexed = self._summary.chunks.has_messages
             yield from self._in_order(window, reading, is_indexed=is_indexed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +21,101 @@ from mp4ds.bags.ros1 import (
     Op,
     connection_of,
     other_format,
+    split_header,
     times_in,
 )
 from mp4ds.bags.salvage.losses import FilePass, FileSalvage, LossLog
-from mp4ds.bags.salvage.scan import RecordFrame, Ros1Framing, Scan, Window
+from mp4ds.bags.salvage.scan import Framing, RecordFrame, Scan, Window
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record
+
+# ---------------------------------------------------------------- finding records
+
+_MAX_HEADER = 2**16
+"""Maximum size of a record's header: a few fields, and the topic of a connection."""
+
+_ROS1_OP = re.compile(rb"\x04\x00\x00\x00op=[\x02\x04-\x07]")
+_MAX_BEFORE_OP = 512
+_MAX_FOUND_HEADER = 4096
+
+# Sizes of the fields that a record of a kind must have.
+_FIELDS: Mapping[int, Mapping[bytes, int]] = {
+    Op.MESSAGE: {b"conn": 4, b"time": 8},
+    Op.BAG: {b"index_pos": 8},
+    Op.INDEX: {b"ver": 4, b"conn": 4, b"count": 4},
+    Op.CHUNK: {b"size": 4},
+    Op.CHUNK_INFO: {b"chunk_pos": 8, b"count": 4, b"start_time": 8, b"end_time": 8},
+    Op.CONNECTION: {b"conn": 4},
+}
+
+
+class _Framing(Framing):
+    """Finds records by the fields of their headers.
+
+    An uncompressed chunk is framed by its header alone, so that its records are read like any other
+    in the file: damage to one does not hide the others.
+    """
+
+    lookahead = _MAX_HEADER + 8
+    outer: Collection[int] = frozenset({Op.CHUNK, Op.INDEX, Op.CHUNK_INFO})
+
+    def frame(self, view: memoryview) -> RecordFrame | None:
+        """The record at the start of these bytes; its header has all fields of its kind."""
+        if len(view) < 8:
+            return None
+        (length,) = UINT32.unpack_from(view)
+        if length > _MAX_HEADER or length + 8 > len(view):
+            return None
+        try:
+            fields = Fields(split_header(bytes(view[4 : 4 + length])))
+        except DamageError:
+            return None
+        op = fields.get(b"op", b"")
+        needed = _FIELDS.get(op[0]) if len(op) == 1 else None
+        if needed is None:
+            return None
+        if any(len(fields.get(name, b"")) != size for name, size in needed.items()):
+            return None
+        head = length + 8
+        (body,) = UINT32.unpack_from(view, length + 4)
+        if op[0] == Op.CHUNK:
+            if b"compression" not in fields:
+                return None
+            if fields[b"compression"] == b"none":
+                body = 0
+        return RecordFrame(op[0], head, head + body, fields)
+
+    def find(
+        self,
+        view: memoryview,
+        end: int,
+        is_followed: Callable[[int], bool],
+        kinds: Collection[int] | None = None,
+    ) -> int | None:
+        """The start of the first record: a header with all its fields is proof enough."""
+        for match in _ROS1_OP.finditer(view):
+            if kinds is None or view[match.end() - 1] in kinds:
+                start = self._start(view, match.start())
+                if start is not None and start < end:
+                    return start
+            if match.start() > end + _MAX_BEFORE_OP:
+                break
+        return None
+
+    def _start(self, view: memoryview, op: int) -> int | None:
+        """The start of the record whose field ``op`` is at a byte."""
+        first = max(0, op - _MAX_BEFORE_OP)
+        before = bytes(view[first:op])
+        for start in range(len(before) - 4, -1, -1):
+            if before[start + 2] or before[start + 3]:
+                continue
+            (length,) = UINT32.unpack_from(before, start)
+            if not op - first - start + 4 <= length <= _MAX_FOUND_HEADER:
+                continue
+            if self.frame(view[first + start :]):
+                return first + start
+        return None
+
 
 _SEARCHED = 16 * 2**20
 _OF_INDEX = (Op.CONNECTION, Op.CHUNK_INFO)
@@ -118,7 +207,7 @@ def read_index(path: Path) -> BagIndex:
         SourceError: The bag is encrypted, or cannot be read.
     """
     index = BagIndex()
-    framing = Ros1Framing()
+    framing = _Framing()
     with Window.of_file(path) as window:
         window.skip(len(MAGIC))
         header = framing.frame(window.peek(framing.lookahead))
@@ -138,7 +227,7 @@ def read_index(path: Path) -> BagIndex:
 
 def _read_records(path: Path, offset: int, index: BagIndex) -> None:
     """Read an index at its expected place."""
-    framing = Ros1Framing()
+    framing = _Framing()
     with Window.of_file(path, offset) as window:
         if framing.frame(window.peek(framing.lookahead)) is None:
             return
@@ -154,7 +243,7 @@ def _read_records(path: Path, offset: int, index: BagIndex) -> None:
 
 def _search_connections(path: Path, offset: int, index: BagIndex) -> None:
     """Search for connections from a byte on, if the index is not at its expected place."""
-    framing = Ros1Framing()
+    framing = _Framing()
     with Window.of_file(path, offset) as window:
         scan = Scan(window, framing, lambda *_: None)
         if offset > len(MAGIC):
@@ -198,7 +287,7 @@ class Ros1Salvage(FileSalvage):
 
     def _pass(self, log: LossLog) -> Iterator[Record]:
         with Window.of_file(self.path) as window:
-            reading = _Pass(self.path, window, log, self._index, self._channels)
+            reading = _Pass(window, log, self._index, self._channels)
             yield from self._in_order(window, reading, is_indexed=bool(self._index.chunks))
 
 
@@ -210,13 +299,12 @@ class _Pass(FilePass):
 
     def __init__(
         self,
-        path: Path,
         window: Window,
         log: LossLog,
         index: BagIndex,
         channels: dict[int, Channel],
     ) -> None:
-        super().__init__(path, window, log, Ros1Framing(), channels, index.offset)
+        super().__init__(window, log, _Framing(), channels, index.offset)
         self._channels: dict[int, Channel] = channels
         self._index = index
         self._next_listed = 0
