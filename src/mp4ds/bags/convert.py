@@ -23,7 +23,6 @@ from mp4ds.bags.types import (
     MAX_TAIL,
     RosVersion,
     by_library,
-    field_shape,
     fields_of,
     has_empty_items,
     incomprehensible,
@@ -32,6 +31,7 @@ from mp4ds.bags.types import (
     ros2_store,
     ros2_version,
     same_wire,
+    shapes_of,
     sizes_of,
     translate,
     types_of,
@@ -52,22 +52,16 @@ def where_times_are(types: Typesdict, name: str) -> Where:
     """Whether messages of a type have times: none, one in the header they begin with, or others."""
 
     def has_time(part: str) -> bool:
-        return part == TIME or any(has_time(inner) for _, inner, _ in _parts(types, part))
+        return part == TIME or any(
+            shape.message and has_time(shape.message) for shape in shapes_of(types, part)
+        )
 
-    parts = _parts(types, name)
-    is_headed = bool(parts) and parts[0] == (0, HEADER, False)
-    others = name == TIME or any(has_time(part) for _, part, _ in parts[is_headed:])
-    return "anywhere" if others else "header" if is_headed else "nowhere"
-
-
-def _parts(types: Typesdict, name: str) -> list[tuple[int, str, bool]]:
-    """The fields that are messages: place, type, and whether there are several."""
-    shapes = [field_shape(desc) for _, desc in fields_of(types, name)]
-    return [
-        (place, shape.message, shape.length is not None or shape.bound is not None)
-        for place, shape in enumerate(shapes)
-        if shape.message
-    ]
+    shapes = shapes_of(types, name)
+    is_headed = bool(shapes) and shapes[0].message == HEADER and not shapes[0].is_several
+    rest = [shape.message for shape in shapes[is_headed:] if shape.message]
+    if name == TIME or any(map(has_time, rest)):
+        return "anywhere"
+    return "header" if is_headed else "nowhere"
 
 
 # ---------------------------------------------------------------- convert

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 FILLER = "structure_needs_at_least_one_member"
 """Name of the field that empty messages have in ROS 2."""
 
+_BYTES_OF: Mapping[str, int] = SIZEMAP
 _MAX_PARTS = 5000  # fields of all types, with the items that rosbags' code spells out
 _MAX_STEPS = 2**16  # fields of a message whose sequences have one item
 _MAX_EMPTY = 2**16  # messages without any byte in one, besides two for each of its bytes
@@ -75,6 +76,71 @@ def incomprehensible(name: str) -> str:
     return f"the definition of type {name} cannot be parsed"
 
 
+# ---------------------------------------------------------------- fields
+
+
+@dataclass(frozen=True, slots=True)
+class FieldShape:
+    """The type of a field.
+
+    Attributes:
+        base: A basic type such as ``uint8`` or ``string``; empty for a message.
+        message: Name of the message type; empty for a basic type.
+        text_bound: Maximum number of characters of a string; 0 for no limit.
+        length: Elements of an array of fixed length; None for anything else.
+        bound: Maximum number of elements of a sequence, 0 for no limit; None for anything else.
+    """
+
+    base: str
+    message: str
+    text_bound: int
+    length: int | None
+    bound: int | None
+
+    @property
+    def is_several(self) -> bool:
+        """Whether it is an array or a sequence."""
+        return self.length is not None or self.bound is not None
+
+    @property
+    def on_wire(self) -> tuple[object, ...]:
+        """What determines its bytes, except for the message type; bounds do not."""
+        base = _BYTES.get(self.base, self.base)
+        return base, bool(self.message), self.length, self.bound is None
+
+
+def field_shape(desc: FieldDesc) -> FieldShape:
+    """The shape of a field of `fields_of`."""
+    length, bound = None, None
+    if desc[0] == Nodetype.ARRAY:
+        desc, length = desc[1]
+    elif desc[0] == Nodetype.SEQUENCE:
+        desc, bound = desc[1]
+    if desc[0] == Nodetype.NAME:
+        return FieldShape("", str(desc[1]), 0, length, bound)
+    if desc[0] == Nodetype.BASE:
+        return FieldShape(str(desc[1][0]), "", int(desc[1][1] or 0), length, bound)
+    raise Refused("it holds arrays of arrays")
+
+
+def fields_of(types: Typesdict, name: str) -> Fielddefs:
+    """A type's fields; none for an unknown type."""
+    fields = types[name][1] if name in types else []
+    return [field for field in fields if field[0] != FILLER]
+
+
+def shapes_of(types: Typesdict, name: str) -> list[FieldShape]:
+    """The shapes of a type's fields.
+
+    Raises:
+        Refused: It holds arrays of arrays.
+    """
+    return [field_shape(desc) for _, desc in fields_of(types, name)]
+
+
+# ---------------------------------------------------------------- bounds
+
+
 class Size(NamedTuple):
     """Minimum size of a message of a type, with empty sequences.
 
@@ -99,19 +165,36 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
         Refused: A type contains itself, or is larger than any real message.
     """
     sizes: dict[str, Size] = {}
+
+    def size_of(name: str, level: int) -> Size:
+        if name in sizes:
+            return sizes[name]
+        if level > _MAX_DEPTH:
+            raise Refused(f"{name} contains itself, or is nested too deeply")
+        least, steps, depth = 0, 1, 0
+        for shape in shapes_of(types, name):
+            part = Size(_BYTES_OF.get(shape.base, 1), 0, 0)
+            if shape.message:
+                part = size_of(shape.message, level + 1)
+            elif shape.base == "string":
+                part = Size(4, 1, 0)
+            depth = max(depth, part.depth + 1)
+            if shape.bound is not None:
+                part = Size(4, part.steps, 0)
+            length = 1 if shape.length is None else shape.length
+            least += length * part.least
+            steps += 1 + length * part.steps
+        if steps > _MAX_STEPS or depth > _MAX_DEPTH:
+            raise Refused(f"{name} has more fields than any real message")
+        sizes[name] = Size(least, steps, depth)
+        return sizes[name]
+
     parts = 0
     for name in types:
-        todo = [name]
-        while todo:
-            missing = [part for part in _messages(types, todo[-1]) if part not in sizes]
-            if not missing:
-                sizes[todo[-1]] = _size(types, todo[-1], sizes)
-                todo.pop()
-            elif len(todo) > _MAX_DEPTH:
-                raise Refused(f"{name} contains itself, or is nested too deeply")
-            else:
-                todo.append(missing[0])
-        parts += sum(_spelled_out(desc) for _, desc in types[name][1])
+        size_of(name, 1)
+        for shape in shapes_of(types, name):
+            is_plain = shape.base not in ("", "string")
+            parts += 1 if is_plain else 1 + (1 if shape.length is None else shape.length)
     if parts > _MAX_PARTS:
         raise Refused(f"its definition has more than {_MAX_PARTS} fields")
     return sizes
@@ -120,11 +203,9 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
 def has_empty_items(types: Typesdict, sizes: dict[str, Size]) -> bool:
     """Whether there are arrays of messages of zero bytes."""
     return any(
-        desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)
-        and desc[1][0][0] == Nodetype.NAME
-        and not sizes[str(desc[1][0][1])].least
-        for _, fields in types.values()
-        for _, desc in fields
+        shape.is_several and shape.message and not sizes[shape.message].least
+        for name in types
+        for shape in shapes_of(types, name)
     )
 
 
@@ -175,47 +256,6 @@ def _checked(read: Callable[..., Any], least: int) -> Callable[..., Any]:
         return read(data, position, *rest)
 
     return checked
-
-
-def _item(desc: FieldDesc) -> Any:
-    """A field, or what an array or sequence holds."""
-    return desc[1][0] if desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else desc
-
-
-def _messages(types: Typesdict, name: str) -> list[str]:
-    items = (_item(desc) for _, desc in types[name][1])
-    return [str(item[1]) for item in items if item[0] == Nodetype.NAME]
-
-
-def _length(desc: FieldDesc) -> int:
-    return int(desc[1][1]) if desc[0] == Nodetype.ARRAY else 1
-
-
-def _spelled_out(desc: FieldDesc) -> int:
-    item = _item(desc)
-    is_plain = item[0] == Nodetype.BASE and item[1][0] != "string"
-    return 1 if is_plain else 1 + _length(desc)
-
-
-def _size(types: Typesdict, name: str, sizes: dict[str, Size]) -> Size:
-    least, steps, depth = 0, 1, 0
-    for field, desc in types[name][1]:
-        item, length = _item(desc), _length(desc)
-        if field == FILLER:
-            continue
-        part = Size(SIZEMAP.get(item[1][0], 1), 0, 0)
-        if item[0] == Nodetype.NAME:
-            part = sizes[str(item[1])]
-        elif item[1][0] == "string":
-            part = Size(4, 1, 0)
-        depth = max(depth, part.depth + 1)
-        if desc[0] == Nodetype.SEQUENCE:
-            part = Size(4, part.steps, 0)
-        least += length * part.least
-        steps += 1 + length * part.steps
-    if steps > _MAX_STEPS or depth > _MAX_DEPTH:
-        raise Refused(f"{name} has more fields than any real message")
-    return Size(least, steps, depth)
 
 
 # ---------------------------------------------------------------- definitions
@@ -350,15 +390,8 @@ def closure(types: Typesdict, root: str, standard: Typesdict) -> Typesdict:
             raise Refused(f"no definition of type {name} is known")
         if name not in found:
             found[name] = types[name] if name in types else standard[name]
-            shapes = (field_shape(desc) for _, desc in found[name][1])
-            todo += [shape.message for shape in shapes if shape.message]
+            todo += [shape.message for shape in shapes_of(found, name) if shape.message]
     return found
-
-
-def fields_of(types: Typesdict, name: str) -> Fielddefs:
-    """A type's fields; none for an unknown type."""
-    fields = types[name][1] if name in types else []
-    return [field for field in fields if field[0] != FILLER]
 
 
 def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str) -> bool:
@@ -368,56 +401,14 @@ def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str
     """
     if left_name == right_name == HEADER:
         return True
-    left_fields, right_fields = fields_of(left, left_name), fields_of(right, right_name)
-    if len(left_fields) != len(right_fields):
+    left_shapes, right_shapes = shapes_of(left, left_name), shapes_of(right, right_name)
+    if len(left_shapes) != len(right_shapes):
         return False
-    for (_, left_desc), (_, right_desc) in zip(left_fields, right_fields, strict=True):
-        left_shape, right_shape = field_shape(left_desc), field_shape(right_desc)
-        if left_shape.on_wire != right_shape.on_wire:
-            return False
-        part = left_shape.message
-        if part and not same_wire(left, part, right, right_shape.message):
-            return False
-    return True
-
-
-@dataclass(frozen=True, slots=True)
-class FieldShape:
-    """The type of a field.
-
-    Attributes:
-        base: A basic type such as ``uint8`` or ``string``; empty for a message.
-        message: Name of the message type; empty for a basic type.
-        text_bound: Maximum number of characters of a string; 0 for no limit.
-        length: Elements of an array of fixed length; None for anything else.
-        bound: Maximum number of elements of a sequence, 0 for no limit; None for anything else.
-    """
-
-    base: str
-    message: str
-    text_bound: int
-    length: int | None
-    bound: int | None
-
-    @property
-    def on_wire(self) -> tuple[object, ...]:
-        """What determines its bytes, except for the message type; bounds do not."""
-        base = _BYTES.get(self.base, self.base)
-        return base, bool(self.message), self.length, self.bound is None
-
-
-def field_shape(desc: FieldDesc) -> FieldShape:
-    """The shape of a field of `fields_of`."""
-    length, bound = None, None
-    if desc[0] == Nodetype.ARRAY:
-        desc, length = desc[1]
-    elif desc[0] == Nodetype.SEQUENCE:
-        desc, bound = desc[1]
-    if desc[0] == Nodetype.NAME:
-        return FieldShape("", str(desc[1]), 0, length, bound)
-    if desc[0] == Nodetype.BASE:
-        return FieldShape(str(desc[1][0]), "", int(desc[1][1] or 0), length, bound)
-    raise Refused("it holds arrays of arrays")
+    return all(
+        one.on_wire == other.on_wire
+        and (not one.message or same_wire(left, one.message, right, other.message))
+        for one, other in zip(left_shapes, right_shapes, strict=True)
+    )
 
 
 def translate(types: Typesdict, root: str, new_root: str, version: RosVersion) -> Typesdict:
@@ -436,25 +427,21 @@ def translate(types: Typesdict, root: str, new_root: str, version: RosVersion) -
             chosen.update(closure({}, new_name, version.standard))
         else:
             constants, fields = types[name]
-            # ROS 1 cannot write bounds; ROS 1 definitions have none to lose.
-            chosen.setdefault(new_name, (constants, _without_bounds(fields)))
+            # Bounds are not on the wire. ROS 1 cannot write them, its definitions have none.
+            plain = [(field, _unbounded(desc)) for field, desc in fields]
+            chosen.setdefault(new_name, (constants, plain))
     return chosen
 
 
-def _without_bounds(fields: Fielddefs) -> Fielddefs:
-    """Fields without bounds of strings and sequences, which are not visible on the wire."""
-    return [(name, _unbounded(desc)) for name, desc in fields]
-
-
 def _unbounded(desc: FieldDesc) -> FieldDesc:
+    """A field without the bounds of strings and sequences."""
     if desc[0] == Nodetype.BASE:
         return (desc[0], (desc[1][0], 0))
     if desc[0] == Nodetype.NAME:
         return desc
+    part: Any
     part, count = desc[1]
-    if part[0] == Nodetype.BASE:
-        part = (part[0], (part[1][0], 0))
-    return (desc[0], (part, count if desc[0] == Nodetype.ARRAY else 0))
+    return (desc[0], (_unbounded(part), count if desc[0] == Nodetype.ARRAY else 0))
 
 
 def make_store(types: Typesdict, version: RosVersion) -> Typestore:
