@@ -248,22 +248,6 @@ class CombinedReader(BagReader):
         return shared
 
     @property
-    def channels(self) -> Sequence[Channel]:
-        """Those of all parts."""
-        return list(self._channels.values())
-
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """Definitions that no channel of any part refers to."""
-        used = {channel.schema for channel in self._channels.values()}
-        return [schema for schema in self._schemas if schema not in used]
-
-    @property
-    def skipped(self) -> Mapping[str, int]:
-        """Those of all parts."""
-        return self._skipped
-
-    @property
     def losses(self) -> Sequence[Loss]:
         """Those of all parts, in their order."""
         return bounded([loss for number in sorted(self._losses) for loss in self._losses[number]])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import cached_property, partial
@@ -83,7 +83,10 @@ class McapReader(BagReader):
         self._shown = shown or path
         self.files = [self._shown]
         self._decompress = message_decompress
-        self._declared = Declared()
+        self._declared = declared = Declared()
+        self._channels = declared.channels
+        self._schemas = declared.schemas.values()
+        self._skipped = declared.skipped
         self._pass: RecordStream | None = None
         self._position = 0
         self._summary: McapSummary | None = None
@@ -117,21 +120,6 @@ class McapReader(BagReader):
             stream.close()
             raise
         return stream
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """All channels known so far: those of the summary, then those found while reading."""
-        return list(self._declared.channels.values())
-
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """Schemas that no channel refers to, known so far."""
-        return self._declared.unused_schemas
-
-    @property
-    def skipped(self) -> Mapping[str, int]:
-        """Records that only the application that wrote them understands: name -> count."""
-        return dict(self._declared.skipped)
 
     @property
     def has_all_channels(self) -> bool:

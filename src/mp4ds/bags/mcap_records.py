@@ -249,21 +249,15 @@ class Declared:
 
     Attributes:
         channels: By their id in the file, in order of appearance.
+        schemas: By their id in the file.
         skipped: Records that only the application that wrote them understands: name -> count.
     """
 
     def __init__(self) -> None:
         self.channels: dict[int, Channel] = {}
         self.skipped: Counter[str] = Counter()
-        self._schemas: dict[int, mcap_records.Schema] = {}
+        self.schemas: dict[int, Schema] = {}
         self._records: dict[int, mcap_records.Channel] = {}
-
-    @property
-    def unused_schemas(self) -> list[Schema]:
-        """Schemas that no channel refers to."""
-        used = {channel.schema for channel in self.channels.values()}
-        unused = (_schema(record) for record in self._schemas.values())
-        return list(dict.fromkeys(schema for schema in unused if schema not in used))
 
     def take(self, opcode: int, body: bytes | memoryview) -> None:
         """Add a schema or channel, count a private record, ignore any other.
@@ -278,24 +272,24 @@ class Declared:
         elif opcode >= PRIVATE_OPCODE:
             self.skip(opcode)
 
-    def add_schema(self, schema: mcap_records.Schema) -> None:
-        """Add a schema. See `take`."""
-        if self._schemas.setdefault(schema.id, schema) != schema:
-            raise DamageError(f"schema {schema.id} is defined twice and differently")
+    def add_schema(self, record: mcap_records.Schema) -> None:
+        """Add a schema, which must not contradict another one."""
+        schema = Schema(record.name, record.encoding, record.data)
+        if self.schemas.setdefault(record.id, schema) != schema:
+            raise DamageError(f"schema {record.id} is defined twice and differently")
 
     def add_channel(self, record: mcap_records.Channel) -> None:
-        """Add a channel. See `take`."""
+        """Add a channel, which must not contradict another one."""
         if self._records.setdefault(record.id, record) != record:
             raise DamageError(
                 f"channel {record.id} ({record.topic}) is defined twice and differently"
             )
         if record.id not in self.channels:
-            schema = self._schemas.get(record.schema_id) if record.schema_id else None
             self.channels[record.id] = Channel(
                 record.id,
                 record.topic,
                 record.message_encoding,
-                _schema(schema) if schema else None,
+                self.schemas.get(record.schema_id) if record.schema_id else None,
                 record.metadata,
             )
 
@@ -350,10 +344,6 @@ class Declared:
             return MetadataRecord(record.name, record.metadata)
         self.take(opcode, body)
         return None
-
-
-def _schema(record: mcap_records.Schema) -> Schema:
-    return Schema(record.name, record.encoding, record.data)
 
 
 def copy_verified(piece: Path, copy: Path) -> list[Loss]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,7 @@ _WHOLE = RecordingSlice()
 class BagReader(ABC):
     """One recording, opened for reading. A context manager; the file is never changed.
 
-    A reader has at least `channels` and `_records`, from which everything else follows; it
+    A reader has at least `_channels` and `_records`, from which everything else follows; it
     overrides what its index makes faster. Where it has a slice, `records`, `times`, `stats` and
     `first` are those of the slice; everything else is that of the whole recording.
 
@@ -80,13 +80,18 @@ class BagReader(ABC):
     begin: int | None = None
     slice: RecordingSlice = _WHOLE
 
+    # what was found so far, which may grow while reading
+    _channels: Mapping[Any, Channel] = MappingProxyType({})
+    _schemas: Iterable[Schema] = ()
+    _skipped: Mapping[str, int] = MappingProxyType({})
+
     @property
-    @abstractmethod
     def channels(self) -> Sequence[Channel]:
         """All channels known so far.
 
         Complete once `records` of everything is exhausted, or if it `has_all_channels`.
         """
+        return list(self._channels.values())
 
     @property
     def unused_schemas(self) -> Sequence[Schema]:
@@ -94,7 +99,8 @@ class BagReader(ABC):
 
         Complete once `records` of everything is exhausted, or if the recording `is_indexed`.
         """
-        return ()
+        used = {channel.schema for channel in self.channels}
+        return [schema for schema in dict.fromkeys(self._schemas) if schema not in used]
 
     @property
     def skipped(self) -> Mapping[str, int]:
@@ -102,7 +108,7 @@ class BagReader(ABC):
 
         As found by the last `records`.
         """
-        return {}
+        return dict(self._skipped)
 
     @property
     def losses(self) -> Sequence[Loss]:

@@ -383,11 +383,6 @@ class Ros1Reader(BagReader):
             self.close()
             raise
 
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """All connections, in the order of the bag's index."""
-        return list(self._channels.values())
-
     def _read_header(self) -> Fields:
         """The bag's header, if its index can be where that says.
 

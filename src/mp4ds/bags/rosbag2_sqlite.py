@@ -8,7 +8,7 @@ import re
 import sqlite3
 import sys
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import astuple
 from functools import cached_property, partial
@@ -231,6 +231,7 @@ class SqliteReader(BagReader):
         with self._opened() as tables:
             self._check_columns(tables)
             self._definitions = list(self._read_definitions(tables))
+            self._schemas = [schema for schema, _ in self._definitions]
             self._channels = {channel.id: channel for channel in self._read_topics(tables)}
             self.tables: Mapping[str, str] = dict(self._read_tables(tables))
             self.is_indexed = tables.select(_TIME_INDEXES).fetchone() != (0,)
@@ -326,17 +327,6 @@ class SqliteReader(BagReader):
         for name in sorted(self._text(row[0], "sqlite_master") for row in names):
             if name not in _KNOWN_TABLES and not name.startswith("sqlite_"):
                 yield f"{prefix}:other_table:{name}", "left out"
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """All topics."""
-        return list(self._channels.values())
-
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """Message definitions that no topic refers to."""
-        used = {channel.schema for channel in self._channels.values()}
-        return list(dict.fromkeys(item[0] for item in self._definitions if item[0] not in used))
 
     @cached_property
     def span(self) -> tuple[int, int] | None:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FILLER = "structure_needs_at_least_one_member"
 """Name of the field that empty messages have in ROS 2."""
 
-_BYTES_OF: Mapping[str, int] = SIZEMAP
+_BYTES_OF: Mapping[Any, int] = SIZEMAP
 _MAX_PARTS = 5000  # fields of all types, with the items that rosbags' code spells out
 _MAX_STEPS = 2**16  # fields of a message whose sequences have one item
 _MAX_EMPTY = 2**16  # messages without any byte in one, besides two for each of its bytes
@@ -433,13 +433,12 @@ def translate(types: Typesdict, root: str, new_root: str, version: RosVersion) -
     return chosen
 
 
-def _unbounded(desc: FieldDesc) -> FieldDesc:
+def _unbounded(desc: Any) -> Any:
     """A field without the bounds of strings and sequences."""
     if desc[0] == Nodetype.BASE:
         return (desc[0], (desc[1][0], 0))
     if desc[0] == Nodetype.NAME:
         return desc
-    part: Any
     part, count = desc[1]
     return (desc[0], (_unbounded(part), count if desc[0] == Nodetype.ARRAY else 0))
 

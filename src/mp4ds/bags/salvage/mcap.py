@@ -31,7 +31,7 @@ from mp4ds.bags.mcap_records import (
 )
 from mp4ds.bags.salvage.losses import Draft, FilePass, FileSalvage, LossLog, lost_by
 from mp4ds.bags.salvage.scan import Framing, RecordFrame, Scan, Window
-from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
+from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record
 
 # ---------------------------------------------------------------- finding records
 
@@ -605,7 +605,10 @@ class McapSalvage(FileSalvage):
         super().__init__(path, shown=shown, is_alone=is_alone)
         open_source(path, shown).close()
         self._decompress = message_decompress
-        self._declared = Declared()
+        self._declared = declared = Declared()
+        self._channels = declared.channels
+        self._schemas = declared.schemas.values()
+        self._skipped = declared.skipped
         self._summary = read_summary(path)
         self._read_header()
         if self._summary.is_verified:
@@ -621,21 +624,6 @@ class McapSalvage(FileSalvage):
             except DamageError:
                 return
             self.profile, self.library = header.profile, header.library
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """Channels of the summary, then those found while reading."""
-        return list(self._declared.channels.values())
-
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """Schemas that no channel refers to, known so far."""
-        return self._declared.unused_schemas
-
-    @property
-    def skipped(self) -> Mapping[str, int]:
-        """Records that only the application that wrote them understands: name -> count."""
-        return dict(self._declared.skipped)
 
     @property
     def has_all_channels(self) -> bool:

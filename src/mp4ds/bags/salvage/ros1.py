@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -275,11 +275,6 @@ class Ros1Salvage(FileSalvage):
             raise other_format(path, start)
         self._index = read_index(path)
         self._channels: dict[int, Channel] = dict(self._index.channels)
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """Connections of the bag's index, then those found while reading."""
-        return list(self._channels.values())
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the bag's index, including lost messages; otherwise empty."""

@@ -25,7 +25,7 @@ from mp4ds.bags.rosbag2_sqlite import SqliteReader, Tables, open_tables
 from mp4ds.bags.salvage.losses import FileSalvage, LossLog, lost_by
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.errors import Refused, SourceError, SourceNotFoundError
-from mp4ds.records import Channel, Excerpt, Loss, Message, Record, Schema, bounded
+from mp4ds.records import Excerpt, Loss, Message, Record, bounded
 
 _RECOVER = (
     "Its tables may be found page by page: `sqlite3 FILE .recover | sqlite3 NEW.db3`, then give "
@@ -78,17 +78,8 @@ class SqliteSalvage(FileSalvage):
             remedy = _UNFINISHED if Path(f"{path}-journal").exists() else _RECOVER
             raise SourceError(self._shown, error.problem, remedy) from None
         self._channels = {channel.id: channel for channel in self._small.channels}
+        self._schemas = self._small.unused_schemas
         self.tables: Mapping[str, str] = self._small.tables
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """All topics, in the order of their ids."""
-        return list(self._channels.values())
-
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """Message definitions that no topic refers to."""
-        return self._small.unused_schemas
 
     @property
     def span(self) -> tuple[int, int] | None:
