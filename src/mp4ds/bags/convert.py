@@ -8,7 +8,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -353,7 +353,7 @@ def ros2_channel(channel_id: int, topic: str, type_name: str, qos: str = "") -> 
         type_name: Such as ``sensor_msgs/msg/Image``.
         qos: Its profile, such as `LATCHED_QOS`; empty if not known.
     """
-    store = _ros2_store()
+    store = get_typestore(Stores.ROS2_HUMBLE)
     definition, _ = store.generate_msgdef(type_name, ros_version=2)
     return Channel(
         channel_id,
@@ -362,11 +362,6 @@ def ros2_channel(channel_id: int, topic: str, type_name: str, qos: str = "") -> 
         Schema(type_name, "ros2msg", definition.encode()),
         {QOS_KEY: qos, HASH_KEY: store.hash_rihs01(type_name)},
     )
-
-
-@lru_cache(maxsize=1)
-def _ros2_store() -> Typestore:
-    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 # ---------------------------------------------------------------- decoding

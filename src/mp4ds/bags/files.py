@@ -122,11 +122,6 @@ def most_unpacked(packed: int) -> int:
     return min(max(ALWAYS_ALLOWED, _CHUNK_RATIO * packed), _MOST)
 
 
-def most_in_file(packed: int) -> int:
-    """Maximum decompressed size of a file of so many bytes, which is not held in memory."""
-    return max(ALWAYS_ALLOWED, _FILE_RATIO * packed)
-
-
 def most_held(packed: int | None = None) -> int:
     """Maximum decompressed size of a chunk or message, as `DECOMPRESSED` says if it is set.
 
@@ -374,7 +369,8 @@ def decompress_file(path: Path, target: Path, *, to_damage: bool = False) -> str
         SourceError: The file is damaged, cut short, or decompresses to too much; or to nothing.
         OSError: The target cannot be written.
     """
-    most = most_in_file(path.stat().st_size)
+    # not held in memory, so that its ratio alone is limited
+    most = max(ALWAYS_ALLOWED, _FILE_RATIO * path.stat().st_size)
     problem, is_within = "", False
     frame = zstandard.ZstdDecompressor().decompressobj()
     with closing(open_source(path)) as stream, target.open("wb") as output:

@@ -54,9 +54,6 @@ from mp4ds.records import (
     Schema,
 )
 
-Decompress = Callable[[Any], bytes]
-"""Makes the payload of a message from what the file holds; raises `DamageError` if it cannot."""
-
 _NEVER = 2**64  # past all log times
 
 
@@ -76,6 +73,8 @@ class Rosbag2Reader(CombinedReader):
 
     format = "rosbag2"
     profile = "ros2"
+    _mcap_reader: Callable[..., BagReader] = McapReader
+    _sqlite_reader: Callable[..., BagReader] = SqliteReader
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -127,21 +126,10 @@ class Rosbag2Reader(CombinedReader):
     def _file_reader(self, file: Path, shown: Path) -> BagReader:
         """The reader of a file, or of its decompressed copy."""
         is_mcap = self._is_mcap(shown, _start(file))
-        reader = self._mcap_reader if is_mcap else self._sqlite_reader
-        return self._of_compression(partial(reader, file, shown))
-
-    def _of_compression(self, opener: Callable[[Decompress | None], BagReader]) -> BagReader:
-        """The reader of a file whose messages are, or are not, individually compressed."""
-        if self._info:
-            return opener(unzstd if self._info.compression == "message" else None)
-        reader = opener(None)
-        return opener(unzstd) if self._holds_zstd(reader) else reader
-
-    def _mcap_reader(self, file: Path, shown: Path, decompress: Decompress | None) -> BagReader:
-        return McapReader(file, shown=shown, message_decompress=decompress)
-
-    def _sqlite_reader(self, file: Path, shown: Path, decompress: Decompress | None) -> BagReader:
-        return SqliteReader(file, shown=shown, message_decompress=decompress)
+        opened = partial(self._mcap_reader if is_mcap else self._sqlite_reader, file, shown=shown)
+        reader = opened()
+        is_packed = self._info.compression == "message" if self._info else self._holds_zstd(reader)
+        return opened(message_decompress=unzstd) if is_packed else reader
 
     def _holds_zstd(self, reader: BagReader) -> bool:
         """Whether the messages of a file without metadata.yaml are individually compressed."""

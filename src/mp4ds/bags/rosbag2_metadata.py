@@ -258,21 +258,18 @@ def _compression(info: Mapping[str, Any], path: Path) -> str:
 def _topic(item: Mapping[str, Any]) -> TopicMetadata:
     topic = item["topic_metadata"]
     qos = topic.get("offered_qos_profiles")
+    qos_text = _text(qos)
+    if isinstance(qos, list):
+        qos_text = dump_yaml(qos) if qos else ""
     has_qos, has_hash = "offered_qos_profiles" in topic, "type_description_hash" in topic
     return TopicMetadata(
         name=_text(topic["name"]),
         type_name=_text(topic["type"]),
         serialization_format=_text(topic["serialization_format"]),
-        qos=(dump_yaml(qos) if isinstance(qos, list) and qos else _qos_text(qos))
-        if has_qos
-        else None,
+        qos=qos_text if has_qos else None,
         type_hash=_text(topic["type_description_hash"]) if has_hash else None,
         count=int(item.get("message_count") or 0),
     )
-
-
-def _qos_text(qos: Any) -> str:
-    return "" if isinstance(qos, list) else _text(qos)
 
 
 def dump_yaml(value: Any) -> str:

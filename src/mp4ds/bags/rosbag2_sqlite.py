@@ -619,39 +619,27 @@ class SqliteWriter(BagWriter):
             schema = _NEWEST
         elif QOS_KEY in self._keys:
             schema = _WITHOUT_HASHES
-        with self._disk_errors():
-            self._write_topics({_WITHOUT_QOS: 3, _WITHOUT_HASHES: 4, _NEWEST: 5}[schema])
-            if schema >= _WITHOUT_HASHES:
-                self._write_about(schema, version, text, ros_distro)
-            if schema >= _NEWEST:
-                self._write_definitions()
-
-    def _write_topics(self, columns: int) -> None:
+        columns = {_WITHOUT_QOS: 3, _WITHOUT_HASHES: 4, _NEWEST: 5}[schema]
         names = ("offered_qos_profiles", "type_description_hash")[: columns - 3]
-        self._connection.execute(_TOPICS % "".join(f", {name} TEXT NOT NULL" for name in names))
-        self._connection.executemany(
-            f"INSERT INTO topics VALUES (?{', ?' * columns})",
-            ((row, *astuple(topic)[:columns]) for topic, row in self._topics.items()),
-        )
-
-    def _write_about(self, schema: int, version: int, text: str, ros_distro: str) -> None:
-        for statement in _ABOUT.split(";"):
-            self._connection.execute(statement)
-        self._connection.execute("INSERT INTO schema VALUES (?, ?)", (schema, ros_distro))
-        self._connection.execute(
-            "INSERT INTO metadata (metadata_version, metadata) VALUES (?, ?)", (version, text)
-        )
-
-    def _write_definitions(self) -> None:
-        self._connection.execute(_DEFINITIONS)
-        self._connection.executemany(
-            "INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition,"
-            " type_description_hash) VALUES (?, ?, ?, ?)",
-            (
-                (schema.name, schema.encoding, _text_or_blob(schema.data), type_hash)
-                for (_, type_hash), schema in self._definitions.items()
-            ),
-        )
+        rows = ((row, *astuple(topic)[:columns]) for topic, row in self._topics.items())
+        execute, executemany = self._connection.execute, self._connection.executemany
+        with self._disk_errors():
+            execute(_TOPICS % "".join(f", {name} TEXT NOT NULL" for name in names))
+            executemany(f"INSERT INTO topics VALUES (?{', ?' * columns})", rows)
+            if schema >= _WITHOUT_HASHES:
+                for statement in _ABOUT.split(";"):
+                    execute(statement)
+                execute("INSERT INTO schema VALUES (?, ?)", (schema, ros_distro))
+                execute("INSERT INTO metadata VALUES (NULL, ?, ?)", (version, text))
+            if schema >= _NEWEST:
+                execute(_DEFINITIONS)
+                executemany(
+                    "INSERT INTO message_definitions VALUES (NULL, ?, ?, ?, ?)",
+                    (
+                        (schema.name, schema.encoding, _text_or_blob(schema.data), type_hash)
+                        for (_, type_hash), schema in self._definitions.items()
+                    ),
+                )
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Count an attachment."""

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -167,13 +168,16 @@ class Tally:
         topic_of: The topic of a channel, None if unknown.
 
     Attributes:
-        is_doubtful: Whether messages are held.
+        held: The messages that are held, and their channels.
+        losses: What was skipped of the section.
+        is_verified: Whether the section is certainly complete: an index that says otherwise is
+            wrong.
     """
 
     def __init__(self, log: LossLog, topic_of: Callable[[int], str | None]) -> None:
         self._log = log
         self._topic_of = topic_of
-        self._held: list[tuple[int, Message]] = []
+        self.held: list[tuple[int, Message]] = []
         self._begin(None)
 
     def _begin(self, expected: Mapping[int, int] | None) -> None:
@@ -185,8 +189,8 @@ class Tally:
         self._listed_times: Counter[tuple[int, int]] = Counter()  # only while messages are held
         self._end: int | None = None
         self._span: tuple[int, int] | None = None
-        self._is_verified = False
-        self._losses: list[Draft] = []
+        self.is_verified = False
+        self.losses: list[Draft] = []
 
     def open(
         self,
@@ -212,15 +216,6 @@ class Tally:
         else:
             self._expected.update(expected)
 
-    def verified(self) -> None:
-        """The section is certainly complete: an index that says otherwise is wrong."""
-        self._is_verified = True
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether messages are held."""
-        return bool(self._held)
-
     def gave(self, channel: int, time: int) -> None:
         """Count a message that was read, with its log time in ns."""
         self._log.gave(time)
@@ -228,28 +223,22 @@ class Tally:
 
     def hold(self, channel: int, message: Message) -> None:
         """Hold a message that may not be one."""
-        self._held.append((channel, message))
+        self.held.append((channel, message))
 
     def settle(self) -> list[Message]:
         """Decide which of the held messages to return."""
-        held, self._held = self._held, []
+        held, self.held = self.held, []
         left, self._listed_times = self._listed_times, Counter()
+        first, last = self._span or (0, inf)
         sound = []
         for channel, message in held:
             key = channel, message.log_time
-            if left[key] > 0 if self._index_is_whole else self._is_possible(message.log_time):
+            is_listed = left[key] > 0
+            if is_listed if self._index_is_whole else first <= message.log_time <= last:
                 left[key] -= 1
                 sound.append(message)
                 self.gave(channel, message.log_time)
         return sound
-
-    def _is_possible(self, time: int) -> bool:
-        return self._span is None or self._span[0] <= time <= self._span[1]
-
-    @property
-    def has_losses(self) -> bool:
-        """Whether part of the section was skipped."""
-        return bool(self._losses)
 
     def stray(self, channel: int) -> None:
         """Count a message of an unknown channel, separately from lost ones."""
@@ -259,8 +248,8 @@ class Tally:
     def lost(self, offset: int, size: int | None, problem: str) -> Draft:
         """Record skipped bytes."""
         draft = self._log.lost(offset, size, problem)
-        if all(draft is not known for known in self._losses):
-            self._losses.append(draft)
+        if all(draft is not known for known in self.losses):
+            self.losses.append(draft)
         if size is None or self._end is None or offset + size > self._end:
             self._index_is_whole = False  # part of it may be lost, and that of others may follow
             self._end = None
@@ -270,7 +259,7 @@ class Tally:
         """Add the messages that an index at a byte lists, by their log times, ns."""
         self._index_is_whole |= offset == self._end
         self._listed[channel] += len(times)
-        if self._held:
+        if self.held:
             self._listed_times.update((channel, time) for time in times.tolist())
 
     def close(self) -> None:
@@ -281,15 +270,15 @@ class Tally:
             return
         total, missing = min(found, key=lambda one: one[0])
         topics = [topic for key in missing if (topic := self._topic_of(key))]
-        losses = sorted(self._losses, key=lambda draft: draft.size or 0, reverse=True)
+        losses = sorted(self.losses, key=lambda draft: draft.size or 0, reverse=True)
         if losses:
             losses[0].add(total, topics)
             for draft in losses[1:]:
                 draft.add(0, ())
         elif total:
             problem = "an index does not match the messages"
-            self._log.lost(None, None, problem).add(0 if self._is_verified else total, topics)
-        self._losses = []
+            self._log.lost(None, None, problem).add(0 if self.is_verified else total, topics)
+        self.losses = []
 
     def _missing(self, expected: Counter[int]) -> tuple[int, Counter[int]]:
         """Number of messages that an index lists and were not read, in total and by channel."""
@@ -420,7 +409,7 @@ class FilePass(ABC):
         if problems:
             self._lose(offset, window.offset - offset, problems[0])
         else:
-            self._tally.verified()
+            self._tally.is_verified = True
 
 
 class FileSalvage(BagReader):

@@ -330,7 +330,7 @@ class McapPass(FilePass):
             else:
                 ended = False
                 yield from self._record(frame)
-            if not self._tally.is_doubtful:
+            if not self._tally.held:
                 yield None
         self._leave_plain(Opcode.FOOTER)
         yield from self._tally.settle()
@@ -487,7 +487,7 @@ class McapPass(FilePass):
         if offset < end and kind not in self._framing.outer:
             return
         self._plain = None
-        if not self._tally.has_losses:
+        if not self._tally.losses:
             self._lose(start, min(offset, end) - start, problem)
 
     def _content(self, chunk: _Chunk, offset: int, problems: list[str]) -> Iterator[Found]:

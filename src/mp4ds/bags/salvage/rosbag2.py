@@ -6,6 +6,7 @@ import sqlite3
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from mp4ds.bags.files import (
     most_held,
 )
 from mp4ds.bags.protocols import BagReader
-from mp4ds.bags.rosbag2 import STORAGE_NAME, Decompress, Rosbag2Reader, unlisted_storage
+from mp4ds.bags.rosbag2 import STORAGE_NAME, Rosbag2Reader, unlisted_storage
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, BagInfo, read_bag_info
 from mp4ds.bags.rosbag2_sqlite import SqliteReader, Tables, open_tables
 from mp4ds.bags.salvage.losses import FileSalvage, LossLog, lost_by
@@ -47,9 +48,9 @@ class SqliteSalvage(FileSalvage):
         shown: Its name in errors and tables, where it is a decompressed copy.
         message_decompress: Decompresses the payload of a message; raises `DamageError` if it
             cannot.
-        expected: Expected number of messages, if known from elsewhere.
 
     Attributes:
+        expected: Expected number of messages, if known from elsewhere.
         tables: Content of the small tables by ``db3:<file>:<column>``, verbatim.
 
     Raises:
@@ -66,11 +67,10 @@ class SqliteSalvage(FileSalvage):
         *,
         shown: Path | None = None,
         message_decompress: Callable[[bytes], bytes] | None = None,
-        expected: int | None = None,
     ) -> None:
         super().__init__(path, shown=shown, is_alone=False)
         self._decompress = message_decompress
-        self._expected = expected
+        self.expected: int | None = None
         self._lost = 0
         try:
             self._small = SqliteReader(path, shown=shown, damaged=True)
@@ -94,7 +94,7 @@ class SqliteSalvage(FileSalvage):
         size = self._shown.stat().st_size
         with open_tables(self.path, self._shown, damaged=True) as tables:
             most_rows = self.path.stat().st_size // _LEAST_ROW
-            keys, times, problem = _index(tables, most_rows, self._expected)
+            keys, times, problem = _index(tables, most_rows, self.expected)
             for read, row in enumerate(np.lexsort((keys, times)).tolist(), 1):
                 message = self._message(tables, int(keys[row]), log)
                 if message is not None:
@@ -103,7 +103,7 @@ class SqliteSalvage(FileSalvage):
                     yield message
                 self.position = size * read // len(keys)
         # rosbag2 numbers its messages from 1 without gaps
-        expected = self._expected or (int(keys.max(initial=0)) if problem else 0)
+        expected = self.expected or (int(keys.max(initial=0)) if problem else 0)
         missing = expected - given - self._lost
         if problem or missing > 0:
             problem = f"the table of messages: {problem}" if problem else "messages without a row"
@@ -217,6 +217,8 @@ class Rosbag2Salvage(Rosbag2Reader):
     """
 
     is_indexed = False
+    _mcap_reader = partial(McapSalvage, is_alone=False)
+    _sqlite_reader = SqliteSalvage
     _times = BagReader._times  # by reading everything, which no damage stops
 
     def __init__(self, path: Path, *, is_alone: bool = True) -> None:
@@ -286,12 +288,11 @@ class Rosbag2Salvage(Rosbag2Reader):
                 self._storage_files.remove(file)
         return readers
 
-    def _mcap_reader(self, file: Path, shown: Path, decompress: Decompress | None) -> BagReader:
-        return McapSalvage(file, shown=shown, is_alone=False, message_decompress=decompress)
-
-    def _sqlite_reader(self, file: Path, shown: Path, decompress: Decompress | None) -> BagReader:
-        expected = self._expected(shown)
-        return SqliteSalvage(file, shown=shown, message_decompress=decompress, expected=expected)
+    def _file_reader(self, file: Path, shown: Path) -> BagReader:
+        reader = super()._file_reader(file, shown)
+        if isinstance(reader, SqliteSalvage):
+            reader.expected = self._expected(shown)
+        return reader
 
     def _holds_zstd(self, reader: BagReader) -> bool:
         for record in reader.records():
