@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 
 from mp4ds.errors import OptionError
-from mp4ds.messages.arrangements import CHROMA_SHIFTS
 from mp4ds.messages.encodings import (
     ENCODINGS,
     MAX_ROW_PADDING,
     MAX_SIDE,
-    MAX_TABLE,
     NO_PARAMETERS,
-    SCALES,
     Parameters,
     pixel_view,
 )
-from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit, layout_for, why_not
+from mp4ds.messages.layouts import CHROMA_SHIFTS, LAYOUTS, Layout, bind, fit, layout_for, why_not
+from mp4ds.messages.numbers import MAX_TABLE, SCALES
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, bound, rounded, suited, values
 
 SIZES = [(w, h) for w in (1, 2, 3, 4, 7, 8) for h in (1, 2, 3, 5, 6)]

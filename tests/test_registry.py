@@ -14,8 +14,9 @@ import pytest
 
 from mp4ds.format.fields import Body
 from mp4ds.format.models import PIXEL_FORMATS, VIDEO_CODECS
-from mp4ds.messages.encodings import ENCODINGS, SCALES, Parameters
+from mp4ds.messages.encodings import ENCODINGS, Parameters
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind
+from mp4ds.messages.numbers import SCALES
 from mp4ds.messages.png import RULES, zlib_fingerprint
 from mp4ds.messages.protobuf import FOXGLOVE_TYPES
 from mp4ds.messages.serializations import ROS_TYPES, WIRES

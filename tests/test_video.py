@@ -22,9 +22,8 @@ from PIL import Image
 
 from coded_tools import jpeg
 from mp4ds.errors import EncoderRefusedError, OptionError, Refused, VideoError
-from mp4ds.messages.arrangements import CHROMA_SHIFTS
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.messages.layouts import bind, fit, layout_for
+from mp4ds.messages.layouts import CHROMA_SHIFTS, bind, fit, layout_for
 from mp4ds.video.codecs import Recipe, check_codec, recipe_for
 from mp4ds.video.decoder import VideoDecoder, jpeg_pixels
 from mp4ds.video.encoder import VideoEncoder

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from mp4ds.dataset.views import Crop, Resize, View, view_of
 from mp4ds.errors import FormatError
 from mp4ds.format.models import Calibration
-from mp4ds.messages.arrangements import Picture
 from mp4ds.messages.depth import metres_of
-from mp4ds.messages.encodings import ENCODINGS, Pixels
+from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels
 from mp4ds.options import seconds_text
 from mp4ds.records import Channel
 from mp4ds.video.access import FrameReader, open_file_frames

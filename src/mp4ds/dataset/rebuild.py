@@ -14,8 +14,7 @@ from mp4ds.errors import FormatError, Refused
 from mp4ds.format.fields import decode_base64
 from mp4ds.format.models import CameraInfo, StreamSidecar
 from mp4ds.messages import depth, png
-from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, put_padding
+from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, pixel_view, put_padding
 from mp4ds.messages.png import zlib_build, zlib_fingerprint
 from mp4ds.messages.serializations import form_of
 from mp4ds.messages.wire import (

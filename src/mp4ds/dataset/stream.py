@@ -18,8 +18,7 @@ from mp4ds.files.outputs import digest_file
 from mp4ds.format.models import Calibration, StreamSidecar
 from mp4ds.format.sidecars import load_stream
 from mp4ds.messages import depth
-from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.encodings import Pixels
+from mp4ds.messages.encodings import Picture, Pixels
 from mp4ds.messages.layouts import Layout
 from mp4ds.records import Channel, Message
 from mp4ds.video.access import FrameAccess, FrameReader

@@ -20,8 +20,7 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import Crop, Resize, View, output
 from mp4ds.errors import Mp4dsError, OptionError, missing
 from mp4ds.format.models import Calibration
-from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.encodings import ENCODINGS, Pixels
+from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels
 from mp4ds.times import StampIndex
 from mp4ds.video.access import FrameReader
 

@@ -16,8 +16,7 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Refused, VideoError
 from mp4ds.format.models import Calibration
 from mp4ds.messages import depth, png
-from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view
+from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, pixel_view
 from mp4ds.messages.layouts import why_not
 from mp4ds.messages.serializations import MessageSplitter
 from mp4ds.messages.wire import CodedFields, ImageFields, Parts

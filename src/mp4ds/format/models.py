@@ -33,8 +33,9 @@ from mp4ds.format.fields import (
     decode_base64,
     exceeds_padding,
 )
-from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, MAX_TABLE, Parameters
+from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Parameters
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, why_not
+from mp4ds.messages.numbers import MAX_TABLE
 from mp4ds.messages.png import PNG_ENCODINGS
 from mp4ds.messages.serializations import WIRES
 from mp4ds.messages.wire import CalibrationFields

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
-from functools import cache
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,6 +247,9 @@ def put_padding(data: bytearray | memoryview, padding: bytes, *, row_bytes: int,
 Samples = NDArray[Any]
 """Unsigned integers in native byte order, shape of the pixels."""
 
+Picture = tuple[Samples, ...]
+"""What the video holds: one array (rows, columns[, channels]), or one per plane."""
+
 DEPTHS = (8, 10, 12, 14)
 """Bits per sample of pictures, other than 16."""
 
@@ -262,7 +265,7 @@ class Parameters:
         table: The bit patterns that occur, in increasing order.
         entries: Length of the list of values in each picture.
         hole: Bit pattern of the float that stands for no measurement.
-        scale: One of `mp4ds.messages.encodings.SCALES`.
+        scale: One of `mp4ds.messages.numbers.SCALES`.
         alpha: Bit pattern of every pixel's alpha.
     """
 
@@ -304,30 +307,6 @@ class Parameters:
 NO_PARAMETERS = Parameters()
 
 
-class Values(Protocol):
-    """A bijection between the samples of an image and those of its picture."""
-
-    @property
-    def bits(self) -> int:
-        """Bits per sample of the picture."""
-
-    @property
-    def is_identity(self) -> bool:
-        """Whether the picture's samples have the bit patterns of the image's."""
-
-    def shape(self, pixels: Pixels) -> tuple[int, ...]:
-        """Shape of the samples of pixels."""
-
-    def encode(self, pixels: Pixels) -> Samples:
-        """Samples of accepted pixels; may be a view."""
-
-    def decode(self, samples: Samples, out: Pixels) -> None:
-        """Write the pixels of samples into ``out``, in its byte order."""
-
-    def refuses(self, pixels: Pixels) -> str | None:
-        """Why these pixels would not be restored, or None if they would."""
-
-
 def patterns(pixels: Pixels) -> Samples:
     """The bit patterns of pixels as a view, in their byte order."""
     return pixels.view(pixels.dtype.str.replace(pixels.dtype.kind, "u"))
@@ -339,29 +318,86 @@ def native(pixels: Pixels) -> Samples:
     return found.astype(found.dtype.newbyteorder("="), copy=False)
 
 
-@dataclass(frozen=True, slots=True)
-class Whole:
-    """Samples as they are; signed integers have their top bit inverted, which keeps their order.
+def is_integer(value: Any, top: int) -> bool:
+    """Whether a value of a sidecar is an integer from 0 to `top`."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= top
+
+
+class Values(ABC):
+    """A bijection between the samples of an image and those of its picture.
 
     Attributes:
-        encoding: The image's.
+        parameters: Names of the parameters it needs.
+        bits: Bits per sample of the picture.
+        is_identity: Whether the picture's samples have the bit patterns of the image's.
     """
 
-    encoding: Encoding
+    parameters: ClassVar[frozenset[str]] = frozenset()
+    bits: int
+    is_identity = False
 
-    @property
-    def bits(self) -> int:
-        """All of the sample's."""
-        return 8 * self.encoding.bytes_per_sample
+    @classmethod
+    @abstractmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+        """That with some parameters, which are those it needs.
 
-    @property
-    def is_identity(self) -> bool:
-        """Unless there are signs."""
-        return not self.encoding.is_signed
+        Raises:
+            ValueError: They contradict themselves, or the encoding.
+        """
+
+    @classmethod
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+        """Parameters that suit samples of a stream, at least one; None if there are none."""
+        return NO_PARAMETERS
 
     def shape(self, pixels: Pixels) -> tuple[int, ...]:
-        """That of the pixels."""
+        """Shape of the samples of pixels."""
         return pixels.shape
+
+    def refuses(self, pixels: Pixels) -> str | None:
+        """Why these pixels would not be restored, or None if they would."""
+        return None
+
+    @abstractmethod
+    def encode(self, pixels: Pixels) -> Samples:
+        """Samples of accepted pixels; may be a view."""
+
+    @abstractmethod
+    def decode(self, samples: Samples, out: Pixels) -> None:
+        """Write the pixels of samples into ``out``, in its byte order."""
+
+
+class Arrangement(ABC):
+    """A bijection between an array of samples and a picture, which is grey and of its size."""
+
+    def pixel_format(self, bits: int) -> str:
+        """FFmpeg's name of the picture's format, for samples of that many bits."""
+        return "gray" if bits == 8 else f"gray{bits}le"
+
+    def picture_size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height of the image -> of the picture."""
+        return width, height
+
+    @abstractmethod
+    def arrange(self, samples: Samples) -> Picture:
+        """The picture; may be a view."""
+
+    @abstractmethod
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Write the samples of a picture of the right size."""
+
+
+class Whole(Values):
+    """Samples as they are; signed integers have their top bit inverted, which keeps their order."""
+
+    def __init__(self, encoding: Encoding) -> None:
+        self.bits = 8 * encoding.bytes_per_sample
+        self.is_identity = not encoding.is_signed
+
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+        """No parameters are needed."""
+        return cls(encoding)
 
     def encode(self, pixels: Pixels) -> Samples:
         """A view where possible."""
@@ -373,13 +409,8 @@ class Whole:
         top = 0 if self.is_identity else 1 << (self.bits - 1)
         patterns(out)[...] = samples ^ samples.dtype.type(top) if top else samples
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """Never."""
-        return None
 
-
-@dataclass(frozen=True, slots=True)
-class Narrow:
+class Narrow(Values):
     """The bits in use of 16-bit samples.
 
     Attributes:
@@ -388,27 +419,28 @@ class Narrow:
         signed: Whether half of the range is added first.
     """
 
-    bits: int
-    shift: int
-    signed: bool
+    parameters = frozenset({"bits", "shift"})
+    depths: ClassVar[tuple[int, ...]] = DEPTHS
 
-    @property
-    def is_identity(self) -> bool:
-        """If only the picture's format differs."""
-        return self.bits > 8 and not self.shift and not self.signed
+    def __init__(self, bits: int, shift: int, signed: bool) -> None:
+        self.bits, self.shift = bits, shift
+        # whether only the picture's format differs
+        self.is_identity = bits > 8 and not shift and not signed
+        self._half = 1 << (bits + shift - 1) if signed else 0
 
-    @property
-    def _half(self) -> int:
-        return 1 << (self.bits + self.shift - 1) if self.signed else 0
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Narrow:
+        """For so many bits above so many zero bits."""
+        bits, shift = parameters.bits, parameters.shift
+        is_known = is_integer(bits, 16) and bits in cls.depths
+        if not is_known or not is_integer(shift, 16 - (bits or 0)):
+            raise ValueError(f"no layout has {bits} bits above {shift} zero bits")
+        return cls(bits or 0, shift or 0, encoding.is_signed)
 
     def _shifted(self, pixels: Pixels) -> Samples:
         samples = native(pixels)
         # wraps around, as intended
-        return samples + np.uint16(self._half) if self.signed else samples
-
-    def shape(self, pixels: Pixels) -> tuple[int, ...]:
-        """That of the pixels."""
-        return pixels.shape
+        return samples + np.uint16(self._half) if self._half else samples
 
     def encode(self, pixels: Pixels) -> Samples:
         """A view where possible."""
@@ -422,7 +454,7 @@ class Narrow:
         wide = samples.astype(np.uint16, copy=False)
         if self.shift:
             wide = wide << np.uint16(self.shift)
-        patterns(out)[...] = wide - np.uint16(self._half) if self.signed else wide
+        patterns(out)[...] = wide - np.uint16(self._half) if self._half else wide
 
     def refuses(self, pixels: Pixels) -> str | None:
         """A bit outside the kept ones."""
@@ -459,25 +491,65 @@ class Narrow:
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class Opaque:
+class NarrowPlanes(Narrow):
+    """Those of colours, which have more than 8 bits in FFmpeg's planar formats."""
+
+    depths = DEPTHS[1:]
+
+    @classmethod
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+        """As for grey, but at least 10 bits."""
+        found = Narrow.fit(encoding, samples)
+        if found is None or found.bits != 8:
+            return found
+        return replace(found, bits=10, shift=max((found.shift or 0) - 2, 0))
+
+
+_MOST_LOW, _MOST_HIGH = 8, 10  # bits that a plane of folded samples may have
+_LOW_BITS = {12: 3, 14: 5, 16: 8}  # by measurement: the bits that are mostly noise
+
+
+class NarrowFolded(Narrow):
+    """Those of samples to be folded, whose low bits are stored separately."""
+
+    parameters = frozenset({"bits", "shift", "low"})
+    depths = (*DEPTHS, 16)
+
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Narrow:
+        """For so many low bits of them, too."""
+        values, low = super().bind(encoding, parameters), parameters.low
+        if not low or not is_integer(low, _MOST_LOW) or not 1 <= values.bits - low <= _MOST_HIGH:
+            raise ValueError(f"no layout has {low} low bits of {values.bits}")
+        return values
+
+    @classmethod
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+        """All bits, or those in use if there are enough of them to separate noise from the rest."""
+        found = Narrow.fit(encoding, samples) or Parameters(bits=16, shift=0)
+        low = _LOW_BITS.get(found.bits or 0)
+        return None if low is None else replace(found, low=low)
+
+
+class Opaque(Values):
     """The colours of 8-bit pixels that all have the same alpha.
 
     Attributes:
         alpha: Of every pixel.
     """
 
-    alpha: int
+    parameters = frozenset({"alpha"})
+    bits = 8
 
-    @property
-    def bits(self) -> int:
-        """Always 8."""
-        return 8
+    def __init__(self, alpha: int) -> None:
+        self.alpha = alpha
 
-    @property
-    def is_identity(self) -> bool:
-        """Never."""
-        return False
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+        """For that alpha."""
+        if not is_integer(parameters.alpha, 255):
+            raise ValueError(f"an alpha of {parameters.alpha}, which is no byte")
+        return cls(parameters.alpha or 0)
 
     def shape(self, pixels: Pixels) -> tuple[int, ...]:
         """Three channels."""
@@ -505,169 +577,3 @@ class Opaque:
         if any(cls(alpha).refuses(pixels) for pixels in samples):
             return None
         return Parameters(alpha=alpha)
-
-
-# ---------------------------------------------------------------- numbers
-
-MAX_TABLE = 4096
-"""Maximum number of values in a table; bounds a sidecar's size."""
-
-SCALES = ("product", "quotient")
-"""How metres were made from millimetres: ``k * 0.001f`` or ``k / 1000``."""
-
-
-@dataclass(frozen=True, slots=True)
-class PatternTable:
-    """The index of each bit pattern in a list of those that occur.
-
-    Attributes:
-        table: The patterns, increasing, uint16 or uint32.
-    """
-
-    table: Samples
-
-    @property
-    def bits(self) -> int:
-        """As many as its indices need, in whole bytes."""
-        return 8 if len(self.table) <= 256 else 16
-
-    @property
-    def is_identity(self) -> bool:
-        """Never."""
-        return False
-
-    def _numbers(self, samples: Samples) -> Samples:
-        """For each sample the index of the last pattern that is not greater, or 0."""
-        if samples.dtype.itemsize == 2:
-            every = np.arange(65536, dtype=np.uint16)
-            numbers = np.searchsorted(self.table, every, side="right")
-            return (np.maximum(numbers, 1) - 1).astype(np.uint16)[samples]
-        numbers = np.searchsorted(self.table, samples, side="right")
-        return (np.maximum(numbers, 1) - 1).astype(np.uint16)
-
-    def shape(self, pixels: Pixels) -> tuple[int, ...]:
-        """That of the pixels."""
-        return pixels.shape
-
-    def encode(self, pixels: Pixels) -> Samples:
-        """New samples."""
-        numbers = self._numbers(native(pixels))
-        return numbers.astype(np.uint8) if self.bits == 8 else numbers
-
-    def decode(self, samples: Samples, out: Pixels) -> None:
-        """Write the pixels; indices beyond the table, from a damaged video, mean the last entry."""
-        patterns(out)[...] = np.take(self.table, samples, mode="clip")
-
-    def refuses(self, pixels: Pixels) -> str | None:
-        """A pattern that is not in the table."""
-        samples = native(pixels)
-        unknown = self.table[self._numbers(samples)] != samples
-        if unknown.any():
-            value = np.ascontiguousarray(pixels[unknown][:1]).item()
-            return f"value {value} is not one of the {len(self.table)} in the stream's table"
-        return None
-
-    @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
-        """The patterns of the samples, if they are few; integers must also be sparse.
-
-        If the second half of the samples has patterns missing in the first, later images would have
-        yet others.
-        """
-        half = (len(samples) + 1) // 2
-        found: Samples = np.empty(0, f"u{encoding.bytes_per_sample}")
-        for number, pixels in enumerate(samples):
-            patterns_here, before = native(pixels), len(found)
-            for part in (patterns_here[::16, ::16], patterns_here):  # makes most refusals cheap
-                found = np.union1d(found, part)
-                if len(found) > MAX_TABLE or (number >= half and len(found) > before):
-                    return None
-        values = found.tolist()
-        if not encoding.is_float and values[-1] - values[0] + 1 < 2 * len(values):
-            return None  # a plain picture has hardly more values
-        return Parameters(table=tuple(values))
-
-
-_EXPONENT = 0x7F800000  # all ones in NaN and infinity
-
-
-@cache
-def _metres(scale: str) -> Samples:
-    """Bit patterns of 0 to 65535 millimetres in metres, as float32; read-only."""
-    counts = np.arange(65536, dtype=np.float32)
-    thousand = np.float32(1000)
-    metres = counts * np.float32(0.001) if scale == "product" else counts / thousand
-    found: Samples = metres.astype(np.float32).view(np.uint32)
-    found.flags.writeable = False
-    return found
-
-
-@dataclass(frozen=True, slots=True)
-class Metres:
-    """Whole millimetres, from floats in metres; 0 is the hole.
-
-    Attributes:
-        hole: Bit pattern of a float32: 0, a NaN or an infinity.
-        scale: One of `SCALES`.
-    """
-
-    hole: int
-    scale: str
-
-    @property
-    def bits(self) -> int:
-        """Always 16."""
-        return 16
-
-    @property
-    def is_identity(self) -> bool:
-        """Never."""
-        return False
-
-    def _table(self) -> Samples:
-        table: Samples = _metres(self.scale).copy()
-        table[0] = self.hole
-        return table
-
-    def shape(self, pixels: Pixels) -> tuple[int, ...]:
-        """That of the pixels."""
-        return pixels.shape
-
-    def encode(self, pixels: Pixels) -> Samples:
-        """New samples."""
-        with np.errstate(invalid="ignore", over="ignore"):
-            metres = pixels.astype(np.float32, copy=False)
-            counts = np.rint(metres * np.float32(1000))
-            counts[~((counts >= 0) & (counts < 65536))] = 0  # NaN compares as false
-        found: Samples = counts.astype(np.uint16)
-        return found
-
-    def decode(self, samples: Samples, out: Pixels) -> None:
-        """Write the pixels."""
-        patterns(out)[...] = self._table()[samples]
-
-    def refuses(self, pixels: Pixels) -> str | None:
-        """A float that is neither the hole nor a whole number of millimetres."""
-        other = self._table()[self.encode(pixels)] != native(pixels)
-        if other.any():
-            value = np.ascontiguousarray(pixels[other][:1]).item()
-            return f"value {value} is neither whole millimetres nor the stream's mark of a hole"
-        return None
-
-    @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
-        """The scale, and the hole that occurs."""
-        hole = 0
-        for pixels in samples:
-            found = native(pixels)
-            holes = found[(found == 0) | (found & _EXPONENT == _EXPONENT)]
-            if holes.size:
-                hole = int(holes[0])
-                break
-        for scale in SCALES:
-            metres = cls(hole, scale)
-            if not any(metres.refuses(pixels[::16, ::16]) for pixels in samples) and not any(
-                metres.refuses(pixels) for pixels in samples
-            ):
-                return Parameters(hole=hole, scale=scale)
-        return None

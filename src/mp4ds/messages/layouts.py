@@ -1,217 +1,403 @@
 """How the pixels of a ROS image become the picture in a video, and back.
 
 A picture is the encoder's input, in one of FFmpeg's pixel formats; the codec is not chosen here. A
-layout is a step on the values (`mp4ds.messages.encodings`) and one on their places
-(`mp4ds.messages.arrangements`).
+layout is a step on the values (`mp4ds.messages.encodings`) and an arrangement of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from mp4ds.errors import OptionError
-from mp4ds.messages.arrangements import (
-    FEWEST_ENTRIES,
-    MOST_ENTRIES,
-    Arrangement,
-    Bytes,
-    Few,
-    Fold,
-    Halved,
-    Mosaic,
-    Packed,
-    Packed422,
-    Palette,
-    Picture,
-    PlanarRgb,
-    SemiPlanar,
-    Stack,
-)
 from mp4ds.messages.encodings import (
-    DEPTHS,
     ENCODINGS,
     MAX_ROW_PADDING,
     MAX_SIDE,
-    MAX_TABLE,
     NO_PARAMETERS,
-    SCALES,
+    Arrangement,
     Encoding,
-    Metres,
     Narrow,
+    NarrowFolded,
+    NarrowPlanes,
     Opaque,
     Parameters,
-    PatternTable,
+    Picture,
     Pixels,
+    Samples,
     Values,
     Whole,
     patterns,
 )
+from mp4ds.messages.numbers import Few, Metres, Palette, PatternTable
 
-_MOST_LOW, _MOST_HIGH = 8, 10  # bits that a plane of `Fold` may have
-_LOW_BITS = {12: 3, 14: 5, 16: 8}  # by measurement: the bits that are mostly noise
-_OF_COLOURS = {"rgba": "rgb24", "bgra": "bgr24"}
+# ---------------------------------------------------------------- arrangements
 
 
 @dataclass(frozen=True, slots=True)
-class LayoutKind:
-    """A layout of the registry.
+class Packed(Arrangement):
+    """The array itself.
 
     Attributes:
-        name: Its name in the registry.
-        is_exact: Whether the pixels are restored if the picture is.
-        is_shown: Whether the picture looks like the image, so that its colours are tagged.
-        parameters: Names of all the parameters it needs.
-        values: Makes the values of the picture.
-        arrangement: Makes their placement.
-        fit: Finds parameters that suit samples of a stream, if any.
+        packed_format: Pixel format; empty: grey.
     """
 
-    name: str
-    is_exact: bool
-    is_shown: bool
-    parameters: frozenset[str]
-    values: Callable[[Encoding, Parameters], Values]
-    arrangement: Callable[[Encoding, Parameters], Arrangement]
-    fit: Callable[[Encoding, Sequence[Pixels]], Parameters | None]
+    packed_format: str = ""
+
+    def pixel_format(self, bits: int) -> str:
+        """Its own or grey."""
+        return self.packed_format or Arrangement.pixel_format(self, bits)
+
+    def arrange(self, samples: Samples) -> Picture:
+        """A view."""
+        return (samples,)
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy."""
+        np.copyto(samples, picture[0])
 
 
-def _whole(encoding: Encoding, _: Parameters) -> Values:
-    return Whole(encoding)
+@dataclass(frozen=True, slots=True)
+class Mosaic(Arrangement):
+    """Four half-size pictures, one per position in the 2 x 2 block, in a 2 x 2 grid.
+
+    Neighbours then hold the same colour, which is what predictors expect. An odd last row or
+    column of a tile repeats its neighbour.
+    """
+
+    def picture_size(self, width: int, height: int) -> tuple[int, int]:
+        """Even."""
+        return width + width % 2, height + height % 2
+
+    def arrange(self, samples: Samples) -> Picture:
+        """A copy."""
+        height, width = samples.shape
+        half_height, half_width = (height + 1) // 2, (width + 1) // 2
+        picture = np.empty((2 * half_height, 2 * half_width), dtype=samples.dtype)
+        for row in (0, 1):
+            for column in (0, 1):
+                part = samples[row::2, column::2]
+                if not part.size:
+                    part = samples[:1, :1]
+                tile = picture[
+                    row * half_height : (row + 1) * half_height,
+                    column * half_width : (column + 1) * half_width,
+                ]
+                tile[: part.shape[0], : part.shape[1]] = part
+                tile[part.shape[0] :, : part.shape[1]] = part[-1:]
+                tile[:, part.shape[1] :] = tile[:, part.shape[1] - 1 : part.shape[1]]
+        return (picture,)
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy."""
+        height, width = samples.shape
+        half_height, half_width = (height + 1) // 2, (width + 1) // 2
+        for row in (0, 1):
+            for column in (0, 1):
+                target = samples[row::2, column::2]
+                target[...] = picture[0][
+                    row * half_height : row * half_height + target.shape[0],
+                    column * half_width : column * half_width + target.shape[1],
+                ]
 
 
-def _fit_any(_: Encoding, __: Sequence[Pixels]) -> Parameters:
-    return NO_PARAMETERS
+@dataclass(frozen=True, slots=True)
+class Stack(Arrangement):
+    """The channels of an image, stacked vertically.
+
+    Attributes:
+        channels: Number of channels.
+    """
+
+    channels: int
+
+    def picture_size(self, width: int, height: int) -> tuple[int, int]:
+        """Height times the number of channels."""
+        return width, self.channels * height
+
+    def arrange(self, samples: Samples) -> Picture:
+        """A copy."""
+        return (np.concatenate(np.moveaxis(samples, 2, 0)),)
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy."""
+        for n, channel in enumerate(np.split(picture[0], self.channels)):
+            samples[..., n] = channel
 
 
-def _narrow(encoding: Encoding, parameters: Parameters) -> Narrow:
-    bits, shift = parameters.bits, parameters.shift
-    known = DEPTHS if parameters.low is None else (*DEPTHS, 16)
-    if (
-        bits is None
-        or not _is_integer(bits, 16)
-        or bits not in known
-        or not _is_integer(shift, 16 - bits)
-    ):
-        raise ValueError(f"no layout has {bits} bits above {shift} zero bits")
-    return Narrow(bits, shift or 0, encoding.is_signed)
+@dataclass(frozen=True, slots=True)
+class PlanarRgb(Arrangement):
+    """One plane per colour, in ffmpeg's order: G, B, R and alpha.
+
+    Attributes:
+        order: The channels of the image, such as ``bgra``.
+    """
+
+    order: str
+
+    def pixel_format(self, bits: int) -> str:
+        """By alpha and depth."""
+        return f"{'gbrap' if 'a' in self.order else 'gbrp'}{bits}le"
+
+    def _channels(self) -> Iterator[int]:
+        return (self.order.index(colour) for colour in "gbra"[: len(self.order)])
+
+    def arrange(self, samples: Samples) -> Picture:
+        """Views."""
+        return tuple(samples[..., channel] for channel in self._channels())
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy."""
+        for channel, plane in zip(self._channels(), picture, strict=True):
+            samples[..., channel] = plane
 
 
-def _narrow_planes(encoding: Encoding, parameters: Parameters) -> Narrow:
-    """Colour planes have more than 8 bits in FFmpeg's formats."""
-    if parameters.bits == 8:
-        raise ValueError("no layout has colour planes of 8 bits")
-    return _narrow(encoding, parameters)
+@dataclass(frozen=True, slots=True)
+class Fold(Arrangement):
+    """High bits over folded low bits, which are inverted where the high bits are odd.
+
+    So the low bits stay continuous where a slope carries into the high bits, and their noise does
+    not hide the high bits from prediction.
+
+    Attributes:
+        bits: Of a sample, at most 16.
+        low: Number of low bits, at most 8.
+        first: Arrangement applied to the samples first, into one array.
+    """
+
+    bits: int
+    low: int
+    first: Mosaic | Packed = Packed()
+
+    @property
+    def _mask(self) -> int:
+        return (1 << self.low) - 1
+
+    def pixel_format(self, bits: int) -> str:
+        """Grey, with as many bits as the high bits need."""
+        return Arrangement.pixel_format(self, 8 if self.bits - self.low <= 8 else 10)
+
+    def picture_size(self, width: int, height: int) -> tuple[int, int]:
+        """Twice as high."""
+        columns, rows = self.first.picture_size(width, height)
+        return columns, 2 * rows
+
+    def arrange(self, samples: Samples) -> Picture:
+        """A copy."""
+        (plane,) = self.first.arrange(samples)
+        height, width = plane.shape
+        deep = self.pixel_format(self.bits) != "gray"
+        picture = np.empty((2 * height, width), np.uint16 if deep else np.uint8)
+        high, low = picture[:height], picture[height:]
+        np.right_shift(plane, np.uint16(self.low), out=high, casting="unsafe")
+        np.bitwise_and(plane, np.uint16(self._mask), out=low, casting="unsafe")
+        low ^= self._folds(high)
+        return (picture,)
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy."""
+        height = len(picture[0]) // 2
+        high, folded = picture[0][:height], picture[0][height:]
+        wide = high.astype(np.uint16) << np.uint16(self.low)
+        self.first.restore((wide | (folded ^ self._folds(high)),), samples)
+
+    def _folds(self, high: Samples) -> Samples:
+        """All low bits set where the high bits are odd, else 0."""
+        folds: Samples = (high & 1) * high.dtype.type(self._mask)
+        return folds
 
 
-def _fit_planes(encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
-    found = Narrow.fit(encoding, samples)
-    if found is None or found.bits != 8:
-        return found
-    return replace(found, bits=10, shift=max((found.shift or 0) - 2, 0))
+@dataclass(frozen=True, slots=True)
+class Bytes(Arrangement):
+    """A picture for each byte of 32- or 64-bit samples, highest first: two or four side by side.
+
+    In two rows, with channels stacked. So each slice of the codec has bytes of one kind, and the
+    smooth high bytes do not share statistics with the low ones.
+
+    Attributes:
+        size: Bytes of a sample, 4 or 8.
+        channels: Of the image.
+    """
+
+    size: int
+    channels: int
+
+    def pixel_format(self, bits: int) -> str:
+        """Grey, 8 bits."""
+        return "gray"
+
+    def picture_size(self, width: int, height: int) -> tuple[int, int]:
+        """Two rows of pictures for each channel."""
+        return self.size // 2 * width, 2 * self.channels * height
+
+    def _tiles(self, picture: Samples, samples: Samples) -> Samples:
+        """A picture as a view of shape (H, W, channels, rows of pictures, pictures in a row)."""
+        height, width = samples.shape[:2]
+        tiles = picture.reshape(self.channels, 2, height, self.size // 2, width)
+        return tiles.transpose(2, 4, 0, 1, 3)
+
+    def _bytes(self, big: Samples) -> Samples:
+        """Contiguous big-endian samples as a view of the same shape."""
+        split = (*big.shape[:2], self.channels, 2, self.size // 2)
+        return big.view(np.uint8).reshape(split)
+
+    def arrange(self, samples: Samples) -> Picture:
+        """A copy."""
+        width, height = self.picture_size(samples.shape[1], samples.shape[0])
+        picture = np.empty((height, width), np.uint8)
+        big = np.ascontiguousarray(samples, f">u{self.size}")
+        self._tiles(picture, samples)[...] = self._bytes(big)
+        return (picture,)
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy."""
+        big = np.empty(samples.shape, f">u{self.size}")
+        parts, tiles = self._bytes(big), self._tiles(picture[0], samples)
+        for part in np.ndindex(parts.shape[2:]):  # a fifth of the time of all at once
+            parts[(..., *part)] = tiles[(..., *part)]
+        samples[...] = big
 
 
-def _folded(encoding: Encoding, parameters: Parameters) -> Narrow:
-    values, low = _narrow(encoding, parameters), parameters.low
-    if not low or not _is_integer(low, _MOST_LOW) or not 1 <= values.bits - low <= _MOST_HIGH:
-        raise ValueError(f"no layout has {low} low bits of {values.bits}")
-    return values
+# ---------------------------------------------------------------- chroma
+
+CHROMA_SHIFTS = {"yuv420p": (1, 1), "yuv422p": (1, 0), "yuv444p": (0, 0)}
+"""Planar pixel formats: how often width and height of the chroma planes are halved."""
 
 
-def _fit_folded(encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
-    """All bits, or those in use if there are enough of them to separate noise from the rest."""
-    found = Narrow.fit(encoding, samples) or Parameters(bits=16, shift=0)
-    low = _LOW_BITS.get(found.bits or 0)
-    return None if low is None else replace(found, low=low)
+@dataclass(frozen=True, slots=True)
+class Packed422(Arrangement):
+    """Planes Y, U and V, from two-byte pixels that share U and V with a neighbour.
+
+    Attributes:
+        luma: Which of the two bytes is Y; in the other, U and V alternate.
+    """
+
+    luma: int
+
+    def pixel_format(self, bits: int) -> str:
+        """Chroma of half the width."""
+        return "yuv422p"
+
+    def luma_rows(self, samples: Samples) -> int:
+        """Rows of the image."""
+        return int(samples.shape[0])
+
+    def arrange(self, samples: Samples) -> Picture:
+        """Views."""
+        chroma = samples[..., 1 - self.luma]
+        return samples[..., self.luma], chroma[:, 0::2], chroma[:, 1::2]
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy."""
+        for plane, target in zip(picture, self.arrange(samples), strict=True):
+            target[...] = plane
 
 
-def _opaque(_: Encoding, parameters: Parameters) -> Values:
-    if not _is_integer(parameters.alpha, 255):
-        raise ValueError(f"an alpha of {parameters.alpha}, which is no byte")
-    return Opaque(parameters.alpha or 0)
+@dataclass(frozen=True, slots=True)
+class SemiPlanar(Arrangement):
+    """Planes Y, U and V, from a Y plane above a plane of alternating U and V.
+
+    Attributes:
+        halved: Whether chroma has half the width and height (nv12, nv21), or the full size (nv24).
+        first: Which comes first, ``u`` or ``v``.
+    """
+
+    halved: bool
+    first: str
+
+    def pixel_format(self, bits: int) -> str:
+        """By the chroma's size."""
+        return "yuv420p" if self.halved else "yuv444p"
+
+    def arrange(self, samples: Samples) -> Picture:
+        """Views if rows are contiguous."""
+        height = self.luma_rows(samples)
+        both = samples[height:].reshape(height >> self.halved, -1, 2)
+        u = 0 if self.first == "u" else 1
+        return samples[:height], both[..., u], both[..., 1 - u]
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy."""
+        height = self.luma_rows(samples)
+        u = 0 if self.first == "u" else 1
+        both = np.empty((*picture[1].shape, 2), samples.dtype)
+        both[..., u], both[..., 1 - u] = picture[1], picture[2]
+        samples[:height] = picture[0]
+        samples[height:] = both.reshape(-1, samples.shape[1])
+
+    def luma_rows(self, samples: Samples) -> int:
+        """Rows of the image."""
+        return int(samples.shape[0] * 2 // 3 if self.halved else samples.shape[0] // 3)
 
 
-def _table(encoding: Encoding, parameters: Parameters) -> Values:
-    table = parameters.table or ()
-    if not 1 <= len(table) <= MAX_TABLE:
-        raise ValueError(f"a table of {len(table)} values, not of 1 to {MAX_TABLE}")
-    top = 256**encoding.bytes_per_sample - 1
-    if not all(_is_integer(value, top) for value in table):
-        raise ValueError(f"a table with values beyond 0 to {top}")
-    patterns = np.array(table, f"u{encoding.bytes_per_sample}")
-    if (patterns[1:] <= patterns[:-1]).any():
-        raise ValueError("a table that does not increase")
-    return PatternTable(patterns)
+@dataclass(frozen=True, slots=True)
+class Halved(Arrangement):
+    """Chroma averaged to half the width and height; not exact.
 
+    The picture's sides are even; odd images repeat their last row and column.
 
-def _metres(_: Encoding, parameters: Parameters) -> Values:
-    hole, scale = parameters.hole, parameters.scale
-    if not _is_integer(hole, 2**32 - 1):
-        raise ValueError(f"a hole of {hole}, which is no pattern of 32 bits")
-    if scale not in SCALES:
-        raise ValueError(f"scale {scale!r} is not one of {', '.join(SCALES)}")
-    return Metres(hole or 0, scale)
+    Attributes:
+        full: The exact arrangement of the same encoding.
+    """
 
+    full: Packed422 | SemiPlanar
 
-def _few(encoding: Encoding, parameters: Parameters) -> Values:
-    entries = parameters.entries
-    if not entries or not _is_integer(entries, MOST_ENTRIES) or entries & (entries - 1):
-        raise ValueError(
-            f"a list of {entries} values, which is no power of two up to {MOST_ENTRIES}"
+    def pixel_format(self, bits: int) -> str:
+        """The format that every lossy encoder supports."""
+        return "yuv420p"
+
+    def picture_size(self, width: int, height: int) -> tuple[int, int]:
+        """Even."""
+        return width + width % 2, height + height % 2
+
+    @property
+    def _shifts(self) -> tuple[int, int]:
+        """How often the chroma of the encoding itself is halved."""
+        return CHROMA_SHIFTS[self.full.pixel_format(8)]
+
+    def arrange(self, samples: Samples) -> Picture:
+        """A copy."""
+        luma, *chroma = self.full.arrange(samples)
+        height, width = luma.shape
+        across, down = (not shift for shift in self._shifts)
+        return (
+            np.pad(luma, ((0, height % 2), (0, width % 2)), mode="edge"),
+            *(_mean(plane, down=down, across=across) for plane in chroma),
         )
-    if entries < FEWEST_ENTRIES:
-        raise ValueError(f"a list of {entries} values, less than {FEWEST_ENTRIES}")
-    return Few(Whole(encoding), entries)
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy; chroma samples are repeated."""
+        height, width = self.full.luma_rows(samples), samples.shape[1]
+        across, down = self._shifts
+        planes = [picture[0][:height, :width]]
+        for plane in picture[1:]:
+            tall = plane if down else np.repeat(plane, 2, axis=0)
+            wide = tall if across else np.repeat(tall, 2, axis=1)
+            planes.append(wide[: height >> down, : width >> across])
+        self.full.restore(tuple(planes), samples)
 
 
-def _is_integer(value: Any, top: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= top
+def _mean(plane: Samples, *, down: bool, across: bool) -> Samples:
+    """The rounded mean of two rows, two columns or both; odd sizes repeat the last one."""
+    pad = ((0, down and plane.shape[0] % 2), (0, across and plane.shape[1] % 2))
+    total = np.pad(plane, pad, mode="edge").astype(np.uint16)
+    if down:
+        total = total[0::2] + total[1::2]
+    if across:
+        total = total[:, 0::2] + total[:, 1::2]
+    halvings = down + across
+    return ((total + halvings) >> halvings).astype(np.uint8)
+
+
+# ---------------------------------------------------------------- table
 
 
 def _rgb_order(encoding: Encoding) -> str:
     """Unnamed channels are blue, green, red and alpha, as in OpenCV."""
     return encoding.name.rstrip("1680") if encoding.name[0] in "rb" else "bgra"[: encoding.channels]
-
-
-def _planar(encoding: Encoding, _: Parameters) -> Arrangement:
-    return PlanarRgb(_rgb_order(encoding))
-
-
-def _packed(pixel_format: str = "") -> Callable[[Encoding, Parameters], Arrangement]:
-    return lambda _, __: Packed(pixel_format)
-
-
-def _mosaic(_: Encoding, __: Parameters) -> Arrangement:
-    return Mosaic()
-
-
-def _stack(encoding: Encoding, _: Parameters) -> Arrangement:
-    return Stack(encoding.channels)
-
-
-def _fold(_: Encoding, parameters: Parameters) -> Arrangement:
-    return Fold(parameters.bits or 16, parameters.low or 8)
-
-
-def _fold_mosaic(_: Encoding, parameters: Parameters) -> Arrangement:
-    return Fold(parameters.bits or 16, parameters.low or 8, Mosaic())
-
-
-def _numbers(_: Encoding, parameters: Parameters) -> Arrangement:
-    """Numbers of more than a byte are folded."""
-    return Packed() if len(parameters.table or ()) <= 256 else Fold(16, 8)
-
-
-def _palette(encoding: Encoding, parameters: Parameters) -> Arrangement:
-    return Palette(parameters.entries or FEWEST_ENTRIES, encoding.bytes_per_sample)
-
-
-def _planes(encoding: Encoding, _: Parameters) -> Arrangement:
-    return _yuv(encoding)
 
 
 def _yuv(encoding: Encoding) -> Packed422 | SemiPlanar:
@@ -220,68 +406,88 @@ def _yuv(encoding: Encoding) -> Packed422 | SemiPlanar:
     return Packed422(1 if encoding.name in ("yuv422", "uyvy") else 0)
 
 
-_Step = tuple[
-    frozenset[str],
-    Callable[[Encoding, Parameters], Values],
-    Callable[[Encoding, Sequence[Pixels]], Parameters | None],
-]
-_WHOLE: _Step = (frozenset(), _whole, _fit_any)
-_BITS: _Step = (frozenset({"bits", "shift"}), _narrow, Narrow.fit)
-_PLANE_BITS: _Step = (frozenset({"bits", "shift"}), _narrow_planes, _fit_planes)
-_FOLDED: _Step = (frozenset({"bits", "shift", "low"}), _folded, _fit_folded)
-_TABLE: _Step = (frozenset({"table"}), _table, PatternTable.fit)
-_FEW: _Step = (frozenset({"entries"}), _few, Few.fit)
-_MILLIMETRES: _Step = (frozenset({"hole", "scale"}), _metres, Metres.fit)
-_OPAQUE: _Step = (frozenset({"alpha"}), _opaque, Opaque.fit)
+def _fold(parameters: Parameters, first: Mosaic | Packed = Packed()) -> Fold:
+    return Fold(parameters.bits or 16, parameters.low or 8, first)
 
 
-def _kind(
+def _numbers(count: int) -> Arrangement:
+    """Those of a list of so many entries; of more than a byte, they are folded."""
+    return Packed() if count <= 256 else Fold(16, 8)
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutKind:
+    """A layout of the registry.
+
+    Attributes:
+        name: Its name in the registry.
+        values: The step on values, which knows its parameters.
+        arrangement: Makes their placement.
+        is_exact: Whether the pixels are restored if the picture is.
+        is_shown: Whether the picture looks like the image, so that its colours are tagged.
+    """
+
+    name: str
+    values: type[Values]
+    arrangement: Callable[[Encoding, Parameters], Arrangement]
+    is_exact: bool = True
+    is_shown: bool = False
+
+    @property
+    def parameters(self) -> frozenset[str]:
+        """Names of all the parameters it needs."""
+        return self.values.parameters
+
+
+def _shown(
     name: str,
-    step: _Step,
     arrangement: Callable[[Encoding, Parameters], Arrangement],
+    values: type[Values] = Whole,
     *,
     exact: bool = True,
-    shown: bool = False,
 ) -> LayoutKind:
-    parameters, values, fit = step
-    return LayoutKind(name, exact, shown, parameters, values, arrangement, fit)
+    return LayoutKind(name, values, arrangement, is_exact=exact, is_shown=True)
 
+
+_COLOURS = {"rgba": "rgb24", "bgra": "bgr24"}  # without their alpha
 
 LAYOUTS: dict[str, LayoutKind] = {
     kind.name: kind
     for kind in (
-        _kind("gray8", _WHOLE, _packed(), shown=True),
-        _kind("gray16", _WHOLE, _packed()),
-        _kind("gray_bits", _BITS, _packed()),
-        _kind("fold", _FOLDED, _fold),
-        _kind("rgb24", _WHOLE, _packed("rgb24"), shown=True),
-        _kind("bgr24", _WHOLE, _packed("bgr24"), shown=True),
-        _kind("rgba", _WHOLE, _packed("rgba"), shown=True),
-        _kind("bgra", _WHOLE, _packed("bgra"), shown=True),
-        _kind("opaque", _OPAQUE, lambda e, _: Packed(_OF_COLOURS[_rgb_order(e)]), shown=True),
-        _kind("gbr16", _WHOLE, _planar, shown=True),
-        _kind("gbr_bits", _PLANE_BITS, _planar, shown=True),
-        _kind("gbra16", _WHOLE, _planar, shown=True),
-        _kind("gbra_bits", _PLANE_BITS, _planar, shown=True),
-        _kind("mosaic8", _WHOLE, _mosaic),
-        _kind("mosaic16", _WHOLE, _mosaic),
-        _kind("mosaic_bits", _BITS, _mosaic),
-        _kind("mosaic_fold", _FOLDED, _fold_mosaic),
+        _shown("gray8", lambda e, p: Packed()),
+        LayoutKind("gray16", Whole, lambda e, p: Packed()),
+        LayoutKind("gray_bits", Narrow, lambda e, p: Packed()),
+        LayoutKind("fold", NarrowFolded, lambda e, p: _fold(p)),
+        _shown("rgb24", lambda e, p: Packed("rgb24")),
+        _shown("bgr24", lambda e, p: Packed("bgr24")),
+        _shown("rgba", lambda e, p: Packed("rgba")),
+        _shown("bgra", lambda e, p: Packed("bgra")),
+        _shown("opaque", lambda e, p: Packed(_COLOURS[_rgb_order(e)]), Opaque),
+        _shown("gbr16", lambda e, p: PlanarRgb(_rgb_order(e))),
+        _shown("gbr_bits", lambda e, p: PlanarRgb(_rgb_order(e)), NarrowPlanes),
+        _shown("gbra16", lambda e, p: PlanarRgb(_rgb_order(e))),
+        _shown("gbra_bits", lambda e, p: PlanarRgb(_rgb_order(e)), NarrowPlanes),
+        LayoutKind("mosaic8", Whole, lambda e, p: Mosaic()),
+        LayoutKind("mosaic16", Whole, lambda e, p: Mosaic()),
+        LayoutKind("mosaic_bits", Narrow, lambda e, p: Mosaic()),
+        LayoutKind("mosaic_fold", NarrowFolded, lambda e, p: _fold(p, Mosaic())),
         # demosaicing is done by the video's converter; resampling restores the mosaic
-        _kind(
-            "demosaic8", _WHOLE, lambda e, _: Packed(f"bayer_{e.mosaic}8"), exact=False, shown=True
+        _shown("demosaic8", lambda e, p: Packed(f"bayer_{e.mosaic}8"), exact=False),
+        _shown("planar422", lambda e, p: _yuv(e)),
+        _shown("planar420", lambda e, p: _yuv(e)),
+        _shown("planar444", lambda e, p: _yuv(e)),
+        _shown("halved420", lambda e, p: Halved(_yuv(e)), exact=False),
+        LayoutKind("stack8", Whole, lambda e, p: Stack(e.channels)),
+        LayoutKind("stack16", Whole, lambda e, p: Stack(e.channels)),
+        LayoutKind("table", PatternTable, lambda e, p: _numbers(len(p.table or ()))),
+        LayoutKind(
+            "palette",
+            Few,
+            lambda e, p: Palette(p.entries or 0, e.bytes_per_sample, _numbers(p.entries or 0)),
         ),
-        _kind("planar422", _WHOLE, _planes, shown=True),
-        _kind("planar420", _WHOLE, _planes, shown=True),
-        _kind("planar444", _WHOLE, _planes, shown=True),
-        _kind("halved420", _WHOLE, lambda e, _: Halved(_yuv(e)), exact=False, shown=True),
-        _kind("stack8", _WHOLE, _stack),
-        _kind("stack16", _WHOLE, _stack),
-        _kind("table", _TABLE, _numbers),
-        _kind("palette", _FEW, _palette),
-        _kind("metres16", _MILLIMETRES, _packed()),
-        _kind("metres_fold", _MILLIMETRES, lambda _, __: Fold(16, 8)),
-        _kind("bytes", _WHOLE, lambda e, _: Bytes(e.bytes_per_sample, e.channels)),
+        LayoutKind("metres16", Metres, lambda e, p: Packed()),
+        LayoutKind("metres_fold", Metres, lambda e, p: _fold(p)),
+        LayoutKind("bytes", Whole, lambda e, p: Bytes(e.bytes_per_sample, e.channels)),
     )
 }
 
@@ -308,8 +514,8 @@ class Layout:
     is_exact: bool
     is_shown: bool
     pixel_format: str
-    _values: Values
-    _arrangement: Arrangement
+    _values: Values = field(compare=False)  # the others say which
+    _arrangement: Arrangement = field(compare=False)
 
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of the image -> of the picture."""
@@ -367,7 +573,7 @@ def bind(name: str, encoding: Encoding, parameters: Parameters = NO_PARAMETERS) 
         needed = ", ".join(sorted(kind.parameters)) or "none"
         given = ", ".join(sorted(parameters.names)) or "none"
         raise ValueError(f"layout {name} needs the parameters {needed} and was given {given}")
-    values = kind.values(encoding, parameters)
+    values = kind.values.bind(encoding, parameters)
     arrangement = kind.arrangement(encoding, parameters)
     pixel_format = arrangement.pixel_format(values.bits)
     return Layout(
@@ -393,7 +599,7 @@ def fit(name: str, encoding: Encoding, samples: Sequence[Pixels]) -> Layout | No
     Returns:
         A layout that refuses none of the samples.
     """
-    parameters = LAYOUTS[name].fit(encoding, samples)
+    parameters = LAYOUTS[name].values.fit(encoding, samples)
     return None if parameters is None else bind(name, encoding, parameters)
 
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import FormatError, Refused, VideoError, reason_of
 from mp4ds.files.ranges import expect
-from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.encodings import Pixels
+from mp4ds.messages.encodings import Picture, Pixels
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded import StreamParser, UnknownStructure
 from mp4ds.video.decoder import JpegDecoder, VideoFile, maker_of

@@ -18,8 +18,7 @@ from av.error import FFmpegError, InvalidDataError
 from numpy.typing import NDArray
 
 from mp4ds.errors import Refused, VideoError, reason_of
-from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.encodings import MAX_SIDE
+from mp4ds.messages.encodings import MAX_SIDE, Picture
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.media import Media, raise_if_scarce
 from mp4ds.video.mp4 import read_sample_table

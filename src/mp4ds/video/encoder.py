@@ -17,8 +17,7 @@ import numpy as np
 from av.error import FFmpegError
 
 from mp4ds.errors import EncoderRefusedError, OptionError
-from mp4ds.messages.arrangements import Picture
-from mp4ds.messages.encodings import MAX_SIDE, Encoding, Parameters, Pixels
+from mp4ds.messages.encodings import MAX_SIDE, Encoding, Parameters, Picture, Pixels
 from mp4ds.messages.layouts import Layout, fit
 from mp4ds.plan import Purpose
 from mp4ds.times import TIMESCALE

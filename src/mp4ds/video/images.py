@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import OptionError, Refused, SourceError
 from mp4ds.messages import png
-from mp4ds.messages.arrangements import CHROMA_SHIFTS
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels, check_size
-from mp4ds.messages.layouts import Layout, bind
+from mp4ds.messages.layouts import CHROMA_SHIFTS, Layout, bind
 from mp4ds.video.pixels import PictureConverter, plain_frame, scaling
 
 STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp")

@@ -12,7 +12,8 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
-from mp4ds.messages.arrangements import CHROMA_SHIFTS, Picture
+from mp4ds.messages.encodings import Picture
+from mp4ds.messages.layouts import CHROMA_SHIFTS
 from mp4ds.video import colour
 from mp4ds.video.codecs import TEN_BITS
 from mp4ds.video.colour import samples

@@ -13,7 +13,7 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from mp4ds.errors import VideoError
-from mp4ds.messages.arrangements import Picture
+from mp4ds.messages.encodings import Picture
 from mp4ds.video.codecs import TEN_BITS, Recipe
 from mp4ds.video.colour import samples
 from mp4ds.video.media import Media, raise_if_scarce

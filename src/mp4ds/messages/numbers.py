@@ -1,0 +1,312 @@
+"""Images whose values are few, or whole millimetres: their numbers in a list or table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from mp4ds.messages.encodings import (
+    Arrangement,
+    Encoding,
+    Parameters,
+    Picture,
+    Pixels,
+    Samples,
+    Values,
+    Whole,
+    is_integer,
+    native,
+    patterns,
+)
+
+MAX_TABLE = 4096
+"""Maximum number of values in a table; bounds a sidecar's size."""
+
+SCALES = ("product", "quotient")
+"""How metres were made from millimetres: ``k * 0.001f`` or ``k / 1000``."""
+
+
+class PatternTable(Values):
+    """The index of each bit pattern in a list of those that occur, in one or two bytes.
+
+    Attributes:
+        table: The patterns, increasing, uint16 or uint32.
+    """
+
+    parameters = frozenset({"table"})
+
+    def __init__(self, table: Samples) -> None:
+        self.table = table
+        self.bits = 8 if len(table) <= 256 else 16
+
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+        """For that table."""
+        table = parameters.table or ()
+        if not 1 <= len(table) <= MAX_TABLE:
+            raise ValueError(f"a table of {len(table)} values, not of 1 to {MAX_TABLE}")
+        top = 256**encoding.bytes_per_sample - 1
+        if not all(is_integer(value, top) for value in table):
+            raise ValueError(f"a table with values beyond 0 to {top}")
+        array = np.array(table, f"u{encoding.bytes_per_sample}")
+        if (array[1:] <= array[:-1]).any():
+            raise ValueError("a table that does not increase")
+        return cls(array)
+
+    def _numbers(self, samples: Samples) -> Samples:
+        """For each sample the index of the last pattern that is not greater, or 0."""
+        if samples.dtype.itemsize == 2:
+            every = np.arange(65536, dtype=np.uint16)
+            numbers = np.searchsorted(self.table, every, side="right")
+            return (np.maximum(numbers, 1) - 1).astype(np.uint16)[samples]
+        numbers = np.searchsorted(self.table, samples, side="right")
+        return (np.maximum(numbers, 1) - 1).astype(np.uint16)
+
+    def encode(self, pixels: Pixels) -> Samples:
+        """New samples."""
+        numbers = self._numbers(native(pixels))
+        return numbers.astype(np.uint8) if self.bits == 8 else numbers
+
+    def decode(self, samples: Samples, out: Pixels) -> None:
+        """Write the pixels; indices beyond the table, from a damaged video, mean the last entry."""
+        patterns(out)[...] = np.take(self.table, samples, mode="clip")
+
+    def refuses(self, pixels: Pixels) -> str | None:
+        """A pattern that is not in the table."""
+        samples = native(pixels)
+        unknown = self.table[self._numbers(samples)] != samples
+        if unknown.any():
+            value = np.ascontiguousarray(pixels[unknown][:1]).item()
+            return f"value {value} is not one of the {len(self.table)} in the stream's table"
+        return None
+
+    @classmethod
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+        """The patterns of the samples, if they are few; integers must also be sparse.
+
+        If the second half of the samples has patterns missing in the first, later images would have
+        yet others.
+        """
+        half = (len(samples) + 1) // 2
+        found: Samples = np.empty(0, f"u{encoding.bytes_per_sample}")
+        for number, pixels in enumerate(samples):
+            patterns_here, before = native(pixels), len(found)
+            for part in (patterns_here[::16, ::16], patterns_here):  # makes most refusals cheap
+                found = np.union1d(found, part)
+                if len(found) > MAX_TABLE or (number >= half and len(found) > before):
+                    return None
+        values = found.tolist()
+        if not encoding.is_float and values[-1] - values[0] + 1 < 2 * len(values):
+            return None  # a plain picture has hardly more values
+        return Parameters(table=tuple(values))
+
+
+_EXPONENT = 0x7F800000  # all ones in NaN and infinity
+
+
+@cache
+def _metres(scale: str) -> Samples:
+    """Bit patterns of 0 to 65535 millimetres in metres, as float32; read-only."""
+    counts = np.arange(65536, dtype=np.float32)
+    thousand = np.float32(1000)
+    metres = counts * np.float32(0.001) if scale == "product" else counts / thousand
+    found: Samples = metres.astype(np.float32).view(np.uint32)
+    found.flags.writeable = False
+    return found
+
+
+class Metres(Values):
+    """Whole millimetres, from floats in metres; 0 is the hole.
+
+    Attributes:
+        hole: Bit pattern of a float32: 0, a NaN or an infinity.
+        scale: One of `SCALES`.
+    """
+
+    parameters = frozenset({"hole", "scale"})
+    bits = 16
+
+    def __init__(self, hole: int, scale: str) -> None:
+        self.hole, self.scale = hole, scale
+
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+        """For that hole and scale."""
+        hole, scale = parameters.hole, parameters.scale
+        if not is_integer(hole, 2**32 - 1):
+            raise ValueError(f"a hole of {hole}, which is no pattern of 32 bits")
+        if scale not in SCALES:
+            raise ValueError(f"scale {scale!r} is not one of {', '.join(SCALES)}")
+        return cls(hole or 0, scale)
+
+    def _table(self) -> Samples:
+        table: Samples = _metres(self.scale).copy()
+        table[0] = self.hole
+        return table
+
+    def encode(self, pixels: Pixels) -> Samples:
+        """New samples."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            metres = pixels.astype(np.float32, copy=False)
+            counts = np.rint(metres * np.float32(1000))
+            counts[~((counts >= 0) & (counts < 65536))] = 0  # NaN compares as false
+        found: Samples = counts.astype(np.uint16)
+        return found
+
+    def decode(self, samples: Samples, out: Pixels) -> None:
+        """Write the pixels."""
+        patterns(out)[...] = self._table()[samples]
+
+    def refuses(self, pixels: Pixels) -> str | None:
+        """A float that is neither the hole nor a whole number of millimetres."""
+        other = self._table()[self.encode(pixels)] != native(pixels)
+        if other.any():
+            value = np.ascontiguousarray(pixels[other][:1]).item()
+            return f"value {value} is neither whole millimetres nor the stream's mark of a hole"
+        return None
+
+    @classmethod
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+        """The scale, and the hole that occurs."""
+        hole = 0
+        for pixels in samples:
+            found = native(pixels)
+            holes = found[(found == 0) | (found & _EXPONENT == _EXPONENT)]
+            if holes.size:
+                hole = int(holes[0])
+                break
+        for scale in SCALES:
+            metres = cls(hole, scale)
+            if not any(metres.refuses(pixels[::16, ::16]) for pixels in samples) and not any(
+                metres.refuses(pixels) for pixels in samples
+            ):
+                return Parameters(hole=hole, scale=scale)
+        return None
+
+
+# ---------------------------------------------------------------- few values in an image
+
+FEWEST_ENTRIES, MOST_ENTRIES = 256, 4096
+"""Bounds of a list's length, which is a power of two."""
+
+_ROOM = 3 / 2  # entries per value of a sample image
+
+
+class Few(Whole):
+    """Samples of a limited number of different values in each image.
+
+    Attributes:
+        entries: That number.
+    """
+
+    parameters = frozenset({"entries"})
+
+    def __init__(self, encoding: Encoding, entries: int) -> None:
+        super().__init__(encoding)
+        self.entries = entries
+
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+        """For a list of so many entries."""
+        entries = parameters.entries
+        if not entries or not is_integer(entries, MOST_ENTRIES) or entries & (entries - 1):
+            raise ValueError(
+                f"a list of {entries} values, which is no power of two up to {MOST_ENTRIES}"
+            )
+        if entries < FEWEST_ENTRIES:
+            raise ValueError(f"a list of {entries} values, less than {FEWEST_ENTRIES}")
+        return cls(encoding, entries)
+
+    def refuses(self, pixels: Pixels) -> str | None:
+        """Too many values."""
+        count = len(distinct(native(pixels)))
+        if count > self.entries:
+            return f"{count} different values, more than the {self.entries} of the stream's list"
+        return None
+
+    @classmethod
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+        """Allow for half as many values again; integers must be sparse."""
+        most = 0
+        for pixels in samples:
+            if len(distinct(native(pixels)[::8, ::8])) > MOST_ENTRIES / _ROOM:
+                return None
+            values = distinct(Whole(encoding).encode(pixels))
+            if not encoding.is_float and int(values[-1]) - int(values[0]) + 1 < 2 * len(values):
+                return None  # a plain picture hardly has more
+            most = max(most, len(values))
+        entries = FEWEST_ENTRIES
+        while entries < most * _ROOM:
+            entries *= 2
+        return Parameters(entries=entries) if entries <= MOST_ENTRIES else None
+
+
+def distinct(samples: Samples) -> Samples:
+    """The patterns that occur, increasing."""
+    if samples.dtype.itemsize > 2:
+        return np.unique(samples)
+    occurs = np.zeros(65536, bool)
+    occurs[samples] = True
+    return np.flatnonzero(occurs).astype(np.uint16)
+
+
+@dataclass(frozen=True, slots=True)
+class Palette(Arrangement):
+    """The index of each sample in a list, and the list itself below.
+
+    Numbers of more than 8 bits are folded. The list is increasing, its last entry repeated;
+    first come the highest bytes of all entries, then the next ones, by rows of the picture.
+
+    Attributes:
+        entries: Of the list.
+        size: Bytes of a sample.
+        numbers: Arrangement of the numbers.
+    """
+
+    entries: int
+    size: int
+    numbers: Arrangement
+
+    def pixel_format(self, bits: int) -> str:
+        """Grey, 8 bits."""
+        return "gray"
+
+    def picture_size(self, width: int, height: int) -> tuple[int, int]:
+        """Taller by the list."""
+        _, rows = self.numbers.picture_size(width, height)
+        return width, rows + -(-self.entries * self.size // width)
+
+    def arrange(self, samples: Samples) -> Picture:
+        """A copy."""
+        height, width = samples.shape
+        values = distinct(samples)
+        if self.size == 2:
+            numbers_of = np.zeros(65536, np.uint16)
+            numbers_of[values] = np.arange(len(values))
+            numbers = numbers_of[samples]
+        else:
+            numbers = np.searchsorted(values, samples).astype(np.uint16)
+        if self.entries <= 256:
+            numbers = numbers.astype(np.uint8)
+        _, rows = self.picture_size(width, height)
+        picture = np.zeros((rows, width), np.uint8)
+        (upper,) = self.numbers.arrange(numbers)
+        picture[: len(upper)] = upper
+        entries = np.full(self.entries, values[-1], f">u{self.size}")
+        entries[: len(values)] = values
+        listed = entries.view(np.uint8).reshape(-1, self.size).T.ravel()
+        picture[len(upper) :].reshape(-1)[: listed.size] = listed
+        return (picture,)
+
+    def restore(self, picture: Picture, samples: Samples) -> None:
+        """Copy; indices beyond the list, from a damaged video, mean its last entry."""
+        height, width = samples.shape
+        _, upper = self.numbers.picture_size(width, height)
+        numbers = np.empty((height, width), np.uint8 if self.entries <= 256 else np.uint16)
+        self.numbers.restore((picture[0][:upper],), numbers)
+        listed = picture[0][upper:].reshape(-1)[: self.entries * self.size]
+        entries = np.ascontiguousarray(listed.reshape(self.size, -1).T).view(f">u{self.size}")
+        samples[...] = np.take(entries.ravel(), numbers, mode="clip")
