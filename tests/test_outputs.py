@@ -269,8 +269,7 @@ def test_a_move_that_fails_brings_the_old_back(
         return rename(self, to)
 
     monkeypatch.setattr(Path, "rename", failing)
-    for name in ("exchange", "rename_to_new"):
-        monkeypatch.setattr(f"mp4ds.files.outputs.{name}", lambda *_: False)
+    monkeypatch.setattr("mp4ds.files.outputs.rename_as", lambda *_: False)
     with (
         pytest.raises(Mp4dsError, match="Input/output error"),
         staged(target, force=True, owned=anything) as path,
@@ -295,7 +294,7 @@ def test_names_are_exchanged_at_once_where_that_can_be_done(
 
     monkeypatch.setattr(Path, "rename", watched)
     if not can:
-        monkeypatch.setattr("mp4ds.files.outputs.exchange", lambda *_: False)
+        monkeypatch.setattr("mp4ds.files.outputs.rename_as", lambda *_: False)
     elif sys.platform not in ("linux", "darwin"):
         pytest.skip("this system exchanges no names")
     with staged(target, force=True, owned=anything) as path:
@@ -313,7 +312,7 @@ from mp4ds.files.outputs import staged
 
 target, moment = Path(sys.argv[1]), sys.argv[2]
 if moment == "between":
-    outputs.exchange = lambda *_: False
+    outputs.rename_as = lambda *_: False
     rename = Path.rename
     def kill(self, to):
         rename(self, to)

@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import IO, Any
 
 from mp4ds.errors import TargetError, TargetExistsError, WriteError, counted
@@ -68,39 +68,32 @@ def is_mine(stat: os.stat_result, folder: Path) -> bool:
     return False
 
 
-def exchange(one: Path, other: Path) -> bool:
-    """Swap two names atomically.
+_EXCHANGE = {"linux": 2, "darwin": 2}  # RENAME_EXCHANGE, RENAME_SWAP
+_TO_NEW = {"linux": 1, "darwin": 4}  # RENAME_NOREPLACE, RENAME_EXCL
+
+
+def rename_as(old: Path, new: Path, flags: dict[str, int]) -> bool:
+    """Rename atomically: swap two names, or only to a name that nothing has.
+
+    Args:
+        old: What to rename.
+        new: Its new name.
+        flags: `_EXCHANGE` or `_TO_NEW`: the flag of each system that can.
 
     Returns:
         Whether that was done; False if the system or file system cannot.
 
     Raises:
-        OSError: It can, but failed.
-    """
-    return _renamed(one, other, linux=2, macos=2)  # RENAME_EXCHANGE, RENAME_SWAP
-
-
-def rename_to_new(old: Path, new: Path) -> bool:
-    """Rename, unless there is something under the new name.
-
-    Returns:
-        Whether that was done; False if the system or file system cannot.
-
-    Raises:
-        FileExistsError: It exists.
+        FileExistsError: There is something under the new name.
         OSError: It failed.
     """
-    return _renamed(old, new, linux=1, macos=4)  # RENAME_NOREPLACE, RENAME_EXCL
-
-
-def _renamed(old: Path, new: Path, *, linux: int, macos: int) -> bool:
     names = os.fsencode(old), os.fsencode(new)
     try:
         libc = ctypes.CDLL(None, use_errno=True)
         if sys.platform == "darwin":
-            failed = libc.renamex_np(*names, macos)
+            failed = libc.renamex_np(*names, flags["darwin"])
         else:
-            failed = libc.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], linux)
+            failed = libc.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], flags["linux"])
     except (AttributeError, OSError, TypeError):  # the system lacks the function or library
         return False
     if not failed:
@@ -198,7 +191,6 @@ def unknown_files(folder: Path, names: Collection[str]) -> list[str]:
         Names; that of a folder without known files ends with a slash.
     """
     known = set(names)
-    folders = {str(above) for name in known for above in PurePosixPath(name).parents}
     found: list[str] = []
     waiting = [(folder, "")]
     while waiting:
@@ -207,14 +199,8 @@ def unknown_files(folder: Path, names: Collection[str]) -> list[str]:
             for entry in entries:
                 name, path = prefix + entry.name, Path(entry.path)
                 if entry.is_dir(follow_symlinks=False):
-                    listed = listed_names(path) or ()
-                    known.update(f"{name}/{inner}" for inner in listed)
-                    if name in folders or listed:
-                        folders.update(
-                            f"{name}/{above}"
-                            for inner in listed
-                            for above in PurePosixPath(inner).parents
-                        )
+                    known.update(f"{name}/{inner}" for inner in listed_names(path) or ())
+                    if any(one.startswith(f"{name}/") for one in known):
                         waiting.append((path, f"{name}/"))
                     else:
                         found.append(f"{name}/")
@@ -313,7 +299,7 @@ def staged(
         yield path
         sync(path)
         old = folder / _OLD / target.name
-        move_into_place(path, target, old, force=force, owned=owned)
+        _move_into_place(path, target, old, force=force, owned=owned)
     except OSError as error:
         raise as_write_error(error, target) from error
     finally:
@@ -416,7 +402,7 @@ def check_target(
     owned: Owned,
     sources: Sequence[Path] = (),
 ) -> None:
-    """Refuse a target early, before any work is done. See `staged`."""
+    """Refuse a target early, before any work is done, as `staged` refuses it."""
     check_place(target, sources)
     if not os.path.lexists(target):
         return
@@ -531,7 +517,7 @@ def is_seen(is_there: Callable[[], bool], *folders: Path) -> bool:
     return seen
 
 
-def move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned: Owned) -> None:
+def _move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned: Owned) -> None:
     """Give an output its final name, replacing what is there.
 
     Args:
@@ -547,7 +533,7 @@ def move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned: 
     """
     if not os.path.lexists(target):
         try:
-            if not rename_to_new(path, target):
+            if not rename_as(path, target, _TO_NEW):
                 path.rename(target)
         except FileExistsError:
             raise TargetExistsError(target) from None
@@ -555,20 +541,16 @@ def move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned: 
         raise TargetExistsError(target)  # it appeared meanwhile
     else:
         check_replaceable(target, owned)
-        if not exchange(path, target):
-            _replace(path, target, old)
+        if not rename_as(path, target, _EXCHANGE):
+            old.parent.mkdir(exist_ok=True)
+            target.rename(old)
+            try:
+                path.rename(target)
+            except OSError:
+                with suppress(OSError):
+                    old.rename(target)
+                raise
     sync_folder(target.parent)
-
-
-def _replace(path: Path, target: Path, old: Path) -> None:
-    old.parent.mkdir(exist_ok=True)
-    target.rename(old)
-    try:
-        path.rename(target)
-    except OSError:
-        with suppress(OSError):
-            old.rename(target)
-        raise
 
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")

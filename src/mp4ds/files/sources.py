@@ -10,11 +10,10 @@ import hashlib
 import os
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import xxhash
 
@@ -281,14 +280,28 @@ class SourceHasher:
     """
 
     def __init__(self, files: Sequence[Path]) -> None:
-        self._files = list(files)
-        self._sizes = {path: source_size(path) for path in files if is_folder(path)}
-        self._position = 0
-        self._number = 0
-        self._offset = 0
-        self._hash = hashlib.sha256()
-        self._stream: BinaryIO | None = None  # kept open, since another file may get the name
         self._digests: list[tuple[int, str]] = []
+        self._position = 0
+        self._steps = self._hashed(files)
+
+    def _hashed(self, files: Sequence[Path]) -> Generator[int]:
+        """Hash the files step by step, and give the bytes of each step."""
+        for path in files:
+            try:
+                if is_folder(path):
+                    yield source_size(path)
+                    self._digests.append(source_digest(path))
+                    continue
+                size, digest = 0, hashlib.sha256()
+                # it stays open until all is read, since another file may get the name
+                with path.open("rb") as stream:
+                    while block := stream.read(_BLOCK):
+                        size += len(block)
+                        digest.update(block)
+                        yield len(block)
+                self._digests.append((size, digest.hexdigest()))
+            except OSError as error:
+                raise SourceError(path, f"cannot be read: {error.strerror}") from None
 
     def advance(self, position: int | None) -> None:
         """Hash up to a position in all files, None for the end.
@@ -296,23 +309,11 @@ class SourceHasher:
         Raises:
             SourceError: A file cannot be read.
         """
-        while self._number < len(self._files) and (position is None or self._position < position):
-            path = self._files[self._number]
-            end = self._position + self._sizes.get(path, 0)
-            if position is not None and position < end:
+        while position is None or self._position < position:
+            step = next(self._steps, None)
+            if step is None:
                 return
-            try:
-                if path in self._sizes:
-                    self._finish(*source_digest(path))
-                    self._position = end
-                    continue
-                if self._stream is None:
-                    self._stream = path.open("rb")
-                at_end = self._hash_file(self._stream, position)
-            except OSError as error:
-                raise SourceError(path, f"cannot be read: {error.strerror}") from None
-            if at_end:
-                self._finish(self._offset, self._hash.hexdigest())
+            self._position += step
 
     def digest(self, number: int) -> tuple[int, str]:
         """Size in bytes and SHA-256 of a file by its number; reads all files to the end first.
@@ -324,30 +325,8 @@ class SourceHasher:
             self.advance(None)
         return self._digests[number]
 
-    def _hash_file(self, stream: BinaryIO, position: int | None) -> bool:
-        while position is None or self._position < position:
-            block = stream.read(_BLOCK)
-            if not block:
-                return True
-            self._hash.update(block)
-            self._offset += len(block)
-            self._position += len(block)
-        return False
-
-    def _finish(self, size: int, sha256: str) -> None:
-        self._digests.append((size, sha256))
-        self._hash = hashlib.sha256()
-        self._offset = 0
-        self._number += 1
-        self._close()
-
-    def _close(self) -> None:
-        if self._stream:
-            self._stream.close()
-        self._stream = None
-
     def __enter__(self) -> SourceHasher:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._close()
+        self._steps.close()

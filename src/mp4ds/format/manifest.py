@@ -133,16 +133,8 @@ class LossEntry(Model):
     @classmethod
     def from_record(cls, loss: Loss) -> LossEntry:
         """The model of a loss."""
-        return cls(
-            file=loss.file,
-            offset=loss.offset,
-            size=loss.size,
-            problem=loss.problem,
-            messages=loss.messages,
-            topics=list(loss.topics),
-            start=loss.start,
-            end=loss.end,
-        )
+        values = {name: getattr(loss, name) for name in cls.model_fields}
+        return cls.model_validate({**values, "topics": list(loss.topics)})
 
     def to_record(self) -> Loss:
         """The loss."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -90,39 +91,19 @@ class Quality(Model):
 
     @classmethod
     def from_scores(
-        cls,
-        target: QualityTarget,
-        scores: NDArray[np.int64],
-        *,
-        worst_window: float,
-        windows: int,
-        reencoded: int,
-        limited: int,
+        cls, target: QualityTarget, scores: NDArray[np.int64], **windows: Any
     ) -> Quality:
         """The model of scores.
 
         Args:
             target: What was asked for.
             scores: Of each frame, in steps of the metric (`SCORE_STEPS`), shape (frames,).
-            worst_window: Least mean of a window.
-            windows: How many there are.
-            reencoded: How many of them were re-encoded.
-            limited: How many have originals that score too little themselves.
+            **windows: The fields of this model about windows.
         """
         mean, p5, least = _told(scores, target.metric)
-        values = {
-            "metric": target.metric,
-            "target": target.score,
-            "mean": mean,
-            "p5": p5,
-            "min": least,
-            "worst_window": round(worst_window, _DIGITS),
-            "windows": windows,
-            "reencoded": reencoded,
-            "limited": limited,
-            "scores": encode_column(scores),
-        }
-        return cls.model_validate(values)
+        figures = {"mean": mean, "p5": p5, "min": least, "scores": encode_column(scores)}
+        asked = {"metric": target.metric, "target": target.score}
+        return cls.model_validate({**asked, **figures, **windows})
 
     @classmethod
     def joined(cls, parts: Sequence[tuple[Quality, int]]) -> Quality:
@@ -135,13 +116,12 @@ class Quality(Model):
             ValueError: A column does not have a score for each frame.
         """
         first = parts[0][0]
+        counts = ("windows", "reencoded", "limited")
         return cls.from_scores(
             QualityTarget(first.metric, first.target),
             np.concatenate([part.scores.decode(frames) for part, frames in parts]),
             worst_window=min(part.worst_window for part, _ in parts),
-            windows=sum(part.windows for part, _ in parts),
-            reencoded=sum(part.reencoded for part, _ in parts),
-            limited=sum(part.limited for part, _ in parts),
+            **{name: sum(getattr(part, name) for part, _ in parts) for name in counts},
         )
 
     def of(self, numbers: NDArray[np.int64], frames: int) -> Quality:
@@ -154,14 +134,9 @@ class Quality(Model):
         Raises:
             ValueError: There is no score for each of them.
         """
-        return self.from_scores(
-            QualityTarget(self.metric, self.target),
-            self.scores.decode(frames)[numbers],
-            worst_window=self.worst_window,
-            windows=self.windows,
-            reencoded=self.reencoded,
-            limited=self.limited,
-        )
+        scores = self.scores.decode(frames)[numbers]
+        windows = self.model_dump(include={"worst_window", "windows", "reencoded", "limited"})
+        return self.from_scores(QualityTarget(self.metric, self.target), scores, **windows)
 
     def decode(self, frames: int) -> NDArray[np.float64]:
         """The score of each frame, shape (frames,).
@@ -521,46 +496,20 @@ class Calibration(Model):
     @classmethod
     def of(cls, frame_id: str, fields: CalibrationFields, template: str | None) -> Calibration:
         """The calibration of a message."""
-        x_offset, y_offset, height, width = fields.roi
-        roi = Roi(
-            x_offset=x_offset,
-            y_offset=y_offset,
-            height=height,
-            width=width,
-            do_rectify=fields.roi_do_rectify,
-        )
-        return cls(
-            frame_id=frame_id,
-            height=fields.height,
-            width=fields.width,
-            distortion_model=fields.distortion_model,
-            d=list(fields.d),
-            k=list(fields.k),
-            r=list(fields.r),
-            p=list(fields.p),
-            binning_x=fields.binning_x,
-            binning_y=fields.binning_y,
-            roi=roi if any((*fields.roi, fields.roi_do_rectify)) else None,
-            template=template,
-        )
+        values = asdict(fields)
+        region = (*values.pop("roi"), values.pop("roi_do_rectify"))
+        roi = dict(zip(Roi.model_fields, region, strict=True)) if any(region) else None
+        values |= {name: list(values[name]) for name in "dkrp"}
+        values |= {"frame_id": frame_id, "roi": roi, "template": template}
+        return cls.model_validate(values)
 
     @property
     def fields(self) -> CalibrationFields:
         """The fields of its message."""
-        roi = self.roi
-        return CalibrationFields(
-            height=self.height,
-            width=self.width,
-            distortion_model=self.distortion_model,
-            d=tuple(self.d),
-            k=tuple(self.k),
-            r=tuple(self.r),
-            p=tuple(self.p),
-            binning_x=self.binning_x,
-            binning_y=self.binning_y,
-            roi=(roi.x_offset, roi.y_offset, roi.height, roi.width) if roi else (0, 0, 0, 0),
-            roi_do_rectify=roi.do_rectify if roi else 0,
-        )
+        values = self.model_dump(exclude={"frame_id", "roi", "template"})
+        values |= {name: tuple(values[name]) for name in "dkrp"}
+        *roi, do_rectify = self.roi.model_dump().values() if self.roi else (0, 0, 0, 0, 0)
+        return CalibrationFields(**values, roi=tuple(roi), roi_do_rectify=do_rectify)
 
 
 class CameraInfo(Model):
