@@ -10,7 +10,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,35 @@ def run(*arguments: object, **options: Any) -> Result:
     return Result(process.returncode, out, without_progress(err))
 
 
+def program(
+    *command: object, code: int | None = 0, env: Mapping[str, str] | None = None, **options: Any
+) -> Result:
+    """Another program, or Python code behind ``-c`` alone, which is to have an exit code.
+
+    Programs of this environment come first on its path, and Python finds the package.
+
+    Args:
+        command: Its words.
+        code: That it ends with; None for any.
+        env: What is added to the environment.
+        options: Of `subprocess.run`.
+    """
+    words = [sys.executable, *command] if command[0] == "-c" else command
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    done = subprocess.run(
+        list(map(str, words)),
+        capture_output=True,
+        text=True,
+        timeout=WATCHDOG_S,
+        check=False,
+        stdin=subprocess.DEVNULL,
+        env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), **(env or {})},
+        **options,
+    )
+    assert code in (done.returncode, None), done.stdout + done.stderr
+    return Result(done.returncode, done.stdout, done.stderr)
+
+
 def typed(line: str, folder: Path) -> Result:
     """A line as it is typed into a shell in a folder.
 
@@ -80,16 +109,7 @@ def typed(line: str, folder: Path) -> Result:
             stack.callback(os.chdir, Path.cwd())
             os.chdir(folder)
             return call(*words[1:])
-    done = subprocess.run(
-        ["bash", "-c", line],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
-    )
-    return Result(done.returncode, done.stdout, done.stderr)
+    return program("bash", "-c", line, code=None, cwd=folder)
 
 
 def tree(folder: Path) -> dict[str, str]:

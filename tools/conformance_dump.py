@@ -47,11 +47,11 @@ _PACKED = {
 
 
 def as_json(values: Values) -> str:
-    """The result of `conformance_dump` as reproducible text."""
+    """The result of `dump` as reproducible text."""
     return json.dumps(values, indent=1)
 
 
-def conformance_dump(path: Path | str) -> dict[str, Any]:
+def dump(path: Path | str) -> dict[str, Any]:
     """The contents of a sidecar with its video, or of a dataset, as JSON values.
 
     Every frame is decoded and every message rebuilt, one frame at a time; the result has a few
@@ -316,7 +316,7 @@ def _messages(dataset: Dataset) -> Values:
 def main() -> int:
     """Print what a file holds."""
     try:
-        found = conformance_dump(sys.argv[1])
+        found = dump(sys.argv[1])
     except (IndexError, Mp4dsError) as error:
         print(error if isinstance(error, Mp4dsError) else __doc__, file=sys.stderr)
         return 2

@@ -1,0 +1,208 @@
+"""A reader that knows spec/ alone reads the suite, every layout, and what is packed today."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from numpy.typing import NDArray
+
+import documents
+import images
+import mp4ds
+import reader
+import run
+from coded_scenes import CODED
+from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
+from mp4ds import yamlio
+from mp4ds.errors import FormatError
+from mp4ds.messages.encodings import ENCODINGS, Encoding
+from mp4ds.messages.layouts import LAYOUTS, fit
+from scenes import Scene, odd_scene, scene
+from sources import SOURCES
+
+SUITE = Path(__file__).parents[1] / "conformance"
+NOT_READ = ("values", "messages", "version-0")
+"""Parts that the reader does not claim; README.md says the same."""
+CASES = [
+    case
+    for case in json.loads((SUITE / "cases" / "cases.json").read_text())["cases"]
+    if case["part"] not in NOT_READ
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case["path"])
+def test_the_suite(case: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    reader.main(SUITE / "cases" / case["path"])
+    left_out: set[str] = set()
+    found = json.loads(capsys.readouterr().out)
+    assert run.wrong_of(case, found, False, left_out) == []
+    assert not left_out
+
+
+def test_the_readme_says_what_is_not_read() -> None:
+    assert f"--without {','.join(NOT_READ)}" in (SUITE / "README.md").read_text()
+
+
+@pytest.mark.parametrize("path", sorted(SUITE.glob("*.py")), ids=lambda path: path.name)
+def test_it_shares_no_code_with_mp4ds(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            assert "mp4ds" not in {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert (node.module or "").split(".")[0] != "mp4ds"
+
+
+@pytest.mark.parametrize(("inside", "is_taken"), [(31, True), (32, False)])
+def test_both_readers_count_nesting_alike(inside: int, is_taken: bool) -> None:
+    """32 maps and lists within one another, the top being the first."""
+    text = "a: " + "[" * inside + "1" + "]" * inside + "\n"
+    if is_taken:
+        assert yaml.load(text, documents.Loader).keys() == yamlio.load(text.encode(), "").keys()
+        return
+    with pytest.raises(yaml.YAMLError, match="nested too deeply"):
+        yaml.load(text, documents.Loader)
+    with pytest.raises(FormatError, match="nested"):
+        yamlio.load(text.encode(), "some.yaml")
+
+
+# ---------------------------------------------------------------- layouts
+
+CONTENTS = ("random", "12 bits", "12 bits, high", "few values", "many values", "metres", "opaque")
+
+
+def contents(encoding: Encoding, width: int, height: int, seed: int) -> Iterator[NDArray[Any]]:
+    """Pixels that all layouts of an encoding together hold, in its own type."""
+    rng = np.random.default_rng(seed)
+    shape, size = encoding.shape(width, height), encoding.bytes_per_sample
+    top = 256**size - 1
+    for content in CONTENTS:
+        found = rng.integers(0, top, shape, f"u{size}", endpoint=True)
+        if content.startswith("12 bits") and size == 2:
+            found = (found & 4095) << (4 if content.endswith("high") else 0)
+            if encoding.is_signed and not content.endswith("high"):
+                found -= 2048
+        elif content.endswith("values"):
+            count = 20 if content.startswith("few") else 600
+            found = rng.choice(rng.integers(0, top, count, f"u{size}", endpoint=True), shape)
+        elif content == "metres" and encoding.dtype == "f4":
+            whole = rng.integers(0, 65536, shape).astype("f4")
+            metres = whole / np.float32(1000) if seed % 2 else whole * np.float32(0.001)
+            found = np.where(whole < 999, np.float32(np.nan), metres).view("u4")
+        elif content == "opaque" and encoding.channels == 4:
+            found[..., 3] = 77
+        yield found.astype(f"u{size}").view(encoding.dtype)
+
+
+def planes(picture: list[NDArray[Any]], order: str) -> list[NDArray[Any]]:
+    """Those of a picture that is one array, with colours last, or a plane each."""
+    if picture[0].ndim == 2:
+        return list(picture)
+    order = order[: picture[0].shape[2]]
+    return [picture[0][..., order.index(name)] for name in "gbra" if name in order]
+
+
+@pytest.mark.parametrize("size", [(8, 6), (7, 5), (40, 31)], ids=str)
+def test_every_exact_layout_is_what_the_spec_says(size: tuple[int, int]) -> None:
+    seen = set()
+    for name, encoding in ENCODINGS.items():
+        across, down = encoding.even
+        width, height = size[0] + -size[0] % across, size[1] + -size[1] % down
+        image = {"encoding": name, "width": width, "height": height}
+        for pixels in contents(encoding, width, height, seed=size[1]):
+            patterns = pixels.view(f"u{encoding.bytes_per_sample}")
+            for layout_name in encoding.exact:
+                layout = fit(layout_name, encoding, [pixels])
+                if layout is None:
+                    continue
+                seen.add(layout_name)
+                video = {"layout": layout_name, "parameters": layout.parameters.to_values()}
+                order = "rgba" if name.startswith("rgb") else "bgra"
+                found = images.pixels(image, video, planes(layout.to_picture(pixels), order))
+                expected = patterns.reshape(*pixels.shape[:2], -1)
+                assert np.array_equal(found, expected), f"{layout_name} of {name}"
+    assert seen == {name for name, kind in LAYOUTS.items() if kind.is_exact}
+
+
+# ---------------------------------------------------------------- what is packed today
+
+Case = tuple[Callable[..., Scene], str]
+ROS = {"ros1": "mcap-ros1-zstd", "ros2": "mcap-ros2-none"}
+
+
+def odd(trait: str, *, frames: int, **_: int) -> Scene:
+    return odd_scene(trait, frames=frames)
+
+
+ROS_SCENES: dict[str, Callable[..., Scene]] = {
+    **{
+        trait: partial(odd, trait)
+        for trait in ("row-padding-varied", "row-padding-not-last", "cdr-big-endian")
+    },
+    **{
+        f"{encoding}-padded": partial(scene, encoding, pad=5)
+        for encoding in ("mono8", "bgr8", "rgba8", "bayer_rggb8", "16SC1", "nv21")
+    },
+    **{
+        f"{encoding}-big-endian": partial(scene, encoding, pad=5, big_endian=True)
+        for encoding in ("rgb16", "32FC1")
+    },
+    **{
+        f"{encoding}-{content}": partial(scene, encoding, content=content)
+        for encoding, content in (
+            *(("mono16", "12-bit"), ("bayer_grbg16", "12-bit-high"), ("16UC1", "few-values")),
+            *(("32FC1", "millimetres"), ("32FC1", "millimetres-product"), ("yuyv", "full")),
+        )
+    },
+    **{
+        name: CODED[name]
+        for name in (
+            *("jpeg-rgb", "jpeg-exif-trailing", "png-rgb-cv2", "png-gray-pillow", "png-rgba-cv2-9"),
+            *("png-16-bit-cv2", "depth-16UC1-png", "depth-16UC1-rvl", "depth-32FC1-rvl"),
+            *("video-h264-aud-sei", "video-h264-3-byte", "video-h265", "video-av1"),
+            *("video-av1-no-delimiter", "video-vp9", "ffmpeg-libx264", "ffmpeg-libsvtav1"),
+        )
+    },
+}
+PACKED = {
+    **{
+        f"{name}-{ros}": (make, SOURCES[ROS[ros]])
+        for name, make in ROS_SCENES.items()
+        for ros in ROS
+    },
+    **{
+        f"{name}-{source}": (FOXGLOVE[name], FOXGLOVE_SOURCES[source])
+        for name in ("raw-padded", "jpeg-rgb", "video-h264")
+        for source in FOXGLOVE_SOURCES
+        if name == "raw-padded" or source == "mcap-foxglove-ros2"
+    },
+}
+
+
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("case", PACKED)
+def test_every_message_of_what_is_packed(case: str, tmp_path: Path) -> None:
+    make, write = PACKED[case]
+    (source,) = write(tmp_path, make(frames=8, width=192, height=128))
+    mp4ds.pack(source, tmp_path / "packed")
+    recorded: dict[str, list[str]] = {}
+    with source.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            digest = hashlib.sha256(message.data).hexdigest()
+            recorded.setdefault(channel.topic, []).append(digest)
+    streams = reader.dataset(tmp_path / "packed")["streams"]
+    assert streams, "nothing became a stream"
+    for stream in streams:
+        ordinals = map(int, stream["columns"]["ordinal"])
+        assert stream["payloads"] == [recorded[stream["topic"]][n] for n in ordinals]
+        if info := stream["camera_info"]:
+            assert info["payloads"] == recorded[info["topic"]]
