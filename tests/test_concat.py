@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mp4ds.bags.protocols import RecordingSlice
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.concat import concat
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.slicing import copy_part
+from mp4ds.dataset.recording import copy_part
 from mp4ds.errors import FormatError
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack
@@ -45,7 +46,7 @@ def cut(dataset: Path, folder: Path, parts: int) -> list[Path]:
         for span in pairwise(np.linspace(start, end, parts + 1).astype(np.int64).tolist()):
             made.append(folder / f"{len(made)}")
             made[-1].mkdir(parents=True)
-            copy_part(opened, made[-1], span=Excerpt(*span))
+            copy_part(opened, made[-1], part=RecordingSlice(Excerpt(*span)))
     return made
 
 

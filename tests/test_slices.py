@@ -330,7 +330,7 @@ def test_of_nothing_there_is_no_slice(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no messages"):
         mp4ds.pack(tmp_path / "drive.bag", tmp_path / "part", PackOptions(start="1"))
     mp4ds.pack(tmp_path / "drive.bag", tmp_path / "whole")
-    with pytest.raises(OptionError, match="no messages"):
+    with pytest.raises(SourceError, match="no messages"):
         mp4ds.pack(tmp_path / "whole", tmp_path / "part", PackOptions(start="1"))
     assert not (tmp_path / "part").exists()
 

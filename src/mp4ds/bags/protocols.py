@@ -50,7 +50,8 @@ class RecordingSlice:
     left_out: Sequence[str] = ()
 
 
-_WHOLE = RecordingSlice()
+WHOLE = RecordingSlice()
+"""Everything that the recording has."""
 
 
 class BagReader(ABC):
@@ -78,7 +79,7 @@ class BagReader(ABC):
     library: str = ""
     tables: Mapping[str, str] = MappingProxyType({})
     begin: int | None = None
-    slice: RecordingSlice = _WHOLE
+    slice: RecordingSlice = WHOLE
 
     # what was found so far, which may grow while reading
     _channels: Mapping[Any, Channel] = MappingProxyType({})
@@ -155,11 +156,11 @@ class BagReader(ABC):
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times of every message, nanoseconds, sorted, by channel id."""
-        return self._times() if self.slice is _WHOLE else self._sliced_times
+        return self._times() if self.slice is WHOLE else self._sliced_times
 
     def stats(self) -> Mapping[int, ChannelStats]:
         """Counts and time spans by channel id, as far as known without reading messages."""
-        return self._stats() if self.slice is _WHOLE else BagReader._stats(self)
+        return self._stats() if self.slice is WHOLE else BagReader._stats(self)
 
     def first(self, channel: Channel) -> Message | None:
         """The channel's first message by log time, or None."""

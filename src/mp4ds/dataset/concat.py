@@ -5,10 +5,11 @@ A copy or a slice is made in the same way: of one dataset, of which a span and t
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -18,17 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapWriter
-from mp4ds.bags.protocols import in_span, write_record
+from mp4ds.bags.protocols import WHOLE, RecordingSlice, in_span, write_record
 from mp4ds.dataset.channels import by_time
-from mp4ds.dataset.columns import DecodedColumns, within
+from mp4ds.dataset.columns import DecodedColumns, columns_model, digests_model, within
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.segments import JoinedStream, Segment, copy_file
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import Refused
+from mp4ds.errors import Refused, VideoError
 from mp4ds.files.outputs import digest_file
 from mp4ds.format.fields import (
     FORMAT_VERSION,
+    MAX_CAMERA_INFOS,
+    MAX_FRAMES,
+    MAX_VARIANTS,
     MESSAGES_NAME,
+    Columns,
+    exceeds_padding,
 )
 from mp4ds.format.manifest import (
     FileEntry,
@@ -40,8 +45,13 @@ from mp4ds.format.manifest import (
     static_transforms,
 )
 from mp4ds.format.models import (
-    ChannelModel,
+    FACTS,
+    Calibration,
+    CameraInfo,
+    Header,
+    Quality,
     StreamSidecar,
+    video_facts,
 )
 from mp4ds.format.sidecars import MANIFEST_NAME, dump_document, verify_file
 from mp4ds.messages.transforms import Transform, TransformCollector
@@ -51,23 +61,24 @@ from mp4ds.records import (
     MAX_REASONS,
     OTHER_REASONS,
     Channel,
-    Excerpt,
     Message,
     bounded,
 )
+from mp4ds.times import PresentationClock
+from mp4ds.video.mp4 import read_sample_entry
+from mp4ds.video.packets import cut_segment, join_segments
 
 Integers = NDArray[np.int64]
 _Identity = tuple[object, ...]
 _AT_ONCE = 4  # more would only wait for the disk
-_NO_TIMES = np.empty(0, np.int64)
+_NONE = np.empty(0, np.int64)
 
 
 def concat(
     datasets: Sequence[Dataset],
     folder: Path,
     *,
-    span: Excerpt = EVERYTHING,
-    latched: Sequence[Message] = (),
+    part: RecordingSlice = WHOLE,
     selected: Callable[[str], bool] = lambda _: True,
     changes: dict[str, Any] | None = None,
     report: Callable[[str], None] = lambda _: None,
@@ -83,8 +94,7 @@ def concat(
             sidecar tells once are joined. Those of which messages overlap in time have no topic
             in common.
         folder: The folder to fill, empty.
-        span: What to copy of the only dataset; its topics are ignored.
-        latched: Its messages from before the span that are copied, too.
+        part: What to copy of the only dataset; the topics of its span are ignored.
         selected: Whether a topic is to be copied.
         changes: Fields of the manifest that differ from those of the first dataset.
         report: Called with the name of each file when it is begun, perhaps in another thread.
@@ -97,40 +107,170 @@ def concat(
         FormatError: A file does not match its dataset.
         OSError: The disk could not be written.
     """
-    latched = [message for message in latched if selected(message.channel.topic)]
-    parts = [_Part(dataset, span, latched, selected) for dataset in datasets]
-    for part in parts:
-        part.check()
-    return _Concat(parts, folder, report).write(changes or {})
+    sources: list[_Source] = []
+    earlier = Counter[_Identity]()
+    for dataset in datasets:
+        sources.append(_Source(dataset, part, selected, earlier))
+        earlier.update(sources[-1].counts)
+    streams = _joined_streams(sources)
+    for source in sources:
+        source.dataset.verify_sidecars(selected)
+        if len(sources) > 1:
+            source.dataset.verify_messages()
+    made = _write_streams(streams, folder, report, is_one=len(sources) == 1)
+    sidecars = [sidecar for _, sidecar in made]
+    report(MESSAGES_NAME)
+    transforms = _write_messages(sources, folder / MESSAGES_NAME, sidecars)
+    old = sources[0].manifest
+    ranges = [source.range for source in sources if source.range]
+    losses = [entry.to_record() for source in sources for entry in source.manifest.losses]
+    files = [
+        *((one.video.file, one.video.size or 0, one.video.sha256 or "") for one in sidecars),
+        *((name, *digest_file(folder / name)) for name in (MESSAGES_NAME, *(n for n, _ in made))),
+    ]
+    manifest = old.model_copy(
+        update={
+            "mp4ds": FORMAT_VERSION,
+            "messages": earlier.total(),
+            "losses": list(map(LossEntry.from_record, bounded(losses))),
+            "topics_left_out": list(dict.fromkeys(chain(*(one.left_out for one in sources)))),
+            "time_range": TimeRange(
+                start=min(start for start, _ in ranges), end=max(end for _, end in ranges)
+            )
+            if ranges
+            else None,
+            "streams": [
+                StreamEntry(
+                    topic=sidecar.channel.topic,
+                    sidecar=name,
+                    video=sidecar.video.file,
+                    frames=sidecar.frames,
+                )
+                for name, sidecar in made
+            ],
+            "transforms": old.transforms
+            if len(sources) == 1
+            else static_transforms(sidecars, transforms),
+            "verbatim": _verbatim(sources),
+            "files": [
+                FileEntry(name=name, size=size, sha256=sha256)
+                for name, size, sha256 in sorted(files)
+            ],
+            **(changes or {}),
+        }
+    )
+    (folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
+    return manifest, sidecars
 
 
-class _Part:
-    """What is copied of a dataset."""
+# ---------------------------------------------------------------- what is copied
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """What is copied of a stream.
+
+    Attributes:
+        source: The dataset.
+        stream: Of the dataset.
+        images: Numbers of the frames.
+        infos: Numbers of the calibrations.
+        offsets: What is added to the ordinals of images, and of calibrations.
+    """
+
+    source: _Source
+    stream: Stream
+    images: Integers
+    infos: Integers
+    offsets: tuple[int, int]
+
+    @property
+    def has_all(self) -> bool:
+        """Whether the whole video is copied."""
+        return len(self.images) == len(self.stream)
+
+    @cached_property
+    def headers(self) -> list[Header]:
+        """Those of its frames."""
+        kinds = np.unique(self.stream.columns.variant[self.images])
+        return [self.stream.sidecar.headers[kind] for kind in kinds.tolist()]
+
+    @cached_property
+    def calibrations(self) -> list[Calibration]:
+        """Those of its camera."""
+        infos = self.stream.infos
+        if infos is None:
+            return []
+        kinds = np.unique(infos.columns.variant[self.infos])
+        return [infos.info.calibrations[kind] for kind in kinds.tolist()]
+
+
+class _Source:
+    """What is copied of a dataset.
+
+    Args:
+        dataset: The dataset.
+        part: The slice of it.
+        selected: Whether a topic is to be copied.
+        earlier: How many messages of each channel come before, from other datasets.
+
+    Attributes:
+        counts: How many messages are copied, by channel.
+        segments: What is copied of each stream.
+
+    Raises:
+        Refused: It cannot be copied; says why.
+    """
 
     def __init__(
         self,
         dataset: Dataset,
-        span: Excerpt,
-        latched: Sequence[Message],
+        part: RecordingSlice,
         selected: Callable[[str], bool],
+        earlier: Mapping[_Identity, int],
     ) -> None:
         if dataset.manifest is None:
             raise Refused("it is a single video, not a dataset")
         self.dataset = dataset
         self.manifest = dataset.manifest
-        self.span = span
-        self.latched = latched
         self.selected = selected
-        self.is_slice = span.start is not None or span.end is not None
-        self._early = Counter(message.channel.identity for message in latched)
+        self.is_slice = part.span != EVERYTHING
+        if self.is_slice and not dataset.is_in_time:
+            raise Refused("its messages are not ordered by log time")
+        self.span = part.span
+        self.latched = [message for message in part.latched if selected(message.channel.topic)]
+        self.channels = [item for item in dataset.channels if selected(item.topic)]
+        times = dataset.times({channel.topic for channel in self.channels})
+        by_identity: dict[_Identity, list[Integers]] = {}
+        for channel in self.channels:  # several may be equal
+            by_identity.setdefault(channel.identity, []).append(times.get(channel.id, _NONE))
+        self._times = {key: np.sort(np.concatenate(own)) for key, own in by_identity.items()}
+        early = Counter(message.channel.identity for message in self.latched)
+        self.counts = {
+            key: len(in_span(own, self.span)) + early[key] for key, own in self._times.items()
+        }
+        # what is added to the ordinals of a channel, of which messages before the span are left out
+        self._offsets = {
+            key: earlier.get(key, 0) + early[key] - int(np.searchsorted(own, self.span.start))
+            if self.span.start is not None
+            else earlier.get(key, 0)
+            for key, own in self._times.items()
+        }
         self.segments = [self._segment(stream) for stream in dataset.streams]
 
-    def _segment(self, stream: Stream) -> Segment:
-        infos: Integers = _NO_TIMES
-        if stream.infos and self.selected(stream.infos.channel.topic):
-            infos = self._numbers(stream.infos.columns)
-        images = self._numbers(stream.columns) if self.selected(stream.topic) else _NO_TIMES
-        return Segment(self.dataset, stream, images, infos)
+    def _segment(self, stream: Stream) -> _Segment:
+        if len(set(map(self.selected, stream.topics))) > 1:
+            raise Refused(f"{' and '.join(stream.topics)} share one stream")
+        if not self.selected(stream.topic):
+            return _Segment(self, stream, _NONE, _NONE, (0, 0))
+        images = self._numbers(stream.columns)
+        if np.any(np.diff(images) != 1):
+            raise Refused(f"frames of {stream.topic} are not ordered by time")
+        offset = self._offsets[stream.channel.identity]
+        if stream.infos is None:
+            return _Segment(self, stream, images, _NONE, (offset, 0))
+        offsets = offset, self._offsets[stream.infos.channel.identity]
+        return _Segment(self, stream, images, self._numbers(stream.infos.columns), offsets)
 
     def _numbers(self, columns: DecodedColumns) -> Integers:
         """Numbers of the messages in the span."""
@@ -142,51 +282,11 @@ class _Part:
             is_in &= columns.log_time < end
         return np.flatnonzero(is_in).astype(np.int64)
 
-    def check(self) -> None:
-        """Refuse what cannot be copied.
-
-        Raises:
-            Refused: Says why.
-        """
-        if self.is_slice and not self.dataset.is_in_time:
-            raise Refused("its messages are not ordered by log time")
-        for segment in self.segments:
-            topics = segment.stream.topics
-            if len(set(map(self.selected, topics))) > 1:
-                raise Refused(f"{' and '.join(topics)} share one stream")
-            if np.any(np.diff(segment.images) != 1):
-                raise Refused(f"frames of {topics[0]} are not ordered by time")
-
-    @cached_property
-    def times(self) -> dict[_Identity, Integers]:
-        """Sorted log times of all messages on selected topics, by channel identity."""
-        times = self.dataset.times()
-        found: dict[_Identity, list[Integers]] = {}
-        for channel in self.dataset.channels:  # several may be equal
-            if self.selected(channel.topic):
-                found.setdefault(channel.identity, []).append(times.get(channel.id, _NO_TIMES))
-        return {key: np.sort(np.concatenate(arrays)) for key, arrays in found.items()}
-
-    def count(self, identity: _Identity) -> int:
-        """How many messages of a channel are copied."""
-        times = self.times.get(identity, _NO_TIMES)
-        return len(in_span(times, self.span)) + self._early[identity]
-
-    def before(self, identity: _Identity) -> int:
-        """How many messages of a channel come before the span and are left out."""
-        if self.span.start is None:
-            return 0
-        return int(np.searchsorted(self.times[identity], self.span.start)) - self._early[identity]
-
-    def messages(self, topic: str) -> int:
+    def count(self, topic: str) -> int:
         """How many messages of a topic are copied."""
-        identities = {item.identity for item in self.dataset.channels if item.topic == topic}
-        return sum(map(self.count, identities))
-
-    @property
-    def has_all_topics(self) -> bool:
-        """Whether every topic is copied."""
-        return all(self.selected(channel.topic) for channel in self.dataset.channels)
+        return sum(
+            self.counts[item] for item in {c.identity for c in self.channels if c.topic == topic}
+        )
 
     @property
     def left_out(self) -> list[str]:
@@ -197,251 +297,379 @@ class _Part:
     @cached_property
     def range(self) -> tuple[int, int] | None:
         """Log times of the first and the last message copied, ns."""
-        times = [in_span(one, self.span) for one in self.times.values()]
-        times.append(np.sort(np.array([item.log_time for item in self.latched], np.int64)))
-        times = [one for one in times if len(one)]
-        if not times:
-            return None
-        return min(int(one[0]) for one in times), max(int(one[-1]) for one in times)
+        times = [in_span(one, self.span) for one in self._times.values()]
+        times.append(np.array([item.log_time for item in self.latched], np.int64))
+        found = np.concatenate(times)
+        return (int(found.min()), int(found.max())) if len(found) else None
 
     def verbatim(self) -> list[Verbatim]:
         """Camera messages in messages.mcap, by topic, with the known reasons."""
-        old = self.manifest.verbatim
+        old = [item for item in self.manifest.verbatim if self.selected(item.topic)]
         if not self.is_slice:
-            return [item for item in old if self.selected(item.topic)]
+            return old
         found = []
         for topic in dict.fromkeys(item.topic for item in old):
-            reasons = [item.reason for item in old if item.topic == topic]
-            times = np.sort(np.concatenate([_NO_TIMES, *self._times_of(topic)]))
+            own = [times for identity, times in self._times.items() if identity[0] == topic]
             inside = in_span(self.dataset.recorded_times(topic), self.span)
-            if self.selected(topic) and len(inside):
-                first = int(np.searchsorted(in_span(times, self.span), inside[0]))
+            if len(inside):
+                times = in_span(np.sort(np.concatenate([_NONE, *own])), self.span)
                 entry = Verbatim(
-                    topic=topic, messages=len(inside), first=first, reason="; or ".join(reasons)
+                    topic=topic,
+                    messages=len(inside),
+                    first=int(np.searchsorted(times, inside[0])),
+                    reason="; or ".join(item.reason for item in old if item.topic == topic),
                 )
                 found.append(entry)
         return found
 
-    def _times_of(self, topic: str) -> list[Integers]:
-        times = self.dataset.times()
-        channels = [item for item in self.dataset.channels if item.topic == topic]
-        return [times[item.id] for item in channels if item.id in times]
-
-    def verbatim_messages(self) -> Iterator[Message]:
+    def recorded_messages(self) -> Iterator[Message]:
         """The messages for messages.mcap, by log time.
 
         Includes the calibrations of streams without frames in the span.
         """
-        topics = {item.topic for item in self.dataset.channels if self.selected(item.topic)}
-        recorded = self.dataset.recorded_messages(replace(self.span, topics=frozenset(topics)))
-        orphans = [self._orphans(one) for one in self.segments if not len(one.images)]
-        found = by_time(recorded, *orphans)
-        return chain(self.latched, found)
-
-    def _orphans(self, segment: Segment) -> Iterator[Message]:
-        infos = segment.stream.infos
-        if infos is None or not len(segment.infos):
-            return iter(())
-        channels = {channel.identity: channel for channel in self.dataset.channels}
-        found = infos.messages(channels[infos.channel.identity], within(self.span))
-        return (message for _, message in found)
+        topics = frozenset(channel.topic for channel in self.channels)
+        recorded = self.dataset.recorded_messages(replace(self.span, topics=topics))
+        channels = {channel.identity: channel for channel in self.channels}
+        orphans = [
+            infos.messages(channels[infos.channel.identity], within(self.span))
+            for segment in self.segments
+            if (infos := segment.stream.infos) and len(segment.infos) and not len(segment.images)
+        ]
+        calibrations = [(message for _, message in messages) for messages in orphans]
+        return chain(self.latched, by_time(recorded, *calibrations))
 
 
-class _Concat:
-    """See `concat`."""
+def _verbatim(sources: Sequence[_Source]) -> list[Verbatim]:
+    """Camera messages in messages.mcap, by topic and reason."""
+    found: dict[tuple[str, str], Verbatim] = {}
+    earlier = Counter[str]()
+    for source in sources:
+        for entry in source.verbatim():
+            known = sum(topic == entry.topic for topic, _ in found)
+            key = (entry.topic, entry.reason)
+            if key not in found and len(sources) > 1 and known >= MAX_REASONS:
+                key = (entry.topic, OTHER_REASONS)
+            first, messages = entry.first + earlier[entry.topic], entry.messages
+            if key in found:
+                first, messages = found[key].first, found[key].messages + messages
+            found[key] = Verbatim(topic=key[0], messages=messages, first=first, reason=key[1])
+        for topic in {channel.topic for channel in source.channels}:
+            earlier[topic] += source.count(topic)
+    return list(found.values())
 
-    def __init__(self, parts: Sequence[_Part], folder: Path, report: Callable[[str], None]) -> None:
-        self._parts = parts
-        self._folder = folder
-        self._report = report
-        self._copied: list[str] = []  # names of files copied as a whole
-        self._messages = Counter[_Identity]()  # copied, by channel
-        self._channels: dict[tuple[int, int], Channel] = {}  # by number of the part, and id there
-        self._streams: list[JoinedStream] = []
-        for number, part in enumerate(parts):
-            for segment in part.segments:
-                if len(segment.images):
-                    self._add(segment, part)
-            for identity in part.times:
-                self._messages[identity] += part.count(identity)
-            self._add_channels(number, part)
+
+# ---------------------------------------------------------------- videos
+
+
+def _joined_streams(sources: Sequence[_Source]) -> list[_JoinedStream]:
+    streams: list[_JoinedStream] = []
+    for segment in chain(*(source.segments for source in sources)):
+        if len(segment.images):
+            joined = next((stream for stream in streams if stream.takes(segment)), None)
+            if joined is None:
+                streams.append(_JoinedStream(segment))
+            else:
+                joined.add(segment)
+    return streams
+
+
+def _write_streams(
+    streams: Sequence[_JoinedStream], folder: Path, report: Callable[[str], None], *, is_one: bool
+) -> list[tuple[str, StreamSidecar]]:
+    """Write videos and sidecars; each sidecar is returned with its name."""
+    names = FileNames()
+    firsts = [stream.segments[0].stream for stream in streams]
+    stems = [
+        first.video_path.stem if is_one else names.name_for(first.topic)[0] for first in firsts
+    ]
+
+    def write(stem: str, stream: _JoinedStream) -> tuple[str, StreamSidecar]:
+        report(f"{stem}.mp4")
+        sidecar = stream.write(stem, folder)
+        (folder / f"{stem}.yaml").write_bytes(dump_document(sidecar))
+        return f"{stem}.yaml", sidecar
+
+    # copying and hashing run without Python's lock
+    with ThreadPoolExecutor(_AT_ONCE) as threads:
+        return list(threads.map(write, stems, streams))
+
+
+class _JoinedStream:
+    """A stream of the new dataset: segments, in order."""
+
+    def __init__(self, first: _Segment) -> None:
+        self.segments: list[_Segment] = []
+        self._identity = _common(first.stream.sidecar)
+        self._entry = read_sample_entry(first.stream.video_path)
+        # by their text, in which 0.0 and -0.0 differ, and NaNs are equal
+        self._headers: dict[str, Header] = {}
+        self._calibrations: dict[str, Calibration] = {}
+        self._frames = self._infos = 0
+        self._info: CameraInfo | None = None
+        self.add(first)
 
     @property
-    def _is_one(self) -> bool:
-        return len(self._parts) == 1
+    def first(self) -> Stream:
+        """The stream that it begins with."""
+        return self.segments[0].stream
 
-    def _add(self, segment: Segment, part: _Part) -> None:
-        channels = [
-            segment.stream.channel,
-            *([segment.stream.infos.channel] if segment.stream.infos else []),
+    def takes(self, segment: _Segment) -> bool:
+        """Whether a segment continues this stream.
+
+        Raises:
+            VideoError: Its video is damaged.
+        """
+        stream, sidecar = segment.stream, segment.stream.sidecar
+        if sidecar.channel != self.first.sidecar.channel:
+            return False  # most often: the rest takes longer to compare
+        if segment.source is self.segments[-1].source or _common(sidecar) != self._identity:
+            return False
+        if stream.hidden_frames or self.first.hidden_frames:
+            return False  # what a slice hides refers to nothing in another segment
+        headers = [*self._headers.values(), *segment.headers]
+        if exceeds_padding(head.padding for head in headers):
+            return False
+        if not _has_room(self._headers, segment.headers):
+            return False
+        if self._frames + len(segment.images) > MAX_FRAMES:
+            return False
+        if self._entry.differences(read_sample_entry(stream.video_path)):
+            return False  # JPEG files may differ in chroma subsampling
+        info = sidecar.camera_info
+        if info is None or self._info is None:
+            return True
+        return (
+            info.channel == self._info.channel
+            and info.wire == self._info.wire
+            and _has_room(self._calibrations, segment.calibrations)
+            and self._infos + len(segment.infos) <= MAX_CAMERA_INFOS
+        )
+
+    def add(self, segment: _Segment) -> None:
+        """Add the first segment, or one that it `takes`."""
+        self.segments.append(segment)
+        self._frames += len(segment.images)
+        for header in segment.headers:
+            self._headers.setdefault(repr(header), header)
+        info = segment.stream.sidecar.camera_info
+        if info is not None and (not info.messages or len(segment.infos)):
+            self._info = self._info or info
+            self._infos += len(segment.infos)
+            for calibration in segment.calibrations:
+                self._calibrations.setdefault(repr(calibration), calibration)
+
+    @cached_property
+    def _columns(self) -> dict[str, Integers]:
+        return _joined(
+            [
+                (part.stream.columns, part.images, part.stream.sidecar.headers, part.offsets[0])
+                for part in self.segments
+            ],
+            self._headers,
+        )
+
+    def write(self, stem: str, folder: Path) -> StreamSidecar:
+        """Write the video; the sidecar is returned.
+
+        Raises:
+            VideoError: A segment is damaged.
+            OSError: It cannot be written.
+        """
+        first = self.first
+        codec = first.sidecar.video.codec
+        path = folder / f"{stem}.mp4"
+        self._write_video(path)
+        facts = video_facts(path, codec)
+        (*_, last) = self.segments
+        if len(self.segments) == 1 and last.has_all:
+            sha256 = facts["sha256"]
+            if last.stream.sidecar.video.sha256 not in (None, sha256):
+                raise VideoError(
+                    "hash-mismatch", first.video_path, "does not match the SHA-256 in its sidecar"
+                )
+            entry = last.source.manifest.file(first.video_path.name)
+            verify_file(first.video_path, entry, found=(facts["size"], sha256))
+        qualities = [
+            (quality.of(part.images, len(part.stream)), len(part.images))
+            for part in self.segments
+            if (quality := part.stream.sidecar.video.quality) is not None
         ]
-        offsets = [self._messages[one.identity] - part.before(one.identity) for one in channels]
-        segment = replace(segment, offsets=(offsets[0], offsets[-1]))
-        joined = next((joined for joined in self._streams if joined.takes(segment)), None)
-        if joined is None:
-            self._streams.append(JoinedStream(segment))
-        else:
-            joined.add(segment)
-
-    def _add_channels(self, number: int, part: _Part) -> None:
-        """Map channels of a part to those that equal them; in a recording, several may be equal."""
-        known = {channel.identity: channel for channel in reversed(self._channels.values())}
-        next_id = 1 + max((channel.id for channel in self._channels.values()), default=0)
-        for channel in part.dataset.channels:
-            if part.selected(channel.topic):
-                same = known.get(channel.identity) if number else channel
-                if same is None:
-                    same = replace(channel, id=next_id)
-                    known[channel.identity] = same
-                    next_id += 1
-                self._channels[number, channel.id] = same
-
-    def write(self, changes: dict[str, Any]) -> tuple[Manifest, list[StreamSidecar]]:
-        """Write all files, the manifest last."""
-        parts = self._parts
-        for part in parts:
-            part.dataset.verify_sidecars(part.selected)
-            if not self._is_one:
-                part.dataset.verify_messages()
-        made = self._write_streams()
-        self._report(MESSAGES_NAME)
-        transforms = self._write_messages([sidecar for _, sidecar in made])
-        digests = {
-            sidecar.video.file: (sidecar.video.size or 0, sidecar.video.sha256 or "")
-            for _, sidecar in made
-        }
-        for name in (MESSAGES_NAME, *(name for name, _ in made)):
-            digests[name] = digest_file(self._folder / name)
-        for name in self._copied:
-            source = parts[0]
-            path = source.dataset.path / name
-            verify_file(path, source.manifest.file(name), found=digests[name])
-        ranges = [found for part in parts if (found := part.range)]
-        losses = [entry.to_record() for part in parts for entry in part.manifest.losses]
-        old = parts[0].manifest
-        manifest = old.model_copy(
+        if qualities:
+            alone = len(qualities) == 1
+            facts["quality"] = qualities[0][0] if alone else Quality.joined(qualities)
+        digests = [
+            own.decode(len(part.stream))[part.images]
+            for part in self.segments
+            if (own := part.stream.sidecar.digests) is not None
+        ]
+        return first.sidecar.model_copy(
             update={
                 "mp4ds": FORMAT_VERSION,
-                "messages": sum(self._messages.values()),
-                "losses": list(map(LossEntry.from_record, bounded(losses))),
-                "topics_left_out": list(dict.fromkeys(chain(*(part.left_out for part in parts)))),
-                "time_range": TimeRange(
-                    start=min(start for start, _ in ranges), end=max(end for _, end in ranges)
-                )
-                if ranges
-                else None,
-                "streams": [
-                    StreamEntry(
-                        topic=sidecar.channel.topic,
-                        sidecar=name,
-                        video=sidecar.video.file,
-                        frames=sidecar.frames,
-                    )
-                    for name, sidecar in made
-                ],
-                "transforms": old.transforms
-                if self._is_one
-                else static_transforms([sidecar for _, sidecar in made], transforms),
-                "verbatim": self._verbatim(),
-                "files": [
-                    FileEntry(name=name, size=size, sha256=sha256)
-                    for name, (size, sha256) in sorted(digests.items())
-                ],
-                **changes,
+                "frames": self._frames,
+                "headers": list(self._headers.values()),
+                "video": first.sidecar.video.model_copy(update=facts),
+                "camera_info": self._camera_info(),
+                "columns": columns_model(self._columns),
+                "digests": digests_model(np.concatenate(digests).tolist()) if digests else None,
             }
         )
-        (self._folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
-        return manifest, [sidecar for _, sidecar in made]
 
-    def _verbatim(self) -> list[Verbatim]:
-        """Camera messages in messages.mcap, by topic and reason."""
-        found: dict[tuple[str, str], Verbatim] = {}
-        earlier = Counter[str]()
-        for part in self._parts:
-            for entry in part.verbatim():
-                known = sum(topic == entry.topic for topic, _ in found)
-                key = (entry.topic, entry.reason)
-                if key not in found and not self._is_one and known >= MAX_REASONS:
-                    key = (entry.topic, OTHER_REASONS)
-                first, messages = entry.first + earlier[entry.topic], entry.messages
-                if key in found:
-                    first, messages = found[key].first, found[key].messages + messages
-                found[key] = Verbatim(topic=key[0], messages=messages, first=first, reason=key[1])
-            for topic in {channel.topic for channel in part.dataset.channels}:
-                earlier[topic] += part.messages(topic)
-        return list(found.values())
+    def _write_video(self, path: Path) -> None:
+        if len(self.segments) > 1:
+            for part in self.segments:
+                part.stream.verify_video()
+            join_segments([part.stream.video_path for part in self.segments], self._ticks(), path)
+            return
+        (part,) = self.segments
+        if part.has_all:
+            _copy_file(part.stream.video_path, path)
+        else:
+            frames = range(int(part.images[0]), int(part.images[-1]) + 1)
+            cut_segment(part.stream.video_path, frames, self._ticks(), path)
 
-    # ------------------------------------------------------------ videos
+    def _ticks(self) -> list[int]:
+        """When each frame is shown."""
+        clock = PresentationClock()
+        stamps, log_times = self._columns["stamp"], self._columns["log_time"]
+        return list(map(clock.tick, stamps.tolist(), log_times.tolist()))
 
-    def _write_streams(self) -> list[tuple[str, StreamSidecar]]:
-        names = FileNames()
-        stems = [
-            first.video_path.stem if self._is_one else names.name_for(first.topic)[0]
-            for first in (stream.first for stream in self._streams)
-        ]
-        if self._is_one:
-            whole = (stream for stream in self._streams if stream.segments[0].has_all)
-            self._copied += [stream.first.video_path.name for stream in whole]
-
-        def write(stem: str, stream: JoinedStream) -> tuple[str, StreamSidecar]:
-            self._report(f"{stem}.mp4")
-            sidecar = stream.write(stem, self._folder)
-            (self._folder / f"{stem}.yaml").write_bytes(dump_document(sidecar))
-            return f"{stem}.yaml", sidecar
-
-        # copying and hashing run without Python's lock
-        with ThreadPoolExecutor(_AT_ONCE) as threads:
-            return list(threads.map(write, stems, self._streams))
-
-    # ------------------------------------------------------------ messages
-
-    def _write_messages(self, sidecars: Sequence[StreamSidecar]) -> Iterable[Transform]:
-        """Write messages.mcap; returns the static transforms, unless it was merely copied."""
-        part, path = self._parts[0], self._folder / MESSAGES_NAME
-        if self._is_one and not part.is_slice and part.has_all_topics:
-            copy_file(part.dataset.path / MESSAGES_NAME, path)
-            self._copied.append(MESSAGES_NAME)
-            return ()
-        in_videos: set[_Identity] = set()
-        for sidecar in sidecars:
-            in_videos.add(_identity_of(sidecar.channel))
-            if sidecar.camera_info:
-                in_videos.add(_identity_of(sidecar.camera_info.channel))
-        collector = TransformCollector()
-        with McapWriter(path, profile=part.dataset.profile) as writer:
-            others = (part.dataset.other_records() for part in self._parts)
-            for record in chain(chain.from_iterable(others), self._recorded_messages()):
-                write_record(writer, record)
-                if isinstance(record, Message):
-                    collector.add(record.channel, record.data)
-            for channel in self._channels.values():
-                if channel.identity not in in_videos:
-                    writer.add_channel(channel)
-            for part in self._parts:
-                for schema in part.dataset.unused_schemas:
-                    writer.add_schema(schema)
-        return collector.transforms
-
-    def _recorded_messages(self) -> Iterator[Message]:
-        """The messages for messages.mcap, by log time."""
-        chains: list[list[int]] = []  # of parts that do not overlap, of which one is read at a time
-        ends: list[int] = []
-        for number, part in enumerate(self._parts):
-            begin, end = part.range or (0, 0)
-            place = next((i for i, before in enumerate(ends) if before <= begin), len(chains))
-            if place == len(chains):
-                chains.append([])
-                ends.append(end)
-            chains[place].append(number)
-            ends[place] = end
-
-        def messages(numbers: Sequence[int]) -> Iterator[Message]:
-            for number in numbers:
-                for message in self._parts[number].verbatim_messages():
-                    yield message.of_channel(self._channels[number, message.channel.id])
-
-        return by_time(*map(messages, chains))
+    def _camera_info(self) -> CameraInfo | None:
+        if self._info is None or not self._infos:
+            return self._info  # with calibrations that no message told
+        columns = _joined(
+            [
+                (infos.columns, part.infos, infos.info.calibrations, part.offsets[1])
+                for part in self.segments
+                if (infos := part.stream.infos) is not None
+            ],
+            self._calibrations,
+        )
+        return self._info.model_copy(
+            update={
+                "messages": self._infos,
+                "calibrations": list(self._calibrations.values()),
+                "columns": columns_model(columns),
+            }
+        )
 
 
-def _identity_of(channel: ChannelModel) -> _Identity:
-    return channel.to_record(0).identity
+def _has_room(known: Mapping[str, object], models: Iterable[object]) -> bool:
+    """Whether there would not be too many with some more."""
+    return len(known.keys() | set(map(repr, models))) <= MAX_VARIANTS
+
+
+_Rows = tuple[DecodedColumns, Integers, Sequence[object], int]
+"""Columns of a segment, the rows copied, its models, and what is added to the ordinals."""
+
+
+def _joined(segments: Sequence[_Rows], models: Mapping[str, object]) -> dict[str, Integers]:
+    """The columns of segments, one after another, whose variants are numbers of the models."""
+    numbers = {key: number for number, key in enumerate(models)}
+    columns: dict[str, list[Integers]] = {}
+    for own, rows, variants, offset in segments:
+        for name in Columns.model_fields:
+            if (array := getattr(own, name)) is not None:
+                columns.setdefault(name, []).append(array[rows])
+        # those that are not used have no number
+        kinds = np.array([numbers.get(repr(model), 0) for model in variants], np.int64)
+        columns["variant"][-1] = kinds[columns["variant"][-1]]
+        columns["ordinal"][-1] = columns["ordinal"][-1] + offset
+    return {name: np.concatenate(arrays) for name, arrays in columns.items()}
+
+
+def _common(sidecar: StreamSidecar) -> tuple[object, ...]:
+    """What all segments of a stream have in common."""
+    video, info = sidecar.video.model_dump(exclude={*FACTS, "quality"}), sidecar.camera_info
+    return (
+        info if info and not info.messages else None,  # nothing tells when one applied
+        *(sidecar.profile, sidecar.stamps, sidecar.channel, sidecar.wire, sidecar.body),
+        *(sidecar.image, video, sidecar.digests is None, sidecar.video.quality is None),
+        *(name in sidecar.columns.names() for name in ("seq", "pts")),
+    )
+
+
+def _copy_file(path: Path, to: Path) -> None:
+    """Copy a file, which may be at a URL."""
+    with path.open("rb") as source, to.open("wb") as target:
+        shutil.copyfileobj(source, target, 2**20)
+
+
+# ---------------------------------------------------------------- messages
+
+
+def _write_messages(
+    sources: Sequence[_Source], path: Path, sidecars: Sequence[StreamSidecar]
+) -> Iterable[Transform]:
+    """Write messages.mcap; returns the static transforms, unless it was merely copied."""
+    first = sources[0]
+    dataset = first.dataset
+    if len(sources) == 1 and not first.is_slice and len(first.channels) == len(dataset.channels):
+        _copy_file(dataset.path / MESSAGES_NAME, path)
+        verify_file(
+            dataset.path / MESSAGES_NAME,
+            first.manifest.file(MESSAGES_NAME),
+            found=digest_file(path),
+        )
+        return ()
+    in_videos: set[_Identity] = set()
+    for sidecar in sidecars:
+        in_videos.add(sidecar.channel.to_record(0).identity)
+        if sidecar.camera_info:
+            in_videos.add(sidecar.camera_info.channel.to_record(0).identity)
+    collector = TransformCollector()
+    channels = _channels(sources)
+    with McapWriter(path, profile=dataset.profile) as writer:
+        others = (source.dataset.other_records() for source in sources)
+        for record in chain(chain.from_iterable(others), _recorded_messages(sources, channels)):
+            write_record(writer, record)
+            if isinstance(record, Message):
+                collector.add(record.channel, record.data)
+        for channel in chain(*(known.values() for known in channels)):
+            if channel.identity not in in_videos:
+                writer.add_channel(channel)
+        for source in sources:
+            for schema in source.dataset.unused_schemas:
+                writer.add_schema(schema)
+    return collector.transforms
+
+
+def _channels(sources: Sequence[_Source]) -> list[dict[int, Channel]]:
+    """For each dataset, the new channel by the id of its own.
+
+    Channels of later datasets become those that equal them; in a recording, several may be equal.
+    """
+    found = [{channel.id: channel for channel in sources[0].channels}]
+    known = {channel.identity: channel for channel in reversed(sources[0].channels)}
+    next_id = 1 + max(found[0], default=0)
+    for source in sources[1:]:
+        made = {}
+        for channel in source.channels:
+            if channel.identity not in known:
+                known[channel.identity] = replace(channel, id=next_id)
+                next_id += 1
+            made[channel.id] = known[channel.identity]
+        found.append(made)
+    return found
+
+
+def _recorded_messages(
+    sources: Sequence[_Source], channels: Sequence[Mapping[int, Channel]]
+) -> Iterator[Message]:
+    """The messages for messages.mcap, by log time."""
+    chains: list[list[int]] = []  # of datasets that do not overlap: one at a time is read
+    ends: list[int] = []
+    for number, source in enumerate(sources):
+        begin, end = source.range or (0, 0)
+        place = next((i for i, before in enumerate(ends) if before <= begin), len(chains))
+        if place == len(chains):
+            chains.append([])
+            ends.append(end)
+        chains[place].append(number)
+        ends[place] = end
+
+    def messages(numbers: Sequence[int]) -> Iterator[Message]:
+        for number in numbers:
+            for message in sources[number].recorded_messages():
+                yield message.of_channel(channels[number][message.channel.id])
+
+    return by_time(*map(messages, chains))

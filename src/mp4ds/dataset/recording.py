@@ -1,55 +1,60 @@
-"""A dataset as a recording, so that it can be repacked."""
+"""A dataset as a recording: read to be packed again or restored, sliced, copied."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.protocols import BagReader, stats_of
+from mp4ds.bags.latched import take_slice
+from mp4ds.bags.protocols import WHOLE, BagReader, RecordingSlice, stats_of
+from mp4ds.dataset.channels import MessageSource, Part
+from mp4ds.dataset.concat import concat
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.errors import advising
-from mp4ds.format.manifest import Manifest
-from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_manifest
+from mp4ds.errors import OptionError, Refused, advising
+from mp4ds.files.outputs import digest_file
+from mp4ds.format.manifest import About, EarlierDataset, Manifest
+from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.options import Slice
 from mp4ds.records import Channel, ChannelStats, Excerpt, Message, Record, Schema
-
-_BEST_JPEG = 100
 
 
 class DatasetReader(BagReader):
     """The recording held by a dataset.
 
-    Messages of lossy streams have the pixels of the videos; re-encoded JPEG files are made with the
-    best quality.
-
     Args:
-        path: The folder, or its manifest; or its URL.
+        dataset: The dataset; closed with the reader.
+        advice: What errors of a damaged dataset tell the user to do.
 
     Attributes:
-        manifest: Of the dataset.
+        sources: Replacement sources for messages of videos; see `Dataset.records`.
         begin: Where the slice that it holds was cut, after which its own slices are counted.
-
-    Raises:
-        FormatError: A file breaks a rule of the format.
-        SourceError: It is not a dataset.
     """
 
-    def __init__(self, path: Path) -> None:
-        with advising(COPY_AGAIN):
-            self._dataset = Dataset(path, jpeg_quality=_BEST_JPEG)
-            self._dataset.verify_sidecars()
-        self.path = self._dataset.path
-        self.manifest: Manifest = load_manifest(self.path / MANIFEST_NAME)
-        self.format = self.manifest.format
-        self.profile = self.manifest.recording_profile
-        self.library = self.manifest.library
-        self.begin = self._dataset.slice_start
-        names = [MANIFEST_NAME, *(entry.name for entry in self.manifest.files)]
-        self.files = [self.path / name for name in names]
-        self._read = 0
+    def __init__(self, dataset: Dataset, *, advice: str = "") -> None:
+        self._dataset = dataset
+        self._advice = advice
+        self.sources: Mapping[Part, MessageSource] = {}
+        self.path = dataset.path
+        self.profile = dataset.profile
+        self.begin = dataset.slice_start
+        self._read = self._messages = self._bytes = 0
+        if manifest := dataset.manifest:
+            self.format = manifest.format
+            self.library = manifest.library
+            names = [MANIFEST_NAME, *(entry.name for entry in manifest.files)]
+            self.files = [self.path / name for name in names]
+            self._messages = manifest.messages
+            self._bytes = sum(entry.size for entry in manifest.files)
+        else:
+            self.format = "mcap"
+            self.files = [item for one in dataset.streams for item in (one.path, one.video_path)]
 
     @property
     def channels(self) -> Sequence[Channel]:
@@ -64,8 +69,7 @@ class DatasetReader(BagReader):
     @property
     def position(self) -> int:
         """Bytes of its files in proportion to the messages read."""
-        total = sum(entry.size for entry in self.manifest.files)
-        return total * self._read // max(1, self.manifest.messages)
+        return self._bytes * self._read // max(1, self._messages)
 
     @cached_property
     def is_indexed(self) -> bool:
@@ -75,39 +79,34 @@ class DatasetReader(BagReader):
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Its records, decoded; without those that an excerpt lacks."""
         self._read = 0
-        with advising(COPY_AGAIN):
+        with advising(self._advice) if self._advice else nullcontext():
             for record in self._decoded(excerpt):
                 yield record
                 self._read += isinstance(record, Message)
 
     def _decoded(self, excerpt: Excerpt) -> Iterator[Record]:
-        start, end = excerpt.start, excerpt.end
+        start, end, dataset = excerpt.start, excerpt.end, self._dataset
+        topics = None
+        if excerpt.topics is not None or excerpt.without:
+            topics = frozenset(
+                item.topic for item in self.channels if excerpt.has_topic(item.topic)
+            )
         if (start is None and end is None) or not self.is_indexed:
-            records = self._dataset.records(topics=self._topics(excerpt))
-            return filter(excerpt.has, records)
-        return self._span(excerpt, start, end)
-
-    def _span(self, excerpt: Excerpt, start: int | None, end: int | None) -> Iterator[Record]:
+            span = replace(excerpt, topics=None)  # sources may give messages of other topics
+            yield from filter(span.has, dataset.records(self.sources, topics=topics))
+            return
         if excerpt.others:
-            yield from self._dataset.other_records()
+            yield from dataset.other_records()
         if excerpt.has_messages:
-            topics = self._topics(excerpt)
-            yield from self._dataset.records(start=start, end=end, topics=topics)
-
-    def _topics(self, excerpt: Excerpt) -> frozenset[str] | None:
-        if excerpt.topics is None and not excerpt.without:
-            return None
-        return frozenset(
-            channel.topic for channel in self.channels if excerpt.has_topic(channel.topic)
-        )
-
-    def _times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Log times by channel id, nanoseconds, from the sidecars."""
-        return self._recorded_times
+            yield from dataset.records(self.sources, start=start, end=end, topics=topics)
 
     @cached_property
     def _recorded_times(self) -> Mapping[int, NDArray[np.int64]]:
         return self._dataset.times()
+
+    def _times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Log times by channel id, nanoseconds, from the sidecars."""
+        return self._recorded_times
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans of the log times, whether they are in order or not."""
@@ -116,3 +115,96 @@ class DatasetReader(BagReader):
     def close(self) -> None:
         """Close the dataset."""
         self._dataset.close()
+
+
+def slice_of(dataset: Dataset, asked: Slice) -> RecordingSlice:
+    """A slice of a dataset, with its latched messages if requested.
+
+    Raises:
+        OptionError: It is empty, or a time is not valid.
+        SourceError: There are no messages.
+    """
+    if not asked:
+        return WHOLE
+    reader = DatasetReader(dataset)
+    take_slice(reader, asked)
+    return reader.slice
+
+
+def copy_part(
+    dataset: Dataset,
+    folder: Path,
+    *,
+    part: RecordingSlice = WHOLE,
+    selected: Callable[[str], bool] = lambda _: True,
+    about: About | None = None,
+) -> Manifest:
+    """Copy a dataset, or a part of it, into one derived from it; see `concat`.
+
+    Args:
+        dataset: A folder made by `mp4ds pack`.
+        folder: The folder to fill, empty.
+        part: What to copy.
+        selected: Whether a topic is to be copied.
+        about: Description of the recording; None to keep the dataset's.
+    """
+    old = dataset.manifest
+    if old is None:
+        raise Refused("it is a single video, not a dataset")
+    earlier = EarlierDataset(
+        name=dataset.path.name,
+        profile=old.profile,
+        sha256=digest_file(dataset.path / MANIFEST_NAME)[1],
+    )
+    changes = {
+        "about": about or old.about,
+        "sources": [source.within(part.span) for source in old.sources],
+        "derived_from": [*old.derived_from, earlier],
+    }
+    return concat([dataset], folder, part=part, selected=selected, changes=changes)[0]
+
+
+@contextmanager
+def sliced(
+    dataset: Dataset, part: RecordingSlice, folder: Path, selected: Callable[[str], bool]
+) -> Iterator[Dataset]:
+    """A temporary dataset of a slice; the dataset itself if the slice is all of it.
+
+    Args:
+        dataset: A folder made by `mp4ds pack`.
+        part: The slice.
+        folder: Where to make it.
+        selected: Whether a topic has to be in it; those that share a stream with it are, too.
+
+    Raises:
+        OptionError: It cannot be cut out.
+        FormatError: The dataset is damaged.
+        OSError: The disk could not be written.
+    """
+    if part == WHOLE:
+        yield dataset
+        return
+    path = folder / "slice" / dataset.path.name
+    path.mkdir(parents=True)
+    try:
+        kept = _with_shared(dataset, selected).__contains__
+        copy_part(dataset, path, part=part, selected=kept)
+    except Refused as reason:
+        raise OptionError(
+            f"{dataset.path} cannot be sliced: {reason}. Pack the slice first (mp4ds pack with the "
+            "same times), and use that."
+        ) from None
+    try:
+        with Dataset(path, jpeg_quality=dataset.jpeg_quality) as opened:
+            yield opened
+    finally:
+        shutil.rmtree(path.parent, ignore_errors=True)
+
+
+def _with_shared(dataset: Dataset, selected: Callable[[str], bool]) -> set[str]:
+    """The selected topics, and those that share a stream with them."""
+    kept = {channel.topic for channel in dataset.channels if selected(channel.topic)}
+    shared = [set(stream.topics) for stream in dataset.streams]
+    while more := [own for own in shared if own & kept and not own <= kept]:
+        kept.update(*more)
+    return kept

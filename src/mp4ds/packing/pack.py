@@ -18,7 +18,7 @@ from pathlib import Path
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.slicing import copy_part, latched_at, span_in
+from mp4ds.dataset.recording import copy_part, slice_of
 from mp4ds.errors import (
     FormatError,
     OptionError,
@@ -254,17 +254,14 @@ def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
         selected = options.selected
         selected.check(channel.topic for channel in dataset.channels)
         folder.mkdir()
-        span = span_in(dataset, options.slice)
+        part = slice_of(dataset, options.slice)
         if options.slice or options.topics or options.exclude:  # whole files are checked as copied
             dataset.verify_messages()
         for stream in dataset.streams:
             is_cut = options.slice and selected(stream.topic)
             if is_cut and stream.sidecar.digests is None:  # nothing else shows that it is damaged
                 stream.verify_video()
-        latched, too_large = latched_at(dataset, span, options.slice, selected)
-        manifest = copy_part(
-            dataset, folder, span=span, latched=latched, selected=selected, about=about
-        )
+        manifest = copy_part(dataset, folder, part=part, selected=selected, about=about)
         if options.slice:
             for problem in validate(folder, deep=True):
                 raise FormatError(problem.code, dataset.path, f"is damaged: {problem}")
@@ -281,7 +278,7 @@ def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
             skipped={},
             is_copy=True,
             latched=early,
-            latched_left_out=list(too_large),
+            latched_left_out=list(filter(selected, part.left_out)),
         )
 
 

@@ -18,12 +18,13 @@ from mp4ds.bags.formats import RECORDING_SUFFIXES, open_reader, open_sources
 from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.collections import available_cores
+from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.recording import DatasetReader
-from mp4ds.errors import OptionError, SourceError
+from mp4ds.errors import OptionError, SourceError, advising
 from mp4ds.files.sources import SourceState, source_name, source_size
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.manifest import About
-from mp4ds.format.sidecars import MANIFEST_NAME, load_about
+from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.options import WHOLE, Slice
 from mp4ds.packing.calibrations import choose_pairs, pair_camera_infos, unpaired_infos
@@ -38,6 +39,8 @@ from mp4ds.video.encoder import tool_versions
 
 PIECE_NAME = r"all|whole-[0-9]{1,9}|[0-9]{5,9}"
 """Pattern of the names of pieces, which are also folder names."""
+
+_BEST_JPEG = 100  # of the messages of a transcoded stream that is packed again
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +221,10 @@ def _open_one(path: Path) -> BagReader:
     folder = dataset_at(path)
     if folder is None:
         return open_reader(path)
-    return DatasetReader(folder)
+    with advising(COPY_AGAIN):
+        dataset = Dataset(folder, jpeg_quality=_BEST_JPEG)
+        dataset.verify_sidecars()
+    return DatasetReader(dataset, advice=COPY_AGAIN)
 
 
 # ---------------------------------------------------------------- resources

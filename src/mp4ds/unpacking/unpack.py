@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -13,12 +13,12 @@ from pathlib import Path
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.formats import open_writer, recording_names
-from mp4ds.bags.protocols import BagWriter, begun_by, in_span
+from mp4ds.bags.protocols import WHOLE, BagReader, BagWriter, RecordingSlice
 from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
+from mp4ds.dataset.recording import DatasetReader, slice_of, sliced
 from mp4ds.dataset.salvage import examine, open_damaged, open_selected
-from mp4ds.dataset.slicing import latched_at, sliced, span_in
 from mp4ds.errors import (
     ConversionError,
     FormatError,
@@ -33,7 +33,6 @@ from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.plan import FileNames, Selection
 from mp4ds.records import (
-    EVERYTHING,
     Attachment,
     Channel,
     Excerpt,
@@ -118,28 +117,28 @@ def _unpack_here(
                     losses += examine(stream)
             if not chosen.salvage:
                 whole.verify_sidecars(chosen.selected)
-            # where log times do not tell the order, nothing can be cut out, only left out
-            is_filtered = bool(chosen.slice) and to != "images" and not whole.is_in_time
-            is_filtered = is_filtered and _converts_none(chosen)
-            if is_filtered or (to == "images" and _needs_messages(whole, chosen)):
+            if to == "images":
+                reads_all = _needs_messages(whole, chosen)
+            else:  # a slice is filtered out where log times do not tell the order
+                reads_all = bool(chosen.slice) and not whole.is_in_time
+            if reads_all:
                 whole.verify_messages()
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
-            span = EVERYTHING
-            latched: Sequence[Message] = ()
-            if chosen.slice and to != "images":
-                span = span_in(whole, chosen.slice)
-                latched, too_large = latched_at(whole, span, chosen.slice, chosen.selected)
-                summary.latched.update(Counter(item.channel.topic for item in latched))
-                summary.latched_left_out.extend(too_large)
-            if is_filtered:
-                _unpack_recording(whole, path, to, chosen, summary, progress, span, latched)
-            else:
-                with sliced(whole, chosen.slice, path.parent, chosen.selected, latched) as opened:
+            part = slice_of(whole, chosen.slice)
+            if to == "images" or not _converts_none(chosen):
+                # whose frames are counted from the slice's first one
+                with sliced(whole, part, path.parent, chosen.selected) as opened:
                     if to == "images":
                         _unpack_images(opened, path, chosen, summary, progress)
                     else:
                         _unpack_recording(opened, path, to, chosen, summary, progress)
+            else:
+                _unpack_recording(whole, path, to, chosen, summary, progress, part)
+            if to != "images":
+                latched = (item.channel.topic for item in part.latched)
+                summary.latched.update(Counter(filter(chosen.selected, latched)))
+                summary.latched_left_out.extend(filter(chosen.selected, part.left_out))
             summary.notes.extend(_notes(whole, chosen.selected))
             summary.losses[:] = bounded(summary.losses)
             return summary
@@ -322,10 +321,11 @@ def _unpack_recording(
     options: UnpackOptions,
     summary: UnpackSummary,
     progress: Callable[[UnpackProgress], None] | None,
-    span: Excerpt = EVERYTHING,
-    latched: Sequence[Message] = (),
+    part: RecordingSlice = WHOLE,
 ) -> None:
     selected = options.selected
+    reader = DatasetReader(dataset)
+    reader.slice = part
     # a recording is restored to its own format unchanged, whatever its serializations
     source = dataset.manifest.format if dataset.manifest else ""
     converter = Converter(None if source == to else _WORLDS.get(to))
@@ -344,13 +344,11 @@ def _unpack_recording(
         topics = _Topics(writer, converter, selected, summary, may_skip=options.skip_unconvertible)
         topics.declare(dataset, republisher)
         wanted = {item.topic for item in dataset.channels if selected(item.topic)}
-        total = _total(dataset, selected)
-        if span != EVERYTHING:
-            total = len(latched) + _count_in(dataset, wanted, span)
+        total = _total(dataset, reader, selected)
         done = found = 0
-        sources = republisher.sources if republisher else None
-        records = dataset.records(sources, topics=wanted)
-        for record in begun_by(latched, filter(span.has, records)):
+        if republisher:
+            reader.sources = republisher.sources
+        for record in reader.records(Excerpt(topics=frozenset(wanted))):
             if not isinstance(record, Message):
                 _write_other(writer, record, to, source)
                 continue
@@ -375,17 +373,16 @@ def _unpack_recording(
     summary.omitted.update(omitted)
 
 
-def _total(dataset: Dataset, selected: Selection) -> int:
+def _total(dataset: Dataset, reader: BagReader, selected: Selection) -> int:
     """How many messages there should be of the selected topics."""
-    counts = dataset.counts()
-    if dataset.manifest and dataset.manifest.messages and all(map(selected, dataset.all_topics)):
-        return dataset.manifest.messages
+    manifest = dataset.manifest
+    if reader.slice is not WHOLE:
+        counts = {key: len(times) for key, times in reader.times().items()}
+    elif manifest and manifest.messages and all(map(selected, dataset.all_topics)):
+        return manifest.messages
+    else:
+        counts = dataset.counts()
     return sum(counts.get(item.id, 0) for item in dataset.channels if selected(item.topic))
-
-
-def _count_in(dataset: Dataset, topics: Collection[str], span: Excerpt) -> int:
-    """How many messages of some topics there are in a span."""
-    return sum(len(in_span(one, span)) for one in dataset.times(topics).values())
 
 
 def _account_for(missing: int, losses: list[Loss]) -> None:

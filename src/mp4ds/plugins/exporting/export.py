@@ -13,8 +13,8 @@ from pathlib import Path
 
 from mp4ds._version import __version__
 from mp4ds.dataset.collections import datasets_in
+from mp4ds.dataset.recording import slice_of, sliced
 from mp4ds.dataset.salvage import HOW_TO_SALVAGE, open_selected
-from mp4ds.dataset.slicing import sliced
 from mp4ds.errors import OptionError, advising
 from mp4ds.files.outputs import listed_names, staged
 from mp4ds.files.urls import location, remote
@@ -82,7 +82,9 @@ def export(
             )
         )
         opened = [
-            stack.enter_context(sliced(one, chosen.slice, path.parent / str(number), chosen.uses))
+            stack.enter_context(
+                sliced(one, slice_of(one, chosen.slice), path.parent / str(number), chosen.uses)
+            )
             for number, one in enumerate(opened)
         ]
         # LeRobot's videos are in colour
