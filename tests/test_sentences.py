@@ -248,6 +248,13 @@ def test_a_video_alone_that_was_cut_short(dataset: Path, tmp_path: Path) -> None
         mp4ds.open(tmp_path / "alone.mp4")
 
 
+def test_a_video_without_its_sidecar(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "alone.mp4").write_bytes((dataset / VIDEO).read_bytes())
+    refused = call("info", tmp_path / "alone.mp4")
+    assert refused.code == 2
+    assert "alone.mp4: is a video without its sidecar, alone.yaml." in refused.err
+
+
 def test_a_folder_of_datasets_is_not_one(dataset: Path) -> None:
     with pytest.raises(mp4ds.SourceError) as caught:
         mp4ds.open(dataset.parent)
@@ -281,6 +288,7 @@ def test_a_recording_is_not_a_dataset(tmp_path: Path) -> None:
         ("pack IN -o OUT --codec av1", "--codec 'av1' does not support lossless packing. Use "),
         ("pack IN -o OUT --duration +1e9", "--duration '+1e9' is not a number of seconds"),
         ("demo /proc/no.bag", "no.bag: "),
+        ("record --ros1 -e [ -o OUT", "mp4ds: '[' is not a valid regular expression: "),
     ],
 )
 def test_what_an_option_may_be(words: str, said: str, tmp_path: Path) -> None:

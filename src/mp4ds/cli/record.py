@@ -22,7 +22,7 @@ from mp4ds.cli.pack import print_pack
 from mp4ds.cli.progress import Row
 from mp4ds.errors import counted, path_text
 from mp4ds.files.sources import salvage_command
-from mp4ds.options import WHERE
+from mp4ds.options import WHERE, parse_pattern
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.record import RecordProgress, RecordSummary, open_recorder
 from mp4ds.plugins.ros.names import SERVICE_EVENTS
@@ -122,6 +122,8 @@ def record_command(
 
 
 def _whole(patterns: Sequence[str]) -> str:
+    for pattern in patterns:  # refused as typed, not within ours
+        parse_pattern(pattern)
     return f"^(?:{'|'.join(patterns)})$"
 
 

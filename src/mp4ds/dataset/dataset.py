@@ -110,8 +110,14 @@ class Dataset:
             self.manifest = load_manifest(self.path / MANIFEST_NAME)
             sidecars = [self.path / entry.sidecar for entry in self.manifest.streams]
         else:
-            is_video = self.path.suffix == ".mp4"
-            sidecars = [self.path.with_suffix(".yaml") if is_video else self.path]
+            sidecar = self.path.with_suffix(".yaml") if self.path.suffix == ".mp4" else self.path
+            if sidecar != self.path and self.path.exists() and not sidecar.exists():
+                raise SourceError(
+                    self.path,
+                    f"is a video without its sidecar, {sidecar.name}",
+                    "Put them side by side; without one, `mp4ds.open` in Python reads the video.",
+                )
+            sidecars = [sidecar]
         self.streams = [Stream(sidecar, jpeg_quality=jpeg_quality) for sidecar in sidecars]
         self._file = MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
 
