@@ -9,7 +9,6 @@ import json
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from typing import Any
 
 from cyclonedds.builtin import (
@@ -19,7 +18,7 @@ from cyclonedds.builtin import (
 )
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import IdlStruct, make_idl_struct
 from cyclonedds.idl.types import (
     array,
     bounded_str,
@@ -52,191 +51,105 @@ def raw(kind: Any) -> Any:
     return kind
 
 
-@dataclass
-class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
-    sec: int32
-    nanosec: uint32
+def struct(name: str, /, **fields: Any) -> Any:
+    """A type of ROS: ``std_msgs/msg/String`` is ``std_msgs.msg.dds_.String_`` in DDS."""
+    package, kind, short = name.split("/")
+    return make_idl_struct(f"{short}_", f"{package}.{kind}.dds_.{short}_", fields)
 
 
-@dataclass
-class Duration(IdlStruct, typename="builtin_interfaces.msg.dds_.Duration_"):
-    sec: int32
-    nanosec: uint32
-
-
-@dataclass
-class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
-    stamp: Time
-    frame_id: str
-
-
-@dataclass
-class String(IdlStruct, typename="std_msgs.msg.dds_.String_"):
-    data: str
-
-
-@dataclass
-class Clock(IdlStruct, typename="rosgraph_msgs.msg.dds_.Clock_"):
-    clock: Time
-
-
-@dataclass
-class Image(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):
-    header: Header
-    height: uint32
-    width: uint32
-    encoding: str
-    is_bigendian: uint8
-    step: uint32
-    data: sequence[uint8]
-
-
-@dataclass
-class CompressedImage(IdlStruct, typename="sensor_msgs.msg.dds_.CompressedImage_"):
-    header: Header
-    format: str
-    data: sequence[uint8]
-
-
-@dataclass
-class Vector3(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
-    x: float64
-    y: float64
-    z: float64
-
-
-@dataclass
-class Quaternion(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
-    x: float64
-    y: float64
-    z: float64
-    w: float64
-
-
-@dataclass
-class Imu(IdlStruct, typename="sensor_msgs.msg.dds_.Imu_"):
-    header: Header
-    orientation: Quaternion
-    orientation_covariance: array[float64, 9]
-    angular_velocity: Vector3
-    angular_velocity_covariance: array[float64, 9]
-    linear_acceleration: Vector3
-    linear_acceleration_covariance: array[float64, 9]
-
-
-@dataclass
-class Transform(IdlStruct, typename="geometry_msgs.msg.dds_.Transform_"):
-    translation: Vector3
-    rotation: Quaternion
-
-
-@dataclass
-class TransformStamped(IdlStruct, typename="geometry_msgs.msg.dds_.TransformStamped_"):
-    header: Header
-    child_frame_id: str
-    transform: Transform
-
-
-@dataclass
-class TFMessage(IdlStruct, typename="tf2_msgs.msg.dds_.TFMessage_"):
-    transforms: sequence[TransformStamped]
-
-
-@dataclass
-class FieldType(IdlStruct, typename="type_description_interfaces.msg.dds_.FieldType_"):
-    type_id: uint8
-    capacity: uint64
-    string_capacity: uint64
-    nested_type_name: bounded_str[255]
-
-
-@dataclass
-class Field(IdlStruct, typename="type_description_interfaces.msg.dds_.Field_"):
-    name: str
-    type: FieldType
-    default_value: str
-
-
-@dataclass
-class Individual(
-    IdlStruct, typename="type_description_interfaces.msg.dds_.IndividualTypeDescription_"
-):
-    type_name: bounded_str[255]
-    fields: sequence[Field]
-
-
-@dataclass
-class TypeDescription(IdlStruct, typename="type_description_interfaces.msg.dds_.TypeDescription_"):
-    type_description: Individual
-    referenced_type_descriptions: sequence[Individual]
-
-
-@dataclass
-class TypeSource(IdlStruct, typename="type_description_interfaces.msg.dds_.TypeSource_"):
-    type_name: str
-    encoding: str
-    raw_file_contents: str
-
-
-@dataclass
-class KeyValue(IdlStruct, typename="type_description_interfaces.msg.dds_.KeyValue_"):
-    key: str
-    value: str
-
-
-@dataclass
-class DescriptionRequest(
-    IdlStruct, typename="type_description_interfaces.srv.dds_.GetTypeDescription_Request_"
-):
-    client_guid: uint64
-    sequence_number: int64
-    type_name: str
-    type_hash: str
-    include_type_sources: bool
-
-
-@dataclass
-class DescriptionResponse(
-    IdlStruct, typename="type_description_interfaces.srv.dds_.GetTypeDescription_Response_"
-):
-    client_guid: uint64
-    sequence_number: int64
-    successful: bool
-    failure_reason: str
-    type_description: TypeDescription
-    type_sources: sequence[TypeSource]
-    extra_information: sequence[KeyValue]
-
-
+Time = struct("builtin_interfaces/msg/Time", sec=int32, nanosec=uint32)
+Duration = struct("builtin_interfaces/msg/Duration", sec=int32, nanosec=uint32)
+Header = struct("std_msgs/msg/Header", stamp=Time, frame_id=str)
+Vector3 = struct("geometry_msgs/msg/Vector3", x=float64, y=float64, z=float64)
+Quaternion = struct("geometry_msgs/msg/Quaternion", x=float64, y=float64, z=float64, w=float64)
+Transform = struct("geometry_msgs/msg/Transform", translation=Vector3, rotation=Quaternion)
+TransformStamped = struct(
+    "geometry_msgs/msg/TransformStamped", header=Header, child_frame_id=str, transform=Transform
+)
 TYPES: dict[str, Any] = {
     "std_msgs/msg/Header": raw(Header),
-    "std_msgs/msg/String": raw(String),
-    "rosgraph_msgs/msg/Clock": raw(Clock),
-    "sensor_msgs/msg/Image": raw(Image),
-    "sensor_msgs/msg/CompressedImage": raw(CompressedImage),
-    "sensor_msgs/msg/Imu": raw(Imu),
-    "tf2_msgs/msg/TFMessage": raw(TFMessage),
+    "std_msgs/msg/String": raw(struct("std_msgs/msg/String", data=str)),
+    "rosgraph_msgs/msg/Clock": raw(struct("rosgraph_msgs/msg/Clock", clock=Time)),
+    "sensor_msgs/msg/Image": raw(
+        struct(
+            "sensor_msgs/msg/Image",
+            header=Header,
+            height=uint32,
+            width=uint32,
+            encoding=str,
+            is_bigendian=uint8,
+            step=uint32,
+            data=sequence[uint8],
+        )
+    ),
+    "sensor_msgs/msg/Imu": raw(
+        struct(
+            "sensor_msgs/msg/Imu",
+            header=Header,
+            orientation=Quaternion,
+            orientation_covariance=array[float64, 9],
+            angular_velocity=Vector3,
+            angular_velocity_covariance=array[float64, 9],
+            linear_acceleration=Vector3,
+            linear_acceleration_covariance=array[float64, 9],
+        )
+    ),
+    "tf2_msgs/msg/TFMessage": raw(
+        struct("tf2_msgs/msg/TFMessage", transforms=sequence[TransformStamped])
+    ),
 }
-_FIELDS = {
-    "Empty": {"structure_needs_at_least_one_member": uint8},
-    "success": {"success": bool},
-}
+_DESCRIBED = "type_description_interfaces/msg"
+FieldType = struct(
+    f"{_DESCRIBED}/FieldType",
+    type_id=uint8,
+    capacity=uint64,
+    string_capacity=uint64,
+    nested_type_name=bounded_str[255],
+)
+Field = struct(f"{_DESCRIBED}/Field", name=str, type=FieldType, default_value=str)
+Individual = struct(
+    f"{_DESCRIBED}/IndividualTypeDescription",
+    type_name=bounded_str[255],
+    fields=sequence[Field],
+)
+TypeDescription = struct(
+    f"{_DESCRIBED}/TypeDescription",
+    type_description=Individual,
+    referenced_type_descriptions=sequence[Individual],
+)
+TypeSource = struct(f"{_DESCRIBED}/TypeSource", type_name=str, encoding=str, raw_file_contents=str)
+KeyValue = struct(f"{_DESCRIBED}/KeyValue", key=str, value=str)
+_CALL = {"client_guid": uint64, "sequence_number": int64}
+DescriptionRequest = struct(
+    "type_description_interfaces/srv/GetTypeDescription_Request",
+    **_CALL,
+    type_name=str,
+    type_hash=str,
+    include_type_sources=bool,
+)
+DescriptionResponse = struct(
+    "type_description_interfaces/srv/GetTypeDescription_Response",
+    **_CALL,
+    successful=bool,
+    failure_reason=str,
+    type_description=TypeDescription,
+    type_sources=sequence[TypeSource],
+    extra_information=sequence[KeyValue],
+)
+_NOTHING = {"structure_needs_at_least_one_member": uint8}
+_SUCCESS = {"success": bool}
 SERVICES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "Pause": (_FIELDS["Empty"], _FIELDS["Empty"]),
-    "Resume": (_FIELDS["Empty"], _FIELDS["Empty"]),
-    "TogglePaused": (_FIELDS["Empty"], _FIELDS["Empty"]),
-    "IsPaused": (_FIELDS["Empty"], {"paused": bool}),
-    "GetRate": (_FIELDS["Empty"], {"rate": float64}),
-    "SetRate": ({"rate": float64}, _FIELDS["success"]),
-    "PlayNext": (_FIELDS["Empty"], _FIELDS["success"]),
+    **dict.fromkeys(("Pause", "Resume", "TogglePaused", "Stop", "SplitBagfile"), (_NOTHING,) * 2),
+    "IsPaused": (_NOTHING, {"paused": bool}),
+    "GetRate": (_NOTHING, {"rate": float64}),
+    "SetRate": ({"rate": float64}, _SUCCESS),
+    "PlayNext": (_NOTHING, _SUCCESS),
     "Burst": ({"num_messages": uint64}, {"actually_burst": uint64}),
     "Play": (
         {"start_offset": Time, "playback_duration": Duration, "playback_until_timestamp": Time},
-        _FIELDS["success"],
+        _SUCCESS,
     ),
-    "Seek": ({"time": Time}, _FIELDS["success"]),
-    "Stop": (_FIELDS["Empty"], _FIELDS["Empty"]),
-    "SplitBagfile": (_FIELDS["Empty"], _FIELDS["Empty"]),
+    "Seek": ({"time": Time}, _SUCCESS),
 }
 
 
@@ -285,31 +198,13 @@ class Peer:
                 return found
             time.sleep(0.005)
 
-    def count_bytes(self, topic: str, count: int, seconds: float) -> list[int]:
-        """Sizes of messages, for large ones."""
-        sizes: list[int] = []
-        end = time.monotonic() + seconds
-        while len(sizes) < count and time.monotonic() < end:
-            sizes += [len(sample.raw) for sample in self._readers[topic].take(1000)]
-            time.sleep(0.002)
-        return sizes
-
-    def publications(self, topic: str, seconds: float = WATCHDOG_S) -> list[Any]:
+    def publications(self, topic: str) -> list[Any]:
         """What a publisher tells of itself."""
-        return self._endpoints(self._publications, topic, seconds)
+        return _endpoints(self._publications, topic)
 
-    def subscriptions(self, topic: str, seconds: float = WATCHDOG_S) -> list[Any]:
+    def subscriptions(self, topic: str) -> list[Any]:
         """What a subscriber tells of itself."""
-        return self._endpoints(self._subscriptions, topic, seconds)
-
-    def _endpoints(self, reader: Any, topic: str, seconds: float) -> list[Any]:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            found = [one for one in reader.read(1000) if one.topic_name == topic]
-            if found:
-                return [_told(one) for one in found]
-            time.sleep(0.005)
-        return []
+        return _endpoints(self._subscriptions, topic)
 
     def publish(self, topic: str, kind: str, message: str, **qos: Any) -> bool:
         """Publish a message, CDR in base64, when there is a subscriber."""
@@ -325,8 +220,6 @@ class Peer:
 
     def publish_opaque(self, topic: str, typename: str, type_hash: str, message: str) -> bool:
         """Publish a message of a type of which only the name and hash are announced."""
-        from cyclonedds.idl import make_idl_struct
-
         data = base64.b64decode(message)
         if topic not in self._writers:
             kind = make_idl_struct(typename.rpartition(".")[2], typename, {}, dataclassify=False)
@@ -352,8 +245,8 @@ class Peer:
         """Call a service as rmw_cyclonedds does; returns the fields of the reply."""
         asked, replied = SERVICES[kind]
         client = f"clientid={name}.1;".encode()
-        out = self._service(f"{kind}_Request_", asked)
-        back = self._service(f"{kind}_Response_", replied)
+        out = struct(f"rosbag2_interfaces/srv/{kind}_Request", **_CALL, **asked)
+        back = struct(f"rosbag2_interfaces/srv/{kind}_Response", **_CALL, **replied)
         qos = Qos(Policy.Userdata(client), base=_qos(reliable=True))
         writer = DataWriter(
             self._participant, Topic(self._participant, f"rq{name}Request", out), qos=qos
@@ -378,12 +271,15 @@ class Peer:
             time.sleep(0.005)
         return None
 
-    def _service(self, name: str, fields: dict[str, Any]) -> Any:
-        from cyclonedds.idl import make_idl_struct
 
-        header = {"client_guid": uint64, "sequence_number": int64}
-        typename = f"rosbag2_interfaces.srv.dds_.{name}"
-        return make_idl_struct(name, typename, {**header, **fields})
+def _endpoints(reader: Any, topic: str) -> list[Any]:
+    end = time.monotonic() + WATCHDOG_S
+    while time.monotonic() < end:
+        found = [one for one in reader.read(1000) if one.topic_name == topic]
+        if found:
+            return [_told(one) for one in found]
+        time.sleep(0.005)
+    return []
 
 
 def _describe(reader: Any, writer: Any, sources: dict[str, str]) -> None:

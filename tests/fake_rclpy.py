@@ -31,7 +31,6 @@ INSTALLED = (
     "std_msgs/msg/String",
     "rosgraph_msgs/msg/Clock",
     "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/CompressedImage",
     "sensor_msgs/msg/Imu",
     "tf2_msgs/msg/TFMessage",
 )
@@ -39,22 +38,13 @@ INSTALLED = (
 EVENT = "std_srvs/srv/Trigger_Event"
 
 
-class HistoryPolicy(enum.IntEnum):
-    SYSTEM_DEFAULT = 0
-    KEEP_LAST = 1
-    KEEP_ALL = 2
+def _policies(name: str, *values: str) -> Any:
+    return enum.IntEnum(name, ["SYSTEM_DEFAULT", *values], start=0)
 
 
-class ReliabilityPolicy(enum.IntEnum):
-    SYSTEM_DEFAULT = 0
-    RELIABLE = 1
-    BEST_EFFORT = 2
-
-
-class DurabilityPolicy(enum.IntEnum):
-    SYSTEM_DEFAULT = 0
-    TRANSIENT_LOCAL = 1
-    VOLATILE = 2
+HistoryPolicy = _policies("HistoryPolicy", "KEEP_LAST", "KEEP_ALL")
+ReliabilityPolicy = _policies("ReliabilityPolicy", "RELIABLE", "BEST_EFFORT")
+DurabilityPolicy = _policies("DurabilityPolicy", "TRANSIENT_LOCAL", "VOLATILE")
 
 
 class LivelinessPolicy(enum.IntEnum):

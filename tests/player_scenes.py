@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +19,12 @@ from mp4ds.bags.formats import open_reader, open_writer
 from mp4ds.errors import Refused
 from mp4ds.messages.serializations import form_of
 from mp4ds.messages.wire import ImageFields, Slots
+from mp4ds.plugins.playing.options import PlayOptions
+from mp4ds.plugins.playing.play import open_player
+from mp4ds.plugins.playing.player import Player, PlaySummary
 from mp4ds.records import Channel, Message, Schema
 from sources import typestore
+from waiting import WATCHDOG_S
 
 ROS2 = get_typestore(Stores.ROS2_JAZZY)
 
@@ -52,6 +58,7 @@ class RecordingPublisher:
     subscriber_count: int = 1
     on_sent: Callable[[Sent], None] | None = None
     not_installed: frozenset[str] = frozenset()
+    has_ended: bool = False  # what plays in a thread
 
     def advertise(self, channel: Channel) -> None:
         if channel.type_name in self.not_installed:
@@ -91,6 +98,42 @@ class RecordingPublisher:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def run(
+    dataset: Path | list[Path], publisher: RecordingPublisher | None = None, **options: Any
+) -> tuple[RecordingPublisher, PlaySummary]:
+    """Play to the end."""
+    publisher = publisher or RecordingPublisher()
+    with open_player(dataset, PlayOptions(**options), node=publisher) as player:  # type: ignore[arg-type]
+        return publisher, player.run()
+
+
+@contextmanager
+def running(
+    dataset: Path, publisher: RecordingPublisher | None = None, **options: Any
+) -> Iterator[tuple[Player, RecordingPublisher]]:
+    """A player that runs in a thread, stopped at the end."""
+    publisher = publisher or RecordingPublisher()
+    failures: list[BaseException] = []
+    with open_player(dataset, PlayOptions(**options), node=publisher) as player:  # type: ignore[arg-type]
+
+        def work() -> None:
+            try:
+                player.run()
+            except BaseException as error:
+                failures.append(error)
+            publisher.has_ended = True
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        try:
+            yield player, publisher
+        finally:
+            player.stop()
+            thread.join(WATCHDOG_S)
+    assert publisher.has_ended
+    assert not failures
 
 
 START = 1_700_000_000 * 10**9

@@ -49,7 +49,6 @@ KINDS = (
     "std_msgs/msg/Header",
     "std_msgs/msg/String",
     "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/CompressedImage",
     "sensor_msgs/msg/Imu",
     "tf2_msgs/msg/TFMessage",
 )

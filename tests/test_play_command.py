@@ -20,7 +20,8 @@ import mp4ds
 from commands import call
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.play import open_player
-from player_scenes import RecordingPublisher, make_drive, recorded
+from player_scenes import make_drive, recorded
+from player_scenes import run as run_player
 from ros2_sides import alone_in_ros2
 from waiting import WATCHDOG_S
 
@@ -218,9 +219,7 @@ def test_what_is_sourced(
 
 
 def test_the_library_plays_as_the_command_does(drive: Path) -> None:
-    publisher = RecordingPublisher(world="ros1")
-    with open_player(str(drive), PlayOptions(rate=4.0), node=publisher) as player:
-        summary = player.run()
+    publisher, summary = run_player(drive, rate=4.0)
     assert [sent.payload for sent in publisher.sent] == [
         payload for _, payload, _ in recorded(drive.with_suffix(".bag"))
     ]

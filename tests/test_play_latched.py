@@ -9,8 +9,6 @@ import pytest
 
 import mp4ds
 from mp4ds.bags.latched import LATCHED_QOS, LatchedMessages, latched_depth
-from mp4ds.plugins.playing.options import PlayOptions
-from mp4ds.plugins.playing.play import open_player
 from mp4ds.plugins.ros.qos import offered_qos
 from mp4ds.records import Channel
 from player_scenes import (
@@ -19,6 +17,7 @@ from player_scenes import (
     make_ros2,
     profiles,
     ros2_channel,
+    run,
     static_channel,
     static_transform,
     text,
@@ -44,10 +43,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_came_before_the_start_is_sent_at_first(drive: Path) -> None:
-    publisher = RecordingPublisher(world="ros2")
-    options = PlayOptions(start_offset=0.5, immediate=True)
-    with open_player(drive, options, node=publisher) as player:
-        player.run()
+    publisher, _ = run(drive, RecordingPublisher("ros2"), start_offset=0.5, immediate=True)
     first = [(sent.topic, sent.payload) for sent in publisher.sent[:6]]
     assert first == [
         *(("/tf_static", static_transform(child)) for child in STATIC),

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +17,21 @@ from mp4ds.errors import PublishError
 from mp4ds.plugins.playing import pace
 from mp4ds.plugins.playing.options import PlayOptions, Wanted
 from mp4ds.plugins.playing.pace import Lateness, Pace, Ticks
-from mp4ds.plugins.playing.play import open_player
 from mp4ds.plugins.playing.player import Player, PlaySummary
 from mp4ds.plugins.playing.timeline import Timeline
 from mp4ds.records import Message
-from player_scenes import MS, START, STEP, RecordingPublisher, make_ros2, ros2_channel, text
-from waiting import WATCHDOG_S, until
+from player_scenes import (
+    MS,
+    START,
+    STEP,
+    RecordingPublisher,
+    make_ros2,
+    ros2_channel,
+    run,
+    running,
+    text,
+)
+from waiting import until
 
 NS = 10**9
 CHATTER = "/chatter"
@@ -36,14 +43,6 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("strings")
     mp4ds.pack(make_ros2(folder / "drive.mcap"), folder / "drive")
     return folder / "drive"
-
-
-def run(
-    drive: Path, publisher: RecordingPublisher | None = None, **options: Any
-) -> tuple[RecordingPublisher, PlaySummary]:
-    publisher = publisher or RecordingPublisher(world="ros2")
-    with open_player(drive, PlayOptions(**options), node=publisher) as player:
-        return publisher, player.run()
 
 
 # ---------------------------------------------------------------- /clock
@@ -279,42 +278,28 @@ def test_the_last_time_that_is_played(drive: Path, options: dict[str, Any], last
     assert publisher.sent[-1].time_ns == START + last * MS
 
 
-@contextmanager
-def running(
-    drive: Path, publisher: RecordingPublisher, **options: Any
-) -> Iterator[tuple[Player, threading.Thread]]:
-    with open_player(drive, PlayOptions(**options), node=publisher) as player:
-        thread = threading.Thread(target=player.run)
-        thread.start()
-        try:
-            yield player, thread
-        finally:
-            player.stop()
-            thread.join(WATCHDOG_S)
-
-
 def test_it_pauses_before_messages_of_a_topic(drive: Path) -> None:
     publisher = RecordingPublisher(world="ros2")
-    with running(drive, publisher, rate=10.0, pause_topics=["/map"]) as (player, thread):
+    with running(drive, publisher, rate=10.0, pause_topics=["/map"]) as (player, _):
         until(lambda: player.is_paused)
         assert "/map" not in {sent.topic for sent in publisher.sent}
         assert player.play_next()
         assert publisher.sent[-1].payload == text("map 0")
         player.resume()  # as with rosbag play, also for the next one, which it stands before
-        until(lambda: not thread.is_alive())
+        until(lambda: publisher.has_ended)
     assert len(publisher.sent) == 26
     publisher = RecordingPublisher(world="ros2")
-    options = PlayOptions(rate=10.0, pause_topics=["/map"])
-    with open_player(drive, options, node=publisher) as player:
+    with running(drive, publisher, rate=10.0, pause_topics=["/map"], paused=True) as (player, _):
         player.toggle_topic_pauses()
-        assert not player.run().stopped
+        player.resume()
+        until(lambda: publisher.has_ended)
     assert len(publisher.sent) == 26
 
 
 def test_it_waits_for_the_stamps_that_control_its_rate(drive: Path) -> None:
     publisher = RecordingPublisher(world="ros2")
     options = {"rate_control_topic": "/odom", "rate_control_max_delay": 0.1}
-    with running(drive, publisher, topics=[CHATTER], rate=5.0, **options) as (player, thread):
+    with running(drive, publisher, topics=[CHATTER], rate=5.0, **options) as (player, _):
         until(lambda: len(publisher.sent) == 3)  # of 0, 50 and 100 ms
         time.sleep(0.3)
         assert len(publisher.sent) <= 3
@@ -325,7 +310,7 @@ def test_it_waits_for_the_stamps_that_control_its_rate(drive: Path) -> None:
         time.sleep(0.3)
         assert len(publisher.sent) <= 13
         publisher.on_message(START + NS)
-        until(lambda: not thread.is_alive())
+        until(lambda: publisher.has_ended)
         assert not player.is_paused
     assert len(publisher.sent) == 20
 

@@ -6,7 +6,6 @@ import hashlib
 import json
 import re
 import shutil
-import signal
 import socket
 import struct
 import subprocess
@@ -20,7 +19,7 @@ import pytest
 from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag1 import Writer as BagWriter
 
-from roscore import HERE, PLAY, RECORD, Core, Process, python, wait_until
+from roscore import HERE, PLAY, Core, Process, python, wait_until
 from roscore import _core as _core
 from roscore import roscore as roscore
 from sources import SOURCES, scene, typestore
@@ -80,22 +79,17 @@ def recording(tmp_path: Path) -> Path:
     return SOURCES["bag-none"](tmp_path, scene("bayer_rggb8"))[0]
 
 
-def test_every_message_arrives_in_order(roscore: Core, recording: Path, tmp_path: Path) -> None:
+def test_every_message_arrives_in_order(roscore: Core, recording: Path) -> None:
     sent = payloads(recording)
     with BagReader(recording) as reader:
         kinds = {c.topic: c for c in reader.connections}
     published = driver(roscore, recording)
     assert published.ask("advertise") >= len(sent)
     receiver = roscore.receiver(*sent)
-    recorder = roscore.start(RECORD, "-O", str(tmp_path / "again.bag"), *sent)
-    try:
-        assert published.ask("await_subscribers", 2)
-        published.ask("publish")
-        told = receiver.take(sum(map(len, sent.values())))
-        published.ask("close")
-    finally:
-        recorder.send_signal(signal.SIGINT)
-        recorder.wait(WATCHDOG_S)
+    assert published.ask("await_subscribers", 1)
+    published.ask("publish")
+    told = receiver.take(sum(map(len, sent.values())))
+    published.ask("close")
     assert receiver.silence() == []
     got = defaultdict(list)
     for message in told:
@@ -104,7 +98,6 @@ def test_every_message_arrives_in_order(roscore: Core, recording: Path, tmp_path
         assert message["type"] == kind.msgtype.replace("/msg/", "/")
         assert (message["md5sum"], message["definition"]) == (kind.digest, kind.msgdef.data)
     assert got == {topic: list(map(digest, all_)) for topic, all_ in sent.items()}
-    assert payloads(tmp_path / "again.bag") == sent
 
 
 def test_an_mcap_without_md5sums(roscore: Core, tmp_path: Path) -> None:
@@ -420,22 +413,6 @@ def test_recorded_rosout(roscore: Core, tmp_path: Path) -> None:
         ("std_msgs/String", "clock"),
     }
     assert published.ask("clock", 5)[0] == "ConversionError"
-
-
-def test_killed_node(roscore: Core, recording: Path) -> None:
-    published = driver(roscore, recording)
-    published.ask("advertise")
-    published.ask("publish")
-    assert published.ask("is_alive") is True
-    assert roscore.run("rosnode", "kill", published.ask("node"))[0] == 0
-    wait_until(lambda: published.ask("is_alive") is False)
-    for method in (["publish"], ["clock", 1]):
-        kind, sentence = published.ask(*method)
-        assert kind == "PublishError"
-        assert roscore.uri in sentence
-        assert "shut down" in sentence
-    published.ask("close")
-    assert published.popen.wait(WATCHDOG_S) == 0
 
 
 # ---------------------------------------------------------------- no ROS

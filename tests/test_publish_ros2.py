@@ -225,12 +225,6 @@ def test_the_services_are_those_of_rosbag2(side: Side) -> None:
     assert player.asked == [asked for _, _, asked, _ in CALLS.values() if asked]
 
 
-def test_services_belong_to_the_node(side: Side) -> None:
-    with side.open(node="other") as publisher:
-        publisher.serve(player_services(Player()))
-        assert side.peer.call("/other/get_rate", "GetRate", {}) == {"rate": 2.5}
-
-
 def test_ros_names_the_node_and_its_clock(side: Side) -> None:
     names = NodeNames("player", "/robot", (("/clock", "/sim"),))
     with side.open(names=names) as publisher:
@@ -523,6 +517,8 @@ def test_overrides_are_read(tmp_path: Path) -> None:
         "  avoid_ros_namespace_conventions: true\n"
         "/other:\n  reliability: best_effort\n"
     )
+    (tmp_path / "empty.yaml").write_text("# nothing yet\n")
+    assert load_overrides(tmp_path / "empty.yaml") == {}
     assert load_overrides(path) == {
         "/test_topic": Qos(
             history="keep_all",
@@ -534,12 +530,6 @@ def test_overrides_are_read(tmp_path: Path) -> None:
         ),
         "/other": Qos(reliability="best_effort"),
     }
-
-
-def test_an_empty_file_overrides_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "qos.yaml"
-    path.write_text("# nothing yet\n")
-    assert load_overrides(path) == {}
 
 
 @pytest.mark.parametrize(
@@ -560,23 +550,17 @@ def test_an_empty_file_overrides_nothing(tmp_path: Path) -> None:
         ("/x: {deadline: {sec: 1.5, nsec: 0}}", "integers, 0 or more"),
         ("/x: {avoid_ros_namespace_conventions: 1}", "neither true nor false"),
         ("[" * 5000, "not valid YAML"),
+        ("#" * (2**20 + 1), "too large"),
+        (b"\x89PNG\r\n\x1a\n\0\0", "not valid YAML"),
+        (None, "cannot be read"),
     ],
+    ids=lambda value: str(value)[:20],
 )
-def test_bad_overrides_are_told(tmp_path: Path, text: str, says: str) -> None:
+def test_bad_overrides_are_told(tmp_path: Path, text: str | bytes | None, says: str) -> None:
     path = tmp_path / "qos.yaml"
-    path.write_text(text)
+    if text is not None:
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
     with pytest.raises(OptionError) as told:
         load_overrides(path)
     assert says in str(told.value)
     assert str(path) in str(told.value)
-
-
-def test_a_file_of_overrides_that_is_none_is_told(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="cannot be read"):
-        load_overrides(tmp_path / "missing.yaml")
-    (tmp_path / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0")
-    with pytest.raises(OptionError, match="not valid YAML"):
-        load_overrides(tmp_path / "image.png")
-    (tmp_path / "large.yaml").write_bytes(b"#" * (2**20 + 1))
-    with pytest.raises(OptionError, match="too large"):
-        load_overrides(tmp_path / "large.yaml")

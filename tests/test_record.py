@@ -294,20 +294,15 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- splits, pauses
 
 
-def test_datasets_of_a_length(tmp_path: Path, compare: Compare) -> None:
-    paths = write(tmp_path)
-    summary = recorded(PlayedNode(paths), tmp_path / "live", max_duration=0.5)
-    made = [item.dataset for item in summary.datasets]
-    assert [path.name for path in made] == ["live_0", "live_1", "live_2"]
-    mp4ds.pack(made, tmp_path / "whole")
-    assert compare(paths, again(tmp_path / "whole", tmp_path)) == []
-
-
-def test_datasets_of_a_size(tmp_path: Path, compare: Compare) -> None:
+@pytest.mark.parametrize("most", [{"max_duration": 0.5}, {"max_size": 200_000}])
+def test_datasets_of_a_length_or_size(
+    most: dict[str, Any], tmp_path: Path, compare: Compare
+) -> None:
     paths = write(tmp_path, of=scene("mono8", frames=40, width=160, height=120))
-    summary = recorded(PlayedNode(paths), tmp_path / "live", max_size=200_000)
+    summary = recorded(PlayedNode(paths), tmp_path / "live", **most)
     made = [item.dataset for item in summary.datasets]
     assert len(made) > 1
+    assert [path.name for path in made] == [f"live_{number}" for number in range(len(made))]
     mp4ds.pack(made, tmp_path / "whole")
     assert compare(paths, again(tmp_path / "whole", tmp_path)) == []
 
