@@ -6,6 +6,7 @@ field, in backticks; the command line turns it into the flag.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, dataclass, field
@@ -186,6 +187,21 @@ def parse_resize(value: str | float | tuple[int, int]) -> float | tuple[int, int
         raise OptionError(
             f"{value!r} is not a size. Use a factor such as 0.5, or WxH such as 640x480."
         ) from None
+
+
+def parse_number(value: str | float) -> float:
+    """A number; NaN if it is none."""
+    try:
+        return float(value)
+    except ValueError:
+        return math.nan
+
+
+def _parse_seconds(value: str | float) -> float:
+    number = parse_number(value)
+    if not 0 <= number < math.inf:
+        raise OptionError(f"{value} is not a number of seconds, 0 or more.")
+    return number
 
 
 def parse_pattern(value: str | re.Pattern[str]) -> re.Pattern[str] | None:
@@ -450,6 +466,16 @@ def latched() -> Any:
 def jpeg_quality() -> Any:
     """The option for the quality of JPEG files."""
     return option("Quality of JPEG images that are encoded.", 95, least=1, most=100)
+
+
+def pattern(help: str, *flags: str) -> Any:  # noqa: A002
+    """An option for topics by a regular expression."""
+    return option(help, None, *flags, panel=WHAT, metavar="PATTERN", parse=parse_pattern)
+
+
+def seconds(help: str, default: float | None = None, *flags: str, panel: str = HOW) -> Any:  # noqa: A002
+    """An option for a number of seconds, which may be 0."""
+    return option(help, default, *flags, panel=panel, metavar="SECONDS", parse=_parse_seconds)
 
 
 def about() -> Any:

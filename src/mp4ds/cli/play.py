@@ -141,9 +141,9 @@ def _rounded(rate: float) -> float:
 
 
 def _warnings(state: PlayProgress) -> Iterator[str]:
-    if state.slowed_s >= _SLOW_S and not is_quiet():
+    if state.so_far.slowed_s >= _SLOW_S and not is_quiet():
         yield "slowing down: messages are not ready in time (--drop drops late frames instead)"
-    if state.dropped and not is_quiet():
+    if state.so_far.dropped and not is_quiet():
         yield "dropping late frames: they are not decoded in time"
 
 
@@ -152,9 +152,9 @@ def _rows(state: PlayProgress) -> list[Row]:
     texts = [
         f"{now / _NS:.1f} of {length / _NS:.1f} s",
         f"{state.rate:g}x {shown(state.state)}".strip(),
-        f"{state.messages} messages",
-        f"slowed by {state.slowed_s:.1f} s" if state.slowed_s >= _SLOW_S else "",
-        f"{state.dropped} late frames dropped" if state.dropped else "",
+        f"{sum(state.so_far.messages.values())} messages",
+        f"slowed by {state.so_far.slowed_s:.1f} s" if state.so_far.slowed_s >= _SLOW_S else "",
+        f"{state.so_far.dropped} late frames dropped" if state.so_far.dropped else "",
     ]
     return [Row("playing", "  ".join(filter(None, texts)), min(1.0, now / length))]
 

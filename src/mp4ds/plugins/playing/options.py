@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from mp4ds.errors import OptionError
-from mp4ds.options import WHAT, WHERE, Parsed, argument, jpeg_quality, option, parse_pattern
+from mp4ds.options import (
+    WHAT,
+    WHERE,
+    Parsed,
+    argument,
+    jpeg_quality,
+    option,
+    parse_number,
+    pattern,
+    seconds,
+)
 from mp4ds.plan import Selection
 from mp4ds.plugins.ros.names import PLAIN, NodeNames
 from mp4ds.plugins.ros.node import CLOCK
@@ -20,22 +30,11 @@ KINDS = {"raw": "raw", "compressed": "jpeg", "ffmpeg": "ffmpeg"}
 """Transport that cameras are published as -> kind of image in `mp4ds.unpacking`."""
 
 
-def _seconds(value: str | float) -> float:
-    return _number(value, lambda number: number >= 0, "a number of seconds, 0 or more")
-
-
-def _rate(value: str | float) -> float:
-    return _number(value, lambda number: number > 0, "greater than 0")
-
-
-def _number(value: str | float, is_valid: Callable[[float], bool], what: str) -> float:
-    try:
-        number = float(value)
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and is_valid(number)):
-        raise OptionError(f"{value} is not {what}.")
-    return number
+def _parse_rate(value: str | float) -> float:
+    rate = parse_number(value)
+    if not 0 < rate < math.inf:
+        raise OptionError(f"{value} is not greater than 0.")
+    return rate
 
 
 def rooted(topic: str) -> str:
@@ -50,9 +49,7 @@ class PlayOptions(ReductionOptions):
     exclude: Sequence[str] = option(
         "Leave out matching topics.",
         (),
-        "--exclude",
-        "--exclude-topics",
-        "-x",
+        *("--exclude", "--exclude-topics", "-x"),
         panel=WHAT,
         metavar="GLOB",
     )
@@ -62,27 +59,19 @@ class PlayOptions(ReductionOptions):
         1.0,
         "-r",
         metavar="FACTOR",
-        parse=_rate,
+        parse=_parse_rate,
     )
-    start_offset: Parsed[float] = option(
+    start_offset: Parsed[float] = seconds(
         "Start this many seconds into the recording.",
         0.0,
-        "--start-offset",
-        "--start",
-        "-s",
+        *("--start-offset", "--start", "-s"),
         panel=WHAT,
-        metavar="SECONDS",
-        parse=_seconds,
     )
-    duration: Parsed[float | None] = option(
+    duration: Parsed[float | None] = seconds(
         "Play only this many seconds.",
         None,
-        "--duration",
-        "--playback-duration",
-        "-u",
+        *("--duration", "--playback-duration", "-u"),
         panel=WHAT,
-        metavar="SECONDS",
-        parse=_seconds,
     )
     until_sec: float | None = option(
         "Play until this time, in seconds since 1970, or for `duration`, whichever is later.",
@@ -98,37 +87,20 @@ class PlayOptions(ReductionOptions):
     )
     loop: bool = option("Loop playback.", False, "-l")
     keep_alive: bool = option("Keep running at the end, for late subscribers.", False, "-k")
-    delay: Parsed[float] = option(
-        "Seconds to wait before playing; in ROS 2, before each loop.",
-        0.0,
-        "-d",
-        metavar="SECONDS",
-        parse=_seconds,
+    delay: Parsed[float] = seconds(
+        "Seconds to wait before playing; in ROS 2, before each loop.", 0.0, "-d"
     )
     paused: bool = option("Start paused.", False, "--pause", "--start-paused", "-p")
-    regex: Parsed[re.Pattern[str] | None] = option(
-        "Only topics that fully match a regular expression, and those of `topics`.",
-        None,
-        "-e",
-        panel=WHAT,
-        metavar="PATTERN",
-        parse=parse_pattern,
+    regex: Parsed[re.Pattern[str] | None] = pattern(
+        "Only topics that fully match a regular expression, and those of `topics`.", "-e"
     )
-    exclude_regex: Parsed[re.Pattern[str] | None] = option(
-        "Leave out topics that fully match a regular expression.",
-        None,
-        panel=WHAT,
-        metavar="PATTERN",
-        parse=parse_pattern,
+    exclude_regex: Parsed[re.Pattern[str] | None] = pattern(
+        "Leave out topics that fully match a regular expression."
     )
     remap: Sequence[str] = option(
         "Rename a topic; repeatable.", (), "-m", metavar="OLD:=NEW", panel=WHERE
     )
-    prefix: str = option(
-        "Prefix for all topics that are not remapped.",
-        "",
-        panel=WHERE,
-    )
+    prefix: str = option("Prefix for all topics that are not remapped.", "", panel=WHERE)
     clock: float | None = option(
         "Publish /clock, at this rate if one is given; default: 100, or 40 with --ros2.",
         None,
@@ -147,11 +119,8 @@ class PlayOptions(ReductionOptions):
         "--follow-clock/--no-follow-clock",
     )
     immediate: bool = option("Publish as fast as possible.", False, "-i")
-    skip_empty: Parsed[float | None] = option(
-        "Skip gaps between messages that are longer than this.",
-        metavar="SECONDS",
-        panel=WHAT,
-        parse=_seconds,
+    skip_empty: Parsed[float | None] = seconds(
+        "Skip gaps between messages that are longer than this.", panel=WHAT
     )
     pause_topics: Sequence[str] = option(
         "Pause before each message on these topics.", (), metavar="TOPIC"
@@ -162,11 +131,8 @@ class PlayOptions(ReductionOptions):
         metavar="TOPIC",
         only=("ros1",),
     )
-    rate_control_max_delay: Parsed[float] = option(
-        "Seconds that playback may be ahead of `rate_control_topic`.",
-        1.0,
-        metavar="SECONDS",
-        parse=_seconds,
+    rate_control_max_delay: Parsed[float] = seconds(
+        "Seconds that playback may be ahead of `rate_control_topic`.", 1.0
     )
     wait_for_subscribers: bool = option("Wait for a subscriber on each topic first.", False)
     wait_for_all_acked: int | None = option(

@@ -30,9 +30,7 @@ class PlayProgress:
         end_ns: End of what is played.
         rate: Seconds of the recording per second.
         state: ``playing``, ``paused``, or what it is waiting for.
-        messages: Number of messages published.
-        slowed_s: Seconds that the clock waited for messages to be read or decoded.
-        dropped: Number of late frames dropped.
+        so_far: What was played, not to be changed.
     """
 
     time_ns: int
@@ -40,9 +38,7 @@ class PlayProgress:
     end_ns: int
     rate: float
     state: str
-    messages: int
-    slowed_s: float
-    dropped: int
+    so_far: PlaySummary
 
 
 @dataclass
@@ -144,7 +140,7 @@ class Player:
         self._advertised: dict[int, Channel] = {}  # by id()
         self._missing: dict[int, Channel] = {}  # those whose type is not installed
         self._done = PlaySummary()
-        self._restamper = Restamper() if self._options.restamp else None
+        self._restamper = Restamper(self._pace.wall_of) if options.restamp else None
 
     @property
     def address(self) -> str:
@@ -558,9 +554,7 @@ class Player:
     def _send(self, due: Message, time_ns: int) -> None:
         if id(due.channel) in self._missing:
             return
-        payload = due.data
-        if self._restamper is not None:
-            payload = self._restamper.restamped(due.channel, payload, self._pace.wall_of)
+        payload = due.data if self._restamper is None else self._restamper.restamped(due)
         self._node.publish(due.channel, payload, time_ns)
         topic = due.channel.topic
         self._done.messages[topic] = self._done.messages.get(topic, 0) + 1
@@ -576,9 +570,7 @@ class Player:
                 end_ns=self._end,
                 rate=self._pace.rate,
                 state=state,
-                messages=sum(self._done.messages.values()),
-                slowed_s=self._done.slowed_s,
-                dropped=self._done.dropped,
+                so_far=self._done,
             )
         self._progress(progress)
 

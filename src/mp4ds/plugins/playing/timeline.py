@@ -355,45 +355,43 @@ _DISTRIBUTION = "humble"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _POSE = 7 * 8  # bytes: a translation and a quaternion of doubles
 _ENCAPSULATION = 4
-_Places = Callable[[bytearray, str, bool], Iterator[int]]
 
 
 class Restamper:
     """Replaces the stamps in messages: of their header, or of their transforms' headers.
 
     Equal stamps stay equal, and zero stays zero.
+
+    Args:
+        wall_of: Maps recording time to wall-clock time, both in nanoseconds.
     """
 
-    def __init__(self) -> None:
-        self._known: dict[int, tuple[Channel, _Places | None]] = {}
+    def __init__(self, wall_of: Callable[[int], int]) -> None:
+        self._wall_of = wall_of
+        self._known: dict[int, tuple[Channel, str]] = {}  # what has stamps, by id()
 
-    def restamped(
-        self, channel: Channel, payload: bytes | memoryview, wall_of: Callable[[int], int]
-    ) -> bytes | memoryview:
-        """A message with new stamps; unchanged if it has none.
-
-        Args:
-            channel: Channel of the message.
-            payload: The serialized message.
-            wall_of: Maps recording time to wall-clock time, both in nanoseconds.
+    def restamped(self, message: Message) -> bytes | memoryview:
+        """The payload with new stamps; unchanged if it has none.
 
         Raises:
             ConversionError: The message is not of the channel's type, or a stamp is out of range.
         """
+        channel = message.channel
         if id(channel) not in self._known:
-            self._known[id(channel)] = channel, _places_in(channel)
-        places = self._known[id(channel)][1]
-        if places is None:
-            return payload
+            self._known[id(channel)] = channel, _stamped(channel)
+        stamped = self._known[id(channel)][1]
+        if not stamped:
+            return message.data
         is_ros1 = channel.message_encoding == "ros1"
-        made = bytearray(payload)
+        made = bytearray(message.data)
         order = "<" if is_ros1 or made[1:2] != b"\0" else ">"
         stamp = struct.Struct(f"{order}{'I' if is_ros1 else 'i'}I")
         try:
-            for place in places(made, order, is_ros1):
+            # a header is after its sequence number, or the encapsulation of CDR
+            for place in [4] if stamped == HEADER else _of_transforms(made, order, is_ros1):
                 seconds, nanoseconds = stamp.unpack_from(made, place)
                 if seconds or nanoseconds:
-                    time = wall_of(seconds * NS + nanoseconds)
+                    time = self._wall_of(seconds * NS + nanoseconds)
                     stamp.pack_into(made, place, *divmod(time, NS))
         except struct.error as error:
             problem = f"cannot replace the stamp of a message: {error}"
@@ -401,29 +399,26 @@ class Restamper:
         return memoryview(made)
 
 
-def _places_in(channel: Channel) -> _Places | None:
-    """Where the stamps are in a channel's messages; None if they have none, or are not of ROS."""
+def _stamped(channel: Channel) -> str:
+    """What has stamps in a channel's messages: `HEADER`, one of `_TRANSFORMS`, or nothing."""
     schema = channel.schema
     if channel.message_encoding not in ("ros1", "cdr") or schema is None or not schema.name:
-        return None
+        return ""
     name = name_of(schema)
     if name in _TRANSFORMS:
-        return _of_transforms
+        return name
     is_ros1 = channel.message_encoding == "ros1"
     version = ros1_version() if is_ros1 else ros2_version(_DISTRIBUTION)
     try:
         fields = fields_of(types_of(schema, version), name)
+        is_first = fields and field_shape(fields[0][1]) == FieldShape("", HEADER, 0, None, None)
+        return HEADER if is_first else ""
     except Refused:
-        return None
-    has_header = fields and field_shape(fields[0][1]) == FieldShape("", HEADER, 0, None, None)
-    return _of_header if has_header else None
-
-
-def _of_header(_: bytearray, __: str, ___: bool) -> Iterator[int]:
-    yield 4  # after the sequence number of ROS 1, or the encapsulation of CDR
+        return ""
 
 
 def _of_transforms(data: bytearray, order: str, is_ros1: bool) -> Iterator[int]:
+    """Where the stamps of transforms are."""
     number = struct.Struct(f"{order}I")
 
     def aligned(place: int, size: int) -> int:

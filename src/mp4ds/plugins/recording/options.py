@@ -16,8 +16,8 @@ from mp4ds.options import (
     argument,
     force,
     option,
-    parse_pattern,
     parse_size,
+    pattern,
 )
 from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, Selection, parse_quality
 from mp4ds.plugins.ros.names import PLAIN, SERVICE_EVENTS, NodeNames
@@ -44,26 +44,13 @@ class RecordOptions(Options):
         "-a",
         panel=WHAT,
     )
-    all_topics: bool = option(
-        "Record all topics, but no service events.",
-        False,
-        panel=WHAT,
-    )
-    all_services: bool = option(
-        "Record all service events (ROS 2).",
-        False,
-        panel=WHAT,
-    )
+    all_topics: bool = option("Record all topics, but no service events.", False, panel=WHAT)
+    all_services: bool = option("Record all service events (ROS 2).", False, panel=WHAT)
     topic_types: Sequence[str] = option(
         "Record topics of this type; repeatable.", (), metavar="TYPE", panel=WHAT
     )
-    regex: Parsed[re.Pattern[str] | None] = option(
-        "Record topics whose name matches a regular expression.",
-        None,
-        "-e",
-        panel=WHAT,
-        metavar="PATTERN",
-        parse=parse_pattern,
+    regex: Parsed[re.Pattern[str] | None] = pattern(
+        "Record topics whose name matches a regular expression.", "-e"
     )
     exclude: Sequence[str] = option(
         "Leave out topics that match; repeatable.", (), "--exclude", metavar="GLOB", panel=WHAT
@@ -71,14 +58,8 @@ class RecordOptions(Options):
     exclude_topic_types: Sequence[str] = option(
         "Leave out topics of this type; repeatable.", (), metavar="TYPE", panel=WHAT
     )
-    exclude_regex: Parsed[re.Pattern[str] | None] = option(
-        "Leave out topics whose name matches a regular expression.",
-        None,
-        "--exclude-regex",
-        "-x",
-        panel=WHAT,
-        metavar="PATTERN",
-        parse=parse_pattern,
+    exclude_regex: Parsed[re.Pattern[str] | None] = pattern(
+        "Leave out topics whose name matches a regular expression.", "--exclude-regex", "-x"
     )
     duration: Parsed[float | None] = option(
         "Stop after so many seconds; also 5m, 2h.",
@@ -123,13 +104,7 @@ class RecordOptions(Options):
         least=1,
         most=MAX_GOP,
     )
-    start_paused: bool = option(
-        "Start paused.",
-        False,
-        "--start-paused",
-        "--pause",
-        panel=WHAT,
-    )
+    start_paused: bool = option("Start paused.", False, "--start-paused", "--pause", panel=WHAT)
     use_sim_time: bool = option("Take log times from /clock, and wait for it.", False)
     node: str | None = option(
         "Node name; default: that of ROS's own recorder.", None, "--node-name"
