@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
-from threading import Thread
 from types import TracebackType
-from urllib.parse import urlsplit
 
 from distributed import Client
 
@@ -104,61 +100,3 @@ class RealCluster:
         tb: TracebackType | None,
     ) -> None:
         self.end()
-
-
-class Relay:
-    """A way to a scheduler that can be broken; a context manager that closes it.
-
-    Args:
-        address: The scheduler's.
-    """
-
-    def __init__(self, address: str) -> None:
-        parts = urlsplit(address)
-        assert parts.hostname
-        assert parts.port
-        self._target = (parts.hostname, parts.port)
-        self._ends: list[socket.socket] = []
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.address = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
-        self._threads = [Thread(target=self._accept)]
-        self._threads[0].start()
-
-    def _accept(self) -> None:
-        with suppress(OSError):
-            while True:
-                here, _ = self._server.accept()
-                there = socket.create_connection(self._target)
-                self._ends += [here, there]
-                for ends in ((here, there), (there, here)):
-                    self._threads.append(Thread(target=self._pass_on, args=ends))
-                    self._threads[-1].start()
-
-    @staticmethod
-    def _pass_on(one: socket.socket, other: socket.socket) -> None:
-        with one, suppress(OSError):
-            while data := one.recv(2**16):
-                other.sendall(data)
-            other.shutdown(socket.SHUT_RDWR)
-
-    def break_connections(self) -> None:
-        """End those that there are; others can be made."""
-        ends, self._ends = self._ends, []
-        for end in ends:
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def __enter__(self) -> Relay:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
-        self._server.shutdown(socket.SHUT_RDWR)
-        self._server.close()
-        self.break_connections()
-        for thread in self._threads:
-            thread.join()

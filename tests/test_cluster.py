@@ -18,7 +18,7 @@ import dask
 import pytest
 
 import cluster_tasks
-from clusters import WITH_NANNY, RealCluster, Relay
+from clusters import WITH_NANNY, RealCluster
 from mp4ds.errors import ClusterError, OptionError
 from mp4ds.packing.processes import CallError
 from mp4ds.plugins import cluster as access
@@ -108,7 +108,7 @@ def test_a_function_that_the_cluster_lacks(tmp_path: Path) -> None:
         found = errors(ClusterExecutor(cluster.address, 2), cluster_tasks.write, tmp_path, "a", "b")
     for error in found.values():
         assert "No module named 'cluster_tasks'" in str(error)
-        assert "The same version of mp4ds must be installed" in str(error)
+        assert "must have the same version of mp4ds" in str(error)
     assert len(found) == 2
 
 
@@ -175,7 +175,7 @@ def test_a_call_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
         executor = ClusterExecutor(cluster.address, 7)
         found = errors(executor, cluster_tasks.die, tmp_path, "deadly", *numbered(6))
     assert set(found) == {"deadly"}
-    assert str(found["deadly"]).startswith("2 workers died on it, perhaps for lack of memory")
+    assert re.search("2 different workers, but all those workers died", str(found["deadly"]))
 
 
 @pytest.mark.slow
@@ -201,16 +201,6 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
         assert not errors(executor, cluster_tasks.write, tmp_path, *names)
     assert results(tmp_path).keys() >= set(names)
     assert all((tmp_path / name).stat().st_mtime_ns == kept[name] for name in kept)
-
-
-def test_a_broken_connection_is_made_again(cluster: RealCluster, tmp_path: Path) -> None:
-    names = numbered(8)
-    with Relay(cluster.address) as relay, ClusterExecutor(relay.address, 8) as executor:
-        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in names]
-        next(as_completed(calls))
-        relay.break_connections()
-        assert [call.exception() for call in calls] == [None] * 8
-    assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
 
 
 def test_a_cluster_without_workers_is_given_up(
