@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from mp4ds.files.outputs import listed_names, staged
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import document_of
 from mp4ds.plugins.exporting.folders import write_colmap, write_euroc, write_tum
-from mp4ds.plugins.exporting.job import ExportJob, ExportOptions, ExportSource, ExportSummary
+from mp4ds.plugins.exporting.job import ExportJob, ExportOptions, ExportSummary
 
 NOTE_NAME = "mp4ds_export.json"
 """File in an exported folder that lists what it holds and leaves out."""
@@ -28,6 +29,7 @@ NOTE_NAME = "mp4ds_export.json"
 FORMATS = {"euroc": "EuRoC", "tum": "TUM", "colmap": "COLMAP", "lerobot": "LeRobot"}
 """Formats -> display name."""
 
+_Writer = Callable[[Sequence[ExportJob]], None]
 _WRITERS = {"euroc": write_euroc, "tum": write_tum, "colmap": write_colmap}
 
 
@@ -88,35 +90,34 @@ def export(
             for number, one in enumerate(opened)
         ]
         # LeRobot's videos are in colour
-        sources = [ExportSource(one, chosen, in_colour=to == "lerobot") for one in opened]
-        job = ExportJob(path, chosen, sources, progress or (lambda *_: None))
-        write(job)
-        summary = _summary(job, target, to)
+        make = partial(ExportJob, path=path, options=chosen, in_colour=to == "lerobot")
+        jobs = [make(one, tell=progress or (lambda *_: None)) for one in opened]
+        write(jobs)
+        summary = _summary(jobs, target, to)
         if not any(summary.messages.values()):
             why = [f"{topic}: {next(iter(found))}" for topic, found in summary.left_out.items()]
             raise OptionError(
                 f"{FORMATS[to]} cannot hold any topic of {opened[0].path}: "
                 f"{why[0] if why else 'it has no messages'}."
             )
-        if path.is_dir():
-            files = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
-            note: dict[str, object] = {"mp4ds": __version__, **asdict(summary)}
-            note |= {"output": target.name, "files": files}
-            abouts = [one.manifest.about for one in opened if one.manifest and one.manifest.about]
-            if abouts:
-                note["about"] = [document_of(about) for about in abouts]
-            (path / NOTE_NAME).write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
+        files = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
+        note: dict[str, object] = {"mp4ds": __version__, **asdict(summary)}
+        note |= {"output": target.name, "files": files}
+        abouts = [one.manifest.about for one in opened if one.manifest and one.manifest.about]
+        if abouts:
+            note["about"] = [document_of(about) for about in abouts]
+        (path / NOTE_NAME).write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
         return summary
 
 
-def _lerobot_writer() -> Callable[[ExportJob], None]:
+def _lerobot_writer() -> _Writer:
     try:
-        found: Callable[[ExportJob], None] = import_module("mp4ds.plugins.exporting.lerobot").write
+        write: _Writer = import_module("mp4ds.plugins.exporting.lerobot").write
     except ImportError as error:
         raise OptionError(
             f"LeRobot needs pyarrow ({error}). Install it: pip install 'mp4ds[lerobot]'"
         ) from None
-    return found
+    return write
 
 
 def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
@@ -136,18 +137,21 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
     _ = options.reduction  # refuses invalid ones
 
 
-def _summary(job: ExportJob, target: Path, to: str) -> ExportSummary:
-    messages, left_out, notes = Counter[str](), dict[str, Counter[str]](), list[str]()
-    for source in job.sources:
-        source.leave_out_rest(FORMATS[to])
-        messages.update(source.exported)
-        for topic, reasons in source.left_out.items():
+def _summary(jobs: Sequence[ExportJob], target: Path, to: str) -> ExportSummary:
+    summary = ExportSummary(target, to)
+    left_out: dict[str, Counter[str]] = {}
+    messages = Counter[str]()
+    for job in jobs:
+        job.leave_out_rest(FORMATS[to])
+        messages.update(job.exported)
+        for topic, reasons in job.left_out.items():
             left_out.setdefault(topic, Counter()).update(reasons)
-        where = f"{source.dataset.path.name}: " if len(job.sources) > 1 else ""
-        notes += [where + note for note in source.notes]
-    kept = {topic: count for topic, count in messages.items() if count}
-    rest = {topic: dict(reasons) for topic, reasons in left_out.items()}
-    return ExportSummary(target, to, job.places, kept, rest, notes)
+        where = f"{job.dataset.path.name}: " if len(jobs) > 1 else ""
+        summary.notes.extend(where + note for note in job.notes)
+        summary.places.update(job.places)
+    summary.messages.update({topic: count for topic, count in messages.items() if count})
+    summary.left_out.update({topic: dict(reasons) for topic, reasons in left_out.items()})
+    return summary
 
 
 def _export_names(path: Path) -> set[str] | None:

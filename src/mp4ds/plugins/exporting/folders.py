@@ -9,33 +9,89 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.views import lens_of
 from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
-from mp4ds.messages.transforms import quaternion_of
+from mp4ds.messages.transforms import TransformCollector, quaternion_of
 from mp4ds.options import seconds_text
 from mp4ds.plan import FileNames
-from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob
-from mp4ds.plugins.exporting.motion import (
-    IMU,
-    Measures,
-    Pose,
-    Row,
-    StaticTree,
-    inverse,
-    pose_matrix,
-)
+from mp4ds.plugins.exporting.job import IMU, ExportedCamera, ExportJob, Measures, Row
+from mp4ds.records import Message
+from mp4ds.times import INT64_MIN
 from mp4ds.video.images import encoding_as
+
+Pose = NDArray[np.float64]
+"""Shape (4, 4): a point p of a frame is pose @ p in another; metres."""
+
+
+def pose_matrix(translation: Iterable[float], quaternion: Iterable[float]) -> Pose:
+    """The pose of x, y, z in metres and a quaternion x, y, z, w of any length but 0."""
+    x, y, z, w = np.array([*quaternion], np.float64)
+    s = 2.0 / (x * x + y * y + z * z + w * w)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+        [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
+        [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+    ]
+    pose[:3, 3] = [*translation]
+    return pose
+
+
+def inverse(pose: Pose) -> Pose:
+    """The pose of the other frame in this one."""
+    turned = pose[:3, :3].T
+    found = np.eye(4)
+    found[:3, :3] = turned
+    found[:3, 3] = -turned @ pose[:3, 3]
+    return found
+
+
+class StaticTree:
+    """Relative poses of frames, by the static transforms of a dataset.
+
+    Args:
+        dataset: Its messages and its manifest have them.
+    """
+
+    def __init__(self, dataset: Dataset) -> None:
+        listed = dataset.manifest.transforms if dataset.manifest else []
+        collector = TransformCollector(item.to_record() for item in listed)
+        topics = {channel.topic for channel in dataset.channels if collector.takes(channel)}
+        if topics:
+            for record in dataset.records(start=INT64_MIN, topics=topics):
+                if isinstance(record, Message):
+                    collector.add(record.channel, record.data)
+        self._by_child = {item.child.removeprefix("/"): item for item in collector.transforms}
+
+    def pose(self, frame: str, within: str) -> Pose | None:
+        """Pose of a frame in another one; None if no static transforms connect them."""
+        if not frame or not within:
+            return None
+        root, own = self._in_root(frame)
+        other_root, other = self._in_root(within)
+        return inverse(other) @ own if root == other_root else None
+
+    def _in_root(self, frame: str) -> tuple[str, Pose]:
+        """The root of a frame's tree, and the pose of the frame in it."""
+        pose, name, seen = np.eye(4), frame.removeprefix("/"), set[str]()
+        while name in self._by_child and name not in seen:  # a cycle has no root
+            seen.add(name)
+            item = self._by_child[name]
+            pose = pose_matrix(item.translation, item.rotation) @ pose
+            name = item.parent.removeprefix("/")
+        return name, pose
 
 
 def _poses(job: ExportJob) -> Measures | None:
     """The requested poses: before any frame is decoded, as the topic may be unsuitable."""
     topic = job.options.poses
-    return Measures(job.source.dataset, topic, "poses", "poses") if topic else None
+    return Measures(job.dataset, topic, "poses", "poses") if topic else None
 
 
 def _imus(job: ExportJob) -> list[Measures]:
-    return [Measures(job.source.dataset, topic, "imu") for topic in job.source.topics_of(IMU)]
+    return [Measures(job.dataset, topic, "imu") for topic in job.topics_of(IMU)]
 
 
 # ---------------------------------------------------------------- euroc
@@ -49,12 +105,13 @@ _POSE_HEAD = (
 )
 
 
-def write_euroc(job: ExportJob) -> None:
+def write_euroc(jobs: Sequence[ExportJob]) -> None:
     """Write mav0/cam0, imu0 ... with data.csv and sensor.yaml: the format of the ASL data sets."""
-    poses, cameras, imus = _poses(job), [*job.source.png_cameras()], _imus(job)
+    (job,) = jobs
+    poses, cameras, imus = _poses(job), [*job.png_cameras()], _imus(job)
     frames = [*(imu.frame_id for imu in imus), *(camera.frame_id for camera in cameras)]
     body = frames[0] if frames else ""
-    tree = StaticTree(job.source.dataset)
+    tree = StaticTree(job.dataset)
     root = job.path / "mav0"
     root.mkdir(parents=True)
     (root / "body.yaml").write_text(f"comment: {json.dumps(body)}\n", encoding="utf-8")
@@ -71,7 +128,7 @@ def write_euroc(job: ExportJob) -> None:
     def pose_of(frame: str, topic: str) -> Pose | None:
         pose = tree.pose(frame, body)
         if pose is None:
-            job.source.note(f"{topic}: no static transforms give T_BS of {frame!r} in {body!r}")
+            job.note(f"{topic}: no static transforms give T_BS of {frame!r} in {body!r}")
         return pose
 
     for number, camera in enumerate(cameras):
@@ -89,11 +146,9 @@ def write_euroc(job: ExportJob) -> None:
         rows = _csv(_IMU_HEAD, imu.rows())
         job.write_lines(place, imu.topic, f"{place}/data.csv", rows)
         write_sensor(place, "imu", imu.topic, pose)
-        job.source.note(
-            f"{imu.topic}: orientation and covariances have no place in an IMU's data.csv"
-        )
+        job.note(f"{imu.topic}: orientation and covariances have no place in an IMU's data.csv")
     if poses is not None:
-        job.source.note(f"{poses.topic}: only position and orientation are kept")
+        job.note(f"{poses.topic}: only position and orientation are kept")
         place = "mav0/pose0"
         turned = ((time, (*v[:3], v[6], *v[3:6])) for time, v in poses.rows())
         job.write_lines(place, poses.topic, f"{place}/data.csv", _csv(_POSE_HEAD, turned))
@@ -110,13 +165,13 @@ def _described(job: ExportJob, camera: ExportedCamera) -> list[str]:
     """What a sensor.yaml says of a camera."""
     width, height = camera.size
     lines = [f"rate_hz: {camera.rate:.6g}", f"resolution: [{width}, {height}]"]
-    calibration = job.source.export_calibration(camera)
+    calibration = job.export_calibration(camera)
     if calibration is None:
-        job.source.note(f"{camera.topic}: not calibrated")
+        job.note(f"{camera.topic}: not calibrated")
         return lines
     model, coefficients = euroc_distortion(calibration)
     if model not in ("radial-tangential", "equidistant"):
-        job.source.note(f"{camera.topic}: EuRoC has no distortion {model}; it is given by its name")
+        job.note(f"{camera.topic}: EuRoC has no distortion {model}; it is given by its name")
     k = calibration.k
     return [
         *lines,
@@ -140,26 +195,27 @@ def euroc_distortion(calibration: Calibration) -> tuple[str, list[float]]:
 # ---------------------------------------------------------------- tum
 
 
-def write_tum(job: ExportJob) -> None:
+def write_tum(jobs: Sequence[ExportJob]) -> None:
     """Write rgb, depth, and lists of files by time: the format of the TUM RGB-D benchmark."""
-    poses, cameras, imus = _poses(job), [*job.source.png_cameras()], _imus(job)
+    (job,) = jobs
+    poses, cameras, imus = _poses(job), [*job.png_cameras()], _imus(job)
     for kind, wanted in (("rgb", False), ("depth", True)):
         alike = [camera for camera in cameras if _is_depth(camera) is wanted]
         for camera in alike[:1]:
             _write_tum_images(job, kind, camera)
         for camera in alike[1:]:
             reason = f"TUM has one {kind} camera, here {alike[0].topic} (select with --topics)"
-            job.source.leave_out(camera.topic, reason, len(camera))
+            job.leave_out(camera.topic, reason, len(camera))
     for imu in imus[:1]:
         rows = ((time, values[3:]) for time, values in imu.rows())
         _write_tum_rows(job, "accelerometer.txt", imu.topic, "timestamp ax ay az", rows)
-        job.source.note(f"{imu.topic}: TUM only keeps an IMU's acceleration")
+        job.note(f"{imu.topic}: TUM only keeps an IMU's acceleration")
     if poses is not None:
-        job.source.note(f"{poses.topic}: only position and orientation are kept")
+        job.note(f"{poses.topic}: only position and orientation are kept")
         head = "timestamp tx ty tz qx qy qz qw"
         _write_tum_rows(job, "groundtruth.txt", poses.topic, head, poses.rows())
     if any(camera.calibration for camera in cameras):
-        job.source.note("TUM has no place for calibrations")
+        job.note("TUM has no place for calibrations")
 
 
 def _is_depth(camera: ExportedCamera) -> bool:
@@ -177,7 +233,7 @@ def _write_tum_images(job: ExportJob, kind: str, camera: ExportedCamera) -> None
     if kind == "depth":
         unit = "as recorded, in ROS one millimetre (depth factor 1000, not TUM's 5000)"
         heads.append(f"unit: {unit}")
-        job.source.note(f"{camera.topic}: depths are in units {unit}")
+        job.note(f"{camera.topic}: depths are in units {unit}")
     lines = map(" ".join, zip(times, names, strict=True))
     text = "\n".join([*_commented(*heads, "timestamp filename"), *lines, ""])
     (job.path / f"{kind}.txt").write_text(text, encoding="utf-8")
@@ -203,8 +259,9 @@ _MODEL = "sparse/0"
 _HALF_PIXEL = 0.5  # COLMAP counts from the corner of a pixel, ROS and OpenCV from its centre
 
 
-def write_colmap(job: ExportJob) -> None:
+def write_colmap(jobs: Sequence[ExportJob]) -> None:
     """Write images, and a sparse model of cameras, and of poses if known."""
+    (job,) = jobs
     poses = _poses(job)
     if poses is not None and not poses.body:
         raise OptionError(
@@ -215,7 +272,7 @@ def write_colmap(job: ExportJob) -> None:
     folder.mkdir(parents=True)
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     known: list[tuple[ExportedCamera, Sequence[str]]] = []
-    for camera in job.source.png_cameras():
+    for camera in job.png_cameras():
         place, _ = names.name_for(camera.topic)
         files = [f"{place}/{time}.png" for time in camera.times.tolist()]
         job.write_png_files(camera, f"images/{place}", [f"images/{file}" for file in files])
@@ -225,9 +282,9 @@ def write_colmap(job: ExportJob) -> None:
             if camera.calibration:
                 distortion = camera.calibration.distortion_model
                 why = f"COLMAP has no model for distortion {distortion!r}"
-            job.source.note(f"{camera.topic}: {why}, so it is not in cameras.txt")
+            job.note(f"{camera.topic}: {why}, so it is not in cameras.txt")
             continue
-        job.source.export_calibration(camera)
+        job.export_calibration(camera)
         known.append((camera, files))
         width, height = camera.size
         lines.append(f"{len(known)} {model[0]} {width} {height} {' '.join(map(repr, model[1]))}")
@@ -237,7 +294,7 @@ def write_colmap(job: ExportJob) -> None:
     with (folder / "images.txt").open("w", encoding="utf-8") as file:
         file.write("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# no points\n")
         if poses is None:
-            job.source.note("images.txt is empty: it needs the pose of each image (--poses TOPIC)")
+            job.note("images.txt is empty: it needs the pose of each image (--poses TOPIC)")
         else:
             file.writelines(_image_lines(job, known, poses))
 
@@ -261,12 +318,12 @@ def colmap_model(calibration: Calibration) -> tuple[str, list[float]] | None:
 def _image_lines(
     job: ExportJob, cameras: Sequence[tuple[ExportedCamera, Sequence[str]]], poses: Measures
 ) -> Iterator[str]:
-    tree, track = StaticTree(job.source.dataset), PoseTrack.of(poses.rows())
+    tree, track = StaticTree(job.dataset), PoseTrack.of(poses.rows())
     image = 0
     for number, (camera, files) in enumerate(cameras, start=1):
         place = tree.pose(camera.frame_id, poses.body)
         if place is None:
-            job.source.note(
+            job.note(
                 f"{camera.topic}: no static transforms connect {camera.frame_id!r} to "
                 f"{poses.body!r}, so its images are not in images.txt"
             )
@@ -283,13 +340,13 @@ def _image_lines(
             values = [w, x, y, z, *seen[:3, 3].tolist()]
             yield f"{image} {' '.join(map(repr, values))} {number} {name}\n\n"
         if missing:
-            job.source.note(
+            job.note(
                 f"{camera.topic}: {missing} of {len(camera)} images are before the first or "
                 "after the last pose, so they are not in images.txt"
             )
-    job.source.exported[poses.topic] += len(track.times)
+    job.exported[poses.topic] += len(track.times)
     job.places[f"{_MODEL}/images.txt"] = poses.topic
-    job.source.note(f"{poses.topic}: poses of images are interpolated between the recorded ones")
+    job.note(f"{poses.topic}: poses of images are interpolated between the recorded ones")
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import heapq
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,6 @@ from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import WHAT, Parsed, SliceOptions, force, option
-from mp4ds.plugins.exporting.motion import ros_type
 from mp4ds.times import intervals, synchronize, usual_interval
 from mp4ds.unpacking.pictures import ReductionOptions, is_inverse_depth, times_of
 from mp4ds.video.codecs import MAX_CRF
@@ -109,7 +110,7 @@ class ExportSummary:
     out.
 
     Attributes:
-        output: The folder or file made.
+        output: The folder made.
         format: Its format.
         places: Part of the output -> the topic that is in it.
         messages: Kept messages, by topic.
@@ -218,20 +219,162 @@ def _view(stream: Stream, options: ExportOptions, in_colour: bool, notes: list[s
     return stream.view(colours, options.reduction.resize)
 
 
-# ---------------------------------------------------------------- source
+# ---------------------------------------------------------------- numbers
+
+Row = tuple[int, tuple[float, ...]]
+"""Time in nanoseconds, and values."""
+
+_NS = 10**9
+_WINDOW = 1000  # messages that may be out of order
+_ROS = ("ros1", "cdr")
 
 
-class ExportSource:
+def _pose(at: Any, turn: Any) -> Sequence[float]:
+    return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
+
+
+def _imu(message: Any) -> Sequence[float]:
+    turn, pull = message.angular_velocity, message.linear_acceleration
+    return turn.x, turn.y, turn.z, pull.x, pull.y, pull.z
+
+
+IMU = "sensor_msgs/Imu"
+
+# what is asked for -> types that have it -> its numbers in a message
+_MEASURES: Mapping[str, Mapping[str, Callable[[Any], Sequence[float]]]] = {
+    # angular velocity x, y, z in rad/s, then acceleration x, y, z in m/s^2
+    "imu": {IMU: _imu},
+    # position x, y, z in metres, then the quaternion x, y, z, w
+    "poses": {
+        "geometry_msgs/PoseStamped": lambda m: _pose(m.pose.position, m.pose.orientation),
+        "geometry_msgs/PoseWithCovarianceStamped": lambda m: _pose(
+            m.pose.pose.position, m.pose.pose.orientation
+        ),
+        "nav_msgs/Odometry": lambda m: _pose(m.pose.pose.position, m.pose.pose.orientation),
+        "geometry_msgs/TransformStamped": lambda m: _pose(
+            m.transform.translation, m.transform.rotation
+        ),
+    },
+    "vector": {
+        "sensor_msgs/JointState": lambda m: m.position,
+        "std_msgs/Float64MultiArray": lambda m: m.data,
+        "std_msgs/Float32MultiArray": lambda m: m.data,
+    },
+}
+
+
+def ros_type(dataset: Dataset, topic: str) -> str:
+    """Type of a ROS topic as ``package/Name``; empty for other serializations and topics."""
+    for channel in dataset.channels:
+        if channel.topic == topic and channel.message_encoding in _ROS:
+            return channel.type_name.replace("/msg/", "/")
+    return ""
+
+
+class Measures:
+    """The numbers of a topic.
+
+    Args:
+        dataset: The dataset.
+        topic: The topic.
+        kind: ``imu``, ``poses`` or ``vector``.
+        option: That named the topic, for errors.
+
+    Attributes:
+        topic: The topic.
+        first: Its first message, decoded; None if there is none.
+
+    Raises:
+        OptionError: The topic does not exist, or has the wrong type.
+    """
+
+    def __init__(self, dataset: Dataset, topic: str, kind: str, option: str = "topics") -> None:
+        types, name = _MEASURES[kind], ros_type(dataset, topic)
+        if name not in types:
+            raise OptionError(
+                f"`{option}` {topic} is {f'of type {name}' if name else 'not a ROS topic'} in "
+                f"{dataset.path}. Use a topic of type {', '.join(types)}."
+            )
+        self._dataset = dataset
+        self._values = types[name]
+        self.topic = topic
+        first = next(dataset.messages([topic]), None)
+        self.first: Any = None if first is None else first.decoded
+
+    @property
+    def frame_id(self) -> str:
+        """Coordinate frame of the first message; empty if there is none."""
+        return str(self.first.header.frame_id) if hasattr(self.first, "header") else ""
+
+    @property
+    def body(self) -> str:
+        """Frame whose poses these are; empty if messages do not say."""
+        return str(getattr(self.first, "child_frame_id", ""))
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Names of the numbers, from the first message if it has them."""
+        count = len(self._values(self.first)) if self.first else 0
+        own = [str(name) for name in getattr(self.first, "name", ())]
+        last = self.topic.strip("/").rpartition("/")[2]
+        return own if len(own) == count else [f"{last}_{number}" for number in range(count)]
+
+    def rows(self) -> Iterator[Row]:
+        """The numbers by stamp; an array has none and gets its log time.
+
+        Raises:
+            SourceError: A message does not match its topic's type.
+        """
+        return in_order(self._rows())
+
+    def _rows(self) -> Iterator[Row]:
+        for message in self._dataset.messages([self.topic]):
+            decoded, time = message.decoded, message.log_time_ns
+            if hasattr(decoded, "header"):
+                time = int(decoded.header.stamp.sec) * _NS + int(decoded.header.stamp.nanosec)
+            yield time, tuple(map(float, self._values(decoded)))
+
+
+def in_order(rows: Iterable[Row], window: int = _WINDOW) -> Iterator[Row]:
+    """Sort rows by time, of which each is at most `window` rows out of order.
+
+    Args:
+        rows: In the order of the recording.
+        window: Number of rows to hold back.
+    """
+    waiting: list[tuple[int, int, tuple[float, ...]]] = []
+    for number, (time, values) in enumerate(rows):
+        heapq.heappush(waiting, (time, number, values))  # the number keeps equal times in order
+        if len(waiting) > window:
+            time, _, values = heapq.heappop(waiting)
+            yield time, values
+    while waiting:
+        time, _, values = heapq.heappop(waiting)
+        yield time, values
+
+
+# ---------------------------------------------------------------- job
+
+_TELL_EVERY = 16  # frames
+
+
+class ExportJob:
     """A dataset being exported, which counts its messages.
 
     Args:
         dataset: The dataset.
+        path: Where to write.
         options: How.
+        tell: Called now and then with a phrase, and the share of frames done.
         in_colour: Whether all images with colours become RGB.
 
     Attributes:
         dataset: The dataset.
+        path: Where to write.
+        options: How.
+        tell: Called now and then with a phrase, and the share of frames done.
         cameras: Its selected streams: calibrated ones first, then by topic.
+        places: Part of the output -> the topic that is in it.
         exported: Messages exported, by topic.
         left_out: Topic -> reason -> messages.
         notes: Other deviations from the recording.
@@ -241,13 +384,22 @@ class ExportSource:
         FormatError: The dataset is damaged.
     """
 
-    def __init__(self, dataset: Dataset, options: ExportOptions, *, in_colour: bool) -> None:
-        self.dataset = dataset
+    def __init__(
+        self,
+        dataset: Dataset,
+        path: Path,
+        options: ExportOptions,
+        tell: Callable[[str, float | None], None],
+        *,
+        in_colour: bool,
+    ) -> None:
+        self.dataset, self.path, self.options, self.tell = dataset, path, options, tell
+        self.places: dict[str, str] = {}
         self.exported: Counter[str] = Counter()
         self.left_out: dict[str, Counter[str]] = {}
         self.notes = [dataset.damage] if dataset.damage else []
+        self._in_colour, self._written = in_colour, 0
         options.selected.check(dataset.all_topics)
-        self._options, self._in_colour = options, in_colour
         dataset.verify_sidecars(options.chosen)
         streams = [stream for stream in dataset.streams if options.selected(stream.topic)]
         found = [camera for stream in streams for camera in self._camera(stream)]
@@ -277,7 +429,7 @@ class ExportSource:
         for channel in self.dataset.channels:
             totals[channel.topic] += counts.get(channel.id, 0)
         for topic, total in totals.items():
-            if not self._options.chosen(topic):
+            if not self.options.chosen(topic):
                 reason = "not selected"
             elif is_camera(channels[topic]):
                 reason = "stored as recorded in messages.mcap, not as video"
@@ -292,7 +444,7 @@ class ExportSource:
         return [
             topic
             for topic in topics
-            if self._options.chosen(topic) and ros_type(self.dataset, topic) == type_name
+            if self.options.chosen(topic) and ros_type(self.dataset, topic) == type_name
         ]
 
     # ------------------------------------------------ cameras
@@ -304,13 +456,13 @@ class ExportSource:
             self.leave_out(stream.topic, _INVERSE, len(stream))
             return
         columns = stream.columns
-        kept = np.flatnonzero(self._options.reduction.kept(columns))
+        kept = np.flatnonzero(self.options.reduction.kept(columns))
         self.leave_out(stream.topic, _THINNED, len(stream) - len(kept))
         times = times_of(columns)
         if times is not columns.stamp:
             self.note(f"{stream.topic}: its stamps do not increase, so log times are used instead")
         kept = kept[np.argsort(times[kept], kind="stable")]
-        view = _view(stream, self._options, self._in_colour, self.notes)
+        view = _view(stream, self.options, self._in_colour, self.notes)
         yield ExportedCamera(stream, kept, times[kept], view)
 
     def _matched(self, cameras: list[ExportedCamera], tolerance_ns: int) -> list[ExportedCamera]:
@@ -354,35 +506,7 @@ class ExportSource:
             self.leave_out(topic, reason, int((~is_same).sum()))
         return camera.calibration
 
-
-# ---------------------------------------------------------------- job
-
-_TELL_EVERY = 16  # frames
-
-
-@dataclass
-class ExportJob:
-    """An export in progress.
-
-    Attributes:
-        path: Where to make it.
-        options: How.
-        sources: The datasets, one except for formats that hold several.
-        tell: Called now and then with a phrase, and the share of frames done.
-        places: Part of the output -> the topic that is in it.
-    """
-
-    path: Path
-    options: ExportOptions
-    sources: Sequence[ExportSource]
-    tell: Callable[[str, float | None], None]
-    places: dict[str, str] = field(default_factory=dict)
-    _written: int = 0
-
-    @property
-    def source(self) -> ExportSource:
-        """The dataset, for formats that hold only one."""
-        return self.sources[0]
+    # ------------------------------------------------ files
 
     def write_png_files(self, camera: ExportedCamera, place: str, names: Sequence[str]) -> None:
         """Write the frames of a camera as PNG files, and count them.
@@ -394,7 +518,7 @@ class ExportJob:
         """
         (self.path / names[0]).parent.mkdir(parents=True, exist_ok=True)
         file = ImageFile(camera.view.encoding.name, "png")
-        due = sum(len(camera) for camera in self.source.cameras)
+        due = sum(len(camera) for camera in self.cameras)
         for number, (position, pixels) in enumerate(camera.pictures()):
             if number % _TELL_EVERY == 0:
                 done = (self._written + number) / due
@@ -402,7 +526,7 @@ class ExportJob:
             (self.path / names[position]).write_bytes(file.encode(pixels))
         self._written += len(camera)
         self.places[place] = camera.topic
-        self.source.exported[camera.topic] += len(camera)
+        self.exported[camera.topic] += len(camera)
 
     def write_lines(self, place: str, topic: str, name: str, lines: Iterable[str]) -> None:
         """Write a text file; each line but those that begin with # is a message of a topic.
@@ -418,5 +542,5 @@ class ExportJob:
         with path.open("w", encoding="utf-8") as file:
             for line in lines:
                 file.write(f"{line}\n")
-                self.source.exported[topic] += not line.startswith("#")
+                self.exported[topic] += not line.startswith("#")
         self.places[place] = topic

@@ -19,14 +19,11 @@ from mp4ds.dataset.topic import Topic
 from mp4ds.errors import OptionError
 from mp4ds.messages.encodings import Pixels
 from mp4ds.plan import FileNames
-from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, ExportSource
-from mp4ds.plugins.exporting.motion import Measures
+from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, Integers, Measures
 from mp4ds.times import TIMESCALE, nearest
 from mp4ds.video.codecs import CODECS, recipe_for
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketReader
-
-Integers = NDArray[np.int64]
 
 _VERSION = "v3.0"
 _CHUNK = 1000  # files per folder
@@ -119,70 +116,70 @@ class Episode:
         return f"{folder}/{_FILE.format(chunk=chunk, file=file)}.{suffix}"
 
 
-def write(job: ExportJob) -> None:
+def write(jobs: Sequence[ExportJob]) -> None:
     """Write the format."""
-    cameras = [_shown(source) for source in job.sources]
-    fps = job.options.fps or max(1, round(cameras[0][0].rate))
+    cameras = [_shown(job) for job in jobs]
+    path, task = jobs[0].path, jobs[0].options.task
+    fps = jobs[0].options.fps or max(1, round(cameras[0][0].rate))
     episodes: list[Episode] = []
     first = 0
-    for number, (source, own) in enumerate(zip(job.sources, cameras, strict=True)):
-        job.tell(f"episode {number + 1} of {len(job.sources)}", number / len(job.sources))
-        episode = Episode(number, first, _grid(source, own, fps))
-        _add_vectors(job, source, episode, fps)  # first: their topic may be unsuitable
-        _add_videos(job, source, own, episode, fps)
+    for number, (job, own) in enumerate(zip(jobs, cameras, strict=True)):
+        job.tell(f"episode {number + 1} of {len(jobs)}", number / len(jobs))
+        episode = Episode(number, first, _grid(job, own, fps))
+        _add_vectors(job, episode, fps)  # first: their topic may be unsuitable
+        _add_videos(job, own, episode, fps)
         if episodes and episode.features != episodes[0].features:
             raise OptionError(
-                f"{source.dataset.path} differs in cameras, sizes or vector lengths from "
-                f"{job.sources[0].dataset.path}, but LeRobot episodes must agree. Select with "
+                f"{job.dataset.path} differs in cameras, sizes or vector lengths from "
+                f"{jobs[0].dataset.path}, but LeRobot episodes must agree. Select with "
                 "`topics`, and `resize` WxH."
             )
-        _write_table(job.path / episode.path("data", "parquet"), _frames_table(episode, fps))
+        _write_table(path / episode.path("data", "parquet"), _frames_table(episode, fps))
         episodes.append(episode)
         first += len(episode.times)
-    task = job.options.task
-    _write_table(job.path / "meta/tasks.parquet", _tasks_table([task]))
+    _write_table(path / "meta/tasks.parquet", _tasks_table([task]))
     rows = [_episode_row(episode, task, fps) for episode in episodes]
     table = pa.table({name: [row[name] for row in rows] for name in rows[0]})
-    _write_table(job.path / _EPISODES_PATH, table)
+    _write_table(path / _EPISODES_PATH, table)
     statistics = {
         name: _as_lists(merged([episode.statistics[name] for episode in episodes]))
         for name in episodes[0].statistics
     }
-    _write_json(job.path / "meta/stats.json", statistics)
-    _write_json(job.path / "meta/info.json", _info(episodes, fps))
+    _write_json(path / "meta/stats.json", statistics)
+    _write_json(path / "meta/info.json", _info(episodes, fps))
     if not task:
-        job.source.note("no --task was given: every frame's task is empty")
-    job.source.note(
+        jobs[0].note("no --task was given: every frame's task is empty")
+    jobs[0].note(
         f"stamps count up at {fps} frames per second from the first frame; recorded stamps are "
         "not kept"
     )
 
 
-def _shown(source: ExportSource) -> list[ExportedCamera]:
+def _shown(job: ExportJob) -> list[ExportedCamera]:
     """The cameras that LeRobot's videos can show, in the order of their frames."""
     found = []
-    for camera in source.cameras:
+    for camera in job.cameras:
         if camera.view.encoding.name != "rgb8":
             reason = f"LeRobot's videos are in 8-bit colour, not {camera.stream.encoding}"
-            source.leave_out(camera.topic, reason, len(camera))
+            job.leave_out(camera.topic, reason, len(camera))
             continue
         is_later = camera.numbers >= np.maximum.accumulate(camera.numbers)
-        source.leave_out(camera.topic, "its stamp goes backwards", int((~is_later).sum()))
+        job.leave_out(camera.topic, "its stamp goes backwards", int((~is_later).sum()))
         found.append(camera.at(np.flatnonzero(is_later)))
     if not found:
         raise OptionError(
-            f"{source.dataset.path} has no camera for LeRobot, whose videos are in 8-bit colour."
+            f"{job.dataset.path} has no camera for LeRobot, whose videos are in 8-bit colour."
         )
     return found
 
 
-def _grid(source: ExportSource, cameras: Sequence[ExportedCamera], fps: int) -> Integers:
+def _grid(job: ExportJob, cameras: Sequence[ExportedCamera], fps: int) -> Integers:
     """The times of an episode's frames: while all cameras run."""
     start = max(int(camera.times[0]) for camera in cameras)
     end = min(int(camera.times[-1]) for camera in cameras)
     if end < start:
         raise OptionError(
-            f"{source.dataset.path}: its cameras do not overlap in time. Select some with `topics`."
+            f"{job.dataset.path}: its cameras do not overlap in time. Select some with `topics`."
         )
     length = ((end - start) * fps + _NS // 2) // _NS + 1
     # integers throughout: floats would shift late frames
@@ -195,7 +192,6 @@ def _grid(source: ExportSource, cameras: Sequence[ExportedCamera], fps: int) -> 
 
 def _add_videos(
     job: ExportJob,
-    source: ExportSource,
     cameras: Sequence[ExportedCamera],
     episode: Episode,
     fps: int,
@@ -206,7 +202,7 @@ def _add_videos(
         path = job.path / episode.path(f"videos/{feature}", "mp4")
         path.parent.mkdir(parents=True, exist_ok=True)
         used, repeats = np.unique(nearest(camera.times, episode.times), return_counts=True)
-        _count(source, camera, used, episode.times, fps)
+        _count(job, camera, used, episode.times, fps)
         size = _encode(job, camera.at(used), repeats.tolist(), path, fps)
         episode.features[feature] = _video_feature(path, size, job.options.codec, fps)
         episode.statistics[feature] = _sampled(camera, job.options.reduction.resize)
@@ -215,9 +211,9 @@ def _add_videos(
 
 
 def _count(
-    source: ExportSource, camera: ExportedCamera, used: Integers, times: Integers, fps: int
+    job: ExportJob, camera: ExportedCamera, used: Integers, times: Integers, fps: int
 ) -> None:
-    source.exported[camera.topic] += len(used)
+    job.exported[camera.topic] += len(used)
     is_within = (camera.times >= times[0]) & (camera.times <= times[-1])
     is_unused = np.ones(len(camera), np.bool_)
     is_unused[used] = False
@@ -225,9 +221,9 @@ def _count(
         (f"another frame is nearer at {fps} frames per second", is_within),
         ("before the first or after the last frame of all cameras", ~is_within),
     ):
-        source.leave_out(camera.topic, reason, int((is_unused & which).sum()))
+        job.leave_out(camera.topic, reason, int((is_unused & which).sum()))
     if len(times) > len(used):
-        source.note(
+        job.note(
             f"{camera.topic}: {len(times) - len(used)} of {len(times)} frames repeat the previous "
             f"one, to reach {fps} per second"
         )
@@ -295,18 +291,18 @@ def _sampled(camera: ExportedCamera, resize: float | tuple[int, int] | None) -> 
 # ---------------------------------------------------------------- vectors
 
 
-def _add_vectors(job: ExportJob, source: ExportSource, episode: Episode, fps: int) -> None:
+def _add_vectors(job: ExportJob, episode: Episode, fps: int) -> None:
     known: dict[str, NDArray[np.float32]] = {}
     for feature, option in _VECTORS.items():
         topic = getattr(job.options, option)
         if not topic:
             continue
-        measures = Measures(source.dataset, topic, "vector", option)
+        measures = Measures(job.dataset, topic, "vector", option)
         if measures.first is None:
-            raise OptionError(f"`{option}` {topic} has no message in {source.dataset.path}.")
+            raise OptionError(f"`{option}` {topic} has no message in {job.dataset.path}.")
         names = [*measures.names]
         if topic not in known:  # one topic may be both, and is counted once
-            known[topic] = _vector(source, measures, len(names), episode.times, fps)
+            known[topic] = _vector(job, measures, len(names), episode.times, fps)
         episode.vectors[feature] = known[topic]
         episode.features[feature] = {"dtype": "float32", "shape": [len(names)], "names": names}
         episode.statistics[feature] = statistics_of(known[topic])
@@ -314,7 +310,7 @@ def _add_vectors(job: ExportJob, source: ExportSource, episode: Episode, fps: in
 
 
 def _vector(
-    source: ExportSource, measures: Measures, count: int, times: Integers, fps: int
+    job: ExportJob, measures: Measures, count: int, times: Integers, fps: int
 ) -> NDArray[np.float32]:
     """The message nearest to each time."""
     topic, rows = measures.topic, [*measures.rows()]
@@ -327,11 +323,11 @@ def _vector(
     own = np.array([time for time, _ in rows], np.int64)
     places = nearest(own, times)
     used = len(np.unique(places))
-    source.exported[topic] += used
+    job.exported[topic] += used
     reason = f"another message is nearer at {fps} frames per second"
-    source.leave_out(topic, reason, len(rows) - used)
+    job.leave_out(topic, reason, len(rows) - used)
     away = int(np.abs(own[places] - times).max())
-    source.note(f"{topic}: each frame gets the nearest message, at most {away / _NS:.3f} s away")
+    job.note(f"{topic}: each frame gets the nearest message, at most {away / _NS:.3f} s away")
     return np.array([values for _, values in rows], np.float32).reshape(-1, count)[places]
 
 
