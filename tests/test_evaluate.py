@@ -30,6 +30,7 @@ from mp4ds.cli.evaluate import print_evaluation
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, TargetError
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
 from mp4ds.packing.options import PackOptions
+from mp4ds.plan import QualityTarget
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.evaluating.clips import chosen, make_clip, open_cameras
 from mp4ds.plugins.evaluating.evaluate import (
@@ -38,8 +39,13 @@ from mp4ds.plugins.evaluating.evaluate import (
     settings_of,
 )
 from mp4ds.plugins.evaluating.page import page, pareto, table
-from mp4ds.plugins.evaluating.results import Evaluation, ScoreGoal, reachable_score, recommend
-from mp4ds.plugins.evaluating.trials import Cell, Setting
+from mp4ds.plugins.evaluating.trials import (
+    Cell,
+    Evaluation,
+    Setting,
+    reachable_score,
+    recommend,
+)
 from mp4ds.video.planes import PacketSizes, packet_sizes
 from mp4ds.video.scores import ScoreSummary, largest_crf
 from scenes import TRAITS, Scene, odd_scene
@@ -49,7 +55,7 @@ from waiting import WATCHDOG_S, until
 ROOT = Path(__file__).parents[1]
 TOPIC = "/cam/image_raw"
 QUICK = EvaluateOptions(
-    codecs=["h264"], presets=["ultrafast"], crf=["24"], frames=10, target="psnr_y=20",
+    codecs=["h264"], presets=["ultrafast"], crf=["24"], frames=10, target="psnr=20",
     threads=1,
 )  # fmt: skip
 
@@ -90,12 +96,18 @@ def test_no_crfs(text: str) -> None:
         EvaluateOptions(crf=text)
 
 
-def test_targets() -> None:
-    assert EvaluateOptions(target="vmaf=99").target == ScoreGoal("vmaf", 99)
-    assert EvaluateOptions(target="psnr_y=42.5").target == ScoreGoal("psnr_y", 42.5)
-    for text in ("", "99", "vmaf", "vmaf=", "=3", "psnr=40", "vmaf=0", "vmaf=101", "vmaf=nan"):
-        with pytest.raises(OptionError, match="`target`"):
-            EvaluateOptions(target=text)
+@pytest.mark.parametrize("metric", ["vmaf", "psnr", "ssim"])
+def test_targets(metric: str) -> None:
+    assert EvaluateOptions(target=f"{metric}=0.5").target == QualityTarget(metric, 0.5)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "99", "vmaf", "vmaf=", "=3", "psnr_y=40", "crf=20", "vmaf=0", "vmaf=101", "vmaf=nan"],
+)
+def test_no_targets(text: str) -> None:
+    with pytest.raises(OptionError, match=r"`target` .* is not a score"):
+        EvaluateOptions(target=text)
 
 
 def test_presets_go_to_the_codecs_that_have_them() -> None:
@@ -183,22 +195,22 @@ def test_the_smallest_and_the_fastest_that_reach_the_target_are_recommended() ->
         cell(10, 99.9, 90, 9), cell(20, 99.6, 50, 8), cell(20, 99.55, 70, 2, "veryfast"),
         cell(30, 99.4, 20, 1),
     ]  # fmt: skip
-    smallest, fastest = recommend([(cells, 99.5)], ScoreGoal())
+    smallest, fastest = recommend([(cells, 99.5)], QualityTarget("vmaf", 99.5))
     assert (smallest.why, smallest.setting) == ("smallest", cells[1].setting)
     assert (fastest.why, fastest.setting) == ("fastest", cells[2].setting)
     assert smallest.options == "--quality crf=20 --codec h264 --preset fast"
-    assert recommend([(cells, 99.95)], ScoreGoal()) == []
+    assert recommend([(cells, 99.95)], QualityTarget("vmaf", 99.5)) == []
     other = [replace(item, scores={"vmaf": ScoreSummary(99, 99, 99, 99)}) for item in cells]
     other[0] = cells[0]
-    both = recommend([(cells, 99.5), (other, 99.5)], ScoreGoal())
+    both = recommend([(cells, 99.5), (other, 99.5)], QualityTarget("vmaf", 99.5))
     assert {item.setting for item in both} == {cells[0].setting}
 
 
 def test_the_target_keeps_from_the_ceiling() -> None:
     for ceiling, due in ((99.9, 99.5), (99.65, 99.45)):
         scores = {"vmaf": ScoreSummary(ceiling, ceiling, ceiling, ceiling)}
-        assert reachable_score(ScoreGoal("vmaf", 99.5), scores) == pytest.approx(due)
-    assert reachable_score(ScoreGoal("psnr_y", 42), {}) == 42
+        assert reachable_score(QualityTarget("vmaf", 99.5), scores) == pytest.approx(due)
+    assert reachable_score(QualityTarget("psnr", 42), {}) == 42
 
 
 def test_the_front_has_what_nothing_is_better_than() -> None:
@@ -544,7 +556,7 @@ def test_a_killed_one_goes_on(number: signal.Signals, tmp_path: Path) -> None:
     command = [
         *(sys.executable, "-m", "mp4ds", "evaluate", str(path), "-o", str(out)),
         *("--codecs", "h264", "--presets", "ultrafast", "--crf", "20:51", "--frames", "10"),
-        *("--threads", "1", "--target", "psnr_y=20"),
+        *("--threads", "1", "--target", "psnr=20"),
     ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         until(lambda: len(list(out.glob("cells/*.json"))) >= 2, process)
@@ -592,7 +604,7 @@ def test_without_libvmaf(
 ) -> None:
     monkeypatch.setattr("mp4ds.plugins.evaluating.evaluate.find_ffmpeg", no_ffmpeg)
     path = recording(tmp_path)
-    with pytest.raises(ScoringError, match="`target` psnr_y"):
+    with pytest.raises(ScoringError, match="`target` psnr"):
         evaluate(path, replace(QUICK, target="vmaf=99.5"), output=tmp_path / "out")
     found = evaluate(path, QUICK, output=tmp_path / "out")
     (camera,) = found.cameras
@@ -606,10 +618,10 @@ def test_without_libvmaf(
 
 
 def test_where_nothing_reaches_the_target(tmp_path: Path) -> None:
-    options = replace(QUICK, target="psnr_y=59")
+    options = replace(QUICK, target="psnr=59")
     (camera,) = evaluate(recording(tmp_path), options, output=tmp_path / "out").cameras
     assert camera.recommended == []
-    assert any("no setting reaches psnr_y 59.00" in note for note in camera.notes)
+    assert any("no setting reaches psnr 59.00" in note for note in camera.notes)
 
 
 # ---------------------------------------------------------------- command line, documents
@@ -619,7 +631,7 @@ def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     path = recording(tmp_path)
     monkeypatch.chdir(tmp_path)
     plain = ("--codecs", "h264", "--presets", "ultrafast", "--frames", "10", "--crf", "24")
-    given = ("evaluate", path, *plain, "--target", "psnr_y=20")
+    given = ("evaluate", path, *plain, "--target", "psnr=20")
     out = call(*given).out
     assert re.search(r"h264 +ultrafast +24 ", out)
     assert "smallest: --quality crf=24 --codec h264 --preset ultrafast" in out

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from mp4ds.packing.options import ImageFolder, PackOptions, PackSummary
     from mp4ds.packing.pack import pack, pack_each, pack_share
     from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
-    from mp4ds.plugins.evaluating.results import Evaluation
+    from mp4ds.plugins.evaluating.trials import Evaluation
     from mp4ds.plugins.exporting.export import export
     from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
     from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
@@ -80,7 +80,7 @@ _HOMES = {
     "packing.options": "ImageFolder PackOptions PackSummary",
     "packing.pack": "pack pack_each pack_share",
     "plugins.evaluating.evaluate": "EvaluateOptions evaluate",
-    "plugins.evaluating.results": "Evaluation",
+    "plugins.evaluating.trials": "Evaluation",
     "plugins.exporting.export": "export",
     "plugins.exporting.job": "ExportOptions ExportSummary",
     "plugins.importing.ros_mp4": "import_ros_mp4",

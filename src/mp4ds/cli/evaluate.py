@@ -11,7 +11,7 @@ from mp4ds.errors import counted, interrupted, path_text
 from mp4ds.options import WHERE
 from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
 from mp4ds.plugins.evaluating.page import findings_of
-from mp4ds.plugins.evaluating.results import Evaluation
+from mp4ds.plugins.evaluating.trials import Evaluation
 
 _SPARE = {  # see `Column`
     "best": 12,

@@ -11,7 +11,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +24,7 @@ from mp4ds.files.outputs import check_place, refuse_not_ours, work_folder, write
 from mp4ds.files.urls import location
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import LONG, WHAT, Parsed, TopicOptions, jobs, option, parse_words
-from mp4ds.plan import FileNames
+from mp4ds.plan import FileNames, QualityTarget, parse_quality
 from mp4ds.plugins.evaluating.clips import (
     Camera,
     chosen,
@@ -32,30 +32,27 @@ from mp4ds.plugins.evaluating.clips import (
     open_cameras,
 )
 from mp4ds.plugins.evaluating.page import PLOTS, write_files
-from mp4ds.plugins.evaluating.results import (
-    CEILING_MARGIN,
-    CameraEvaluation,
-    Evaluation,
-    ScoreGoal,
-    StorageRow,
-    reachable_score,
-    recommend,
-    score_of,
-)
 from mp4ds.plugins.evaluating.trials import (
+    CEILING_MARGIN,
     CELLS,
     PICTURES,
+    CameraEvaluation,
     Cell,
     Clip,
+    Evaluation,
     Setting,
+    StorageRow,
     Trial,
+    mean_score,
+    reachable_score,
+    recommend,
     try_out,
     versions_of,
 )
 from mp4ds.video.codecs import AV1, LOSSY_GOP, MAX_CRF, check_codec, codec_name
 from mp4ds.video.images import jpeg_bytes
 from mp4ds.video.planes import rgb_of
-from mp4ds.video.scores import METRICS, Ffmpeg, find_ffmpeg, scores_of, summary_of
+from mp4ds.video.scores import Ffmpeg, find_ffmpeg, scores_of, summary_of
 
 _DEFAULT_PRESETS = {
     **dict.fromkeys(AV1, ("6", "8")),
@@ -82,21 +79,18 @@ def _parse_crfs(value: str | Sequence[str | int]) -> tuple[int, ...]:
     return tuple(sorted(found))
 
 
-def _parse_target(value: str | ScoreGoal) -> ScoreGoal:
-    """The target of ``vmaf=99.5``, ``psnr_y=42`` or ``ssim=0.98``."""
-    if isinstance(value, ScoreGoal):
-        return value
-    metric, _, text = value.partition("=")
-    try:
-        score = float(text)
-    except ValueError:
-        score = -1.0
-    if metric not in METRICS or not 0 < score <= 100:
+def _parse_target(value: str | QualityTarget) -> QualityTarget:
+    """The score of ``vmaf=99.5``, ``psnr=42`` or ``ssim=0.98``."""
+    target = value if isinstance(value, QualityTarget) else None
+    if isinstance(value, str):
+        with suppress(OptionError):  # whose sentence is for more than scores
+            target = parse_quality(value).target
+    if target is None:
         raise OptionError(
-            f"{value!r} is not valid. Use METRIC=SCORE, such as vmaf=99.5; metrics: "
-            f"{', '.join(METRICS)}."
+            f"{value!r} is not a score: use vmaf=99.5 (below 100), psnr=42 (dB, below 60) or "
+            "ssim=0.98 (below 1)."
         )
-    return ScoreGoal(metric, score)
+    return target
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,8 +118,8 @@ class EvaluateOptions(TopicOptions):
         most=_MOST,
     )
     frames: int = option("Frames per clip.", 150, panel=WHAT, least=1)
-    target: Parsed[ScoreGoal] = option(
-        "Score to reach, such as vmaf=99.5, psnr_y=42 or ssim=0.98.",
+    target: Parsed[QualityTarget] = option(
+        "Score to reach, such as vmaf=99.5, psnr=42 or ssim=0.98.",
         "vmaf=99.5",
         parse=_parse_target,
     )
@@ -263,13 +257,13 @@ def evaluate(
     return result
 
 
-def _ffmpeg(goal: ScoreGoal) -> Ffmpeg | None:
+def _ffmpeg(goal: QualityTarget) -> Ffmpeg | None:
     try:
         return find_ffmpeg()
     except ScoringError as error:
         if goal.metric == "vmaf":
             raise ScoringError(
-                f"{error} Or choose another metric, such as `target` psnr_y=42."
+                f"{error} Or choose another metric, such as `target` psnr=42."
             ) from None
         return None
 
@@ -414,7 +408,7 @@ def _storage(found: CameraEvaluation, folder: Path, count: float) -> list[Storag
     """The cost of storing so many frames, in several forms."""
     clip, (width, height) = found.clip, found.clip.image_size
     encoding = ENCODINGS[clip.encoding]
-    best = max(found.cells, key=lambda cell: score_of(cell, found.target)).setting
+    best = max(found.cells, key=lambda cell: mean_score(cell.scores, found.target)).setting
     setting = found.recommended[0].setting if found.recommended else best
     cell = next(cell for cell in found.cells if cell.setting == setting)
     sizes = {
@@ -447,11 +441,11 @@ def _jpeg_bytes(clip: Clip, folder: Path, quality: int) -> float:
 
 
 def _notes(
-    clip: Clip, cells: Sequence[Cell], goal: ScoreGoal, reachable: float, lossy: str, jobs: int
+    clip: Clip, cells: Sequence[Cell], goal: QualityTarget, reachable: float, lossy: str, jobs: int
 ) -> list[str]:
     """What is worth knowing about the figures."""
-    best = max(cells, key=lambda cell: score_of(cell, goal))
-    reached = score_of(best, goal)
+    best = max(cells, key=lambda cell: mean_score(cell.scores, goal))
+    reached = mean_score(best.scores, goal)
     notes = {
         f"its images are already lossy ({lossy}): scores measure the distance from these, not "
         "from what the camera saw": bool(lossy),

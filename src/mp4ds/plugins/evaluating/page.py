@@ -16,13 +16,13 @@ from typing import Any
 
 from mp4ds.errors import size_text
 from mp4ds.files.outputs import csv_cell, write_synced
-from mp4ds.plugins.evaluating.results import (
+from mp4ds.plugins.evaluating.trials import (
     CameraEvaluation,
+    Cell,
     Evaluation,
     StorageRow,
-    score_of,
+    mean_score,
 )
-from mp4ds.plugins.evaluating.trials import Cell
 from mp4ds.video.drawing import Dot, Line, Shape, Text, svg_of
 from mp4ds.video.scores import METRICS, ScoreSummary
 
@@ -177,8 +177,7 @@ _LEGEND = _RIGHT + 18
 _SPARE = 1.15  # factor between the outermost cost and the frame
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#666666")
 _GRID, _INK, _FRONT, _TARGET = "#e4e4e4", "#333333", "#999999", "#cc0000"
-_NAMES = {"vmaf": "VMAF", "psnr_y": "PSNR Y, dB", "psnr_cb": "PSNR Cb, dB",
-          "psnr_cr": "PSNR Cr, dB", "ssim": "SSIM"}  # fmt: skip
+_NAMES = {"vmaf": "VMAF", "psnr": "PSNR Y, dB", "ssim": "SSIM"}
 
 
 def plot(camera: CameraEvaluation, kind: str) -> list[Shape]:
@@ -193,9 +192,9 @@ def plot(camera: CameraEvaluation, kind: str) -> list[Shape]:
         max(1e-9, cell.encode_cpu_seconds / camera.clip.frames if kind == "time" else cell.kbps)
         for cell in camera.cells
     ]
-    scores = [score_of(cell, camera.target) for cell in camera.cells]
+    scores = [mean_score(cell.scores, camera.target) for cell in camera.cells]
     shapes, place = _frame(
-        costs, [*scores, camera.reachable, camera.ceiling[camera.target.metric].mean]
+        costs, [*scores, camera.reachable, mean_score(camera.ceiling, camera.target)]
     )
     shapes += [
         Text((SIZE[0] / 2, 12), f"{camera.topic}: {title}", "middle"),
@@ -316,7 +315,7 @@ def _section(result: Evaluation, camera: CameraEvaluation) -> Iterator[str]:
     yield "<h3>The same detail in each, enlarged twice</h3>"
     shown = {"encoder input": camera.ground_truth}
     for cell in camera.cells:
-        score = f"{camera.target.metric} {score_of(cell, camera.target):.2f}"
+        score = f"{camera.target.metric} {mean_score(cell.scores, camera.target):.2f}"
         shown[f"{cell.setting.name}: {score}, {cell.kbps:.0f} kbit/s"] = cell.picture
     figures = []
     for words, name in shown.items():

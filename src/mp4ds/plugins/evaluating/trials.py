@@ -1,4 +1,4 @@
-"""Tries settings on clips, each in its own process, and keeps the measurements."""
+"""Tries settings on clips, each in its own process; what was measured, and what follows from it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from mp4ds._version import __version__
 from mp4ds.files.outputs import write_synced
 from mp4ds.packing.processes import ProcessExecutor, call_error
+from mp4ds.plan import QualityTarget
 from mp4ds.video.codecs import LOSSY_GOP, Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import png_file
@@ -320,3 +321,160 @@ def _encoded(trial: Trial, frames: PlaneSpool, recipe: Recipe, video: Path) -> d
         "whole_bytes": frame_bytes * clip.source_frames,
         "whole_seconds": seconds / clip.frames * clip.source_frames,
     }
+
+
+# ---------------------------------------------------------------- results
+
+
+@dataclass(frozen=True, slots=True)
+class StorageRow:
+    """The cost of one way of storing frames.
+
+    Attributes:
+        form: ``raw``, ``YUV 4:4:4``, ``RGB``, ``JPEG 90``, ``JPEG 75`` or a setting.
+        frame_bytes: Bytes of a frame.
+        gigabytes: Size of the data set, in units of 10^9 bytes.
+        days: Time to encode it here, one camera after another; None if not encoded.
+        cpu_days: CPU time of that.
+    """
+
+    form: str
+    frame_bytes: float
+    gigabytes: float
+    days: float | None = None
+    cpu_days: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Recommendation:
+    """A setting that reaches the target.
+
+    Attributes:
+        why: ``smallest`` or ``fastest``.
+        setting: What to pack with.
+        score: Mean of the target's metric.
+        options: The corresponding options of ``mp4ds pack``.
+    """
+
+    why: str
+    setting: Setting
+    score: float
+    options: str
+
+
+@dataclass
+class CameraEvaluation:
+    """The results for one camera.
+
+    Attributes:
+        topic: Of its images.
+        name: Of its files.
+        clip: What was tried on.
+        ceiling: Scores of the clip against itself, which no setting can exceed.
+        target: The score to reach.
+        reachable: The same, or lower if the ceiling is too close.
+        cells: By setting, in the order of the grid.
+        recommended: The smallest and the fastest setting that reach the target; empty if none.
+        ground_truth: Name of the PNG file of the clip's detail.
+        data_set: The data set that `storage` is for, in words.
+        storage: The cost of storing it, in several forms; empty if there is no frame rate.
+        notes: Anything else worth knowing.
+    """
+
+    topic: str
+    name: str
+    clip: Clip
+    ceiling: Mapping[str, ScoreSummary]
+    target: QualityTarget
+    reachable: float
+    cells: Sequence[Cell]
+    recommended: Sequence[Recommendation]
+    ground_truth: str
+    data_set: str = ""
+    storage: Sequence[StorageRow] = ()
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Evaluation:
+    """The results for a recording.
+
+    Attributes:
+        source: The evaluated source.
+        output: The folder with the results.
+        cameras: In the order of their topics.
+        left_out: Topics of cameras that were not evaluated, and why.
+        versions: Of the software that made the videos and scores.
+        recommended: The smallest and the fastest setting that reach the targets of all cameras,
+            with their lowest score; empty if none.
+        tried: Cells measured in this run.
+        known: Cells measured in an earlier one.
+    """
+
+    source: Path
+    output: Path
+    cameras: list[CameraEvaluation]
+    left_out: dict[str, str]
+    versions: dict[str, str]
+    recommended: Sequence[Recommendation] = ()
+    tried: int = 0
+    known: int = 0
+
+
+# ---------------------------------------------------------------- conclusions
+
+CEILING_MARGIN = 0.2
+"""In VMAF: a target closer to the ceiling than this is indistinguishable from noise."""
+
+
+def reachable_score(target: QualityTarget, ceiling: Mapping[str, ScoreSummary]) -> float:
+    """The target, or less if the ceiling is too close.
+
+    Args:
+        target: The requested target.
+        ceiling: Scores of the clip against itself.
+    """
+    if target.metric != "vmaf":
+        return target.score
+    return min(target.score, ceiling["vmaf"].mean - CEILING_MARGIN)
+
+
+def mean_score(scores: Mapping[str, ScoreSummary], target: QualityTarget) -> float:
+    """Mean score in the target's metric."""
+    return scores["psnr_y" if target.metric == "psnr" else target.metric].mean
+
+
+def recommend(
+    cameras: Sequence[tuple[Sequence[Cell], float]], target: QualityTarget
+) -> list[Recommendation]:
+    """The smallest and the fastest setting that reach the scores of all cameras.
+
+    Args:
+        cameras: At least one: its cells, and the score to reach.
+        target: The target, whose metric is compared.
+
+    Returns:
+        None if no setting does.
+    """
+    able = set.intersection(
+        *(
+            {cell.setting for cell in cells if mean_score(cell.scores, target) >= due}
+            for cells, due in cameras
+        )
+    )
+    cells = [cell for own, _ in cameras for cell in own if cell.setting in able]
+
+    def total(setting: Setting, figure: str) -> float:
+        return sum(float(getattr(cell, figure)) for cell in cells if cell.setting == setting)
+
+    found = []
+    for why, figure in (("smallest", "frame_bytes"), ("fastest", "encode_cpu_seconds")):
+        # by name, so that ties are resolved consistently
+        costs = {(total(setting, figure), setting.name): setting for setting in able}
+        if costs:
+            setting = costs[min(costs)]
+            score = min(
+                mean_score(cell.scores, target) for cell in cells if cell.setting == setting
+            )
+            found.append(Recommendation(why, setting, score, setting.pack_options))
+    return found
