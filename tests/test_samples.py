@@ -52,9 +52,9 @@ def check(path: Path) -> SampleTable:
         packets = [packet for packet in container.demux(stream) if packet.size]
         assert table.timescale == 1 / stream.time_base
         context: Any = stream.codec_context
-        if table.codec in ("avc1", "hev1", "hvc1", "av01", "FFV1"):
-            assert table.configuration == bytes(context.extradata)
-        assert (table.width, table.height) == (context.width, context.height)
+        if table.entry.codec in ("avc1", "hev1", "hvc1", "av01", "FFV1"):
+            assert table.entry.configuration == bytes(context.extradata)
+        assert (table.entry.width, table.entry.height) == (context.width, context.height)
     is_shown = np.zeros(len(table.sizes), bool)
     is_shown[table.order] = True
     found = [table.places, table.sizes, table.presentation, table.decoding, table.sync, is_shown]
@@ -99,8 +99,8 @@ def test_what_is_encoded_here(
     assert table.sync[::4].all()  # and where the encoder sees another scene
     assert not lossless or table.sync.sum() == 3
     entries = {"h264": "avc1", "h265": "hev1", "av1": "av01", "av1-10bit": "av01", "ffv1": "FFV1"}
-    assert table.codec == entries[codec]
-    assert table.configuration
+    assert table.entry.codec == entries[codec]
+    assert table.entry.configuration
 
 
 @pytest.mark.parametrize("name", IN_ORDER)
@@ -109,7 +109,7 @@ def test_packets_that_are_copied(name: str, tmp_path: Path) -> None:
     write_packets(tmp_path / "a.mp4", ENCODINGS[name].codec, packets)
     table = check(tmp_path / "a.mp4")
     assert table.presentation.tolist() == [n * STEP for n in range(len(packets))]
-    assert bool(table.configuration) == (ENCODINGS[name].codec not in ("mjpeg", "png"))
+    assert bool(table.entry.configuration) == (ENCODINGS[name].codec not in ("mjpeg", "png"))
 
 
 @pytest.mark.parametrize("frames", [1, 2])

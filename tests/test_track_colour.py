@@ -14,7 +14,7 @@ from conftest import real
 from mp4ds.dataset.images import VideoImages
 from mp4ds.dataset.topic import Topic
 from mp4ds.video.access import FrameAccess
-from mp4ds.video.mp4 import SampleEntry, TrackColour, read_sample_entry, track_colour
+from mp4ds.video.mp4 import SampleEntry, TrackColour, read_sample_entry
 from test_access import opened
 from test_references import FRAMES, HEIGHT, RECIPES, WIDTH, encoded_file
 
@@ -63,7 +63,7 @@ def test_decoders_know_what_the_track_says(
     recipe = RECIPES[name]
     path = tmp_path / "v.mp4"
     path.write_bytes(tagged(encoded_file(recipe), colour, colour_range))
-    assert track_colour(read_sample_entry(path)) == TrackColour(*colour, colour_range == 2)
+    assert read_sample_entry(path).colour == TrackColour(*colour, colour_range == 2)
     with av.open(str(path)) as container:
         expected = [tags(frame) for frame in container.decode(video=0)]
     if name in ("ffv1", NAMES[0]):  # whose packets say nothing
@@ -81,14 +81,14 @@ def test_decoders_know_what_the_track_says(
 def test_a_track_without_colours(tmp_path: Path) -> None:
     path = tmp_path / "v.mp4"
     path.write_bytes(encoded_file(RECIPES["ffv1"]))
-    assert track_colour(read_sample_entry(path)) is None
+    assert read_sample_entry(path).colour is None
     with opened(path, RECIPES["ffv1"]) as access:
-        assert access.table.colour is None
+        assert access.table.entry.colour is None
 
 
 def test_a_real_one() -> None:
     path = real("video/bt709_full_range.mp4")
-    colour = track_colour(read_sample_entry(path))
+    colour = read_sample_entry(path).colour
     video = Topic([VideoImages(path)])
     every = [frame.data for frame in video]
     numbers = [len(every) - 1, 0, len(every) // 2]
@@ -123,4 +123,4 @@ def colr(kind: bytes, *numbers: int, flags: bytes = b"") -> tuple[str, bytes]:
     ],
 )
 def test_boxes(boxes: list[tuple[str, bytes]], expected: TrackColour | None) -> None:
-    assert track_colour(entry(*boxes)) == expected
+    assert entry(*boxes).colour == expected

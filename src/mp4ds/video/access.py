@@ -173,7 +173,7 @@ class Chains:
             yield samples[start:end]
 
     def _new_parser(self) -> StreamParser:
-        return CODECS[self._codec].parser(self._table.configuration)
+        return CODECS[self._codec].parser(self._table.entry.configuration)
 
     def _begin(self, place: int) -> Group:
         count = len(self._table.sizes)
@@ -263,13 +263,13 @@ class FrameAccess:
         except Refused as error:
             raise UnknownStructure(f"its index cannot be used: {error}") from None
         known = CODECS.get(self._codec)
-        if known is None or table.codec not in known.entries:
-            raise UnknownStructure(f"its track is {table.codec!r}")
+        if known is None or table.entry.codec not in known.entries:
+            raise UnknownStructure(f"its track is {table.entry.codec!r}")
         if frames is not None and len(table.order) != frames:
             raise VideoError(
                 "frame-count", self._path, f"has {len(table.order)} frames, not {frames}"
             )
-        if (table.width, table.height) != self._maker.coded_size:
+        if (table.entry.width, table.entry.height) != self._maker.coded_size:
             raise UnknownStructure("its frames have a different size")
         if int(table.order.min()) + len(table.order) != len(table.sizes) or not table.sync[0]:
             raise UnknownStructure(
@@ -391,11 +391,12 @@ class FrameAccess:
         if self._codec == "mjpeg":
             return JpegDecoder(self._maker.coded_size)
         context: Any = av.CodecContext.create(CODECS[self._codec].decoder, "r")
-        if self.table.configuration:
-            context.extradata = self.table.configuration
-        context.width, context.height = self.table.width, self.table.height
-        if self.table.colour:
-            self.table.colour.apply(context)
+        entry = self.table.entry
+        if entry.configuration:
+            context.extradata = entry.configuration
+        context.width, context.height = entry.width, entry.height
+        if entry.colour:
+            entry.colour.apply(context)
         context.thread_count = self._threads
         context.thread_type = "SLICE"
         # concealed damage would depend on which frames were decoded before

@@ -109,11 +109,48 @@ def why_unreadable(path: Path) -> str:
     return "" if b"moov" in kinds else "was cut short: it has no index (moov)"
 
 
+# ---------------------------------------------------------------- track colour
+
+_UNSPECIFIED = 2
+_LIMITED, _FULL = 1, 2  # ffmpeg's AVColorRange
+_WORDS = 6  # bytes of three numbers, behind the four letters of the box's kind
+# the numbers of ITU-T H.273 that ffmpeg knows
+_PRIMARIES = frozenset((1, *range(4, 13), 22))
+_TRANSFERS = frozenset((1, *range(4, 19)))
+_MATRICES = frozenset((0, 1, *range(4, 18)))
+
+
+@dataclass(frozen=True, slots=True)
+class TrackColour:
+    """The box ``colr`` (ISO/IEC 14496-12, 12.1.5), numbers as in ITU-T H.273.
+
+    Attributes:
+        primaries: Colour primaries.
+        transfer: Transfer characteristics.
+        matrix: Matrix coefficients.
+        full_range: Whether samples use their full range; None if not stated.
+    """
+
+    primaries: int
+    transfer: int
+    matrix: int
+    full_range: bool | None
+
+    def apply(self, context: Any) -> None:
+        """Set them on PyAV's decoder context; the packets' own values take precedence."""
+        context.color_primaries = self.primaries
+        context.color_trc = self.transfer
+        context.colorspace = self.matrix
+        if self.full_range is not None:
+            context.color_range = _FULL if self.full_range else _LIMITED
+
+
 # ---------------------------------------------------------------- sample entry
 
 _TO_DESCRIPTION = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
 _ENTRY_BYTES = 78  # of a video's sample entry, between its header and the boxes in it
 _LONGEST_ENTRY = 1 << 20
+_CONFIGURATIONS = ("avcC", "hvcC", "av1C", "vpcC", "glbl")
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +160,8 @@ class SampleEntry:
     Bit rates are left out: they are of the packets, not of the codec.
 
     Attributes:
-        codec: Its four letters.
+        codec: Its four letters: ``avc1``, ``hev1``, ``hvc1``, ``av01``, ``vp09``, ``FFV1``,
+            ``mp4v``, ...
         values: Size, resolution and depth, as stored.
         boxes: What follows: parameter sets, colour, aspect ratio, ...
     """
@@ -150,9 +188,32 @@ class SampleEntry:
         return int.from_bytes(self.values[26:28], "big")
 
     @property
-    def size(self) -> str:
-        """Width and height in pixels."""
-        return f"{self.width}x{self.height}"
+    def configuration(self) -> bytes:
+        """Contents of avcC, hvcC, av1C, vpcC or glbl; empty if there is none."""
+        return next((body for kind, body in self.boxes if kind in _CONFIGURATIONS), b"")
+
+    @property
+    def colour(self) -> TrackColour | None:
+        """The colours of the track, as ffmpeg reads them; None if not stated.
+
+        QuickTime's ``nclc`` has no range. Undefined values count as unspecified; profiles are
+        ignored.
+        """
+        found = None
+        for kind, body in self.boxes:
+            if kind != "colr" or body[:4] not in (b"nclx", b"nclc") or len(body) < 4 + _WORDS:
+                continue
+            primaries, transfer, matrix = (
+                int.from_bytes(body[at : at + 2], "big") for at in (4, 6, 8)
+            )
+            is_stated = body[:4] == b"nclx" and len(body) > 10
+            found = TrackColour(
+                primaries if primaries in _PRIMARIES else _UNSPECIFIED,
+                transfer if transfer in _TRANSFERS else _UNSPECIFIED,
+                matrix if matrix in _MATRICES else _UNSPECIFIED,
+                bool(body[10] & 0x80) if is_stated else None,
+            )
+        return found
 
     def differences(self, other: SampleEntry) -> str:
         """What differs, in words; empty if nothing does."""
@@ -160,8 +221,9 @@ class SampleEntry:
             return ""
         if self.codec != other.codec:
             return f"their codec ({self.codec} and {other.codec})"
-        if self.size != other.size:
-            return f"their size ({self.size} and {other.size})"
+        sizes = [f"{entry.width}x{entry.height}" for entry in (self, other)]
+        if sizes[0] != sizes[1]:
+            return f"their size ({' and '.join(sizes)})"
         kinds = sorted({kind for kind, _ in set(self.boxes) ^ set(other.boxes)})
         return f"their codec configuration ({', '.join(kinds) or 'order or depth'})"
 
@@ -232,67 +294,10 @@ def _without_rates(esds: bytes) -> bytes:
     return esds[:19] + bytes(11) + esds[30:]
 
 
-# ---------------------------------------------------------------- track colour
-
-_UNSPECIFIED = 2
-_LIMITED, _FULL = 1, 2  # ffmpeg's AVColorRange
-_WORDS = 6  # bytes of three numbers, behind the four letters of the box's kind
-# the numbers of ITU-T H.273 that ffmpeg knows
-_PRIMARIES = frozenset((1, *range(4, 13), 22))
-_TRANSFERS = frozenset((1, *range(4, 19)))
-_MATRICES = frozenset((0, 1, *range(4, 18)))
-
-
-@dataclass(frozen=True, slots=True)
-class TrackColour:
-    """The box ``colr`` (ISO/IEC 14496-12, 12.1.5), numbers as in ITU-T H.273.
-
-    Attributes:
-        primaries: Colour primaries.
-        transfer: Transfer characteristics.
-        matrix: Matrix coefficients.
-        full_range: Whether samples use their full range; None if not stated.
-    """
-
-    primaries: int
-    transfer: int
-    matrix: int
-    full_range: bool | None
-
-    def apply(self, context: Any) -> None:
-        """Set them on PyAV's decoder context; the packets' own values take precedence."""
-        context.color_primaries = self.primaries
-        context.color_trc = self.transfer
-        context.colorspace = self.matrix
-        if self.full_range is not None:
-            context.color_range = _FULL if self.full_range else _LIMITED
-
-
-def track_colour(entry: SampleEntry) -> TrackColour | None:
-    """The colours of a track, as ffmpeg reads them; None if not stated.
-
-    QuickTime's ``nclc`` has no range. Undefined values count as unspecified; profiles are ignored.
-    """
-    found = None
-    for kind, body in entry.boxes:
-        if kind != "colr" or body[:4] not in (b"nclx", b"nclc") or len(body) < 4 + _WORDS:
-            continue
-        primaries, transfer, matrix = (int.from_bytes(body[at : at + 2], "big") for at in (4, 6, 8))
-        full_range = bool(body[10] & 0x80) if body[:4] == b"nclx" and len(body) > 10 else None
-        found = TrackColour(
-            primaries if primaries in _PRIMARIES else _UNSPECIFIED,
-            transfer if transfer in _TRANSFERS else _UNSPECIFIED,
-            matrix if matrix in _MATRICES else _UNSPECIFIED,
-            full_range,
-        )
-    return found
-
-
 # ---------------------------------------------------------------- samples
 
 Integers = NDArray[np.int64]
 
-_CONFIGURATIONS = ("avcC", "hvcC", "av1C", "vpcC", "glbl")
 _LONGEST_INDEX = 1 << 26  # bytes; about two days at 30 Hz
 _MOST_ALIKE = 1 << 22  # samples of one size: all that bounds the memory for them
 _LARGEST_TIMESCALE = 1 << 31  # negative to some readers
@@ -318,12 +323,7 @@ class SampleTable:
     """The index of a video track's samples, which are its coded frames.
 
     Attributes:
-        codec: Four letters of the sample entry: ``avc1``, ``hev1``, ``hvc1``, ``av01``,
-            ``vp09``, ``FFV1``, ``mp4v``, ...
-        width: Columns, from the sample entry.
-        height: Rows, from the sample entry.
-        colour: The track's colours, if stated.
-        configuration: Contents of avcC, hvcC, av1C, vpcC or glbl; empty if there is none.
+        entry: Their description.
         timescale: Ticks per second.
         places: Byte of the file where each sample begins, in decoding order. All arrays but
             `sync` are int64.
@@ -335,11 +335,7 @@ class SampleTable:
             frame ``n`` of the video is sample ``order[n]``.
     """
 
-    codec: str
-    width: int
-    height: int
-    colour: TrackColour | None
-    configuration: bytes
+    entry: SampleEntry
     timescale: int
     places: Integers
     sizes: Integers
@@ -488,11 +484,7 @@ def _parse_track(movie: _Movie, track: Box, file_size: int) -> SampleTable:
     if np.any(times[1:] < times[:-1]):
         order = order[np.argsort(times, kind="stable")]
     return SampleTable(
-        codec=entry.codec,
-        width=entry.width,
-        height=entry.height,
-        colour=track_colour(entry),
-        configuration=_configuration(entry),
+        entry=entry,
         timescale=timescale,
         places=places,
         sizes=sizes,
@@ -524,10 +516,6 @@ def _description(movie: _Movie, stsd: Box) -> SampleEntry:
     if movie.number(stsd, 4) > 1:
         raise Refused("its frames have several descriptions")
     return parse_descriptions(movie.file, stsd)
-
-
-def _configuration(entry: SampleEntry) -> bytes:
-    return next((body for kind, body in entry.boxes if kind in _CONFIGURATIONS), b"")
 
 
 def _sizes(movie: _Movie, tables: dict[bytes, Box], file_size: int) -> Integers:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import av
@@ -112,54 +110,6 @@ def rgb_of(planes: Planes, recipe: Recipe) -> NDArray[np.uint8]:
         np.copyto(target, plane)
     converter = PictureConverter(recipe.matrix, source_full_range=recipe.full_range)
     return np.asarray(converter.convert(frame, "rgb24").to_ndarray(), np.uint8)
-
-
-@dataclass(frozen=True, slots=True)
-class PacketSizes:
-    """The sizes of the packets of a video.
-
-    Attributes:
-        keys: Bytes of each key frame.
-        others: Bytes of each other frame.
-    """
-
-    keys: tuple[int, ...]
-    others: tuple[int, ...]
-
-    @property
-    def total(self) -> int:
-        """Bytes of all of them."""
-        return sum(self.keys) + sum(self.others)
-
-    def frame_bytes(self, gop: int) -> float:
-        """Mean bytes per frame of a long video: a short clip has a larger share of key frames.
-
-        Args:
-            gop: Frames from one key frame to the next.
-        """
-        key = sum(self.keys) / max(1, len(self.keys))
-        if not self.others:
-            return key
-        return (key + (gop - 1) * sum(self.others) / len(self.others)) / gop
-
-
-def packet_sizes(path: Path) -> PacketSizes:
-    """The sizes of a video's packets.
-
-    Raises:
-        VideoError: It cannot be read.
-    """
-    keys: list[int] = []
-    others: list[int] = []
-    try:
-        with closing(Media(path)) as media:
-            for packet in media.container.demux(media.track):
-                if packet.size:
-                    (keys if packet.is_keyframe else others).append(packet.size)
-    except (FFmpegError, OSError) as error:
-        raise_if_scarce(error)
-        raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
-    return PacketSizes(tuple(keys), tuple(others))
 
 
 # ---------------------------------------------------------------- spool

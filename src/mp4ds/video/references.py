@@ -229,7 +229,7 @@ def digest_video(path: Path, codec: str) -> tuple[int, str, Structures | None]:
     table = _table(path) if codec in CODECS and CODECS[codec].is_free else None
     if table is None:
         return *digest_file(path), None
-    recorder = StructureRecorder(codec, table.configuration)
+    recorder = StructureRecorder(codec, table.entry.configuration)
     digest = hashlib.sha256()
     size = 0
     with path.open("rb") as file:

@@ -23,7 +23,6 @@ from mp4ds.plugins.evaluating.trials import (
     StorageRow,
     mean_score,
 )
-from mp4ds.video.drawing import Dot, Line, Shape, Text, svg_of
 from mp4ds.video.scores import METRICS, ScoreSummary
 
 PLOTS = "plots"
@@ -48,7 +47,7 @@ def write_files(result: Evaluation, options: dict[str, Any]) -> None:
     for camera in result.cameras:
         for kind in COSTS:
             path = folder / PLOTS / f"{camera.name}-{kind}.svg"
-            write_synced(path, svg_of(plot(camera, kind), SIZE).encode())
+            write_synced(path, plot(camera, kind).encode())
     write_synced(folder / "index.html", page(result).encode())
 
 
@@ -180,8 +179,8 @@ _GRID, _INK, _FRONT, _TARGET = "#e4e4e4", "#333333", "#999999", "#cc0000"
 _NAMES = {"vmaf": "VMAF", "psnr": "PSNR Y, dB", "ssim": "SSIM"}
 
 
-def plot(camera: CameraEvaluation, kind: str) -> list[Shape]:
-    """A plot of all settings of a camera.
+def plot(camera: CameraEvaluation, kind: str) -> str:
+    """A plot of all settings of a camera, as an SVG element.
 
     Args:
         camera: With at least one cell.
@@ -197,17 +196,17 @@ def plot(camera: CameraEvaluation, kind: str) -> list[Shape]:
         costs, [*scores, camera.reachable, mean_score(camera.ceiling, camera.target)]
     )
     shapes += [
-        Text((SIZE[0] / 2, 12), f"{camera.topic}: {title}", "middle"),
-        Text((_LEFT, _TOP - 14), _NAMES[camera.target.metric]),
-        Text(((_LEFT + _RIGHT) / 2, _BOTTOM + 36), label, "middle"),
+        _text((SIZE[0] / 2, 12), f"{camera.topic}: {title}", "middle"),
+        _text((_LEFT, _TOP - 14), _NAMES[camera.target.metric]),
+        _text(((_LEFT + _RIGHT) / 2, _BOTTOM + 36), label, "middle"),
     ]
     _, height = place(costs[0], camera.reachable)
-    shapes.append(Line([(_LEFT, height), (_RIGHT, height)], _TARGET, dashed=True))
+    shapes.append(_line([(_LEFT, height), (_RIGHT, height)], _TARGET, dashed=True))
     target = f"target {camera.reachable:.4g}"
-    shapes.append(Text((_LEFT + 6, height - 9), target, color=_TARGET))
+    shapes.append(_text((_LEFT + 6, height - 9), target, color=_TARGET))
     front = [place(costs[n], scores[n]) for n in pareto(costs, scores)]
     if len(front) > 1:
-        shapes.append(Line(front, _FRONT, 6))
+        shapes.append(_line(front, _FRONT, 6))
     groups: dict[str, list[int]] = {}
     for number, cell in enumerate(camera.cells):
         groups.setdefault(f"{cell.setting.codec} {cell.setting.preset}", []).append(number)
@@ -216,15 +215,15 @@ def plot(camera: CameraEvaluation, kind: str) -> list[Shape]:
         color = _COLORS[number % len(_COLORS)]
         places = [place(costs[n], scores[n]) for n in members]
         if len(places) > 1:
-            shapes.append(Line(places, color, 1.5))
+            shapes.append(_line(places, color, 1.5))
         for n, dot in zip(members, places, strict=True):
             tip = f"{camera.cells[n].setting.name}: {scores[n]:.3f}, {costs[n]:.4g} {label}"
-            shapes.append(Dot(dot, color, 3.5, tip))
-        shapes += [Dot((_LEGEND, legend), color), Text((_LEGEND + 12, legend), name)]
+            shapes.append(_dot(dot, color, 3.5, tip))
+        shapes += [_dot((_LEGEND, legend), color), _text((_LEGEND + 12, legend), name)]
         legend += 20
-    shapes.append(Line([(_LEGEND - 7, legend), (_LEGEND + 7, legend)], _FRONT, 6))
-    shapes.append(Text((_LEGEND + 12, legend), "Pareto front"))
-    return shapes
+    shapes.append(_line([(_LEGEND - 7, legend), (_LEGEND + 7, legend)], _FRONT, 6))
+    shapes.append(_text((_LEGEND + 12, legend), "Pareto front"))
+    return _svg(shapes)
 
 
 def pareto(costs: Sequence[float], scores: Sequence[float]) -> list[int]:
@@ -238,7 +237,7 @@ def pareto(costs: Sequence[float], scores: Sequence[float]) -> list[int]:
 
 def _frame(
     costs: Sequence[float], scores: Sequence[float]
-) -> tuple[list[Shape], Callable[[float, float], tuple[float, float]]]:
+) -> tuple[list[str], Callable[[float, float], tuple[float, float]]]:
     """Axes of costs, which are logarithmic, and of scores; and where a pair of both is."""
     least, most = min(costs) / _SPARE, max(costs) * _SPARE
     margin = max((max(scores) - min(scores)) * 0.05, 1e-6 * max(1.0, abs(max(scores))))
@@ -249,20 +248,59 @@ def _frame(
         up = (score - low) / (high - low)
         return _LEFT + across * (_RIGHT - _LEFT), _BOTTOM - up * (_BOTTOM - _TOP)
 
-    shapes: list[Shape] = []
+    shapes: list[str] = []
     powers = range(floor(log10(least)), ceil(log10(most)) + 1)
     for cost in (times * 10.0**power for power in powers for times in (1, 2, 5)):
         if least <= cost <= most:
             x, _ = place(cost, low)
-            shapes.append(Line([(x, _BOTTOM), (x, _TOP)], _GRID))
-            shapes.append(Text((x, _BOTTOM + 14), f"{cost:g}", "middle"))
+            shapes.append(_line([(x, _BOTTOM), (x, _TOP)], _GRID))
+            shapes.append(_text((x, _BOTTOM + 14), f"{cost:g}", "middle"))
     step = _round_step((high - low) / 6)
     for score in (step * n for n in range(ceil(low / step), floor(high / step) + 1)):
         _, y = place(least, score)
-        shapes.append(Line([(_LEFT, y), (_RIGHT, y)], _GRID))
-        shapes.append(Text((_LEFT - 6, y), f"{score:.6g}", "end"))
-    shapes.append(Line([(_LEFT, _TOP), (_LEFT, _BOTTOM), (_RIGHT, _BOTTOM)], _INK))
+        shapes.append(_line([(_LEFT, y), (_RIGHT, y)], _GRID))
+        shapes.append(_text((_LEFT - 6, y), f"{score:.6g}", "end"))
+    shapes.append(_line([(_LEFT, _TOP), (_LEFT, _BOTTOM), (_RIGHT, _BOTTOM)], _INK))
     return shapes, place
+
+
+def _line(
+    points: Sequence[tuple[float, float]], color: str, width: float = 1, *, dashed: bool = False
+) -> str:
+    """A line through points, in pixels from the top left."""
+    places = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+    dashes = ' stroke-dasharray="5 4"' if dashed else ""
+    return (
+        f'<polyline points="{places}" fill="none" stroke="{color}" '
+        f'stroke-width="{width:g}"{dashes}/>'
+    )
+
+
+def _dot(place: tuple[float, float], color: str, radius: float = 4, tip: str = "") -> str:
+    """A disc around a place, with a tooltip."""
+    x, y = place
+    title = f"<title>{escape(tip)}</title>" if tip else ""
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{color}">{title}</circle>'
+
+
+def _text(place: tuple[float, float], words: str, anchor: str = "start", color: str = _INK) -> str:
+    """Words, of which the start, middle or end is at a place; it is at half of their height."""
+    x, y = place
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" '
+        f'dominant-baseline="central" fill="{color}">{escape(words)}</text>'
+    )
+
+
+def _svg(shapes: Sequence[str]) -> str:
+    """The drawing; later shapes cover earlier ones."""
+    width, height = SIZE
+    parts = "\n".join(shapes)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
+        f'viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="12">\n'
+        f'<rect width="{width}" height="{height}" fill="#ffffff"/>\n{parts}\n</svg>\n'
+    )
 
 
 def _round_step(step: float) -> float:
@@ -308,7 +346,7 @@ def _head(result: Evaluation) -> Iterator[str]:
 
 def _section(result: Evaluation, camera: CameraEvaluation) -> Iterator[str]:
     yield f"<h2>{escape(camera.topic)}</h2>"
-    plots = "".join(f"<figure>{svg_of(plot(camera, kind), SIZE)}</figure>" for kind in COSTS)
+    plots = "".join(f"<figure>{plot(camera, kind)}</figure>" for kind in COSTS)
     yield f'<div class="plots">{plots}</div>'
     for item in findings_of(camera):
         yield f"<p>{escape(item)}</p>" if isinstance(item, str) else _table(item)

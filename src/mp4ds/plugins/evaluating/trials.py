@@ -22,12 +22,12 @@ from mp4ds.plan import QualityTarget
 from mp4ds.video.codecs import LOSSY_GOP, Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import png_file
+from mp4ds.video.packets import PacketReader
 from mp4ds.video.planes import (
     PLANES_FORMAT,
     Planes,
     PlaneSpool,
     decoded_planes,
-    packet_sizes,
     rgb_of,
 )
 from mp4ds.video.scores import Ffmpeg, ScoreSummary, find_ffmpeg, scores_of, summary_of
@@ -285,6 +285,20 @@ def run(trial: Trial) -> Cell:
     return Cell(setting=setting, scores=summaries, picture=trial.picture, **figures)
 
 
+def mean_size(sizes: Sequence[int], keyframes: Sequence[int], gop: int) -> float:
+    """Mean bytes per frame of a long video: a short clip has a larger share of key frames.
+
+    Args:
+        sizes: Of the packets of the clip.
+        keyframes: Whether each is a key frame.
+        gop: Frames from one key frame to the next.
+    """
+    keys = [size for size, is_key in zip(sizes, keyframes, strict=True) if is_key]
+    others = [size for size, is_key in zip(sizes, keyframes, strict=True) if not is_key]
+    key = sum(keys) / max(1, len(keys))
+    return (key + (gop - 1) * sum(others) / len(others)) / gop if others else key
+
+
 def _encoded(trial: Trial, frames: PlaneSpool, recipe: Recipe, video: Path) -> dict[str, Any]:
     """Encode the clip as `mp4ds pack` does, and decode it; returns the figures of a `Cell`."""
     clip, gop = trial.clip, trial.setting.gop
@@ -308,14 +322,14 @@ def _encoded(trial: Trial, frames: PlaneSpool, recipe: Recipe, video: Path) -> d
     for _ in decoded_planes(video):
         pass
     decode_seconds = time.process_time() - encoded
-    sizes = packet_sizes(video)
-    frame_bytes = sizes.frame_bytes(gop)
+    with PacketReader(video, codec=recipe.codec) as packets:
+        size, frame_bytes = sum(packets.sizes), mean_size(packets.sizes, packets.keyframes, gop)
     return {
         "encode_seconds": seconds,
         "encode_cpu_seconds": encoded - cpu,
         "encode_fps": clip.frames / max(1e-9, seconds),
         "decode_fps": clip.frames / max(1e-9, decode_seconds),
-        "size": sizes.total,
+        "size": size,
         "frame_bytes": frame_bytes,
         "kbps": frame_bytes * clip.frames / clip.seconds * 8 / 1000,
         "whole_bytes": frame_bytes * clip.source_frames,

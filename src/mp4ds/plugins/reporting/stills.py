@@ -28,8 +28,7 @@ from mp4ds.options import (
     parse_time,
 )
 from mp4ds.plugins.reporting.proxies import Look
-from mp4ds.video.drawing import Page
-from mp4ds.video.images import ImageFile, encoding_as
+from mp4ds.video.images import ImageFile, Page, encoding_as
 
 _SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 _MOST_FRAMES = 400  # of a sheet
