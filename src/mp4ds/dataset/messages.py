@@ -20,7 +20,16 @@ from mp4ds.errors import FormatError, SourceError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import verify_file
 from mp4ds.messages.wire import WireError
-from mp4ds.records import Channel, Excerpt, Loss, Message, MetadataRecord, Record, Schema
+from mp4ds.records import (
+    EVERYTHING,
+    Channel,
+    Excerpt,
+    Loss,
+    Message,
+    MetadataRecord,
+    Record,
+    Schema,
+)
 
 _Item = TypeVar("_Item")
 
@@ -172,16 +181,20 @@ class SalvagedMessages(MessagesFile):
 
     def in_file_order(self) -> Iterator[Record]:
         """All that can be read."""
-        return self._salvage.records()
+        return self._records(EVERYTHING)
 
     def others(self) -> Iterator[Record]:
         """The attachments and metadata records."""
-        return self._salvage.records(Excerpt(start=0, end=0))
+        return self._records(Excerpt(start=0, end=0))
 
     def in_time(self, excerpt: Excerpt) -> Iterator[Message]:
         """The messages of an excerpt."""
-        records = self._salvage.records(replace(excerpt, others=False))
+        records = self._records(replace(excerpt, others=False))
         return (record for record in records if isinstance(record, Message))
+
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
+        # by a reader of its own: one reads once at a time
+        return McapSalvage(self._salvage.path).records(excerpt)
 
 
 def recorded_format(file: MessagesFile) -> Format:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +19,6 @@ from mp4ds.errors import SourceError
 from mp4ds.records import (
     MAX_LOSSES,
     MAX_LOST_TOPICS,
-    Channel,
     Excerpt,
     Loss,
     Message,
@@ -298,49 +297,85 @@ def lost_by(error: DamageError) -> str:
     return "whose compressed data is damaged"
 
 
-class FilePass(ABC):
-    """One reading of a damaged file.
+class FileSalvage(BagReader):
+    """Reads what is readable of a file, record by record, and says what is not.
+
+    It never fails because of damage. For an intact recording, it gives the same as the usual
+    reader. Messages come in log-time order if the index at the end of the file is readable, and
+    they are not too far out of it; otherwise in file order. Some doubtful messages are included: if
+    a checksum shows that a chunk is damaged but not where, the loss says so.
+
+    Unlike other readers, it reads once at a time: its state is that of the last `records`.
 
     Args:
-        window: At its start.
-        log: Where losses are recorded.
-        framing: Of its records.
-        channels: The known ones by their id in the file; grows while reading.
-        index: Byte where the index at the end of the file begins, after which no messages are lost;
-            None if unknown.
+        path: The file.
+        shown: Its name in losses, if it is a decompressed copy.
+        is_alone: Whether it is an error, not just a loss, if nothing can be read.
 
     Attributes:
-        found: Number of valid records found.
-        count: Number of messages that the file states; None if unknown.
-        earliest: Earliest log time, ns, of messages from here on, by the file's index; None if no
-            message follows.
+        magic: The first bytes of such a file.
+        kind: What such a file is, in words.
     """
 
     magic: bytes
     kind: str
+    position = 0
+    losses: Sequence[Loss] = ()
 
-    def __init__(
-        self,
-        window: Window,
-        log: LossLog,
-        framing: Framing,
-        channels: Mapping[int, Channel],
-        index: int | None,
-    ) -> None:
-        self._window = window
-        self._log = log
+    _framing: Framing
+    _index_offset: int | None = None  # where the final index begins: no message is lost from there
+    _is_timed = False  # whether the file's index tells how long messages must wait for earlier ones
+
+    def __init__(self, path: Path, *, shown: Path | None = None, is_alone: bool = True) -> None:
+        self.path = path
+        self._shown = shown or path
+        self.files = [self._shown]
+        self._is_alone = is_alone
+
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
+        """Everything readable, of which all but the excerpt is dropped.
+
+        Raises:
+            RuntimeError: `records` was called again before this one was exhausted.
+        """
+        self.losses = []
+        self._log = log = LossLog(self._shown.name)
         self._tally = Tally(log, self._topic_of)
-        self._framing = framing
-        self._scan = Scan(window, framing, self._lose)
-        self._channels = channels
-        self._index_offset = index
-        self.found = 0
-        self.count: int | None = None
-        self.earliest: int | None = None
+        self._found = 0  # valid records
+        self._count: int | None = None  # messages that the file states
+        self._earliest: int | None = None  # log time from here on; None if no message follows
+        held = HoldBack()
+        given = 0
+        with Window.of_file(self.path) as window:
+            self._window = window
+            self._scan = Scan(window, self._framing, self._lose)
+            for record in self._scanned():
+                self.position = self._place(window)
+                given += isinstance(record, Message)
+                if record is None:
+                    if self._is_timed:
+                        yield from filter(excerpt.has, held.release(self._earliest))
+                elif self._is_timed and isinstance(record, Message):
+                    held.add(record)
+                elif excerpt.has(record):
+                    yield record
+                if self._log is not log:
+                    raise RuntimeError(f"{self.path} is salvaged once at a time")
+            yield from filter(excerpt.has, held.release(None))
+            self.position = self._place(window)
+        if self._is_alone and not self._found and not self.channels:
+            raise SourceError(self.path, f"holds no records of {self.kind}")
+        self.losses = log.finish(None if self._count is None else max(0, self._count - given))
 
     @abstractmethod
-    def records(self) -> Iterator[Record | None]:
-        """All records in the order of the file; None where `earliest` may be later than before."""
+    def _scanned(self) -> Iterator[Record | None]:
+        """All records in the order of the file; None where `_earliest` may be later than before."""
+
+    def _place(self, window: Window) -> int:
+        """Bytes of the file, compressed as it may be, that were read."""
+        if self._shown == self.path:
+            return window.offset
+        return window.offset * self._shown.stat().st_size // max(1, window.size)
 
     def _topic_of(self, channel_id: int) -> str | None:
         channel = self._channels.get(channel_id)
@@ -410,65 +445,3 @@ class FilePass(ABC):
             self._lose(offset, window.offset - offset, problems[0])
         else:
             self._tally.is_verified = True
-
-
-class FileSalvage(BagReader):
-    """Reads what is readable of a file, in one pass, and records what is not.
-
-    It never fails because of damage. For an intact recording, it gives the same as the usual
-    reader. Messages come in log-time order if the index at the end of the file is readable, and
-    they are not too far out of it; otherwise in file order. Some doubtful messages are included: if
-    a checksum shows that a chunk is damaged but not where, the loss says so.
-
-    Args:
-        path: The file.
-        shown: Its name in losses, if it is a decompressed copy.
-        is_alone: Whether it is an error, not just a loss, if nothing can be read.
-    """
-
-    position = 0
-    losses: Sequence[Loss] = ()
-
-    def __init__(self, path: Path, *, shown: Path | None = None, is_alone: bool = True) -> None:
-        self.path = path
-        self._shown = shown or path
-        self.files = [self._shown]
-        self._is_alone = is_alone
-        self._lost_in_all: int | None = None
-
-    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
-        """Everything readable, of which all but the excerpt is dropped."""
-        self.losses = []
-        log = LossLog(self._shown.name)
-        yield from filter(excerpt.has, self._pass(log))
-        self.losses = log.finish(self._lost_in_all)
-
-    @abstractmethod
-    def _pass(self, log: LossLog) -> Iterator[Record]:
-        """Read everything once, recording what is lost."""
-
-    def _place(self, window: Window) -> int:
-        """Bytes of the file, compressed as it may be, that were read."""
-        if self._shown == self.path:
-            return window.offset
-        return window.offset * self._shown.stat().st_size // max(1, window.size)
-
-    def _in_order(self, window: Window, reading: FilePass, *, is_indexed: bool) -> Iterator[Record]:
-        """The records of a pass, messages by log time if the file's index tells when to wait."""
-        held = HoldBack()
-        given = 0
-        for record in reading.records():
-            self.position = self._place(window)
-            given += isinstance(record, Message)
-            if record is None:
-                if is_indexed:
-                    yield from held.release(reading.earliest)
-            elif is_indexed and isinstance(record, Message):
-                held.add(record)
-            else:
-                yield record
-        yield from held.release(None)
-        self.position = self._place(window)
-        self._lost_in_all = None if reading.count is None else max(0, reading.count - given)
-        if self._is_alone and not reading.found and not self.channels:
-            raise SourceError(self.path, f"holds no records of {reading.kind}")

@@ -29,9 +29,9 @@ from mp4ds.bags.mcap_records import (
     parse,
     unpack_chunk,
 )
-from mp4ds.bags.salvage.losses import Draft, FilePass, FileSalvage, LossLog, lost_by
+from mp4ds.bags.salvage.losses import Draft, FileSalvage, lost_by
 from mp4ds.bags.salvage.scan import Framing, RecordFrame, Scan, Window
-from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record
+from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord
 
 # ---------------------------------------------------------------- finding records
 
@@ -277,236 +277,7 @@ def _read_from(window: Window, start: int, summary: SalvagedSummary) -> None:
 
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _MARGIN = 600 * 10**9  # ns; a damaged chunk may seem to end where the next one does
-Found = Message | Attachment | MetadataRecord | None
-
-
-class McapPass(FilePass):
-    """One reading of an MCAP file.
-
-    Args:
-        window: At its start.
-        log: Where losses are recorded.
-        framing: Of its records.
-        declared: Schemas and channels, those of the summary at first.
-        summary: Its readable part.
-        decompress: Decompresses the payload of a message, if necessary.
-    """
-
-    magic = MAGIC
-    kind = "an MCAP file"
-
-    def __init__(
-        self,
-        window: Window,
-        log: LossLog,
-        framing: McapFraming,
-        declared: Declared,
-        summary: SalvagedSummary,
-        decompress: Callable[[memoryview], bytes] | None,
-    ) -> None:
-        super().__init__(window, log, framing, declared.channels, summary.offset or None)
-        self._declared = declared
-        self._summary = summary
-        self._decompress = decompress
-        self._schemas = set[int]()
-        if summary.is_verified:
-            self._schemas.update(summary.schemas)
-        self._undefined: dict[int, int] = {}
-        # a damaged uncompressed chunk: where it begins and ends, and what is wrong
-        self._plain: tuple[int, int, str] | None = None
-        self.count = _message_count(summary.statistics)
-
-    def records(self) -> Iterator[Found]:
-        """All records in the order of the file; None after each of the file's own records."""
-        if self._begins():
-            self._read_header()
-        ended = False
-        while frame := self._scan.next():
-            self.found += 1
-            self.earliest = self._summary.chunks.later.after(self._window.offset)
-            if frame.kind == Opcode.FOOTER:
-                ended = True
-                self._end(frame)
-            else:
-                ended = False
-                yield from self._record(frame)
-            if not self._tally.held:
-                yield None
-        self._leave_plain(Opcode.FOOTER)
-        yield from self._tally.settle()
-        if not ended:
-            self._tally.lost(self._window.offset, None, "the file ends before its footer")
-        self._tally.close()
-        for channel_id, schema_id in self._undefined.items():
-            topic = self._topic_of(channel_id)
-            if schema_id not in self._schemas and topic is not None:
-                problem = f"the definition of its messages, schema {schema_id}, is missing"
-                self._log.lost(None, None, problem).add(0, [topic])
-
-    def _read_header(self) -> None:
-        window = self._window
-        frame = self._framing.frame(window.peek(self._framing.lookahead))
-        if frame is None or frame.kind != Opcode.HEADER or not self._scan.is_followed(frame.size):
-            self._scan.resync(window.offset, "the header is damaged", passed=0)
-            return
-        self.found += 1
-        body = self._scan.body(frame)
-        try:
-            parse(mcap_records.Header, body or b"")
-        except DamageError:
-            self._lose(len(MAGIC), frame.size, "the header is damaged")
-
-    def _end(self, frame: RecordFrame) -> None:
-        self._scan.body(frame)
-        window = self._window
-        if bytes(window.peek(len(MAGIC))) == MAGIC:
-            window.skip(len(MAGIC))
-        else:
-            start = window.offset
-            window.skip(len(MAGIC))
-            self._lose(start, window.offset - start, "the last bytes are not those of an MCAP file")
-
-    def _record(self, frame: RecordFrame) -> Iterator[Found]:
-        self._leave_plain(frame.kind)
-        if frame.kind != Opcode.MESSAGE_INDEX and self._plain is None:
-            yield from self._tally.settle()
-        if frame.kind == Opcode.CHUNK:
-            yield from self._chunk(frame)
-            return
-        offset = self._window.offset
-        body = self._scan.body(frame)
-        if body is None:
-            return
-        try:
-            if frame.kind == Opcode.MESSAGE:
-                yield from self._take(body, offset, is_doubtful=self._plain is not None)
-            elif frame.kind == Opcode.MESSAGE_INDEX:
-                self._listed(body, offset)
-            else:
-                yield self._other(frame.kind, body)
-        except DamageError as error:
-            self._lose(offset, frame.size, str(error))
-
-    def _other(self, opcode: int, body: bytes | memoryview) -> Found:
-        """Process a record that is neither message nor chunk.
-
-        Raises:
-            DamageError: It is damaged, or contradicts another one.
-        """
-        if opcode == Opcode.STATISTICS:
-            self.count = _message_count(parse(mcap_records.Statistics, body))
-        elif opcode == Opcode.SCHEMA:
-            self._schemas.add(parse(mcap_records.Schema, body).id)
-        elif opcode == Opcode.CHANNEL:
-            channel = parse(mcap_records.Channel, body)
-            if channel.schema_id and channel.schema_id not in self._schemas:
-                self._undefined[channel.id] = channel.schema_id
-        return self._declared.other(opcode, body)
-
-    def _take(
-        self, body: bytes | memoryview, offset: int, *, is_doubtful: bool
-    ) -> Iterator[Message]:
-        """Yield a message, or hold it until an index confirms it.
-
-        Raises:
-            DamageError: It is shorter than its fields.
-        """
-        channel_id = int.from_bytes(body[:2], "little")
-        if is_doubtful and channel_id not in self._declared.channels:
-            return
-        message = self._message(channel_id, body, offset)
-        if message and is_doubtful:
-            self._tally.hold(channel_id, message)
-        elif message:
-            self._tally.gave(channel_id, message.log_time)
-            yield message
-
-    def _message(self, channel_id: int, body: bytes | memoryview, offset: int) -> Message | None:
-        """A message; None if it is lost.
-
-        Raises:
-            DamageError: It is shorter than its fields.
-        """
-        if self._channel(channel_id) is None and len(body) >= MESSAGE_HEAD.size:
-            problem = f"messages of channel {channel_id}, whose record is missing"
-            self._lose_message(channel_id, offset, problem)
-            return None
-        message = self._declared.message(body)
-        if self._decompress:
-            topic = message.channel.topic
-            try:
-                message = replace(message, data=self._decompress(memoryview(message.data)))
-            except DamageError as error:
-                problem = f"messages of {topic} {lost_by(error)}"
-                loss = self._lose_message(channel_id, offset, problem)
-                loss.topics[topic] = None
-                return None
-        return message
-
-    def _channel(self, channel_id: int) -> Channel | None:
-        """The channel with an id; from a doubtful summary only as a last resort."""
-        channels = self._declared.channels
-        if channel_id not in channels and channel_id in self._summary.doubtful:
-            record = self._summary.doubtful[channel_id]
-            schema = self._summary.schemas.get(record.schema_id)
-            if schema is not None and schema.id not in self._schemas:
-                self._schemas.add(schema.id)
-                self._declared.add_schema(schema)
-            self._declared.add_channel(record)
-        return channels.get(channel_id)
-
-    def _lose_message(self, channel_id: int, offset: int, problem: str) -> Draft:
-        self._tally.stray(channel_id)
-        loss = self._log.lost_of_kind(problem, offset, problem)
-        loss.add(1, ())
-        return loss
-
-    def _chunk(self, frame: RecordFrame) -> Iterator[Found]:
-        """The messages of a chunk, as far as it can be decompressed."""
-        offset = self._window.offset
-        have, proven = self._peek_chunk(frame)
-        chunk = _Chunk.unpacked(have[frame.head :])
-        self._tally.open(None, offset + frame.size, chunk.span)
-        if chunk.is_plain and chunk.problem:
-            # Its records are in the file like any other: damage to one does not hide the others.
-            if chunk.is_doubtful:
-                self._plain = offset, offset + frame.size, chunk.problem
-            self._window.skip(frame.head + chunk.head)
-            return
-        problems = [chunk.problem] if chunk.problem else []
-        yield from self._content(chunk, offset, problems)
-        used = frame.head + chunk.used
-        self._leave_chunk(frame, used, problems, proven=proven, whole=not chunk.problem)
-
-    def _leave_plain(self, kind: int) -> None:
-        """At the end of a damaged uncompressed chunk, record the damage if nothing else did."""
-        if self._plain is None:
-            return
-        start, end, problem = self._plain
-        offset = self._window.offset
-        if offset < end and kind not in self._framing.outer:
-            return
-        self._plain = None
-        if not self._tally.losses:
-            self._lose(start, min(offset, end) - start, problem)
-
-    def _content(self, chunk: _Chunk, offset: int, problems: list[str]) -> Iterator[Found]:
-        """The records of a chunk."""
-        scanned = ((frame.kind, body) for frame, body in self._inside(chunk.content, problems))
-        for kind, body in chunk.records or scanned:
-            try:
-                if kind != Opcode.MESSAGE:
-                    self._other(kind, body)
-                else:
-                    yield from self._take(body, offset, is_doubtful=chunk.is_doubtful)
-            except DamageError as error:
-                problems.append(f"in a chunk, {error}")
-
-    def _listed(self, body: bytes, offset: int) -> None:
-        """Process a message index: what it lists was read, or is lost."""
-        channel_id, length = struct.unpack_from("<HI", body)
-        pairs = np.frombuffer(body, "<u8", count=min(length, len(body) - 6) // 8, offset=6)
-        self._tally.listed(channel_id, pairs[::2], offset)
+_Found = Message | Attachment | MetadataRecord | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -593,6 +364,8 @@ class McapSalvage(FileSalvage):
     """
 
     format = "mcap"
+    magic = MAGIC
+    kind = "an MCAP file"
 
     def __init__(
         self,
@@ -610,11 +383,16 @@ class McapSalvage(FileSalvage):
         self._schemas = declared.schemas.values()
         self._skipped = declared.skipped
         self._summary = read_summary(path)
-        self._read_header()
+        self._index_offset = self._summary.offset or None
+        self._is_timed = self._summary.chunks.has_messages
+        # a small compressed file may hold what claims to be large
+        longest = _MAX_LENGTH if path == self._shown else most_held()
+        self._framing = McapFraming(declared.channels, longest)
+        self._read_profile()
         if self._summary.is_verified:
             self._declared.add_summary(self._summary.schemas, self._summary.channels)
 
-    def _read_header(self) -> None:
+    def _read_profile(self) -> None:
         with Window.of_file(self.path) as window:
             frame = bytes(window.peek(2**16))
         if frame[len(MAGIC) : len(MAGIC) + 1] == bytes([Opcode.HEADER]):
@@ -639,14 +417,201 @@ class McapSalvage(FileSalvage):
         """Counts and spans from the summary, including lost messages; otherwise empty."""
         return self._summary.stats()
 
-    def _pass(self, log: LossLog) -> Iterator[Record]:
+    def _scanned(self) -> Iterator[_Found]:
+        """All records in the order of the file; None after each of the file's own records."""
+        summary = self._summary
         self._declared.skipped.clear()
-        with Window.of_file(self.path) as window:
-            # a small compressed file may hold what claims to be large
-            longest = _MAX_LENGTH if self.path == self._shown else most_held()
-            framing = McapFraming(self._declared.channels, longest)
-            reading = McapPass(
-                window, log, framing, self._declared, self._summary, self._decompress
-            )
-            is_indexed = self._summary.chunks.has_messages
-            yield from self._in_order(window, reading, is_indexed=is_indexed)
+        self._count = _message_count(summary.statistics)
+        self._defined = set(summary.schemas if summary.is_verified else ())
+        self._undefined: dict[int, int] = {}
+        # a damaged uncompressed chunk: where it begins and ends, and what is wrong
+        self._plain: tuple[int, int, str] | None = None
+        if self._begins():
+            self._read_header()
+        ended = False
+        while frame := self._scan.next():
+            self._found += 1
+            self._earliest = summary.chunks.later.after(self._window.offset)
+            if frame.kind == Opcode.FOOTER:
+                ended = True
+                self._end(frame)
+            else:
+                ended = False
+                yield from self._record(frame)
+            if not self._tally.held:
+                yield None
+        self._leave_plain(Opcode.FOOTER)
+        yield from self._tally.settle()
+        if not ended:
+            self._tally.lost(self._window.offset, None, "the file ends before its footer")
+        self._tally.close()
+        for channel_id, schema_id in self._undefined.items():
+            topic = self._topic_of(channel_id)
+            if schema_id not in self._defined and topic is not None:
+                problem = f"the definition of its messages, schema {schema_id}, is missing"
+                self._log.lost(None, None, problem).add(0, [topic])
+
+    def _read_header(self) -> None:
+        window = self._window
+        frame = self._framing.frame(window.peek(self._framing.lookahead))
+        if frame is None or frame.kind != Opcode.HEADER or not self._scan.is_followed(frame.size):
+            self._scan.resync(window.offset, "the header is damaged", passed=0)
+            return
+        self._found += 1
+        body = self._scan.body(frame)
+        try:
+            parse(mcap_records.Header, body or b"")
+        except DamageError:
+            self._lose(len(MAGIC), frame.size, "the header is damaged")
+
+    def _end(self, frame: RecordFrame) -> None:
+        self._scan.body(frame)
+        window = self._window
+        if bytes(window.peek(len(MAGIC))) == MAGIC:
+            window.skip(len(MAGIC))
+        else:
+            start = window.offset
+            window.skip(len(MAGIC))
+            self._lose(start, window.offset - start, "the last bytes are not those of an MCAP file")
+
+    def _record(self, frame: RecordFrame) -> Iterator[_Found]:
+        self._leave_plain(frame.kind)
+        if frame.kind != Opcode.MESSAGE_INDEX and self._plain is None:
+            yield from self._tally.settle()
+        if frame.kind == Opcode.CHUNK:
+            yield from self._chunk(frame)
+            return
+        offset = self._window.offset
+        body = self._scan.body(frame)
+        if body is None:
+            return
+        try:
+            if frame.kind == Opcode.MESSAGE:
+                yield from self._take(body, offset, is_doubtful=self._plain is not None)
+            elif frame.kind == Opcode.MESSAGE_INDEX:
+                self._listed(body, offset)
+            else:
+                yield self._other(frame.kind, body)
+        except DamageError as error:
+            self._lose(offset, frame.size, str(error))
+
+    def _other(self, opcode: int, body: bytes | memoryview) -> _Found:
+        """Process a record that is neither message nor chunk.
+
+        Raises:
+            DamageError: It is damaged, or contradicts another one.
+        """
+        if opcode == Opcode.STATISTICS:
+            self._count = _message_count(parse(mcap_records.Statistics, body))
+        elif opcode == Opcode.SCHEMA:
+            self._defined.add(parse(mcap_records.Schema, body).id)
+        elif opcode == Opcode.CHANNEL:
+            channel = parse(mcap_records.Channel, body)
+            if channel.schema_id and channel.schema_id not in self._defined:
+                self._undefined[channel.id] = channel.schema_id
+        return self._declared.other(opcode, body)
+
+    def _take(
+        self, body: bytes | memoryview, offset: int, *, is_doubtful: bool
+    ) -> Iterator[Message]:
+        """Yield a message, or hold it until an index confirms it.
+
+        Raises:
+            DamageError: It is shorter than its fields.
+        """
+        channel_id = int.from_bytes(body[:2], "little")
+        if is_doubtful and channel_id not in self._declared.channels:
+            return
+        message = self._message(channel_id, body, offset)
+        if message and is_doubtful:
+            self._tally.hold(channel_id, message)
+        elif message:
+            self._tally.gave(channel_id, message.log_time)
+            yield message
+
+    def _message(self, channel_id: int, body: bytes | memoryview, offset: int) -> Message | None:
+        """A message; None if it is lost.
+
+        Raises:
+            DamageError: It is shorter than its fields.
+        """
+        if self._channel(channel_id) is None and len(body) >= MESSAGE_HEAD.size:
+            problem = f"messages of channel {channel_id}, whose record is missing"
+            self._lose_message(channel_id, offset, problem)
+            return None
+        message = self._declared.message(body)
+        if self._decompress:
+            topic = message.channel.topic
+            try:
+                message = replace(message, data=self._decompress(memoryview(message.data)))
+            except DamageError as error:
+                problem = f"messages of {topic} {lost_by(error)}"
+                loss = self._lose_message(channel_id, offset, problem)
+                loss.topics[topic] = None
+                return None
+        return message
+
+    def _channel(self, channel_id: int) -> Channel | None:
+        """The channel with an id; from a doubtful summary only as a last resort."""
+        channels = self._declared.channels
+        if channel_id not in channels and channel_id in self._summary.doubtful:
+            record = self._summary.doubtful[channel_id]
+            schema = self._summary.schemas.get(record.schema_id)
+            if schema is not None and schema.id not in self._defined:
+                self._defined.add(schema.id)
+                self._declared.add_schema(schema)
+            self._declared.add_channel(record)
+        return channels.get(channel_id)
+
+    def _lose_message(self, channel_id: int, offset: int, problem: str) -> Draft:
+        self._tally.stray(channel_id)
+        loss = self._log.lost_of_kind(problem, offset, problem)
+        loss.add(1, ())
+        return loss
+
+    def _chunk(self, frame: RecordFrame) -> Iterator[_Found]:
+        """The messages of a chunk, as far as it can be decompressed."""
+        offset = self._window.offset
+        have, proven = self._peek_chunk(frame)
+        chunk = _Chunk.unpacked(have[frame.head :])
+        self._tally.open(None, offset + frame.size, chunk.span)
+        if chunk.is_plain and chunk.problem:
+            # Its records are in the file like any other: damage to one does not hide the others.
+            if chunk.is_doubtful:
+                self._plain = offset, offset + frame.size, chunk.problem
+            self._window.skip(frame.head + chunk.head)
+            return
+        problems = [chunk.problem] if chunk.problem else []
+        yield from self._content(chunk, offset, problems)
+        used = frame.head + chunk.used
+        self._leave_chunk(frame, used, problems, proven=proven, whole=not chunk.problem)
+
+    def _leave_plain(self, kind: int) -> None:
+        """At the end of a damaged uncompressed chunk, record the damage if nothing else did."""
+        if self._plain is None:
+            return
+        start, end, problem = self._plain
+        offset = self._window.offset
+        if offset < end and kind not in self._framing.outer:
+            return
+        self._plain = None
+        if not self._tally.losses:
+            self._lose(start, min(offset, end) - start, problem)
+
+    def _content(self, chunk: _Chunk, offset: int, problems: list[str]) -> Iterator[_Found]:
+        """The records of a chunk."""
+        scanned = ((frame.kind, body) for frame, body in self._inside(chunk.content, problems))
+        for kind, body in chunk.records or scanned:
+            try:
+                if kind != Opcode.MESSAGE:
+                    self._other(kind, body)
+                else:
+                    yield from self._take(body, offset, is_doubtful=chunk.is_doubtful)
+            except DamageError as error:
+                problems.append(f"in a chunk, {error}")
+
+    def _listed(self, body: bytes, offset: int) -> None:
+        """Process a message index: what it lists was read, or is lost."""
+        channel_id, length = struct.unpack_from("<HI", body)
+        pairs = np.frombuffer(body, "<u8", count=min(length, len(body) - 6) // 8, offset=6)
+        self._tally.listed(channel_id, pairs[::2], offset)

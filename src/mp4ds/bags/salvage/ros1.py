@@ -24,7 +24,7 @@ from mp4ds.bags.ros1 import (
     split_header,
     times_in,
 )
-from mp4ds.bags.salvage.losses import FilePass, FileSalvage, LossLog
+from mp4ds.bags.salvage.losses import FileSalvage
 from mp4ds.bags.salvage.scan import Framing, RecordFrame, Scan, Window
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record
@@ -266,6 +266,9 @@ class Ros1Salvage(FileSalvage):
 
     format = "bag"
     profile = "ros1"
+    magic = MAGIC
+    kind = "a ROS 1 bag"
+    _framing = _Framing()
 
     def __init__(self, path: Path, *, is_alone: bool = True) -> None:
         super().__init__(path, is_alone=is_alone)
@@ -274,43 +277,22 @@ class Ros1Salvage(FileSalvage):
         if re.match(rb"#ROS(BAG|RECORD|LOG) V1\.\d\n", start):
             raise other_format(path, start)
         self._index = read_index(path)
+        self._index_offset = self._index.offset
+        self._is_timed = bool(self._index.chunks)
         self._channels: dict[int, Channel] = dict(self._index.channels)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the bag's index, including lost messages; otherwise empty."""
         return self._index.stats(self._channels)
 
-    def _pass(self, log: LossLog) -> Iterator[Record]:
-        with Window.of_file(self.path) as window:
-            reading = _Pass(window, log, self._index, self._channels)
-            yield from self._in_order(window, reading, is_indexed=bool(self._index.chunks))
-
-
-class _Pass(FilePass):
-    """One reading of a bag."""
-
-    magic = MAGIC
-    kind = "a ROS 1 bag"
-
-    def __init__(
-        self,
-        window: Window,
-        log: LossLog,
-        index: BagIndex,
-        channels: dict[int, Channel],
-    ) -> None:
-        super().__init__(window, log, _Framing(), channels, index.offset)
-        self._channels: dict[int, Channel] = channels
-        self._index = index
+    def _scanned(self) -> Iterator[Record | None]:
+        """All messages, in the order of the file; None at each chunk."""
         self._next_listed = 0
         self._contradicted: set[int] = set()
         self._others: dict[tuple[object, ...], Channel] = {}
-
-    def records(self) -> Iterator[Record | None]:
-        """All messages, in the order of the file; None at each chunk."""
         self._begins()
         while frame := self._scan.next():
-            self.found += 1
+            self._found += 1
             if frame.kind != Op.INDEX:
                 yield from self._tally.settle()
             yield from self._record(frame)
@@ -418,7 +400,7 @@ class _Pass(FilePass):
         if self._next_listed < len(starts) and starts[self._next_listed] == offset:
             self._next_listed += 1
         self._tally.open(self._index.counts(offset), end, self._index.span(offset))
-        self.earliest = self._index.later.after(offset - 1)
+        self._earliest = self._index.later.after(offset - 1)
 
     def _pass_listed(self, end: int) -> None:
         """Record as lost the chunks that the index lists before a byte but that were not found."""

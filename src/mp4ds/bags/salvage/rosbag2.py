@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -22,8 +22,8 @@ from mp4ds.bags.files import (
 from mp4ds.bags.protocols import BagReader
 from mp4ds.bags.rosbag2 import STORAGE_NAME, Rosbag2Reader, unlisted_storage
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, BagInfo, read_bag_info
-from mp4ds.bags.rosbag2_sqlite import SqliteReader, Tables, open_tables
-from mp4ds.bags.salvage.losses import FileSalvage, LossLog, lost_by
+from mp4ds.bags.rosbag2_sqlite import SqliteReader, Tables
+from mp4ds.bags.salvage.losses import LossLog, lost_by
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.errors import Refused, SourceError, SourceNotFoundError
 from mp4ds.records import Excerpt, Loss, Message, Record, bounded
@@ -37,7 +37,7 @@ _LEAST_ROW = 8  # bytes of a row in the table of messages
 _MORE = "; `.recover` of the sqlite3 tool may find more"
 
 
-class SqliteSalvage(FileSalvage):
+class SqliteSalvage(SqliteReader):
     """Reads what sqlite3 can read of one ``.db3`` file.
 
     The files are neither changed nor copied. Messages come by log time; 24 bytes of each are held
@@ -51,15 +51,15 @@ class SqliteSalvage(FileSalvage):
 
     Attributes:
         expected: Expected number of messages, if known from elsewhere.
-        tables: Content of the small tables by ``db3:<file>:<column>``, verbatim.
 
     Raises:
         SourceError: sqlite3 cannot open it, or its topics are damaged.
     """
 
-    format = "rosbag2"
-    profile = "ros2"
-    has_all_channels = True
+    losses: Sequence[Loss] = ()
+    # by reading everything, which no damage stops
+    _times = BagReader._times
+    _stats = BagReader._stats
 
     def __init__(
         self,
@@ -68,49 +68,53 @@ class SqliteSalvage(FileSalvage):
         shown: Path | None = None,
         message_decompress: Callable[[bytes], bytes] | None = None,
     ) -> None:
-        super().__init__(path, shown=shown, is_alone=False)
-        self._decompress = message_decompress
         self.expected: int | None = None
-        self._lost = 0
         try:
-            self._small = SqliteReader(path, shown=shown, damaged=True)
+            super().__init__(path, shown=shown, message_decompress=message_decompress, damaged=True)
         except SourceError as error:
             remedy = _UNFINISHED if Path(f"{path}-journal").exists() else _RECOVER
-            raise SourceError(self._shown, error.problem, remedy) from None
-        self._channels = {channel.id: channel for channel in self._small.channels}
-        self._schemas = self._small.unused_schemas
-        self.tables: Mapping[str, str] = self._small.tables
+            raise SourceError(shown or path, error.problem, remedy) from None
+        self.is_indexed = False
 
     @property
     def span(self) -> tuple[int, int] | None:
         """Earliest and latest log time, ns, if sqlite3 can find them; otherwise None."""
         try:
-            return self._small.span
+            return super().span
         except SourceError:
             return None
 
-    def _pass(self, log: LossLog) -> Iterator[Record]:
-        given = self._lost = 0
+    def _records(self, excerpt: Excerpt) -> Iterator[Message]:
+        """Everything readable, of which all but the excerpt is dropped."""
+        self.losses = []
+        log = LossLog(self._shown.name)
+        yield from filter(excerpt.has, self._found(log))
+        self.losses = log.finish()
+
+    def _found(self, log: LossLog) -> Iterator[Message]:
+        given = lost = 0
         size = self._shown.stat().st_size
-        with open_tables(self.path, self._shown, damaged=True) as tables:
+        with self._opened() as tables:
             most_rows = self.path.stat().st_size // _LEAST_ROW
             keys, times, problem = _index(tables, most_rows, self.expected)
             for read, row in enumerate(np.lexsort((keys, times)).tolist(), 1):
-                message = self._message(tables, int(keys[row]), log)
-                if message is not None:
+                message = self._salvaged(tables, int(keys[row]), log)
+                if message is None:
+                    lost += 1
+                else:
                     given += 1
                     log.gave(message.log_time)
                     yield message
                 self.position = size * read // len(keys)
         # rosbag2 numbers its messages from 1 without gaps
         expected = self.expected or (int(keys.max(initial=0)) if problem else 0)
-        missing = expected - given - self._lost
+        missing = expected - given - lost
         if problem or missing > 0:
             problem = f"the table of messages: {problem}" if problem else "messages without a row"
             log.lost(None, None, problem + _MORE).add(max(0, missing), ())
         self.position = size
 
-    def _message(self, tables: Tables, key: int, log: LossLog) -> Message | None:
+    def _salvaged(self, tables: Tables, key: int, log: LossLog) -> Message | None:
         """A message; None if it is lost, which is recorded."""
         topics: list[str] = []
         try:
@@ -135,7 +139,6 @@ class SqliteSalvage(FileSalvage):
             of = f" of {topics[0]}" if topics else ""
             problem = f"messages{of} with damaged or missing pages"
         log.lost_of_kind(problem, None, problem).add(1, topics)
-        self._lost += 1
         return None
 
     def _decompressed(self, data: bytes, topic: str) -> bytes:
