@@ -17,8 +17,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -51,27 +53,61 @@ def instead_of_open(patch: pytest.MonkeyPatch, opened: Callable[..., Any]) -> No
         patch.setattr("pathlib._NormalAccessor.open", staticmethod(opened))
 
 
-def recorded(folder: Path, kind: str = "bag-none") -> Path:
-    """A recording of two parts."""
-    (folder / "source").mkdir()
-    (path,) = SOURCES[kind](folder / "source", scene("bayer_rggb8", frames=6))
-    return path
+class Pack:
+    """A pack in two parts that meets hard times, and is then to end well.
+
+    Args:
+        folder: Where all of it is.
+        kind: Of the recording.
+        patch: Undoes what is changed for it.
+    """
+
+    def __init__(self, folder: Path, kind: str, patch: pytest.MonkeyPatch) -> None:
+        (folder / "source").mkdir()
+        (self.source,) = SOURCES[kind](folder / "source", scene("bayer_rggb8", frames=6))
+        self.target = folder / "dataset"
+        self._folder, self._patch = folder, patch
+
+    @cached_property
+    def expected(self) -> dict[str, Any]:
+        """What an undisturbed pack in one pass makes."""
+        mp4ds.pack(self.source, self._folder / "undisturbed", PackOptions(codec="h264"))
+        return facts(self._folder / "undisturbed")
+
+    def run(
+        self,
+        executor: Executor | None = None,
+        progress: Callable[[mp4ds.PackProgress], None] | None = None,
+        **options: Any,
+    ) -> list[str]:
+        """The command; returns the tasks that it ran."""
+        inline = InlineExecutor()
+        use(self._patch, executor or inline)
+        mp4ds.pack(self.source, self.target, replace(IN_PARTS, **options), progress=progress)
+        return inline.ran
+
+    def refused(self, words: str | None, *given: Any, **options: Any) -> Mp4dsError:
+        """The error of the command, which leaves nothing under the dataset's name."""
+        with pytest.raises(Mp4dsError, match=words) as caught:
+            self.run(*given, **options)
+        assert not self.target.exists()
+        return caught.value
+
+    def goes_on(self) -> list[str]:
+        """The same command ends well; returns the tasks that it ran."""
+        ran = self.run()
+        assert facts(self.target) == self.expected
+        assert mp4ds.validate(self.target, deep=True) == []
+        assert leftovers(self.target.parent) == []
+        return ran
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> Path:
-    return recorded(tmp_path)
-
-
-@pytest.fixture
-def expected(source: Path, tmp_path: Path) -> dict[str, Any]:
-    return undisturbed(source, tmp_path)
-
-
-def undisturbed(source: Path, folder: Path) -> dict[str, Any]:
-    """What an undisturbed pack in one pass makes."""
-    mp4ds.pack(source, folder / "undisturbed", PackOptions(codec="h264"))
-    return facts(folder / "undisturbed")
+def pack(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pack:
+    """Of a bag, or of the kind that a test names."""
+    made = Pack(tmp_path, getattr(request, "param", "bag-none"), monkeypatch)
+    assert made.expected
+    return made
 
 
 def before_task(name: str, action: Callable[[], object]) -> InlineExecutor:
@@ -109,18 +145,6 @@ def _mount(*arguments: str) -> None:
 def with_room(disk: Path) -> None:
     """Somebody makes space."""
     _mount("-o", "remount,size=64m,nr_inodes=10000", str(disk))
-
-
-def goes_on(
-    source: Path, target: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> list[str]:
-    """The same command ends well; returns the tasks that it ran."""
-    executor = use(monkeypatch, InlineExecutor())
-    mp4ds.pack(source, target, IN_PARTS)
-    assert facts(target) == expected
-    assert mp4ds.validate(target, deep=True) == []
-    assert leftovers(target.parent) == []
-    return executor.ran
 
 
 # ---------------------------------------------------------------- a disk that is full
@@ -162,47 +186,34 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> set[tuple[str, str]]:
     return seen
 
 
-def refusal(source: Path, target: Path) -> Mp4dsError | None:
-    """The error of a pack, if there is one."""
-    try:
-        mp4ds.pack(source, target, IN_PARTS)
-    except Mp4dsError as error:
-        return error
-    return None
-
-
 @pytest.mark.parametrize("limit", REACHED)
 def test_a_disk_that_is_full_at_any_moment(
-    limit: str,
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    reached: set[tuple[str, str]],
-    monkeypatch: pytest.MonkeyPatch,
-    compare: Compare,
+    limit: str, pack: Pack, tmp_path: Path, reached: set[tuple[str, str]], compare: Compare
 ) -> None:
-    before = tree(source.parent)
+    before = tree(pack.source.parent)
     refusals = 0
     for number in range(1, 100):
         options = (
             [f"size={number * PAGE}"] if limit == "pages" else ["size=64m", f"nr_inodes={number}"]
         )
         with disk_of(tmp_path / "disk", *options) as disk:
-            use(monkeypatch, InlineExecutor())
-            error = refusal(source, disk / "dataset")
-            if error is None:
+            pack.target = disk / "dataset"
+            try:
+                pack.run()
                 break
+            except Mp4dsError as error:
+                told, code = str(error), error.exit_code
             refusals += 1
-            assert "No space left" in str(error)
-            assert str(disk) in str(error)
-            assert error.exit_code == 1
-            assert not (disk / "dataset").exists()
-            assert tree(source.parent) == before
+            assert "No space left" in told
+            assert str(disk) in told
+            assert code == 1
+            assert not pack.target.exists()
+            assert tree(pack.source.parent) == before
             with_room(disk)
-            goes_on(source, disk / "dataset", expected, monkeypatch)
+            pack.goes_on()
             if number % 6 == 0:
-                shutil.copytree(disk / "dataset", tmp_path / str(number) / "dataset")
-                assert compare([source], unpacked(tmp_path / str(number), "bag")) == []
+                shutil.copytree(pack.target, tmp_path / str(number) / "dataset")
+                assert compare([pack.source], unpacked(tmp_path / str(number), "bag")) == []
     assert refusals >= 12
     assert REACHED[limit] <= reached
 
@@ -212,23 +223,15 @@ def test_a_disk_that_is_full_at_any_moment(
 )
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS], ids=errno.errorcode.get)
 def test_a_file_that_the_disk_refuses(
-    code: int,
-    name: str,
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
+    code: int, name: str, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every file that is written by Python, in a part or in the joining."""
-    target = tmp_path / "dataset"
     with failing_open(monkeypatch, lambda path, mode: "w" in mode and name in path, code):
-        use(monkeypatch, InlineExecutor())
-        with pytest.raises((PartsFailedError, WriteError), match=os.strerror(code)) as caught:
-            mp4ds.pack(source, target, IN_PARTS)
-    assert caught.value.exit_code == 1
-    assert str(tmp_path) in str(caught.value)
-    assert not target.exists()
-    goes_on(source, target, expected, monkeypatch)
+        error = pack.refused(os.strerror(code))
+    assert isinstance(error, (PartsFailedError, WriteError))
+    assert error.exit_code == 1
+    assert str(tmp_path) in str(error)
+    pack.goes_on()
 
 
 @contextmanager
@@ -300,36 +303,33 @@ class _BadSector(io.FileIO):
         return super().readall()
 
 
-@pytest.mark.parametrize("kind", ["bag-none", "bag-bz2", "mcap-ros2-zstd", "mcap-ros2-none"])
+@pytest.mark.parametrize(
+    "pack", ["bag-none", "bag-bz2", "mcap-ros2-zstd", "mcap-ros2-none"], indirect=True
+)
 def test_a_bad_sector(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
+    pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
 ) -> None:
-    source = recorded(tmp_path, kind)
-    expected = undisturbed(source, tmp_path)
-    middle = source.stat().st_size // 2
+    middle = pack.source.stat().st_size // 2
     real = io.open
 
     class Drive(_BadSector):
         pass
 
     def opened(file: Any, mode: str = "r", buffering: int = -1, *args: Any, **options: Any) -> Any:
-        if str(file) == str(source) and mode == "rb":
+        if str(file) == str(pack.source) and mode == "rb":
             return io.BufferedReader(Drive(str(file), range(middle, middle + 512)), 512)
         return real(file, mode, buffering, *args, **options)
 
-    executor = use(monkeypatch, before_task(PARTS[0], lambda: setattr(Drive, "broken", True)))
+    executor = before_task(PARTS[0], lambda: setattr(Drive, "broken", True))
     with monkeypatch.context() as patch:
         instead_of_open(patch, opened)
-        with pytest.raises(PartsFailedError, match="Input/output error") as caught:
-            mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, keep_going=True))
+        error = pack.refused("Input/output error", executor, keep_going=True)
+    assert isinstance(error, PartsFailedError)
     assert executor.ran == PARTS
-    sentence = str(caught.value)
-    assert "could not be written" not in sentence
-    assert str(source) in sentence
-    assert not (tmp_path / "dataset").exists()
-    goes_on(source, tmp_path / "dataset", expected, monkeypatch)
-    own = kind.partition("-")[0]
-    assert compare([source], unpacked(tmp_path, own)) == []
+    assert "could not be written" not in str(error)
+    assert str(pack.source) in str(error)
+    pack.goes_on()
+    assert compare([pack.source], unpacked(tmp_path, pack.source.suffix[1:])) == []
 
 
 def files_of(source: Path) -> list[Path]:
@@ -346,45 +346,31 @@ CHANGES: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_source_that_changes_while_it_is_packed(
-    kind: str, change: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = recorded(tmp_path, kind)
-    expected = undisturbed(source, tmp_path)
-    file = max(files_of(source), key=lambda path: path.stat().st_size)
+@pytest.mark.parametrize("pack", KINDS, indirect=True)
+def test_a_source_that_changes_while_it_is_packed(change: str, pack: Pack) -> None:
+    file = max(files_of(pack.source), key=lambda path: path.stat().st_size)
     times = file.stat().st_atime_ns, file.stat().st_mtime_ns
     data = file.read_bytes()
-    use(monkeypatch, before_task(PARTS[1], lambda: CHANGES[change](file)))
-    with pytest.raises(PartsFailedError, match=f"Part {PARTS[1]}: .*{file.name}") as caught:
-        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
-    assert caught.value.exit_code == 2
-    with pytest.raises(SourceError):  # it is still not what it was
-        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
+    executor = before_task(PARTS[1], lambda: CHANGES[change](file))
+    assert pack.refused(f"Part {PARTS[1]}: .*{file.name}", executor).exit_code == 2
+    assert isinstance(pack.refused(None), SourceError)  # it is still not what it was
     if file.is_dir():
         file.rmdir()
     file.write_bytes(data)
     os.utime(file, ns=times)
-    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[1]]
+    assert pack.goes_on() == [PARTS[1]]
 
 
-def test_a_source_that_goes_before_the_joining(
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    use(monkeypatch, InlineExecutor())
-    away = source.with_suffix(".away")
+def test_a_source_that_goes_before_the_joining(pack: Pack) -> None:
+    away = pack.source.with_suffix(".away")
 
     def vanish(told: mp4ds.PackProgress) -> None:
-        if told.phase == "joining" and source.exists():
-            source.rename(away)
+        if told.phase == "joining" and pack.source.exists():
+            pack.source.rename(away)
 
-    with pytest.raises(SourceError, match=r"no such file"):
-        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS, progress=vanish)
-    away.rename(source)
-    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == []
+    assert isinstance(pack.refused("no such file", progress=vanish), SourceError)
+    away.rename(pack.source)
+    assert pack.goes_on() == []
 
 
 # ---------------------------------------------------------------- processes that die
@@ -410,47 +396,41 @@ class Harmed(ProcessExecutor):
         return super().submit(fn, *args, **kwargs)
 
 
-def use_harmed(monkeypatch: pytest.MonkeyPatch, jobs: int, name: str, harm: str) -> None:
-    """Have pieces packed by processes that do something before one of them."""
+@pytest.fixture
+def harm(monkeypatch: pytest.MonkeyPatch) -> type[Harmed]:
+    """Processes that do something before they pack a piece."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where they find `harmed`
-    use(monkeypatch, Harmed(jobs, name, harm))
+    return Harmed
 
 
 @pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_a_process_that_is_killed_again_and_again(
-    jobs: int,
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
+    jobs: int, pack: Pack, harm: type[Harmed], tmp_path: Path
 ) -> None:
     log = tmp_path / "tries"
-    kill = "os.kill(os.getpid(), signal.SIGKILL)"
-    use_harmed(monkeypatch, jobs, PARTS[0], f"open({str(log)!r}, 'a').write('x'); {kill}")
-    options = replace(IN_PARTS, keep_going=True, jobs=jobs)
-    with pytest.raises(PartsFailedError, match=r"SIGKILL, perhaps for lack of memory") as caught:
-        mp4ds.pack(source, tmp_path / "dataset", options)
-    assert [name for name, _ in caught.value.failures] == [PARTS[0]]
-    assert caught.value.exit_code == 1
-    assert AGAIN in str(caught.value)
+    kill = f"open({str(log)!r}, 'a').write('x'); os.kill(os.getpid(), signal.SIGKILL)"
+    words = "SIGKILL, perhaps for lack of memory"
+    error = pack.refused(words, harm(jobs, PARTS[0], kill), keep_going=True, jobs=jobs)
+    assert isinstance(error, PartsFailedError)
+    assert [name for name, _ in error.failures] == [PARTS[0]]
+    assert error.exit_code == 1
+    assert AGAIN in str(error)
     assert log.read_text() == "xx"  # it is tried once more, and no oftener
-    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[0]]
+    assert pack.goes_on() == [PARTS[0]]
 
 
-def test_a_process_that_finds_its_source_gone(
-    tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    away = source.with_suffix(".away")
-    use_harmed(monkeypatch, 1, PARTS[1], f"os.rename({str(source)!r}, {str(away)!r})")
-    with pytest.raises(PartsFailedError, match=rf"Part {PARTS[1]}: .*drive\.bag: cannot be read"):
-        mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, jobs=1))
-    away.rename(source)
-    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[1]]
+def test_a_process_that_finds_its_source_gone(pack: Pack, harm: type[Harmed]) -> None:
+    away = pack.source.with_suffix(".away")
+    remove = f"os.rename({str(pack.source)!r}, {str(away)!r})"
+    words = rf"Part {PARTS[1]}: .*drive\.bag: cannot be read"
+    pack.refused(words, harm(1, PARTS[1], remove), jobs=1)
+    away.rename(pack.source)
+    assert pack.goes_on() == [PARTS[1]]
 
 
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize(
-    ("harm", "sentence"),
+    ("end", "sentence"),
     [
         ("raise MemoryError", "out of memory; try fewer `jobs`"),
         ("bytearray(2**60)", "out of memory; try fewer `jobs`"),
@@ -460,53 +440,39 @@ def test_a_process_that_finds_its_source_gone(
     ],
 )
 def test_a_task_that_ends_its_process(
-    harm: str,
-    sentence: str,
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
+    end: str, sentence: str, pack: Pack, harm: type[Harmed]
 ) -> None:
-    use_harmed(monkeypatch, 1, PARTS[1], harm)
-    with pytest.raises(PartsFailedError) as caught:
-        mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, keep_going=True, jobs=1))
-    assert f"Part {PARTS[1]}: {sentence}" in str(caught.value)
-    assert AGAIN in str(caught.value)
-    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == [PARTS[1]]
+    error = pack.refused(
+        f"Part {PARTS[1]}: {sentence}", harm(1, PARTS[1], end), keep_going=True, jobs=1
+    )
+    assert AGAIN in str(error)
+    assert pack.goes_on() == [PARTS[1]]
 
 
 @pytest.mark.skipif(shutil.which("prlimit") is None, reason="prlimit is not installed")
 @pytest.mark.parametrize("megabytes", [20, 150])
 def test_processes_that_cannot_begin_for_want_of_memory(
-    megabytes: int,
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
+    megabytes: int, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     python = tmp_path / "python"
     limit = f"prlimit --as={megabytes * 2**20}"
     python.write_text(f'#!/bin/sh\nexec {limit} {sys.executable} "$@"\n')
     python.chmod(0o755)
-    monkeypatch.setattr("sys.executable", str(python))
-    with pytest.raises(PartsFailedError, match=r"Part source-0: its process exited") as caught:
-        mp4ds.pack(source, tmp_path / "dataset", replace(IN_PARTS, jobs=1))
-    assert "\n" not in str(caught.value)
+    with monkeypatch.context() as patch:
+        patch.setattr("sys.executable", str(python))
+        error = pack.refused("Part source-0: its process exited", ProcessExecutor(1), jobs=1)
+    assert "\n" not in str(error)
     assert leftovers(tmp_path) == []
-    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == PARTS
+    assert pack.goes_on() == PARTS
 
 
 # ---------------------------------------------------------------- folders that are not as they were
 
 
-def test_a_work_folder_that_is_removed_meanwhile(
-    tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    use(monkeypatch, before_task(PARTS[1], lambda: shutil.rmtree(tmp_path / WORK)))
-    with pytest.raises(PartsFailedError, match="all machines must share"):
-        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
-    ran = goes_on(source, tmp_path / "dataset", expected, monkeypatch)
-    assert ran == PARTS
+def test_a_work_folder_that_is_removed_meanwhile(pack: Pack, tmp_path: Path) -> None:
+    executor = before_task(PARTS[1], lambda: shutil.rmtree(tmp_path / WORK))
+    pack.refused("all machines must share", executor)
+    assert pack.goes_on() == PARTS
 
 
 @pytest.mark.parametrize(
@@ -521,36 +487,20 @@ def test_a_work_folder_that_is_removed_meanwhile(
     ],
 )
 def test_what_is_removed_before_the_joining(
-    gone: str,
-    again: list[str],
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
+    gone: str, again: list[str], pack: Pack, tmp_path: Path
 ) -> None:
-    use(monkeypatch, InlineExecutor())
     place = tmp_path / WORK / gone
 
     def vanish(told: mp4ds.PackProgress) -> None:
         if told.phase == "joining" and not told.note and place.exists():
             shutil.rmtree(place) if place.is_dir() else place.unlink()
 
-    with pytest.raises(Mp4dsError, match=r"mp4ds-part|No such file"):
-        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS, progress=vanish)
-    assert not (tmp_path / "dataset").exists()
-    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == again
+    pack.refused(r"mp4ds-part|No such file", progress=vanish)
+    assert pack.goes_on() == again
 
 
 @pytest.mark.parametrize("name", ["messages.mcap", "cam_image_raw.yaml", "cam_image_raw.mp4"])
-def test_what_rots_before_the_joining_is_made_again(
-    name: str,
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    use(monkeypatch, InlineExecutor())
-
+def test_what_rots_before_the_joining_is_made_again(name: str, pack: Pack, tmp_path: Path) -> None:
     def rot(told: mp4ds.PackProgress) -> None:
         path = tmp_path / WORK / PARTS[0] / name
         if told.phase == "joining" and not told.note:
@@ -558,78 +508,52 @@ def test_what_rots_before_the_joining_is_made_again(
             data[len(data) // 2] ^= 0x10
             path.write_bytes(data)
 
-    with pytest.raises(Mp4dsError, match=rf"{PARTS[0]}/{name}"):
-        mp4ds.pack(source, tmp_path / "dataset", IN_PARTS, progress=rot)
-    assert not (tmp_path / "dataset").exists()
-    assert goes_on(source, tmp_path / "dataset", expected, monkeypatch) == PARTS[:1]
+    pack.refused(rf"{PARTS[0]}/{name}", progress=rot)
+    assert pack.goes_on() == PARTS[:1]
 
 
 @contextmanager
-def read_only(folder: Path) -> Iterator[None]:
-    """A folder that nobody can write into, not even root."""
-    _mount("--bind", str(folder), str(folder))
+def unmounted_at_the_end(folder: Path) -> Iterator[Callable[[], None]]:
+    """Gives a function that makes a folder one that nobody can write into, not even root."""
+
+    def protect() -> None:
+        if not os.path.ismount(folder):
+            _mount("--bind", str(folder), str(folder))
+            _mount("-o", "remount,bind,ro", str(folder))
+
     try:
-        _mount("-o", "remount,bind,ro", str(folder))
-        yield
+        yield protect
     finally:
         subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
-def test_a_target_folder_that_is_read_only(
-    tmp_path: Path, source: Path, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    use(monkeypatch, InlineExecutor())
+def test_a_target_folder_that_is_read_only(pack: Pack, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
-    with (
-        read_only(tmp_path / "out"),
-        pytest.raises(TargetError, match="cannot be created: Read-only file system"),
-    ):
-        mp4ds.pack(source, tmp_path / "out" / "dataset", IN_PARTS)
-    goes_on(source, tmp_path / "out" / "dataset", expected, monkeypatch)
+    pack.target = tmp_path / "out" / "dataset"
+    with unmounted_at_the_end(tmp_path / "out") as protect:
+        protect()
+        error = pack.refused("cannot be created: Read-only file system")
+        assert isinstance(error, TargetError)
+    pack.goes_on()
 
 
 @pytest.mark.parametrize("when", ["packing", "joining"])
-def test_a_work_folder_that_becomes_read_only(
-    when: str,
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    folder = tmp_path / WORK if when == "packing" else tmp_path
-
-    def protect(task: str) -> bool:
-        if task == PARTS[1] and when == "packing":
-            _mount("--bind", str(folder), str(folder))
-            _mount("-o", "remount,bind,ro", str(folder))
-        return False
-
-    def told(progress: mp4ds.PackProgress) -> None:
-        if progress.phase == "joining" and when == "joining" and not os.path.ismount(folder):
-            _mount("--bind", str(folder), str(folder))
-            _mount("-o", "remount,bind,ro", str(folder))
-
-    use(monkeypatch, InlineExecutor(protect))
-    try:
-        with pytest.raises(Mp4dsError, match="Read-only file system"):
-            mp4ds.pack(source, tmp_path / "dataset", IN_PARTS, progress=told)
-        if when == "packing":  # now the same command, and --restart, cannot do anything
-            for options in (IN_PARTS, replace(IN_PARTS, restart=True)):
-                use(monkeypatch, InlineExecutor())
-                with pytest.raises(Mp4dsError, match="Read-only file system"):
-                    mp4ds.pack(source, tmp_path / "dataset", options)
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
-    goes_on(source, tmp_path / "dataset", expected, monkeypatch)
+def test_a_work_folder_that_becomes_read_only(when: str, pack: Pack, tmp_path: Path) -> None:
+    words = "Read-only file system"
+    if when == "packing":
+        with unmounted_at_the_end(tmp_path / WORK) as protect:
+            pack.refused(words, before_task(PARTS[1], protect))
+            for restart in (False, True):  # neither can do anything now
+                pack.refused(words, restart=restart)
+    else:
+        with unmounted_at_the_end(tmp_path) as protect:
+            pack.refused(words, progress=lambda told: told.phase == "joining" and protect())
+    pack.goes_on()
 
 
 @pytest.mark.parametrize("year", [1970, 2100])
 def test_a_clock_that_goes_wrong(
-    year: int,
-    tmp_path: Path,
-    source: Path,
-    expected: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
+    year: int, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = (year - 1970) * 31_556_952
 
@@ -639,9 +563,8 @@ def test_a_clock_that_goes_wrong(
         clock = iter(range(now + 10**6, 0, -1))
         monkeypatch.setattr("time.time", lambda: float(next(clock)))
 
-    use(monkeypatch, before_task(PARTS[1], wrong))
-    mp4ds.pack(source, tmp_path / "dataset", IN_PARTS)
-    assert facts(tmp_path / "dataset") == expected
+    pack.run(before_task(PARTS[1], wrong))
+    assert facts(pack.target) == pack.expected
 
 
 # ---------------------------------------------------------------- signals
