@@ -3,7 +3,7 @@
     ros1_driver.py RECORDING [OPTIONS]
 
 OPTIONS are those of `NodeOptions` in JSON. Each line of the input is a call of a method of
-`Driver` with its arguments, each line of the output what it returns.
+`Driver`, or of its node, with its arguments, each line of the output what it returns.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 import signal
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +25,6 @@ from mp4ds.records import Channel, Message
 def say(what: Any) -> None:
     sys.stdout.write(json.dumps(what) + "\n")  # at once: threads say things too
     sys.stdout.flush()
-
-
-class Standing:
-    """A player that only says what it was told."""
-
-    def __init__(self) -> None:
-        self.is_paused = False
-
-    def pause(self) -> None:
-        self.is_paused = True
-
-    def resume(self) -> None:
-        self.is_paused = False
 
 
 class Driver:
@@ -54,7 +42,7 @@ class Driver:
         for message in self.messages:
             if not any(message.channel is channel for channel in self.channels):
                 self.channels.append(message.channel)
-        self.player = Standing()
+        self.is_paused = False
         self.publisher = open_node("ros1", NodeOptions(**{"node": "mp4ds_play", **options}))
         self.waited = 0
         ros1: Any = sys.modules["mp4ds.plugins.ros.ros1"]  # since the node is open
@@ -103,9 +91,6 @@ class Driver:
                 self.publisher.publish(message.channel, data, message.log_time)
         return self.waited - before
 
-    def dropped(self) -> int:
-        return self.publisher.dropped
-
     def clock(self, *times: int) -> int:
         for time_ns in times:
             self.publisher.clock(time_ns)
@@ -119,19 +104,13 @@ class Driver:
         self.publisher.listen(topic, lambda stamp: say(["heard", topic, stamp]))
 
     def serve(self) -> None:
-        player = self.player
-        paused = Service("is_paused", "", "", lambda _: {"paused": player.is_paused})
-        changes = (action("pause", player.pause), action("resume", player.resume))
-        self.publisher.serve((paused, *changes))
+        paused = Service("is_paused", "", "", lambda _: {"paused": self.is_paused})
+        changes = {"pause": True, "resume": False}
+        services = [action(name, partial(self._set, value)) for name, value in changes.items()]
+        self.publisher.serve([paused, *services])
 
-    def is_paused(self) -> bool:
-        return self.player.is_paused
-
-    def wants_clock(self) -> bool:
-        return self.publisher.wants_clock
-
-    def is_alive(self) -> bool:
-        return self.publisher.is_alive
+    def _set(self, is_paused: bool) -> None:
+        self.is_paused = is_paused
 
     def close(self) -> None:
         self.publisher.close()
@@ -149,7 +128,8 @@ def main() -> None:
     for line in sys.stdin:
         method, *arguments = json.loads(line)
         try:
-            say(getattr(driver, method)(*arguments))
+            found = getattr(driver if hasattr(driver, method) else driver.publisher, method)
+            say(found(*arguments) if callable(found) else found)
         except Mp4dsError as error:
             say([type(error).__name__, str(error)])
         if method == "close":

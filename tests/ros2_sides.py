@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import base64
 import gc
-import json
 import os
 import random
-import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 import fake_rclpy
 from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
 from mp4ds.records import Channel, Schema
-from waiting import WATCHDOG_S
+from roscore import Process
+from waiting import WATCHDOG_S, until
 
 LOOPBACK = (
     '<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>'
@@ -82,14 +79,6 @@ def padded(payload: bytes) -> bytes:
     return payload.ljust((len(payload) + 3) // 4 * 4, b"\0")
 
 
-def until(condition: Callable[[], Any]) -> bool:
-    """Wait for something that happens soon, on a busy machine later; returns whether it did."""
-    end = time.monotonic() + WATCHDOG_S
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
-    return bool(condition())
-
-
 def connect(side: Side, publisher: Any, recorded: Channel, **options: Any) -> None:
     """Subscribe, and send messages until they arrive: from then on each one does.
 
@@ -105,23 +94,16 @@ def connect(side: Side, publisher: Any, recorded: Channel, **options: Any) -> No
         publisher.publish(recorded, sent[-1], 0)
         return bool(side.peer.received(topic, 1, 0.5))
 
-    assert until(arrives)
-    assert until(lambda: padded(sent[-1]) in map(padded, side.peer.received(topic, 1)))
+    until(arrives)
+    until(lambda: padded(sent[-1]) in map(padded, side.peer.received(topic, 1)))
     side.peer.forget(topic)
 
 
-class DdsPeer:
+class DdsPeer(Process):
     """A process that subscribes, publishes and calls, without a line of the package."""
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self._process = process
-
-    def ask(self, command: str, *arguments: Any, **options: Any) -> Any:
-        assert self._process.stdin
-        assert self._process.stdout
-        self._process.stdin.write(json.dumps([command, arguments, options]) + "\n")
-        self._process.stdin.flush()
-        return json.loads(self._process.stdout.readline())
+    def ask(self, what: str, *arguments: Any, **options: Any) -> Any:
+        return super().ask(what, arguments, options)
 
     def subscribe(self, topic: str, kind: str, **options: Any) -> None:
         self.ask("subscribe", f"rt{topic}", kind, **options)
@@ -137,11 +119,11 @@ class DdsPeer:
 
     @contextmanager
     def stopped(self, topic: str) -> Iterator[None]:
-        self._process.send_signal(signal.SIGSTOP)
+        self.stop()
         try:
             yield
         finally:
-            self._process.send_signal(signal.SIGCONT)
+            self.resume()
 
     def connected(self, topic: str, count: int) -> int:
         return int(self.ask("connected", f"rt{topic}", count))
@@ -158,6 +140,23 @@ class DdsPeer:
         assert number == 77
         fields.pop("structure_needs_at_least_one_member", None)
         return dict(fields)
+
+
+class Controls:
+    """Controls of a player or recorder that note what was asked of them."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Any, ...]] = []
+        self.is_paused = True
+        self.rate = 2.5
+        self.start_ns = 100 * 10**9
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        def noted(*arguments: Any) -> Any:
+            self.asked.append((name, *arguments))
+            return 3 if name == "burst" else True
+
+        return noted
 
 
 class Side:
@@ -192,19 +191,13 @@ def dds_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
     """Cyclone DDS on loopback, in a domain where no other test is."""
     pytest.importorskip("cyclonedds")
     domain = alone_in_ros2(monkeypatch)
-    process = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("dds_peer.py")), str(domain)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        assert process.stdout
-        assert json.loads(process.stdout.readline()) == "ready"
-        yield Side(DdsPeer(process))
-        assert process.stdin
-        process.stdin.close()
-        process.wait(WATCHDOG_S)
+    script = str(Path(__file__).with_name("dds_peer.py"))
+    peer = DdsPeer([sys.executable, script, str(domain)], dict(os.environ))
+    assert peer.next() == "ready"
+    try:
+        yield Side(peer)
+    finally:
+        peer.end()
 
 
 @contextmanager

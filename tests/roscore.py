@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import queue
-import shutil
 import signal
 import socket
 import subprocess
@@ -17,15 +16,16 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+from xmlrpc.client import Fault, ServerProxy, Transport
 
 import pytest
 
 import mp4ds
-from waiting import WATCHDOG_S
+from waiting import WATCHDOG_S, until
 
 HERE = Path(__file__).parent
 SECONDS = WATCHDOG_S
@@ -45,15 +45,6 @@ if sys.argv[0].endswith(".py"):
 else:
     runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 """
-
-
-def wait_until(true: Callable[[], bool], seconds: float = SECONDS) -> None:
-    """Wait for something, but not for ever."""
-    deadline = time.monotonic() + seconds
-    while not true():
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"not in {seconds:g} s")
-        time.sleep(0.02)
 
 
 def python(*arguments: str) -> list[str]:
@@ -142,6 +133,24 @@ class Process:
         return code
 
 
+class _Transport(Transport):
+    """Of requests that are answered soon, or not at all."""
+
+    def make_connection(self, host: Any) -> Any:
+        connection = super().make_connection(host)
+        connection.timeout = 5.0
+        return connection
+
+
+def asked(uri: str, method: str, *arguments: str) -> Any:
+    """What a master or node answers; None if it does not, or has gone."""
+    try:
+        with ServerProxy(uri, transport=_Transport()) as proxy:
+            return getattr(proxy, method)("/tests", *arguments)
+    except (OSError, Fault):
+        return None
+
+
 class Core:
     """A master, and the environment of those that use it; a context manager that ends all.
 
@@ -152,11 +161,9 @@ class Core:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._processes: list[Process] = []
-        port, self._prefix, own_net = 11311, [], _own_net()
-        if not own_net:
-            with socket.socket() as free:
-                free.bind(("127.0.0.1", 0))
-                port = free.getsockname()[1]
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
         self.uri = f"http://127.0.0.1:{port}/"
         home = {"ROS_HOME": str(folder / "ros"), "ROS_LOG_DIR": str(folder / "log")}
         address = {"ROS_MASTER_URI": self.uri, "ROS_IP": "127.0.0.1"}
@@ -168,22 +175,13 @@ class Core:
         }
         command = ["/usr/bin/rosmaster", "--core", "-p", str(port)]
         with (folder / "master.log").open("w") as log:
-            self._master = subprocess.Popen(
-                [*own_net, *command], env=self.environment, stdout=log, stderr=log
-            )
-        if own_net:
-            self._prefix = ["nsenter", "-t", str(self._master.pid), "-n"]
-            # until then, who is started beside it would be in the network of the tests
-            net, here = (Path(f"/proc/{pid}/ns/net") for pid in (self._master.pid, "self"))
-            wait_until(lambda: net.readlink() != here.readlink())
-        asking = [*self._prefix, sys.executable, str(HERE / "ros1_state.py"), self.uri]
-        self._state = Process(asking, self.environment)
-        wait_until(lambda: self._master.poll() is not None or self._state.ask("nodes") is not None)
+            self._master = subprocess.Popen(command, env=self.environment, stdout=log, stderr=log)
+        until(lambda: asked(self.uri, "getPid"), self._master)
 
     def run(self, *command: str, **environment: str) -> tuple[int, str, str]:
         """Run a program beside the master; returns exit code, output and errors."""
         done = subprocess.run(
-            [*self._prefix, *command],
+            command,
             env={**self.environment, **environment},
             stdin=subprocess.DEVNULL,
             capture_output=True,
@@ -196,7 +194,7 @@ class Core:
         """Start a program beside the master, the output of which goes into the folder."""
         with (self.folder / f"{Path(command[0]).name}.log").open("a") as log:
             return subprocess.Popen(
-                [*self._prefix, *command],
+                command,
                 env=self.environment,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -206,8 +204,8 @@ class Core:
 
     def script(self, name: str, *arguments: str) -> Process:
         """Start a script of the tests with the tests' Python."""
-        command = [*self._prefix, *python(str(HERE / name), *arguments)]
-        process = Process(command, {**self.environment, "PYTHONPATH": str(HERE)})
+        environment = {**self.environment, "PYTHONPATH": str(HERE)}
+        process = Process(python(str(HERE / name), *arguments), environment)
         self._processes.append(process)
         return process
 
@@ -219,11 +217,14 @@ class Core:
 
     def nodes(self) -> list[str]:
         """The names of all nodes."""
-        return list(self._state.ask("nodes"))
+        state = asked(self.uri, "getSystemState") or [[]]
+        return sorted({node for kind in state[-1] for _, names in kind for node in names})
 
     def connections(self, node: str) -> Counter[str]:
         """How many connections a node has, by topic."""
-        return Counter(self._state.ask("connections", node))
+        code, _, uri = asked(self.uri, "lookupNode", node) or (-1, "", "")
+        found = (asked(uri, "getBusInfo") if code == 1 else None) or [[]]
+        return Counter(one[4] for one in found[-1] if len(one) < 6 or one[5])
 
     def play(self, command: list[str], topics: Iterable[str], subscribers: int) -> tuple[str, str]:
         """Run a player to its end, once each topic has its subscribers.
@@ -232,7 +233,7 @@ class Core:
         """
         before, wanted = {*self.nodes()}, dict.fromkeys(topics, subscribers)
         player = subprocess.Popen(
-            [*self._prefix, *command, "--pause"],
+            [*command, "--pause"],
             env=self.environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -240,18 +241,18 @@ class Core:
             text=True,
         )
         try:
-            wait_until(lambda: any("play" in node for node in {*self.nodes()} - before))
+            until(lambda: any("play" in node for node in {*self.nodes()} - before))
             (node,) = (node for node in {*self.nodes()} - before if "play" in node)
-            wait_until(lambda: self.connections(node) >= Counter(wanted))
-            wait_until(lambda: sum(map(self.connections, before), Counter()) >= Counter(wanted))
+            until(lambda: self.connections(node) >= Counter(wanted))
+            until(lambda: sum(map(self.connections, before), Counter()) >= Counter(wanted))
             service = f"{node}/pause_playback"
-            wait_until(lambda: self.run("rosservice", "call", service, "false")[0] == 0)
+            until(lambda: self.run("rosservice", "call", service, "false")[0] == 0)
             output, errors = player.communicate(timeout=SECONDS)
         finally:
             player.kill()
             player.communicate()  # and close its pipes
         assert player.returncode == 0, errors
-        wait_until(lambda: not any(map(self.connections, before)))
+        until(lambda: not any(map(self.connections, before)))
         return output, errors
 
     def end_processes(self) -> None:
@@ -269,22 +270,8 @@ class Core:
         trace: TracebackType | None,
     ) -> None:
         self.end_processes()
-        self._state.end()
         self._master.terminate()
         self._master.wait(SECONDS)
-
-
-def _own_net() -> list[str]:
-    """A command that runs another one in a network of its own, empty where that is not possible.
-
-    Some ports of ROS 1 listen on all addresses.
-    """
-    if os.geteuid() or not all(map(shutil.which, ("unshare", "nsenter", "ip"))):
-        return []
-    lo = "ip link set lo up"
-    if subprocess.run(["unshare", "-n", "sh", "-c", lo], capture_output=True).returncode:
-        return []
-    return ["unshare", "-n", "sh", "-c", f'{lo} && exec "$@"', "sh"]
 
 
 def missing() -> str:

@@ -20,10 +20,10 @@ from rosbags.rosbag1 import Reader as BagReader
 import mp4ds
 from conftest import real
 from player_scenes import make_drive
-from roscore import PLAY, RECORD, Core, Process, python, wait_until
+from roscore import PLAY, RECORD, Core, Process, python
 from roscore import _core as _core
 from roscore import roscore as roscore
-from waiting import WATCHDOG_S
+from waiting import WATCHDOG_S, until
 
 NS = 10**9
 Digests = Mapping[str, Sequence[str]]
@@ -60,7 +60,7 @@ def published(core: Core, command: list[str], topics: Iterable[str], count: int)
     bag = core.folder / f"{time.monotonic_ns()}.bag"
     recorder = core.start(RECORD, "-O", str(bag), *topics)
     try:
-        wait_until(lambda: any("record" in node for node in core.nodes()))
+        until(lambda: any("record" in node for node in core.nodes()))
         _, errors = core.play(command, topics, 2)
         assert all(line.startswith("mp4ds: ") for line in errors.splitlines())
         told = receiver.take(count)
@@ -128,7 +128,7 @@ def test_two_players_in_step(roscore: Core, tmp_path: Path, leader: str) -> None
     assert roscore.run("rosparam", "set", "/use_sim_time", "true")[0] == 0
     follower = roscore.start(*mp4ds_play(second, "--topics", "/second/*"))
     try:
-        wait_until(lambda: any("play" in node for node in roscore.nodes()))
+        until(lambda: any("play" in node for node in roscore.nodes()))
         assert receiver.silence() == []  # nobody has begun
         options = ("--clock", "--topics", CAMERA)
         if leader == "mp4ds":

@@ -182,24 +182,33 @@ class Machine:
         player._changed.wait = pass_time
 
 
-def stalled(drive: Path, seconds: float) -> tuple[list[int], PlaySummary]:
-    """How late each message comes where the process stands at the fifth string."""
+def stalled(drive: Path, seconds: float, rate: float = 1.0) -> tuple[list[int], PlaySummary]:
+    """How late each string comes, where the process stands at the fifth one."""
     machine, publisher = Machine(), RecordingPublisher(world="ros2")
-    late: list[int] = []
+    times: list[int] = []
 
     def on_sent(sent: Any) -> None:
         if sent.topic == CHATTER:
-            late.append(machine() - sent.time_ns)
-            machine.now += round(seconds * NS) if len(late) == 5 else 0
+            times.append(machine())
+            machine.now += round(seconds * NS) if len(times) == 5 else 0
 
     publisher.on_sent = on_sent
     with Dataset(drive) as dataset:
-        options = PlayOptions()
+        options = PlayOptions(rate=rate)
         timeline = Timeline([dataset], options, Wanted(options), "ros2")
-        player = Player(timeline, publisher, steady=machine)
+        player = Player(timeline, publisher, options, steady=machine)
         machine.drive(player)
         summary = player.run()
-    return [one - late[0] for one in late], summary
+    due = (round(times[0] + number * STEP / rate) for number in range(len(times)))
+    return [time - at for time, at in zip(times, due, strict=True)], summary
+
+
+@pytest.mark.parametrize("rate", [0.7, 1.0, 8.0])
+def test_times_are_kept(drive: Path, rate: float) -> None:
+    late, summary = stalled(drive, 0.0, rate)
+    assert len(late) == 20
+    assert all(0 <= by < MS for by in late)
+    assert summary.slowed_s == 0
 
 
 def test_a_stall_is_made_up_for(drive: Path) -> None:

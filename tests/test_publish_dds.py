@@ -20,8 +20,8 @@ from mp4ds.plugins.ros.dds_types import dds_name, dds_topic, message_type
 from mp4ds.plugins.ros.node import NodeOptions, open_node
 from mp4ds.plugins.ros.qos import Qos
 from mp4ds.records import Channel, Schema
-from ros2_sides import KINDS, STORE, Side, channel, connect, dds_side, message, padded, until
-from waiting import WATCHDOG_S
+from ros2_sides import KINDS, STORE, Side, channel, connect, dds_side, message, padded
+from waiting import WATCHDOG_S, until
 
 STRING = "std_msgs/msg/String"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"

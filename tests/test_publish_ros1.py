@@ -19,11 +19,11 @@ import pytest
 from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag1 import Writer as BagWriter
 
-from roscore import HERE, PLAY, Core, Process, python, wait_until
+from roscore import HERE, PLAY, Core, Process, python
 from roscore import _core as _core
 from roscore import roscore as roscore
 from sources import SOURCES, scene, typestore
-from waiting import WATCHDOG_S
+from waiting import WATCHDOG_S, until
 
 STRING = "std_msgs/msg/String"
 CAMERA = ("/cam/image_raw", "/cam/camera_info")
@@ -66,6 +66,17 @@ def driver(core: Core, path: Path, **options: Any) -> Process:
     return process
 
 
+def connected(
+    core: Core, path: Path, *subscriptions: Iterable[str], **options: Any
+) -> tuple[Process, ...]:
+    """A driver that has advertised all, and a subscriber of each of some topics."""
+    published = driver(core, path, **options)
+    published.ask("advertise")
+    receivers = [core.receiver(*topics) for topics in subscriptions]
+    assert published.ask("await_subscribers", len(receivers))
+    return published, *receivers
+
+
 def texts(told: Iterable[Mapping[str, Any]]) -> list[str]:
     return [bytes.fromhex(message["start"])[4:].decode() for message in told]
 
@@ -83,10 +94,7 @@ def test_every_message_arrives_in_order(roscore: Core, recording: Path) -> None:
     sent = payloads(recording)
     with BagReader(recording) as reader:
         kinds = {c.topic: c for c in reader.connections}
-    published = driver(roscore, recording)
-    assert published.ask("advertise") >= len(sent)
-    receiver = roscore.receiver(*sent)
-    assert published.ask("await_subscribers", 1)
+    published, receiver = connected(roscore, recording, sent)
     published.ask("publish")
     told = receiver.take(sum(map(len, sent.values())))
     published.ask("close")
@@ -111,10 +119,7 @@ def test_an_mcap_without_md5sums(roscore: Core, tmp_path: Path) -> None:
         kind = writer.register_schema("sensor_msgs/msg/Imu", "ros1msg", definition.encode())
         writer.add_message(writer.register_channel("imu", "ros1", kind), 1, b"anything", 1)
         writer.finish()
-    published = driver(roscore, tmp_path / "imu.mcap")
-    published.ask("advertise")
-    receiver = roscore.receiver("/imu")
-    published.ask("await_subscribers", 1)
+    published, receiver = connected(roscore, tmp_path / "imu.mcap", ["/imu"])
     published.ask("publish")
     told = receiver.next()
     assert (told["type"], told["md5sum"]) == ("sensor_msgs/Imu", md5sum)
@@ -175,10 +180,7 @@ LATCHED = [
 
 def test_latched_as_rosbag_play_does(roscore: Core, tmp_path: Path) -> None:
     bag = write_strings(tmp_path / "latched.bag", LATCHED)
-    published = driver(roscore, bag)
-    published.ask("advertise")
-    early = roscore.receiver("/tf_static", "/plain")
-    published.ask("await_subscribers", 1)
+    published, early = connected(roscore, bag, ["/tf_static", "/plain"])
     published.ask("publish")
     told = early.take(5)
     assert [t for t in texts(told) if t != "gone"] == [text for _, text, _, _ in LATCHED[:4]]
@@ -230,7 +232,7 @@ def test_clock(roscore: Core, recording: Path) -> None:
         take(follower.silence(0.1), receiver.silence(0.1))
         return bool(followed and received)
 
-    wait_until(are_connected)
+    until(are_connected)
     published.ask("clock", *times)
     while followed[-1] != times[-1]:
         take([follower.next()], [])
@@ -250,7 +252,7 @@ def test_listen(roscore: Core, recording: Path) -> None:
     listener.ask("listen", CAMERA[0])
     assert listener.ask("listen", "no topic")[0] == "OptionError"
     index = published.ask("topics").index(CAMERA[0])
-    wait_until(lambda: published.ask("subscribers")[index] == 1)
+    until(lambda: published.ask("subscribers")[index] == 1)
     published.ask("publish")
     count = len(payloads(recording)[CAMERA[0]])
     heard = listener.take(count)
@@ -292,7 +294,7 @@ def test_use_sim_time(roscore: Core, recording: Path) -> None:
         later = driver(roscore, recording)
         later.ask("advertise")
         receiver = roscore.receiver(*CAMERA)
-        wait_until(lambda: sum(later.ask("subscribers")) >= 2)
+        until(lambda: sum(later.ask("subscribers")) >= 2)
         later.ask("publish")
         assert len(receiver.take(16)) == 16
         later.ask("close")
@@ -305,10 +307,7 @@ def test_use_sim_time(roscore: Core, recording: Path) -> None:
 
 def test_slow_subscriber_holds_up_nobody(roscore: Core, tmp_path: Path) -> None:
     bag = write_strings(tmp_path / "long.bag", [("/a", "x" * 10_000_000, "/n", 0)] * 3)
-    published = driver(roscore, bag)
-    published.ask("advertise")
-    slow, quick = roscore.receiver("/a"), roscore.receiver("/a")
-    published.ask("await_subscribers", 2)
+    published, slow, quick = connected(roscore, bag, ["/a"], ["/a"])
     slow.stop()
     for _ in range(10):
         published.ask("publish")
@@ -323,10 +322,7 @@ def test_slow_subscriber_holds_up_nobody(roscore: Core, tmp_path: Path) -> None:
 def test_short_queue_drops_the_oldest(roscore: Core, tmp_path: Path) -> None:
     messages = [("/a", f"{i:03}" + "x" * 1_000_000, "/n", 0) for i in range(30)]
     bag = write_strings(tmp_path / "many.bag", messages)
-    published = driver(roscore, bag, queue_size=3)
-    published.ask("advertise")
-    receiver = roscore.receiver("/a")
-    published.ask("await_subscribers", 1)
+    published, receiver = connected(roscore, bag, ["/a"], queue_size=3)
     receiver.stop()
     published.ask("publish")
     dropped = published.ask("dropped")
@@ -338,25 +334,10 @@ def test_short_queue_drops_the_oldest(roscore: Core, tmp_path: Path) -> None:
     assert got == sorted(got)
 
 
-def test_player_that_waits_loses_nothing(roscore: Core, tmp_path: Path) -> None:
-    messages = [("/a", f"{i:04}" + "x" * 100_000, "/n", 0) for i in range(400)]
-    bag = write_strings(tmp_path / "many.bag", messages)
-    published = driver(roscore, bag, queue_size=2, wait_s=60.0)
-    published.ask("advertise")
-    receiver = roscore.receiver("/a")
-    published.ask("await_subscribers", 1)
-    published.ask("publish")
-    assert [int(text[:4]) for text in texts(receiver.take(400))] == list(range(400))
-    assert published.ask("dropped") == 0
-
-
 def test_player_that_waits_does_not_wait_for_ever(roscore: Core, tmp_path: Path) -> None:
     messages = [("/a", "x" * 1_000_000, "/n", 0)] * 40
     bag = write_strings(tmp_path / "many.bag", messages)
-    published = driver(roscore, bag, queue_size=2, wait_s=1.0)
-    published.ask("advertise")
-    receiver = roscore.receiver("/a")
-    published.ask("await_subscribers", 1)
+    published, receiver = connected(roscore, bag, ["/a"], queue_size=2, wait_s=1.0)
     receiver.stop()
     assert published.ask("publish") == 1  # and no other one waited
     receiver.resume()
@@ -371,14 +352,14 @@ def test_subscriber_that_goes(roscore: Core, recording: Path) -> None:
     published.ask("advertise")
     stays, goes = roscore.receiver(*CAMERA), roscore.receiver(*CAMERA)
     index = published.ask("topics").index(CAMERA[0])
-    wait_until(lambda: published.ask("subscribers")[index] == 2)
+    until(lambda: published.ask("subscribers")[index] == 2)
     published.ask("publish")
     goes.end()
     stays.take(16)
     for _ in range(4):
         published.ask("publish")
         stays.take(16)
-    wait_until(lambda: published.ask("subscribers")[index] == 1)
+    until(lambda: published.ask("subscribers")[index] == 1)
 
 
 @pytest.mark.skipif(not shutil.which("ss"), reason="needs iproute2")
@@ -402,10 +383,7 @@ def test_many_come_at_once(roscore: Core, tmp_path: Path) -> None:
 def test_recorded_rosout(roscore: Core, tmp_path: Path) -> None:
     """Topics that a node of rospy has, too, are those of the recording."""
     bag = write_strings(tmp_path / "out.bag", [(f"/{t}", t, "/n", 0) for t in ("rosout", "clock")])
-    published = driver(roscore, bag)
-    published.ask("advertise")
-    receiver = roscore.receiver("/rosout", "/clock")
-    published.ask("await_subscribers", 1)
+    published, receiver = connected(roscore, bag, ["/rosout", "/clock"])
     published.ask("publish")
     told = receiver.take(2)
     assert {(m["type"], t) for m, t in zip(told, texts(told), strict=True)} == {

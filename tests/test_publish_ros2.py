@@ -6,7 +6,7 @@ import json
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,8 +22,8 @@ from mp4ds.plugins.ros.names import NodeNames
 from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
 from mp4ds.plugins.ros.qos import Qos, load_overrides, offered_qos, recorded_qos
 from mp4ds.records import Channel, Schema
-from ros2_sides import KINDS, SIDES, STORE, Side, channel, connect, message, padded, until
-from waiting import WATCHDOG_S
+from ros2_sides import KINDS, SIDES, STORE, Controls, Side, channel, connect, message, padded
+from waiting import WATCHDOG_S, until
 
 STRING = "std_msgs/msg/String"
 
@@ -34,23 +34,6 @@ def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
         yield found
 
 
-class Player:
-    """Controls that note what was asked of them."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[Any, ...]] = []
-        self.is_paused = True
-        self.rate = 2.5
-        self.start_ns = 100 * 10**9
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        def noted(*arguments: Any) -> Any:
-            self.asked.append((name, *arguments))
-            return 3 if name == "burst" else True
-
-        return noted
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_message_arrives_in_order(side: Side, kind: str) -> None:
     recorded = channel("/robot/topic", kind)
@@ -59,7 +42,7 @@ def test_every_message_arrives_in_order(side: Side, kind: str) -> None:
         publisher.advertise(recorded)
         assert publisher.subscribers(recorded) == 0
         connect(side, publisher, recorded)
-        assert until(lambda: publisher.subscribers(recorded) == 1)
+        until(lambda: publisher.subscribers(recorded) == 1)
         for number, payload in enumerate(sent):
             publisher.publish(recorded, memoryview(payload) if number % 2 else payload, number)
         got = side.peer.received("/robot/topic", 20)
@@ -99,15 +82,15 @@ def test_best_effort_is_only_for_best_effort(side: Side, reliable: bool) -> None
         other = channel("/other", STRING)
         publisher.advertise(other)
         side.peer.subscribe("/other", STRING, reliable=reliable)
-        assert until(lambda: publisher.subscribers(other) == 1)
-        assert until(lambda: publisher.subscribers(recorded) == (0 if reliable else 1))
+        until(lambda: publisher.subscribers(other) == 1)
+        until(lambda: publisher.subscribers(recorded) == (0 if reliable else 1))
         if not reliable:
 
             def arrives() -> bool:
                 publisher.publish(recorded, message(STRING, 1), 0)
                 return bool(side.peer.received("/camera", 1, 0.1))
 
-            assert until(arrives)
+            until(arrives)
 
 
 def test_the_clock_is_that_of_ros(side: Side) -> None:
@@ -123,7 +106,7 @@ def test_the_clock_is_that_of_ros(side: Side) -> None:
             got[:] = side.peer.received("/clock", 1, 0.02)
             return bool(got)
 
-        assert until(heard)  # best effort: whoever is connected on one side may not be on both
+        until(heard)  # best effort: whoever is connected on one side may not be on both
         told: list[int] = []
 
         def is_told(time_ns: int) -> bool:
@@ -135,7 +118,7 @@ def test_the_clock_is_that_of_ros(side: Side) -> None:
 
         for time_ns in times:
             publisher.clock(time_ns)
-            assert until(lambda time_ns=time_ns: is_told(time_ns))
+            until(lambda time_ns=time_ns: is_told(time_ns))
     assert told == sorted(told)
     assert [one for one in told if one] == times
 
@@ -153,7 +136,7 @@ def test_the_clock_of_others_is_followed(side: Side) -> None:
                 side.peer.publish("/clock", kind, payload, reliable=False)
                 return told in heard
 
-            assert until(arrives)
+            until(arrives)
     assert heard == sorted(heard)
 
 
@@ -174,7 +157,7 @@ def test_topics_of_others_are_heard_whatever_their_type(
             return is_heard
 
         # whoever is connected on one side may not be on both; from the first on, each one arrives
-        assert until(lambda: arrives(0.5))
+        until(lambda: arrives(0.5))
         assert arrives(WATCHDOG_S)
         assert arrives(WATCHDOG_S)
         while count.acquire(blocking=False):
@@ -217,7 +200,7 @@ CALLS: dict[str, tuple[str, dict[str, Any], tuple[Any, ...] | None, dict[str, An
 
 
 def test_the_services_are_those_of_rosbag2(side: Side) -> None:
-    player = Player()
+    player = Controls()
     with side.open() as publisher:
         publisher.serve(player_services(player))
         for name, (kind, request, _, reply) in CALLS.items():
@@ -228,7 +211,7 @@ def test_the_services_are_those_of_rosbag2(side: Side) -> None:
 def test_ros_names_the_node_and_its_clock(side: Side) -> None:
     names = NodeNames("player", "/robot", (("/clock", "/sim"),))
     with side.open(names=names) as publisher:
-        publisher.serve(player_services(Player()))
+        publisher.serve(player_services(Controls()))
         publisher.clock(0)
         assert side.peer.call("/robot/player/get_rate", "GetRate", {}) == {"rate": 2.5}
         side.peer.subscribe("/sim", "rosgraph_msgs/msg/Clock", reliable=False)
@@ -335,7 +318,7 @@ def test_rclpy_tells_of_a_topic_whose_type_it_has_not(bus: fake_rclpy.Bus) -> No
     del bus.kinds["own/msg/Own"]
     with rclpy_node() as publisher:
         publisher.listen("/own", lambda _: None)
-        assert until(lambda: bus.errors)
+        until(lambda: bus.errors)
     assert "'own/msg/Own' is not installed" in bus.errors[0]
 
 
@@ -345,7 +328,7 @@ def test_rclpy_reads_a_big_endian_clock(bus: fake_rclpy.Bus) -> None:
     with rclpy_node() as publisher:
         publisher.follow_clock(heard.append)
         fake_rclpy.FakePeer(bus).publish("/clock", "rosgraph_msgs/msg/Clock", payload)
-        assert until(lambda: heard)
+        until(lambda: heard)
     assert heard == [5_000_000_006]
 
 
@@ -395,7 +378,7 @@ def test_services_may_be_missing_in_a_ros(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rosbag2_interfaces.srv", None)
     with rclpy_node() as publisher:
-        publisher.serve(player_services(Player()))
+        publisher.serve(player_services(Controls()))
     assert not bus.services
 
 

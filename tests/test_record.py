@@ -397,14 +397,14 @@ def test_a_buffer_that_is_full(tmp_path: Path) -> None:
     buffer = MessageBuffer(3 * len(message.data))
     for number in range(5):
         buffer.put(replace(message, sequence=number))
-    assert buffer.dropped == {message.channel.topic: 2}
+    assert buffer.topics[message.channel.topic].dropped == 2
     buffer.close()
     buffer.put(message)
     found = [buffer.take(0.0) for _ in range(3)]
     assert [item.sequence for item in found if item] == [2, 3, 4]
     with pytest.raises(EOFError):
         buffer.take(0.0)
-    assert buffer.received == {message.channel.topic: 5}
+    assert buffer.topics[message.channel.topic].messages == 5
 
 
 def test_times_that_no_recording_can_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,14 +15,12 @@ import pytest
 import mp4ds
 from conftest import real
 from mp4ds.bags.formats import open_reader
-from mp4ds.files.sources import RECORDING_NAME
-from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
 from player_scenes import make_drive
-from roscore import PLAY, RECORD, Core, missing, python, wait_until
+from roscore import PLAY, RECORD, Core, missing, python
 from roscore import _core as _core
 from roscore import roscore as roscore
-from waiting import WATCHDOG_S
+from waiting import WATCHDOG_S, until
 
 NOT_OF_PLAYERS = "/rosout.*|/clock"
 
@@ -47,7 +45,7 @@ def recorded(core: Core, recorders: Sequence[list[str]], bag: Path, topics: Iter
     """Record a player with several recorders, until all that it plays was received."""
     processes = [core.start(*command) for command in recorders]
     try:
-        wait_until(lambda: sum("record" in node for node in core.nodes()) == len(recorders))
+        until(lambda: sum("record" in node for node in core.nodes()) == len(recorders))
         play = [PLAY, "--quiet", "--queue", "100000", str(bag)]
         core.play(play, topics, len(recorders))
     finally:
@@ -99,31 +97,6 @@ def spooled(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.glob("*.mcap"))
 
 
-def test_a_recorder_that_is_killed(roscore: Core, tmp_path: Path) -> None:
-    bag = make_drive(tmp_path / "drive.bag", frames=400)
-    recorder = roscore.start(*ours(tmp_path / "live", "-a"))
-    folder = tmp_path / "live.recording"
-    wait_until(lambda: any("record" in node for node in roscore.nodes()))
-    player = roscore.start(PLAY, "-q", "--loop", str(bag))
-    try:
-        wait_until(lambda: spooled(folder) > 30_000)
-        recorder.kill()
-        recorder.wait(WATCHDOG_S)
-        assert (folder / RECORDING_NAME).exists()
-    finally:
-        player.terminate()
-        player.wait(WATCHDOG_S)
-    mp4ds.pack(folder, tmp_path / "live", PackOptions(salvage=True))
-    assert mp4ds.validate(tmp_path / "live", deep=True) == []
-    mp4ds.unpack(tmp_path / "live", None, tmp_path / "again.bag")
-    due = {key[0]: found for key, found in contents(bag).items()}
-    for (topic, *_), found in contents(tmp_path / "again.bag").items():
-        if topic in ("/camera/image_raw", "/tf"):
-            assert found
-            played = 2 * due[topic]  # from where the recorder joined, perhaps into the next loop
-            assert any(played[n : n + len(found)] == found for n in range(len(due[topic])))
-
-
 def test_a_clock_that_starts_late(roscore: Core, tmp_path: Path) -> None:
     """Nothing is recorded before its first time: no message has the time 0."""
     bag = make_drive(tmp_path / "drive.bag")
@@ -132,9 +105,9 @@ def test_a_clock_that_starts_late(roscore: Core, tmp_path: Path) -> None:
     player = None
     try:
         log = roscore.folder / "python.log"
-        wait_until(lambda: log.exists() and "waiting for /clock" in log.read_text())
+        until(lambda: log.exists() and "waiting for /clock" in log.read_text())
         player = roscore.start(PLAY, "-q", "--clock", "--loop", str(bag))
-        wait_until(lambda: spooled(tmp_path / "live.recording") > 10_000)
+        until(lambda: spooled(tmp_path / "live.recording") > 10_000)
         recorder.send_signal(signal.SIGINT)
         assert recorder.wait(WATCHDOG_S) == 0
     finally:

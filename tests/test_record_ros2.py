@@ -6,7 +6,8 @@ import base64
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,9 @@ from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
 from mp4ds.plugins.ros.qos import Qos, asked_qos, qos_text, recorded_qos
 from mp4ds.plugins.ros.ros2 import installed_definition, is_hidden, standard_definition
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
-from ros2_sides import SIDES, STORE, Side, channel, message, padded, until
+from ros2_sides import SIDES, STORE, Controls, Side, channel, message, padded
 from scenes import scene
+from waiting import until
 
 pytest.importorskip("cyclonedds")
 
@@ -68,6 +70,21 @@ class Heard:
         self.payloads[message.channel.topic].append(bytes(message.data))
 
 
+@contextmanager
+def recording(
+    side: Side, *channels: Channel, topics: Sequence[str] = (), **options: Any
+) -> Iterator[tuple[Node, Source, Heard]]:
+    """A node that has advertised channels, a source that hears of it, and what it receives."""
+    heard = Heard()
+    with side.open() as publisher:
+        for one in channels:
+            publisher.advertise(one)
+        source = receiving(heard.take, *topics, **options)
+        source.start()
+        yield publisher, source, heard
+        source.close()
+
+
 def test_every_message_is_received(side: Side) -> None:
     """Topics that appear later too, each by the quality of service of its publishers."""
     strings = channel("/robot/name", STRING)
@@ -82,11 +99,11 @@ def test_every_message_is_received(side: Side) -> None:
         source.start()
         for one in (strings, lossy):
             publisher.advertise(one)
-            assert until(lambda one=one: publisher.subscribers(one) == 1)
+            until(lambda one=one: publisher.subscribers(one) == 1)
             for payload in sent[one.topic]:
                 publisher.publish(one, payload, 0)
-                assert until(lambda one=one, payload=payload: ends_with(heard, one.topic, payload))
-        assert until(lambda: heard.payloads["/robot/map"])
+                until(lambda one=one, payload=payload: ends_with(heard, one.topic, payload))
+        until(lambda: heard.payloads["/robot/map"])
         source.close()
     assert [*map(padded, heard.payloads["/robot/map"])] == [padded(message(STRING, 77))]
     for topic, payloads in sent.items():
@@ -119,7 +136,7 @@ def test_a_recording_is_a_rosbag2(
         with open_recorder((), tmp_path / "live", options) as recorder:
 
             def publish() -> None:
-                assert until(lambda: publisher.subscribers(recorded) == 1)
+                until(lambda: publisher.subscribers(recorded) == 1)
                 for payload in images:
                     publisher.publish(recorded, payload, 0)
                 until(lambda: recorder.received == len(images))
@@ -149,8 +166,8 @@ def test_what_metadata_yaml_says(
         with open_recorder((), tmp_path / "live", options) as recorder:
 
             def publish() -> None:
-                assert until(lambda: publisher.subscribers(silent) == 1)
-                assert until(lambda: publisher.subscribers(heard) == 1)
+                until(lambda: publisher.subscribers(silent) == 1)
+                until(lambda: publisher.subscribers(heard) == 1)
                 publisher.publish(heard, message(STRING, 1), 0)
                 until(lambda: recorder.received == 1)
                 recorder.stop()
@@ -173,26 +190,6 @@ def test_what_metadata_yaml_says(
     assert hashes["/robot/silent"] == STORE.hash_rihs01(IMAGE)
 
 
-class Controls:
-    """Of a recorder, that keeps what it is asked."""
-
-    def __init__(self) -> None:
-        self.is_paused = False
-        self.asked: list[str] = []
-
-    def pause(self) -> None:
-        self.is_paused = True
-
-    def resume(self) -> None:
-        self.is_paused = False
-
-    def split(self) -> None:
-        self.asked.append("split")
-
-    def stop(self) -> None:
-        self.asked.append("stop")
-
-
 def test_ros_renames_topics(side: Side) -> None:
     """And /clock; the recording has the names that were asked for."""
     names = NodeNames("bag", "/robot", (("name", "/front/name"), ("/clock", "/sim")))
@@ -211,10 +208,10 @@ def test_ros_renames_topics(side: Side) -> None:
             publisher.publish(found, message(STRING, 1), 0)
             return any(log == clock for _, log in heard.times)
 
-        assert until(arrives)
+        until(arrives)
         asked = side.peer.call("/robot/bag/is_paused", "IsPaused", {})
         source.close()
-    assert asked == {"paused": False}
+    assert asked == {"paused": True}
     assert {*heard.payloads} == {*source.topics} == {"/robot/name"}
     assert ("bag" in node.address) != node.address.endswith("(Cyclone DDS)")
 
@@ -239,10 +236,10 @@ def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
             publisher.clock(clock)
             return bool(heard.payloads["/robot/map"]) and publisher.subscribers(plain) == 1
 
-        assert until(arrives)
+        until(arrives)
         assert source.waiting_for == ""
         publisher.publish(plain, message(STRING, 3), 0)
-        assert until(lambda: heard.payloads["/robot/name"])
+        until(lambda: heard.payloads["/robot/name"])
         source.close()
     assert [*map(padded, heard.payloads["/robot/map"])] == [padded(message(STRING, 77))]
     assert [*map(padded, heard.payloads["/robot/name"])] == [padded(message(STRING, 3))]
@@ -250,37 +247,31 @@ def test_nothing_is_recorded_before_the_clock(side: Side) -> None:
 
 
 def test_the_clock_is_recorded_by_itself(side: Side) -> None:
-    heard, clock = Heard(), 1_700_000_000 * 10**9
-    with side.open() as publisher:
-        source = receiving(heard.take, use_sim_time=True, polling_interval=10.0)
-        source.start()
+    clock = 1_700_000_000 * 10**9
+    options = {"use_sim_time": True, "polling_interval": 10.0}
+    with recording(side, **options) as (publisher, _, heard):
 
         def arrives() -> bool:
             publisher.clock(clock + len(heard.times))
             return len(heard.payloads["/clock"]) > 3
 
-        assert until(arrives)
-        source.close()
+        until(arrives)
     assert {log for _, log in heard.times} <= {*range(clock, clock + 5)}
 
 
 def test_services(side: Side) -> None:
     """Those of rosbag2's recorder."""
     controls = Controls()
-    node = side.open(node="rosbag2_recorder")
-    node.serve(recorder_services(controls))
+    with side.open(node="rosbag2_recorder") as node:
+        node.serve(recorder_services(controls))
 
-    def call(name: str, kind: str) -> dict[str, Any]:
-        return side.peer.call(f"/rosbag2_recorder/{name}", kind, {})
+        def call(name: str) -> dict[str, Any]:
+            kind = "".join(map(str.capitalize, name.split("_")))
+            return side.peer.call(f"/rosbag2_recorder/{name}", kind, {})
 
-    assert call("is_paused", "IsPaused") == {"paused": False}
-    assert call("pause", "Pause") == {}
-    assert call("is_paused", "IsPaused") == {"paused": True}
-    assert call("resume", "Resume") == {}
-    assert call("split_bagfile", "SplitBagfile") == {}
-    assert call("stop", "Stop") == {}
-    node.close()
-    assert (controls.is_paused, controls.asked) == (False, ["split", "stop"])
+        assert call("is_paused") == {"paused": True}
+        assert [*map(call, ("pause", "resume", "split_bagfile", "stop"))] == [{}] * 4
+    assert controls.asked == [("pause",), ("resume",), ("split",), ("stop",)]
 
 
 def test_a_message_that_cannot_be_taken(side: Side) -> None:
@@ -297,71 +288,44 @@ def test_a_message_that_cannot_be_taken(side: Side) -> None:
     with side.open() as publisher:
         publisher.advertise(recorded)
         source.start()
-        assert until(lambda: publisher.subscribers(recorded) == 1)
+        until(lambda: publisher.subscribers(recorded) == 1)
         for number in range(3):
             publisher.publish(recorded, message(STRING, number), 0)
-        assert until(lambda: len(taken) == 3)
+        until(lambda: len(taken) == 3)
         source.close()
     assert source.lost == {"/robot/name": 1}
     assert [*source.warnings] == ["/robot/name: a message could not be recorded: ValueError('no')"]
 
 
-def test_a_topic_of_several_types(side: Side) -> None:
-    """One of them is recorded, and that is said."""
-    both = channel("/robot/name", STRING), channel("/robot/name", "std_msgs/msg/Header")
-    with side.open() as publisher:
-        for one in both:
-            publisher.advertise(one)
-        source = receiving(Heard().take, "/robot/*")
-        source.start()
-        assert until(lambda: sum(map(publisher.subscribers, both)) == 1)
-        source.close()
-    (warning,) = source.warnings
-    assert warning.startswith("/robot/name: has several types: only std_msgs/msg/")
-
-
-def test_hidden_topics_are_left_out(side: Side) -> None:
-    hidden, plain = channel("/robot/_internal", STRING), channel("/robot/name", STRING)
-    heard = Heard()
-    with side.open() as publisher:
-        for one in (hidden, plain):
-            publisher.advertise(one)
-        source = receiving(heard.take)
-        source.start()
-        assert until(lambda: publisher.subscribers(plain) == 1)
-        source.close()
-    assert [*source.topics] == ["/robot/name"]
-
-
 EVENT = "std_srvs/srv/Trigger_Event"
+NAME, HEARD = "/robot/name", {"topics": ["/robot/*"], "ignore_leaf": True}
+CHOSEN: dict[str, tuple[list[Channel], dict[str, Any]]] = {
+    "one of several types": ([channel(NAME, STRING), channel(NAME, "std_msgs/msg/Header")], {}),
+    "not hidden": ([channel(NAME, STRING), channel("/robot/_internal", STRING)], {}),
+    "heard by others": ([channel(NAME, STRING), channel("/robot/leaf", STRING)], HEARD),
+    "events": ([Channel(1, "/arm/_service_event", "cdr", Schema(EVENT, "", b""), {})], {}),
+}
+"""Topics there are, and options; of all only the first is recorded."""
 
 
-def test_events_of_services(side: Side) -> None:
-    """Recorded with -a though their topics are hidden."""
-    events = Channel(1, "/arm/_service_event", "cdr", Schema(EVENT, "", b""), {})
-    heard = Heard()
-    with side.open() as publisher:
-        publisher.advertise(events)
-        source = receiving(heard.take)
-        source.start()
-        assert until(lambda: publisher.subscribers(events) == 1)
-        publisher.publish(events, bytes([0, 1, 0, 0, *range(32)]), 0)
-        assert until(lambda: heard.payloads["/arm/_service_event"])
-        source.close()
-    assert heard.channels["/arm/_service_event"].type_name == EVENT
-
-
-def test_topics_that_nobody_listens_to(side: Side) -> None:
-    heard_by, leaf = channel("/robot/name", STRING), channel("/robot/leaf", STRING)
-    side.peer.subscribe("/robot/name", STRING)
-    with side.open() as publisher:
-        for one in (heard_by, leaf):
-            publisher.advertise(one)
-        source = receiving(Heard().take, "/robot/*", ignore_leaf=True)
-        source.start()
-        assert until(lambda: publisher.subscribers(heard_by) == 2)
-        source.close()
-    assert [*source.topics] == ["/robot/name"]
+@pytest.mark.parametrize("case", CHOSEN)
+def test_topics_that_are_recorded(side: Side, case: str) -> None:
+    channels, options = CHOSEN[case]
+    (topic, *_) = (one.topic for one in channels)
+    others = 0
+    if "ignore_leaf" in options:
+        side.peer.subscribe(topic, STRING)
+        others = 1
+    with recording(side, *channels, **options) as (publisher, source, _):
+        there = [one for one in channels if one.topic == topic]
+        until(lambda: sum(map(publisher.subscribers, there)) == 1 + others)
+    assert [*source.topics] == [topic]
+    said = [*source.warnings]
+    if case == "one of several types":
+        assert said.pop().startswith("/robot/name: has several types: only std_msgs/msg/")
+    if case == "events":  # nobody defines them here, and they are recorded nevertheless
+        said = []
+    assert said == []
 
 
 def test_topics_that_nobody_publishes_yet(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -374,7 +338,7 @@ def test_topics_that_nobody_publishes_yet(monkeypatch: pytest.MonkeyPatch) -> No
             publisher.advertise(plain)
             assert publisher.subscribers(plain) == 2
             publisher.publish(plain, message(STRING, 1), 0)
-            assert until(lambda: heard.payloads["/robot/name"])
+            until(lambda: heard.payloads["/robot/name"])
         source.close()
     assert [*map(padded, heard.payloads["/robot/name"])] == [padded(message(STRING, 1))]
     with pytest.raises(OptionError, match="source a ROS 2"):
@@ -405,16 +369,12 @@ def test_a_definition_that_is_announced(monkeypatch: pytest.MonkeyPatch) -> None
     recorded = Channel(1, "/robot/whole", "cdr", schema, {})
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg(text, "my_msgs/msg/Whole"))
-    heard = Heard()
-    with SIDES["dds"](monkeypatch) as side, side.open() as publisher:
-        publisher.advertise(recorded)
-        source = receiving(heard.take)
-        source.start()
-        assert until(lambda: publisher.subscribers(recorded) == 1)
-        payload = bytes(store.serialize_cdr(whole(store), "my_msgs/msg/Whole"))
+    with SIDES["dds"](monkeypatch) as side, recording(side, recorded) as (publisher, _, heard):
+        until(lambda: publisher.subscribers(recorded) == 1)
+        value = default_message(store, "my_msgs/msg/Whole")
+        payload = bytes(store.serialize_cdr(value, "my_msgs/msg/Whole"))
         publisher.publish(recorded, payload, 0)
-        assert until(lambda: heard.payloads["/robot/whole"])
-        source.close()
+        until(lambda: heard.payloads["/robot/whole"])
     found = heard.channels["/robot/whole"]
     assert found.metadata[HASH_KEY] == store.hash_rihs01("my_msgs/msg/Whole")
     assert found.schema
@@ -455,7 +415,7 @@ def test_a_definition_that_a_node_describes(
             side.peer.ask("publish_opaque", "rt/robot/part", typename, type_hash, message)
             return bool(heard.payloads["/robot/part"])
 
-        assert until(arrives)
+        until(arrives)
         source.close()
     assert padded(heard.payloads["/robot/part"][0]) == padded(payload)
     found = heard.channels["/robot/part"]
@@ -473,10 +433,6 @@ def test_a_definition_that_a_node_describes(
     again = get_typestore(Stores.ROS2_JAZZY)
     again.register(get_types_from_msg(found.schema.data.decode(), CUSTOM))
     assert again.hash_rihs01(CUSTOM) == type_hash
-
-
-def whole(store: Any) -> Any:
-    return default_message(store, "my_msgs/msg/Whole")
 
 
 # ---------------------------------------------------------------- without a network

@@ -23,12 +23,12 @@ from mp4ds.errors import SourceError
 from mp4ds.files.sources import UNFINISHED
 from mp4ds.records import Message
 from player_scenes import make_drive
-from roscore import RECORD, Core, python, wait_until
+from roscore import RECORD, Core, python
 from roscore import _core as _core
 from roscore import roscore as roscore
 from test_examples import ROOT
 from test_record_ros1 import contents
-from waiting import WATCHDOG_S
+from waiting import WATCHDOG_S, until
 
 ROS1, ROS2 = ROOT / "ros" / "ros1", ROOT / "ros" / "ros2"
 LAUNCHED = {
@@ -213,14 +213,14 @@ def test_roslaunch(roscore: Core, workspace: Workspace, drive: Path, tmp_path: P
     start = workspace.command(tmp_path, "roslaunch", "mp4ds", "record.launch")
     recorder = roscore.start(*start, "output:=a live one", "topics:=/camera/* /tf", "name:=bag")
     try:
-        wait_until(lambda: "/bag" in roscore.nodes())
+        until(lambda: "/bag" in roscore.nodes())
         start = workspace.command(tmp_path, "roslaunch", "mp4ds", "play.launch")
         start += ["dataset:=a drive", "clock:=true", f"topics:={IMAGES} /tf", "rate:=2"]
         code, output, errors = roscore.run(*start, "options:=--wait-for-subscribers")
         assert code == 0, errors
         assert "has died" not in output + errors
         assert roscore.run("rosparam", "get", "/use_sim_time")[1].strip() == "true"
-        wait_until(lambda: noted(tmp_path / "a live one") == 20)
+        until(lambda: noted(tmp_path / "a live one") == 20)
     finally:
         recorder.send_signal(signal.SIGINT)
         code = recorder.wait(WATCHDOG_S)
@@ -252,12 +252,12 @@ def test_rosrun_renames_topics(
     play = workspace.command(tmp_path, "rosrun", "mp4ds", "play", "-q", "--pause", "--topics")
     try:
         started.append(roscore.start(*play, IMAGES, str(drive), "__name:=player"))
-        wait_until(lambda: roscore.connections("/player")[IMAGES] == 2)
+        until(lambda: roscore.connections("/player")[IMAGES] == 2)
         pause = ("rosservice", "call", "/player/pause_playback")
         assert roscore.run(*pause, "false")[0] == 0
         started[-1].wait(WATCHDOG_S)
-        wait_until(lambda: noted(tmp_path / "live") == 20)
-        wait_until(lambda: not any(map(roscore.connections, roscore.nodes())))
+        until(lambda: noted(tmp_path / "live") == 20)
+        until(lambda: not any(map(roscore.connections, roscore.nodes())))
     finally:
         for process in started:
             process.send_signal(signal.SIGINT)  # which nobody gets where it has ended
@@ -267,29 +267,3 @@ def test_rosrun_renames_topics(
     found, due = payloads(tmp_path / "again.bag"), payloads(tmp_path / "theirs.bag")
     assert found == due
     assert {*found} == {"/renamed"}
-
-
-def test_a_namespace_of_roslaunch(
-    roscore: Core, workspace: Workspace, drive: Path, tmp_path: Path
-) -> None:
-    """Which it tells by the environment."""
-    (tmp_path / "robot.launch").write_text(
-        '<launch><group ns="robot"><remap from="front" to="/camera/image_raw"/>'
-        '<include file="$(find mp4ds)/launch/record.launch">'
-        '<arg name="topics" value="front"/><arg name="output" value="live"/>'
-        "</include></group></launch>"
-    )
-    start = workspace.command(tmp_path, "roslaunch", str(tmp_path / "robot.launch"))
-    recorder = roscore.start(*start)
-    try:
-        wait_until(lambda: "/robot/recorder" in roscore.nodes())
-        play = workspace.command(tmp_path, "rosrun", "mp4ds", "play", str(drive))
-        options = ("--topics", IMAGES, "--wait-for-subscribers")
-        code, _, errors = roscore.run(*play, *options)
-        assert code == 0, errors
-        wait_until(lambda: noted(tmp_path / "live") == 20)
-    finally:
-        recorder.send_signal(signal.SIGINT)
-        assert recorder.wait(WATCHDOG_S) == 0
-    with mp4ds.open(tmp_path / "live") as dataset:
-        assert {channel.topic for channel in dataset.channels} == {"/robot/front"}

@@ -14,6 +14,7 @@ from typing import Any
 
 try:
     import termios
+    import tty
 except ImportError:  # Windows
     termios = None  # type: ignore[assignment]
 
@@ -123,7 +124,7 @@ class Keyboard:
             if self._before is None:
                 try:
                     before = termios.tcgetattr(fd)
-                    termios.tcsetattr(fd, termios.TCSANOW, _keyed(before))
+                    tty.setcbreak(fd, termios.TCSANOW)
                 except termios.error:  # it was closed
                     return False
                 self._before = before
@@ -151,14 +152,6 @@ def keys_in(data: bytes) -> Iterator[str]:
             yield _ARROWS[key]
         elif len(key) == 1 and key.isascii() and key != b"\x1b":
             yield key.decode()
-
-
-def _keyed(before: list[Any]) -> list[Any]:
-    attributes = [*before[:6], [*before[6]]]
-    attributes[3] &= ~(termios.ICANON | termios.ECHO)
-    attributes[6][termios.VMIN] = 1
-    attributes[6][termios.VTIME] = 0
-    return attributes
 
 
 def _is_in_foreground(fd: int) -> bool:

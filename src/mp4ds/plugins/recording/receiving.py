@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from mp4ds.errors import Mp4dsError, Refused
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
@@ -151,6 +152,29 @@ class Source:
         self._node.close()
 
 
+@dataclass
+class TopicProgress:
+    """What came of a topic.
+
+    Attributes:
+        messages: Messages received.
+        bytes: Their payloads.
+        dropped: Messages dropped because the buffer was full.
+        untimed: Messages left out because their log time is negative or too large.
+        lost: Messages lost, as reported by the middleware.
+        hz: Messages per second, recently.
+        bytes_per_s: Bytes per second, recently.
+    """
+
+    messages: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    untimed: int = 0
+    lost: int = 0
+    hz: float = 0.0
+    bytes_per_s: float = 0.0
+
+
 class MessageBuffer:
     """Messages on their way from the threads that receive them to the one that writes them.
 
@@ -160,10 +184,7 @@ class MessageBuffer:
     """
 
     def __init__(self, most_bytes: int, last_ns: int = INT64_MAX) -> None:
-        self.dropped: Counter[str] = Counter()
-        self.untimed: Counter[str] = Counter()  # with a time that no recording can hold
-        self.received: Counter[str] = Counter()
-        self.received_bytes: Counter[str] = Counter()
+        self.topics: dict[str, TopicProgress] = {}
         self._most = most_bytes
         self._last_ns = last_ns
         self._bytes = 0
@@ -178,20 +199,20 @@ class MessageBuffer:
 
     def put(self, message: Message) -> None:
         """Add a message, from any thread; it never waits."""
-        topic = message.channel.topic
         with self._changed:
             if self._is_closed:
                 return
-            self.received[topic] += 1
-            self.received_bytes[topic] += len(message.data)
+            topic = self.topics.setdefault(message.channel.topic, TopicProgress())
+            topic.messages += 1
+            topic.bytes += len(message.data)
             times = message.log_time, message.publish_time
             if min(times) < 0 or max(times) > self._last_ns:
-                self.untimed[topic] += 1
+                topic.untimed += 1
                 return
             while self._messages and self._bytes + len(message.data) > self._most:
                 dropped = self._messages.popleft()
                 self._bytes -= len(dropped.data)
-                self.dropped[dropped.channel.topic] += 1
+                self.topics[dropped.channel.topic].dropped += 1
             self._messages.append(message)
             self._bytes += len(message.data)
             self._changed.notify()

@@ -22,7 +22,7 @@ from mp4ds.packing.pack import checked_codec
 from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.plan import SPEED, Purpose
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.recording.receiving import MessageBuffer, Source
+from mp4ds.plugins.recording.receiving import MessageBuffer, Source, TopicProgress
 from mp4ds.plugins.recording.spool import Split
 from mp4ds.plugins.ros.node import (
     Node,
@@ -49,27 +49,6 @@ _NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
 
 _LAST_NS = {"ros1": 2**32 * _NS - 1, "ros2": INT64_MAX}
 """The latest time that a bag or rosbag2 can hold."""
-
-
-@dataclass(frozen=True)
-class TopicProgress:
-    """State of a topic.
-
-    Attributes:
-        messages: Messages received.
-        hz: Messages per second, recently.
-        bytes_per_s: Bytes per second, recently.
-        dropped: Messages dropped because the buffer was full.
-        lost: Messages lost, as reported by the middleware.
-        untimed: Messages left out because their log time is negative or too large.
-    """
-
-    messages: int
-    hz: float
-    bytes_per_s: float
-    dropped: int
-    lost: int
-    untimed: int
 
 
 @dataclass(frozen=True)
@@ -261,7 +240,7 @@ class Recorder:
         self._splits: list[Split] = []
         self._process = ProcessExecutor(1, nice=_NICE)
         self._jobs = ThreadPoolExecutor(1, "packing")  # waits for the process
-        self._rates: dict[str, tuple[float, int, int, float, float]] = {}
+        self._counted: dict[str, tuple[float, TopicProgress]] = {}  # when, and what
         self._error: Exception | None = None
 
     @property
@@ -272,7 +251,7 @@ class Recorder:
     @property
     def received(self) -> int:
         """Number of messages received so far."""
-        return sum(self._buffer.received.values())
+        return sum(topic.messages for topic in list(self._buffer.topics.values()))
 
     @property
     def unfinished(self) -> list[Path]:
@@ -328,12 +307,13 @@ class Recorder:
                 raise split.failure(error)
         if self._error is not None:
             raise self._error
+        received = self._buffer.topics
         return RecordSummary(
             datasets=[split.made for split in self._splits if split.made],
             seconds=time.monotonic() - begun,
-            dropped=dict(self._buffer.dropped),
+            dropped={name: one.dropped for name, one in received.items() if one.dropped},
             lost=dict(self._source.lost),
-            untimed=dict(self._buffer.untimed),
+            untimed={name: one.untimed for name, one in received.items() if one.untimed},
             warnings=list(self._source.warnings),
         )
 
@@ -431,7 +411,7 @@ class Recorder:
         split, now = self._splits[-1], time.monotonic()
         topics = {
             topic: self._topic(topic, now)
-            for topic in sorted({*self._source.topics, *self._buffer.received})
+            for topic in sorted({*self._source.topics, *self._buffer.topics})
         }
         self._progress(
             RecordProgress(
@@ -447,19 +427,15 @@ class Recorder:
         )
 
     def _topic(self, topic: str, now: float) -> TopicProgress:
-        count, size = self._buffer.received[topic], self._buffer.received_bytes[topic]
-        then, its_count, its_size, hz, rate = self._rates.get(topic, (0.0, count, size, 0.0, 0.0))
+        received = self._buffer.topics.get(topic, TopicProgress())
+        then, before = self._counted.get(topic, (0.0, received))
         if now - then >= 1.0:
-            hz, rate = (count - its_count) / (now - then), (size - its_size) / (now - then)
-            self._rates[topic] = (now, count, size, hz, rate)
-        return TopicProgress(
-            messages=count,
-            hz=hz,
-            bytes_per_s=rate,
-            dropped=self._buffer.dropped[topic],
-            lost=self._source.lost[topic],
-            untimed=self._buffer.untimed[topic],
-        )
+            hz = (received.messages - before.messages) / (now - then)
+            rate = (received.bytes - before.bytes) / (now - then)
+            before = replace(received, hz=hz, bytes_per_s=rate)
+            self._counted[topic] = now, before
+        lost, hz, rate = self._source.lost[topic], before.hz, before.bytes_per_s
+        return replace(received, lost=lost, hz=hz, bytes_per_s=rate)
 
     def _warn_of_unfinished(self) -> None:
         """Warn of unfinished recordings next to this one."""
