@@ -13,7 +13,7 @@ import pytest
 
 import mp4ds
 from commands import call, refused, unchanged
-from mp4ds.cli.output import Column, print_table
+from mp4ds.cli.output import print_table
 from scenes import START, Record, Scene
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
 from test_terminal import Screen
@@ -125,14 +125,7 @@ def write_named(folder: Path) -> Path:
 
 # ---------------------------------------------------------------- tables
 
-TABLE = [
-    Column("topic", "topic"),
-    Column("type", "type", spare=1),
-    Column("messages"),
-    Column("gaps", spare=3),
-    Column("jitter", spare=2),
-    Column("content", "text"),
-]
+COLUMNS = ("topic", "type", "messages", "gaps", "jitter", "content")
 NAMES = [f"/vehicle/sensor_{n:02}/camera/image_rect_color/compressed" for n in range(70)]
 ROWS = [[name, "sensor_msgs/Image", "123", "", "0.5", "rgb8 " * 9] for name in NAMES]
 
@@ -144,7 +137,12 @@ def printed(
     screen = Screen() if columns else io.StringIO()
     monkeypatch.setenv("COLUMNS", str(columns or 80))
     with contextlib.redirect_stdout(screen):
-        is_cut = print_table(TABLE, rows, first=4)
+        is_cut = print_table(
+            [dict(zip(COLUMNS, row, strict=True)) for row in rows],
+            {"topic": "topic", "type": "type", "content": "text"},
+            spare=("gaps", "jitter", "type"),
+            first=4,
+        )
     assert is_cut == bool(columns)
     return re.sub(r"\x1b\[[0-9;]*m", "", screen.getvalue()).splitlines()
 

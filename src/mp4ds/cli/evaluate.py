@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import chain
 
 from mp4ds.cli.options import argument, command, option, takes
-from mp4ds.cli.output import Column, print_table, say, show
+from mp4ds.cli.output import print_table, say, show
 from mp4ds.cli.progress import progress_of
 from mp4ds.errors import counted, interrupted, path_text
 from mp4ds.options import WHERE
@@ -13,20 +13,10 @@ from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
 from mp4ds.plugins.evaluating.page import findings_of
 from mp4ds.plugins.evaluating.trials import Evaluation
 
-_SPARE = {  # see `Column`
-    "best": 12,
-    "PSNR Cr": 11,
-    "PSNR Cb": 10,
-    "B/frame": 9,
-    "harmonic": 8,
-    "decoded/CPU s": 7,
-    "CPU s": 6,
-    "SSIM": 5,
-    "5 %": 4,
-    "least": 3,
-    "time": 2,
-    "fps": 1,
-}
+_SPARE = (
+    *("best", "PSNR Cr", "PSNR Cb", "B/frame", "harmonic", "decoded/CPU s"),
+    *("CPU s", "SSIM", "5 %", "least", "time", "fps"),
+)
 
 
 def print_evaluation(result: Evaluation) -> None:
@@ -34,12 +24,8 @@ def print_evaluation(result: Evaluation) -> None:
     for item in chain.from_iterable(map(findings_of, result.cameras)):
         if isinstance(item, str):
             say(item)
-            continue
-        columns = [
-            Column(name, "text" if name == "stored as" else "number", _SPARE.get(name, 0))
-            for name in item[0]
-        ]
-        print_table(columns, [list(row.values()) for row in item])
+        else:
+            print_table(item, {"stored as": "text"}, spare=_SPARE)
     for topic, reason in result.left_out.items():
         say(f"{topic}: left out: {reason}")
     if len(result.cameras) > 1:

@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 from mp4ds.cli.options import argument, command, datasets_argument, jobs_option, option, takes
-from mp4ds.cli.output import Column, number, print_table, say, show
+from mp4ds.cli.output import number, print_table, say, show
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.checks import Problem, validate
 from mp4ds.dataset.collections import datasets_in, each
@@ -24,34 +24,12 @@ from mp4ds.options import HOW, SliceOptions, iso_text
 from mp4ds.plugins import info as facts
 from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, ListedCalibration, intrinsics
 
-_SPEED_COLUMNS = [
-    Column("topic", "topic"),
-    Column("per frame"),
-    Column("ms, random access"),
-    Column("ms, in order"),
-]
-_OVERVIEW_COLUMNS = [
-    Column("dataset", "topic"),
-    Column("begins", "text", spare=1),
-    Column("seconds"),
-    Column("messages", spare=3),
-    Column("cameras", spare=2),
-    Column("frames"),
-    Column("size"),
-    Column("profile", "text", spare=4),
-]
-_INFO_COLUMNS = [
-    Column("topic", "topic"),
-    Column("type", "type", spare=1),
-    Column("messages"),
-    Column("Hz"),
-    Column("jitter ms", spare=6),
-    Column("gaps", spare=4),
-    Column("longest s", spare=5),
-    Column("size", spare=2),
-    Column("content", "text"),
-    Column("stored", "text", spare=3),
-]
+_TEXTS = {
+    "topic": "topic",
+    "dataset": "topic",
+    "type": "type",
+    **dict.fromkeys(("content", "stored", "begins", "profile"), "text"),
+}
 
 
 @command()
@@ -182,29 +160,29 @@ def _print_overview(rows: Sequence[facts.Brief]) -> None:
     """Print a line for each dataset, and totals."""
     base = os.path.commonpath([str(row.path.parent) for row in rows])
     table = [
-        [
-            os.path.relpath(str(row.path), base) if base else str(row.path),
-            _moment(row.start),
-            f"{row.seconds:.1f}",
-            str(row.messages),
-            str(len(row.frames)),
-            str(sum(row.frames.values())),
-            size_text(row.bytes),
-            row.profile,
-        ]
+        {
+            "dataset": os.path.relpath(str(row.path), base) if base else str(row.path),
+            "begins": _moment(row.start),
+            "seconds": f"{row.seconds:.1f}",
+            "messages": str(row.messages),
+            "cameras": str(len(row.frames)),
+            "frames": str(sum(row.frames.values())),
+            "size": size_text(row.bytes),
+            "profile": row.profile,
+        }
         for row in rows
     ]
-    total = [
-        f"{len(rows)} datasets",
-        "",
-        f"{sum(row.seconds for row in rows):.1f}",
-        str(sum(row.messages for row in rows)),
-        str(len({topic for row in rows for topic in row.frames})),
-        str(sum(sum(row.frames.values()) for row in rows)),
-        size_text(sum(row.bytes for row in rows)),
-        "",
-    ]
-    print_table(_OVERVIEW_COLUMNS, [*table, total])
+    total = {
+        "dataset": f"{len(rows)} datasets",
+        "begins": "",
+        "seconds": f"{sum(row.seconds for row in rows):.1f}",
+        "messages": str(sum(row.messages for row in rows)),
+        "cameras": str(len({topic for row in rows for topic in row.frames})),
+        "frames": str(sum(sum(row.frames.values()) for row in rows)),
+        "size": size_text(sum(row.bytes for row in rows)),
+        "profile": "",
+    }
+    print_table([*table, total], _TEXTS, spare=("profile", "messages", "cameras", "begins"))
 
 
 def _moment(time_ns: int | None) -> str:
@@ -227,7 +205,8 @@ def _print_info(result: facts.Info) -> None:
     cameras = [topic for topic in result.topics if topic.content or topic.stored]
     others = [topic for topic in result.topics if not topic.content and not topic.stored]
     rows = [_info_row(topic) for topic in (*cameras, *others)]
-    if print_table(_INFO_COLUMNS, rows, first=len(cameras)):
+    spare = ("jitter ms", "longest s", "gaps", "stored", "size", "type")
+    if print_table(rows, _TEXTS, spare=spare, first=len(cameras)):
         say("shortened to fit; in full: --json, or `| less -S`")
     for note in result.notes:
         say(note)
@@ -236,31 +215,30 @@ def _print_info(result: facts.Info) -> None:
 def _print_speeds(speeds: Sequence[facts.ReadingSpeed]) -> None:
     """Print how long reading frames takes."""
     rows = [
-        [
-            item.topic,
-            size_text(item.bytes_per_frame),
-            number(item.random_ms, 1),
-            number(item.in_order_ms, 1),
-        ]
+        {
+            "topic": item.topic,
+            "per frame": size_text(item.bytes_per_frame),
+            "ms, random access": number(item.random_ms, 1),
+            "ms, in order": number(item.in_order_ms, 1),
+        }
         for item in speeds
     ]
-    if rows:
-        print_table(_SPEED_COLUMNS, rows)
+    print_table(rows, _TEXTS)
 
 
-def _info_row(topic: facts.TopicInfo) -> list[str]:
-    return [
-        topic.topic,
-        topic.type_name,
-        str(topic.messages),
-        number(topic.rate_hz, 2),
-        number(topic.jitter_ms, 2),
-        str(topic.gaps) if topic.gaps else "",
-        number(topic.longest_gap_s, 3),
-        size_text(topic.bytes) if topic.bytes is not None else "",
-        topic.content,
-        topic.stored,
-    ]
+def _info_row(topic: facts.TopicInfo) -> dict[str, str]:
+    return {
+        "topic": topic.topic,
+        "type": topic.type_name,
+        "messages": str(topic.messages),
+        "Hz": number(topic.rate_hz, 2),
+        "jitter ms": number(topic.jitter_ms, 2),
+        "gaps": str(topic.gaps) if topic.gaps else "",
+        "longest s": number(topic.longest_gap_s, 3),
+        "size": size_text(topic.bytes) if topic.bytes is not None else "",
+        "content": topic.content,
+        "stored": topic.stored,
+    }
 
 
 # ---------------------------------------------------------------- calibrations

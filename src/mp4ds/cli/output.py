@@ -7,9 +7,9 @@ import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, is_dataclass
 from typing import Any
 from unicodedata import east_asian_width
 
@@ -112,25 +112,12 @@ _MOST_LINES = 3  # of the names of other rows
 _SHORTEST = {"topic": 24, "type": 12, "text": 20}
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column of a table.
-
-    Attributes:
-        name: Its heading.
-        kind: ``number``, right-aligned; ``topic``, ``type`` or ``text``, which a terminal that is
-            too narrow shortens.
-        spare: A terminal that is too narrow leaves out the column with the largest number first;
-            0: none does.
-    """
-
-    name: str
-    kind: str = "number"
-    spare: int = 0
-
-
 def print_table(
-    columns: Sequence[Column], rows: Sequence[Sequence[str]], *, first: int = 0
+    rows: Sequence[Mapping[str, str]],
+    texts: Mapping[str, str],
+    *,
+    spare: Sequence[str] = (),
+    first: int = 0,
 ) -> bool:
     """Print a table with a line for each row, without the columns that are empty.
 
@@ -138,59 +125,65 @@ def print_table(
     all.
 
     Args:
-        columns: Its columns.
-        rows: A text for each of them.
+        rows: A text for each column, by its heading. All have the same columns; the first one
+            names a row.
+        texts: Columns that do not hold numbers -> ``topic``, ``type`` or ``text``, which a
+            terminal that is too narrow shortens.
+        spare: Columns that such a terminal leaves out, as many as it has to, in this order.
         first: How many rows a terminal shows if there are too many for it, the others by name.
 
     Returns:
         Whether anything was shortened or left out.
     """
-    if is_quiet():
+    if is_quiet() or not rows:
         return False
-    cells = [[shown(cell) for cell in row] for row in rows]
     is_terminal = sys.stdout.isatty()
-    most = (first or _MOST_ROWS) if is_terminal and len(cells) > _MOST_ROWS else len(cells)
-    cells, folded = cells[:most], [row[0] for row in cells[most:]]
-    used = [n for n in range(len(columns)) if any(row[n] for row in cells)]
-    table = [[column.name for column in columns], *cells]
-    widths = {n: max(_width(row[n]) for row in table) for n in used}
+    most = (first or _MOST_ROWS) if is_terminal and len(rows) > _MOST_ROWS else len(rows)
+    columns = {
+        name: [name, *(shown(row[name]) for row in rows[:most])]
+        for name in rows[0]
+        if any(row[name] for row in rows[:most])
+    }
+    kinds = {name: texts.get(name, "number") for name in columns}
+    widths = {name: max(map(_width, cells)) for name, cells in columns.items()}
     width = shutil.get_terminal_size().columns if is_terminal else sys.maxsize
     is_cut = _total(widths) > width
     if is_cut:
-        widths = _fitted(columns, used, table, width)
+        widths = _fitted(columns, kinds, spare, width)
     with printed():
-        for number, row in enumerate(table):
-            line = "  ".join(_cell(row[n], size, columns[n].kind) for n, size in widths.items())
-            is_heading = is_terminal and not number
-            print(click.style(line.rstrip(), bold=True) if is_heading else line.rstrip())
-    if folded:
-        say(f"{counted(len(folded), f'other {columns[0].name}')}:")
-        names = ", ".join(folded)
+        for number in range(most + 1):
+            cells = (_cell(columns[name][number], widths[name], kinds[name]) for name in widths)
+            line = "  ".join(cells).rstrip()
+            print(click.style(line, bold=True) if is_terminal and not number else line)
+    if folded := rows[most:]:
+        heading = next(iter(rows[0]))
+        say(f"{counted(len(folded), f'other {heading}')}:")
+        names = ", ".join(shown(row[heading]) for row in folded)
         for line in textwrap.wrap(names, width - 2, max_lines=_MOST_LINES, placeholder=" ..."):
             say(f"  {line}")
     return is_cut or bool(folded)
 
 
 def _fitted(
-    columns: Sequence[Column], used: Sequence[int], table: list[list[str]], width: int
-) -> dict[int, int]:
-    """The columns that a terminal shows, and how wide; type names in the table are shortened."""
-    for row in table:
-        for n in used:
-            if columns[n].kind == "type":
-                row[n] = re.sub(r"[\w.]+/(?:msg/)?", "", row[n])
-    widths = {n: max(_width(row[n]) for row in table) for n in used}
-    least = {n: min(size, _SHORTEST.get(columns[n].kind, size)) for n, size in widths.items()}
-    while _total(least) > width and any(columns[n].spare for n in least):
-        del least[max(least, key=lambda n: columns[n].spare)]
-    found = {n: widths[n] for n in least}
+    columns: dict[str, list[str]], kinds: Mapping[str, str], spare: Sequence[str], width: int
+) -> dict[str, int]:
+    """The columns that a terminal shows, and how wide; type names in them are shortened."""
+    for name, cells in columns.items():
+        if kinds[name] == "type":
+            cells[:] = [re.sub(r"[\w.]+/(?:msg/)?", "", cell) for cell in cells]
+    widths = {name: max(map(_width, cells)) for name, cells in columns.items()}
+    least = {name: min(size, _SHORTEST.get(kinds[name], size)) for name, size in widths.items()}
+    for name in spare:
+        if _total(least) > width:
+            least.pop(name, None)
+    found = {name: widths[name] for name in least}
     while _total(found) > max(width, _total(least)):
-        longer = [n for n in found if found[n] > least[n]]
-        found[max(longer, key=lambda n: (columns[n].kind == "text", found[n]))] -= 1
+        longer = [name for name in found if found[name] > least[name]]
+        found[max(longer, key=lambda name: (kinds[name] == "text", found[name]))] -= 1
     return found
 
 
-def _total(widths: dict[int, int]) -> int:
+def _total(widths: Mapping[str, int]) -> int:
     """Columns of a terminal that a table takes."""
     return sum(widths.values()) + 2 * len(widths) - 2
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import mp4ds
 from mp4ds.cli.options import argument, command, option, parse_share, takes
-from mp4ds.cli.output import Column, number, print_table, say, show
+from mp4ds.cli.output import number, print_table, say, show
 from mp4ds.cli.progress import pack_progress
 from mp4ds.errors import OptionError, counted, path_text, size_text
 from mp4ds.options import LONG, WHERE, seconds_text
@@ -14,16 +14,8 @@ from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary
 from mp4ds.records import Loss, latched_text
 
 _LOSSES_SHOWN = 20
-_COLUMNS = [
-    Column("topic", "topic"),
-    Column("type", "type", spare=3),
-    Column("messages"),
-    Column("frames", spare=2),
-    Column("raw", spare=1),
-    Column("packed"),
-    Column("ratio"),
-    Column("stored in", "text"),
-]
+_TEXTS = {"topic": "topic", "type": "type", "stored in": "text"}
+_SPARE = ("type", "frames", "raw")
 
 
 @command()
@@ -76,7 +68,7 @@ def print_pack(summary: PackSummary) -> None:
     cameras = [topic for topic in summary.topics if topic.frames]
     others = [topic for topic in summary.topics if not topic.frames]
     rows = [_pack_row(topic) for topic in (*cameras, *others)]
-    print_table(_COLUMNS, rows, first=len(cameras))
+    print_table(rows, _TEXTS, spare=_SPARE, first=len(cameras))
     for topic in summary.topics:
         for reason, (count, first) in topic.verbatim.items():
             share = f"{count} of {counted(topic.messages, 'message')}"
@@ -140,22 +132,22 @@ def _loss_text(loss: Loss) -> str:
     return f"{loss.file}: {frames}{topics}{logged}: {loss.problem}"
 
 
-def _pack_row(topic: TopicSummary) -> list[str]:
+def _pack_row(topic: TopicSummary) -> dict[str, str]:
     stored = ", ".join(topic.files)
     if not stored:
         modelled = topic.messages and topic.frames == topic.messages
         stored = "sidecar" if modelled else "messages.mcap"
     ratio = topic.raw_bytes / topic.packed_bytes if topic.packed_bytes else 0
-    return [
-        topic.topic,
-        topic.type_name,
-        str(topic.messages),
-        str(topic.frames) if topic.files else "",
-        size_text(topic.raw_bytes) if topic.raw_bytes else "",
-        size_text(topic.packed_bytes) if topic.packed_bytes else "",
-        number(ratio or None, 2),
-        stored,
-    ]
+    return {
+        "topic": topic.topic,
+        "type": topic.type_name,
+        "messages": str(topic.messages),
+        "frames": str(topic.frames) if topic.files else "",
+        "raw": size_text(topic.raw_bytes) if topic.raw_bytes else "",
+        "packed": size_text(topic.packed_bytes) if topic.packed_bytes else "",
+        "ratio": number(ratio or None, 2),
+        "stored in": stored,
+    }
 
 
 def print_latched(latched: Mapping[str, int], left_out: Sequence[str]) -> None:
