@@ -65,21 +65,9 @@ class Parsed(Generic[_T]):
         def __set__(self, instance: object, value: _T | str | float | Sequence[str]) -> None: ...
 
 
-def option(
-    help: str,  # noqa: A002 - as all libraries of command lines call it
-    default: Any = None,
-    *flags: str,
-    panel: str = HOW,
-    metavar: str | None = None,
-    least: float | None = None,
-    most: float | None = None,
-    parse: Callable[[Any], Any] | None = None,
-    changes: str = "",
-    only: tuple[str, ...] = (),
-) -> Any:
-    """A field of `Options`; see `Declared`."""
-    declared = Declared(help, flags, panel, metavar, least, most, parse, changes, only)
-    return field(default=default, metadata={"declared": declared})
+def option(help: str, default: Any = None, *flags: str, **more: Any) -> Any:  # noqa: A002 - as click has it
+    """A field of `Options`; `more` are fields of `Declared`."""
+    return field(default=default, metadata={"declared": Declared(help, flags, **more)})
 
 
 def argument(help: str, default: Any = None, *, changes: str = "") -> Any:  # noqa: A002
@@ -490,15 +478,6 @@ def about() -> Any:
 def jobs(help: str, default: int | None = None) -> Any:  # noqa: A002
     """The option for the number of processes."""
     return option(help, default, "-j", panel=LONG, metavar="N", least=1, most=1024)
-
-
-def cluster() -> Any:
-    """The option for what runs the tasks."""
-    return option(
-        "Dask scheduler at tcp://HOST:PORT, or slurm; default: this machine.",
-        panel=LONG,
-        metavar="ADDRESS",
-    )
 
 
 def force(help: str = "Replace an existing output.") -> Any:  # noqa: A002

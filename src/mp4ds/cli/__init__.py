@@ -20,10 +20,10 @@ from mp4ds.cli.process import DEBUG, exit_code_of, prepare_process, report_error
 COMMANDS = {
     "pack": ("pack", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
     "repack": ("pack", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
-    "unpack": ("unpack", "Turn a dataset back into a recording: a bag, rosbag2, MCAP or images."),
-    "import": ("imports", "Make a dataset from images, or from a video made by the paper's tool."),
+    "unpack": ("pack", "Turn a dataset back into a recording: a bag, rosbag2, MCAP or images."),
+    "import": ("exchange", "Make a dataset from images, or from a video made by the paper's tool."),
     "export": (
-        "export",
+        "exchange",
         "Export a dataset to another tool's format, keeping what that format supports.",
     ),
     "play": ("play", "Play back datasets, publishing to ROS 1 or ROS 2."),
@@ -43,7 +43,7 @@ COMMANDS = {
     ),
     "info": ("info", "Show what is in a recording or a dataset."),
     "demo": (
-        "imports",
+        "exchange",
         "Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf.",
     ),
 }

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from itertools import chain
 
-from mp4ds.cli.options import argument, command, option, takes
+from mp4ds.cli.options import argument, command, output_option, takes
 from mp4ds.cli.output import print_table, say, show
 from mp4ds.cli.progress import progress_of
 from mp4ds.errors import counted, interrupted, path_text
-from mp4ds.options import WHERE
 from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
 from mp4ds.plugins.evaluating.page import findings_of
 from mp4ds.plugins.evaluating.trials import Evaluation
@@ -40,13 +39,7 @@ def print_evaluation(result: Evaluation) -> None:
 
 @command()
 @argument("source", "SOURCE", "A .bag, rosbag2 folder, .mcap, dataset or video.")
-@option(
-    "--output",
-    "-o",
-    panel=WHERE,
-    metavar="DIR",
-    help="Folder for the results; default: NAME_evaluation.",
-)
+@output_option("DIR", "Folder for the results; default: NAME_evaluation.")
 @takes(EvaluateOptions)
 def evaluate_command(source: str, output: str | None, options: EvaluateOptions) -> None:
     """Compare encoder settings on clips of a recording: quality, size and time.

@@ -12,7 +12,7 @@ import click
 
 from mp4ds.cli.output import be_json, be_quiet
 from mp4ds.errors import OptionError
-from mp4ds.options import LONG, PANELS, Declared, Options, declared_in
+from mp4ds.options import LONG, PANELS, WHERE, Declared, Options, declared_in
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _COMMAND = "mp4ds.command"  # key in click's context: the one that runs
@@ -142,6 +142,13 @@ jobs_option = option(
     type=click.IntRange(1, 1024),
     help="Datasets to process in parallel; default: one per core.",
 )
+
+
+def output_option(metavar: str, help: str, **values: Any) -> Callable[[_F], _F]:  # noqa: A002
+    """The option for where a command writes."""
+    return option("--output", "-o", panel=WHERE, metavar=metavar, help=help, **values)
+
+
 datasets_argument = argument(
     "datasets",
     "DATASET...",

@@ -1,17 +1,30 @@
-"""``mp4ds pack``, also known as ``mp4ds repack``, and what is printed of datasets that are made."""
+"""``mp4ds pack``, also known as ``mp4ds repack``, and ``mp4ds unpack``."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import mp4ds
-from mp4ds.cli.options import argument, command, option, parse_share, takes
+from mp4ds.cli.options import (
+    argument,
+    command,
+    datasets_argument,
+    jobs_option,
+    option,
+    output_option,
+    parse_share,
+    takes,
+)
 from mp4ds.cli.output import number, print_table, say, show
-from mp4ds.cli.progress import pack_progress
+from mp4ds.cli.progress import pack_progress, progress_of
+from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, counted, path_text, size_text
 from mp4ds.options import LONG, WHERE, seconds_text
 from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary
 from mp4ds.records import Loss, latched_text
+from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
+from mp4ds.unpacking.unpack import unpack, unpack_each
 
 _LOSSES_SHOWN = 20
 _TEXTS = {"topic": "topic", "type": "type", "stored in": "text"}
@@ -26,12 +39,9 @@ _SPARE = ("type", "frames", "raw")
     nargs=-1,
     required=True,
 )
-@option(
-    "--output",
-    "-o",
-    panel=WHERE,
-    metavar="DATASET",
-    help="Folder to create; if it ends in a slash, one dataset per SOURCE is made in it. Default: "
+@output_option(
+    "DATASET",
+    "Folder to create; if it ends in a slash, one dataset per SOURCE is made in it. Default: "
     "named after SOURCE, in the current folder.",
 )
 @option("--shard", panel=LONG, metavar="I/N", help="Pack only share I of N shares of the parts.")
@@ -82,8 +92,8 @@ def print_pack(summary: PackSummary) -> None:
         say(f"not packed exactly: {what} ({count})")
     if summary.left_out:
         say(f"left out: {', '.join(summary.left_out)}")
-    print_latched(summary.latched, summary.latched_left_out)
-    print_losses(summary.losses, "listed in dataset.yaml")
+    _print_latched(summary.latched, summary.latched_left_out)
+    _print_losses(summary.losses, "listed in dataset.yaml")
     if not any(topic.files for topic in summary.topics):
         say("no topic became a video: all messages are stored unchanged in messages.mcap")
     if summary.not_copied:
@@ -108,7 +118,101 @@ def _change(summary: PackSummary) -> str:
     return f" ({ratio:.2f} times smaller)" if ratio >= 1 else f" ({1 / ratio:.2f} times as large)"
 
 
-def print_losses(losses: Sequence[Loss], where: str) -> None:
+def _pack_row(topic: TopicSummary) -> dict[str, str]:
+    stored = ", ".join(topic.files)
+    if not stored:
+        modelled = topic.messages and topic.frames == topic.messages
+        stored = "sidecar" if modelled else "messages.mcap"
+    ratio = topic.raw_bytes / topic.packed_bytes if topic.packed_bytes else 0
+    return {
+        "topic": topic.topic,
+        "type": topic.type_name,
+        "messages": str(topic.messages),
+        "frames": str(topic.frames) if topic.files else "",
+        "raw": size_text(topic.raw_bytes) if topic.raw_bytes else "",
+        "packed": size_text(topic.packed_bytes) if topic.packed_bytes else "",
+        "ratio": number(ratio or None, 2),
+        "stored in": stored,
+    }
+
+
+# ---------------------------------------------------------------- unpack
+
+
+@command()
+@datasets_argument
+@option(
+    "--to",
+    panel=WHERE,
+    metavar="TEXT",
+    help="bag, rosbag2, mcap or images; default: the recorded format.",
+)
+@output_option(
+    "OUT", "Output, or a folder for the outputs of several datasets; default: NAME_unpacked."
+)
+@jobs_option
+@takes(UnpackOptions)
+def unpack_command(
+    datasets: Sequence[str],
+    to: str | None,
+    output: str | None,
+    jobs: int | None,
+    options: UnpackOptions,
+) -> None:
+    """Turn a dataset back into a recording: a bag, rosbag2, MCAP or images.
+
+    Messages are converted between ROS 1 and ROS 2 if the output format requires it.
+    """
+    noun = "image" if to == "images" else "message"
+    found = datasets_in(datasets)
+    with progress_of("unpacking") as tell:
+
+        def progress(state: UnpackProgress) -> None:
+            total = state.messages_total
+            unit = noun if len(found) == 1 else "dataset"
+            done = f"{state.messages} of {total}" if total else f"{state.messages}"
+            tell(f"{done} {unit}s", state.messages / total if total else None)
+
+        if len(found) == 1:
+            summaries = [unpack(found[0], to, output, options, progress=progress)]
+        else:
+            summaries = unpack_each(found, to, output, options, jobs=jobs, progress=progress)
+    result = summaries[0] if len(found) == 1 else summaries
+    show(result, lambda _: [*map(partial(_print_unpack, noun=noun), summaries)])
+
+
+def _print_unpack(summary: UnpackSummary, noun: str) -> None:
+    """Print what was written, of things of that name, and what the target could not hold."""
+    total = sum(summary.messages.values())
+    topics = counted(len(summary.messages), "topic")
+    say(f"{path_text(summary.output)}: {counted(total, noun)} of {topics}")
+    for topic, now in summary.republished.items():
+        taken = f" (the name {now.instead_of} is taken)" if now.instead_of else ""
+        say(f"{topic}: written as {now.topic}, {now.type_name}{taken}")
+    for topic, reasons in summary.as_recorded.items():
+        for reason, count in reasons.items():
+            say(f"{topic}: {counted(count, 'message')} as recorded: {reason}")
+    for topic, reasons in summary.unconvertible.items():
+        for reason, count in reasons.items():
+            say(f"{topic}: {counted(count, 'message')} left out: {reason}")
+    for topic, count in summary.thinned.items():
+        say(f"{topic}: {counted(count, 'message')} left out")
+    if summary.converted:
+        say(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
+    for what, count in summary.omitted.items():
+        say(f"not supported by this format: {what} ({count})")
+    if summary.left_out:
+        say(f"left out: {', '.join(summary.left_out)}")
+    _print_latched(summary.latched, summary.latched_left_out)
+    for note in summary.notes:
+        say(note)
+    _print_losses(summary.losses, "listed with --json")
+
+
+# ---------------------------------------------------------------- of both
+
+
+def _print_losses(losses: Sequence[Loss], where: str) -> None:
     """Print what could not be read, and where the rest is listed."""
     for loss in losses[:_LOSSES_SHOWN]:
         say(f"lost: {_loss_text(loss)}")
@@ -132,25 +236,7 @@ def _loss_text(loss: Loss) -> str:
     return f"{loss.file}: {frames}{topics}{logged}: {loss.problem}"
 
 
-def _pack_row(topic: TopicSummary) -> dict[str, str]:
-    stored = ", ".join(topic.files)
-    if not stored:
-        modelled = topic.messages and topic.frames == topic.messages
-        stored = "sidecar" if modelled else "messages.mcap"
-    ratio = topic.raw_bytes / topic.packed_bytes if topic.packed_bytes else 0
-    return {
-        "topic": topic.topic,
-        "type": topic.type_name,
-        "messages": str(topic.messages),
-        "frames": str(topic.frames) if topic.files else "",
-        "raw": size_text(topic.raw_bytes) if topic.raw_bytes else "",
-        "packed": size_text(topic.packed_bytes) if topic.packed_bytes else "",
-        "ratio": number(ratio or None, 2),
-        "stored in": stored,
-    }
-
-
-def print_latched(latched: Mapping[str, int], left_out: Sequence[str]) -> None:
+def _print_latched(latched: Mapping[str, int], left_out: Sequence[str]) -> None:
     """Print which latched messages from before a slice were included, by topic."""
     if latched:
         say(latched_text(latched))

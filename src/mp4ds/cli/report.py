@@ -9,7 +9,15 @@ from pathlib import Path
 
 import click
 
-from mp4ds.cli.options import argument, command, datasets_argument, jobs_option, option, takes
+from mp4ds.cli.options import (
+    argument,
+    command,
+    datasets_argument,
+    jobs_option,
+    option,
+    output_option,
+    takes,
+)
 from mp4ds.cli.output import is_json, printed, say, show
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.collections import datasets_in
@@ -105,14 +113,8 @@ def _print_report(summary: ReportSummary) -> None:
 
 @command()
 @argument("dataset", "DATASET", "A dataset, or a sidecar next to its video.")
-@option(
-    "--output",
-    "-o",
-    required=True,
-    panel=WHERE,
-    metavar="IMAGE",
-    type=click.Path(path_type=Path),
-    help="The .png or .jpg to write.",
+@output_option(
+    "IMAGE", "The .png or .jpg to write.", required=True, type=click.Path(path_type=Path)
 )
 @takes(StillOptions)
 def frames_command(dataset: str, output: Path, options: StillOptions) -> None:

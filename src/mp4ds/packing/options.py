@@ -18,7 +18,6 @@ from mp4ds.options import (
     TopicOptions,
     about,
     argument,
-    cluster,
     force,
     jobs,
     latched,
@@ -130,7 +129,11 @@ class PackOptions(SliceOptions, TopicOptions):
     jobs: int | None = jobs(
         "Parallel processes; default: one per core. Each holds the encoders of all cameras."
     )
-    cluster: str | None = cluster()
+    cluster: str | None = option(
+        "Dask scheduler at tcp://HOST:PORT, or slurm; default: this machine.",
+        panel=LONG,
+        metavar="ADDRESS",
+    )
     join: bool = option("Join the parts packed with --shard into the dataset.", False, panel=LONG)
     keep_going: bool = option("If a part fails, continue with the others.", False, panel=LONG)
     restart: bool = option("Discard an unfinished run and start over.", False, panel=LONG)

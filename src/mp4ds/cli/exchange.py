@@ -1,25 +1,25 @@
-"""``mp4ds import``, and ``mp4ds demo``: datasets and recordings from other things."""
+"""``mp4ds import``, ``mp4ds export`` and ``mp4ds demo``: from other things, and to them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import click
 
 import mp4ds
-from mp4ds.cli.options import argument, command, option, takes
+from mp4ds.cli.options import argument, command, option, output_option, takes
 from mp4ds.cli.output import say, show
 from mp4ds.cli.pack import print_pack
-from mp4ds.cli.progress import pack_progress
+from mp4ds.cli.progress import pack_progress, progress_of
 from mp4ds.errors import counted, path_text
 from mp4ds.options import HOW, WHERE
 from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.plugins.demo import demo
+from mp4ds.plugins.exporting.export import export
+from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
 
-_output = option(
-    "--output", "-o", panel=WHERE, required=True, metavar="DATASET", help="Folder to create."
-)
 _force = option("--force", "-f", is_flag=True, panel=WHERE, help="Replace an existing output.")
 
 
@@ -30,7 +30,7 @@ def import_command() -> None:
 
 @command("images")
 @argument("folder", "FOLDER", "Folder of images, plain or in a known layout.")
-@_output
+@output_option("DATASET", "Folder to create.", required=True)
 @takes(ImageFolder, "images")
 @takes(PackOptions, without=("camera_info", "join", "salvage"))
 def images_command(folder: str, output: str, images: ImageFolder, options: PackOptions) -> None:
@@ -47,7 +47,7 @@ def images_command(folder: str, output: str, images: ImageFolder, options: PackO
 @command("ros-mp4")
 @argument("video", "VIDEO", "The mp4 file.")
 @argument("sidecar", "YAML", "The YAML file that belongs to it.")
-@_output
+@output_option("DATASET", "Folder to create.", required=True)
 @_force
 def ros_mp4_command(video: str, sidecar: str, output: str, force: bool) -> None:
     """Convert an mp4 and YAML made by the tool published with the paper.
@@ -83,3 +83,38 @@ def demo_command(output: Path, seconds: float, force: bool) -> None:
     messages = demo(output, seconds=seconds, force=force)
     text = f"{path_text(output)}: {counted(messages, 'message')}"
     show({"output": output, "messages": messages}, lambda _: say(text))
+
+
+@command()
+@argument("to", "FORMAT", "euroc, tum, colmap or lerobot.")
+@argument(
+    "datasets",
+    "DATASET...",
+    "A dataset; for lerobot one or more, each an episode.",
+    nargs=-1,
+    required=True,
+)
+@output_option("OUT", "Folder to create.", required=True, type=click.Path(path_type=Path))
+@takes(ExportOptions)
+def export_command(to: str, datasets: Sequence[str], output: Path, options: ExportOptions) -> None:
+    """Export a dataset to another tool's format, keeping what that format supports.
+
+    What is left out is counted by topic and listed, here and in mp4ds_export.json.
+    """
+    with progress_of("exporting") as tell:
+        summary = export(datasets, to, output, options, progress=tell)
+    show(summary, _print_export)
+
+
+def _print_export(summary: ExportSummary) -> None:
+    """Print what was written, and every message that was not."""
+    total = sum(summary.messages.values())
+    topics = counted(len(summary.messages), "topic")
+    say(f"{path_text(summary.output)}: {counted(total, 'message')} of {topics}")
+    for place, topic in summary.places.items():
+        say(f"{place}: {topic}")
+    for note in summary.notes:
+        say(f"note: {note}")
+    for topic, reasons in summary.left_out.items():
+        for reason, count in reasons.items():
+            say(f"left out: {counted(count, 'message')} of {topic}: {reason}")
