@@ -7,7 +7,6 @@ interrupted.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -91,41 +90,25 @@ def of_kind(kind: str, folder: Path) -> Path:
     return path
 
 
-def cut(kind: str, keep: float) -> Callable[[Path], Path]:
-    """A file that ends early: after a part of its bytes, or so many before its end."""
+def cut(kind: str) -> Callable[[Path], Path]:
+    """A file that ends in its middle."""
 
     def make(folder: Path) -> Path:
         path = of_kind(kind, folder)
-        size = path.stat().st_size
-        os.truncate(path, int(size * keep) if keep > 0 else size + int(keep))
+        os.truncate(path, path.stat().st_size // 2)
         return path
 
     return make
 
 
-def unindexed(folder: Path) -> Path:
-    path = of_kind("bag", folder)
+def damaged(folder: Path) -> Path:
+    """A file whose index is whole and whose messages are not."""
+    path = of_kind("mcap", folder)
     data = bytearray(path.read_bytes())
-    place = data.index(b"index_pos=") + len(b"index_pos=")
-    data[place : place + 8] = bytes(8)
+    middle = len(data) // 2
+    data[middle : middle + 64] = bytes(byte ^ 0x55 for byte in data[middle : middle + 64])
     path.write_bytes(data)
     return path
-
-
-def damaged(kind: str, compression: str) -> Callable[[Path], Path]:
-    """A file whose index is whole and whose messages are not."""
-
-    def make(folder: Path) -> Path:
-        path = folder / f"drive.{kind}"
-        write = write_bag if kind == "bag" else write_mcap
-        write(path, scene("mono8"), compression=compression)
-        data = bytearray(path.read_bytes())
-        middle = len(data) // 2
-        data[middle : middle + 64] = bytes(byte ^ 0x55 for byte in data[middle : middle + 64])
-        path.write_bytes(data)
-        return path
-
-    return make
 
 
 def folder_of(change: Callable[[Path], object], **options: Any) -> Callable[[Path], Path]:
@@ -156,23 +139,12 @@ BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "name-too-long": (lambda folder: folder / ("x" * 300 + ".bag"), "xxx.bag"),
     "below-a-file": (lambda folder: written("a.bag", b"")(folder) / "b.bag", "b.bag"),
     **{f"text.{s}": (written(f"drive.{s}", b"hello\n" * 9), "is not a") for s in SUFFIXES},
-    **{
-        f"random.{s}": (written(f"drive.{s}", hashlib.sha512(s.encode()).digest() * 99), "is not a")
-        for s in SUFFIXES
-    },
     **{f"empty.{s}": (written(f"drive.{s}", b""), "is empty") for s in SUFFIXES},
     **{f"git-lfs.{s}": (written(f"drive.{s}", LFS_POINTER), "git lfs pull") for s in SUFFIXES},
     "text": (written("notes.txt", b"hello\n"), "is not in a recording format"),
     "no-suffix": (written("notes", b""), "is not in a recording format"),
-    "bag-1.2": (written("drive.bag", b"#ROSBAG V1.2\n" + bytes(99)), "1.2"),
-    **{f"half.{s}": (cut(s, 0.5), "drive." + s) for s in SUFFIXES},
-    **{f"start.{s}": (cut(s, 0.01), "drive." + s) for s in SUFFIXES},
-    "index-cut.bag": (cut("bag", -300), "drive.bag"),
-    "footer-cut.mcap": (cut("mcap", -20), "ends before its footer"),
-    "unindexed.bag": (unindexed, "rosbag reindex"),
-    "damaged-bz2.bag": (damaged("bag", "bz2"), "is damaged"),
-    "damaged-lz4.bag": (damaged("bag", "lz4"), "is damaged"),
-    "damaged-zstd.mcap": (damaged("mcap", "zstd"), "is damaged"),
+    **{f"half.{s}": (cut(s), "drive." + s) for s in SUFFIXES},
+    "damaged.mcap": (damaged, "is damaged"),
     "other-database": (database, "but not of rosbag2"),
     "empty-folder": (empty_folder, "has no metadata.yaml"),
     "no-metadata": (
@@ -183,51 +155,31 @@ BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
         folder_of(lambda folder: sorted(folder.glob("*.db3"))[1].unlink(), files=3),
         "is missing",
     ),
-    "split-missing.mcap": (
-        folder_of(
-            lambda folder: sorted(folder.glob("*.mcap"))[1].unlink(), files=3, storage="mcap"
-        ),
-        "is missing",
-    ),
-    "metadata-empty": (
-        folder_of(lambda folder: (folder / "metadata.yaml").write_bytes(b"")),
-        "is empty",
-    ),
     "metadata-junk": (
         folder_of(lambda folder: (folder / "metadata.yaml").write_bytes(b"\xff: [")),
         "metadata.yaml",
     ),
-    "metadata-outside": (
-        folder_of(
-            lambda folder: (folder / "metadata.yaml").write_text(
-                (folder / "metadata.yaml").read_text().replace("drive_0.db3", "../../etc/passwd")
-            )
-        ),
-        "passwd",
-    ),
 }
 
 
-@pytest.mark.parametrize("name", BAD_SOURCES)
-def test_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        *(("pack", name) for name in BAD_SOURCES),
+        *(("info", name) for name in BAD_SOURCES if name != "damaged.mcap"),  # reads no images
+    ],
+)
+def test_a_source_that_cannot_be_read(command: str, name: str, tmp_path: Path) -> None:
     make, word = BAD_SOURCES[name]
     path = make(tmp_path)
+    options = ("-o", tmp_path / "dataset") if command == "pack" else ()
     with unchanged(tmp_path):
-        refused(call("pack", path, "-o", tmp_path / "dataset"), 2, word)
-
-
-@pytest.mark.one_in(5)
-@pytest.mark.parametrize("name", [n for n in BAD_SOURCES if not n.startswith("damaged")])
-def test_info_on_a_source_that_cannot_be_read(name: str, tmp_path: Path) -> None:
-    make, word = BAD_SOURCES[name]
-    path = make(tmp_path)
-    with unchanged(tmp_path):
-        refused(call("info", path), 2, word)
+        refused(call(command, path, *options), 2, word)
 
 
 def test_one_bad_part_of_several(small_bag: Path, tmp_path: Path) -> None:
     (tmp_path / "second").mkdir()
-    second = cut("bag", 0.5)(tmp_path / "second")
+    second = cut("bag")(tmp_path / "second")
     with unchanged(tmp_path):
         refused(call("pack", small_bag, second, "-o", tmp_path / "dataset"), 2, str(second))
 
@@ -474,7 +426,7 @@ def test_unpack_replaces_its_own_output_with_force_only(
 def test_what_is_replaced_stays_until_the_new_one_is_whole(
     small_dataset: Path, tmp_path: Path
 ) -> None:
-    bad = damaged("bag", "bz2")(tmp_path)
+    bad = damaged(tmp_path)
     with unchanged(tmp_path):
         refused(call("pack", bad, "-o", small_dataset, "--force"), 2, "is damaged")
     assert call("unpack", small_dataset, "--to", "bag", "-o", tmp_path / "again.bag").code == 0
@@ -697,19 +649,7 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     ),
     **{
         f"resize {value}": (("unpack", "DATASET", "--to", "mcap", "--resize", value), "--resize")
-        for value in (
-            "",
-            "0",
-            "-1",
-            "640x",
-            "640x480x3",
-            "0x9",
-            "nan",
-            "inf",
-            "1e9",
-            "big",
-            "99999x9",
-        )
+        for value in ("", "0", "-1", "640x", "640x480x3", "nan", "1e9", "big", "99999x9")
     },
     **{
         f"max-rate {value}": (("unpack", "DATASET", "--to", "mcap", "--max-rate", value), "Hz")

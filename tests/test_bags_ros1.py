@@ -386,6 +386,8 @@ def test_messages_that_the_index_does_not_list_are_not_lost(tmp_path: Path) -> N
     twice = two[:entry] + two[entry - 12 : entry] + two[entry + 12 :]
     path.write_bytes(bag_header(index, 1, 1) + twice[4109:])
     refuse(path, "its index lists a message twice")
+    with open_sources([path], salvage=True) as reader:
+        assert len(list(reader.records())) == 2
     end = two[two.index(b"\4\0\0\0op=\6") - 4 :]
     path.write_bytes(bag_header(index, 1, 2) + two[4109:] + end)
     refuse(path, "its index lists a chunk twice")

@@ -311,6 +311,14 @@ NEXT = "\n" + "=" * 80 + "\nMSG: "
 MANY = struct.pack("<I", 2**32 - 1)
 CDR = b"\0\1\0\0"
 CONSTANT = "module a {{ module msg {{ const long X = {}; struct A {{ long x; }}; }}; }};"
+
+
+def nested(levels: int, fields: str, last: str) -> str:
+    """A type whose fields are of a type whose fields are of a type, and so on."""
+    types = (f"{NEXT}a/B{n}\n" + fields.replace("{}", f"B{n + 1}") for n in range(levels))
+    return f"B0 x\n{''.join(types)}{NEXT}a/B{levels}\n{last} x\n"
+
+
 DEFINITIONS: dict[str, tuple[str, str, bytes]] = {
     "empty-messages": ("ros1", "std_msgs/Empty[] x\n", MANY),
     "empty-in-small-messages": (
@@ -332,35 +340,11 @@ DEFINITIONS: dict[str, tuple[str, str, bytes]] = {
     "array": ("ros1", "uint8[4000000000] x\n", bytes(10)),
     "array-of-texts": ("ros1", "string[4000000000] x\n", bytes(10)),
     "array-of-messages": ("ros1", f"B[4000000000] x{NEXT}a/B\nuint8 x\n", bytes(10)),
-    "doubling": (
-        "ros1",
-        "B0 x\n"
-        + "".join(f"{NEXT}a/B{n}\nB{n + 1} x\nB{n + 1} y\n" for n in range(40))
-        + f"{NEXT}a/B40\nuint8 x\n",
-        bytes(10),
-    ),
-    "doubling-of-nothing": (
-        "ros1",
-        "B0 x\n"
-        + "".join(f"{NEXT}a/B{n}\nB{n + 1} x\nB{n + 1} y\n" for n in range(40))
-        + f"{NEXT}a/B40\nstd_msgs/Empty x\n",
-        bytes(10),
-    ),
-    "doubling-of-sequences": (
-        "ros1",
-        "B0 x\n"
-        + "".join(f"{NEXT}a/B{n}\nB{n + 1}[] x\nB{n + 1}[] y\n" for n in range(40))
-        + f"{NEXT}a/B40\ntime x\n",
-        bytes(8),
-    ),
+    "doubling": ("ros1", nested(40, "{} x\n{} y\n", "uint8"), bytes(10)),
+    "doubling-of-nothing": ("ros1", nested(40, "{} x\n{} y\n", "std_msgs/Empty"), bytes(10)),
+    "doubling-of-sequences": ("ros1", nested(40, "{}[] x\n{}[] y\n", "time"), bytes(8)),
     "itself": ("ros1", "A[] x\n", bytes(10**6)),
-    "deep": (
-        "ros1",
-        "B0 x\n"
-        + "".join(f"{NEXT}a/B{n}\nB{n + 1} x\n" for n in range(500))
-        + f"{NEXT}a/B500\nuint8 x\n",
-        bytes(10),
-    ),
+    "deep": ("ros1", nested(500, "{} x\n", "uint8"), bytes(10)),
     "many-fields": ("ros1", "".join(f"uint8 x{n}\n" for n in range(5500)), bytes(10)),
     "cdr-messages": ("cdr", f"B[] x{NEXT}a/B\nuint8 x\n", CDR + MANY + bytes(100)),
     "cdr-array": ("cdr", "uint8[4000000000] x\n", CDR + bytes(10)),
@@ -478,14 +462,8 @@ def write_bag_info(folder: Path, name: str, mode: str) -> None:
     )
 
 
-FILES = {
-    "a.db3.zstd": "it unpacks to more than 134217728 bytes, too many for its size",
-    "a.mcap.zstd": "it unpacks to more than 134217728 bytes, too many for its size",
-}
-
-
-@pytest.mark.parametrize(("name", "problem"), FILES.items())
-def test_a_file_that_unpacks_to_much(name: str, problem: str, tmp_path: Path, jail: Jail) -> None:
+@pytest.mark.parametrize("name", ["a.db3.zstd", "a.mcap.zstd"])
+def test_a_file_that_unpacks_to_much(name: str, tmp_path: Path, jail: Jail) -> None:
     suffix = name.partition(".")[2].removesuffix(".zstd")
     start = b"SQLite format 3\0"
     if suffix == "mcap":
@@ -494,6 +472,7 @@ def test_a_file_that_unpacks_to_much(name: str, problem: str, tmp_path: Path, ja
     (tmp_path / name).write_bytes(packed)
     write_bag_info(tmp_path, name, "FILE")
     outcome = bounded(jail.records(tmp_path))
+    problem = "it unpacks to more than 134217728 bytes, too many for its size"
     assert problem in outcome.text
     bounded(jail.records(tmp_path, salvage=True))
 
@@ -624,22 +603,6 @@ def test_what_is_written_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 # ---------------------------------------------------------------- what is not what it seems
-
-
-def test_an_index_that_lists_messages_again(tmp_path: Path, jail: Jail) -> None:
-    path = tmp_path / "a.bag"
-    channel = Channel(0, "/a", "ros1", Schema("a/A", "ros1msg", b"uint8[] x"), {"md5sum": "0" * 32})
-    with Ros1Writer(path) as writer:
-        writer.add_channel(channel)
-        for _ in range(2):
-            writer.write(Message(channel, 1, 1, 0, b"x" * 10))
-    data = bytearray(path.read_bytes())
-    entries = data.index(b"ver=\1\0\0\0") + 8
-    entries = data.index(struct.pack("<I", 24), entries) + 4
-    data[entries + 12 : entries + 24] = data[entries : entries + 12]
-    path.write_bytes(data)
-    assert "its index lists a message twice" in bounded(jail.records(path)).text
-    assert bounded(jail.records(path, salvage=True)).messages == 2
 
 
 @pytest.mark.parametrize("name", ["metadata.yaml", "a_0.db3"])
