@@ -184,24 +184,20 @@ def test_files_that_a_note_names_are_not_read(bag: Path, work: Path, tmp_path: P
     [
         dict.clear,
         lambda facts: facts.update(topics=3),
-        lambda facts: facts.update(topics=[{"topic": "/cam"}]),
-        lambda facts: facts["topics"][0].update(messages="x"),
-        lambda facts: facts["topics"][0].update(messages=facts["topics"][0]["messages"] + 28),
-        lambda facts: facts["topics"][0].update(notes=7),
+        lambda facts: facts["topics"].update({"/cam/image_raw": ["x", 1]}),
+        lambda facts: facts["topics"].update({"/cam/image_raw": [28, 1], "/none": [1, 1]}),
+        lambda facts: facts.update(notes=7),
         lambda facts: facts.update(skipped=0.5),
     ],
 )
 def test_facts_that_were_planted_are_no_part(
     change: Callable[[dict[str, Any]], object], bag: Path, work: Path, tmp_path: Path
 ) -> None:
-    """It is made anew, at once or by the next run."""
+    """It is made anew; numbers of messages are not taken from it."""
     path = work / "00001" / "part.json"
     facts_of_part = json.loads(path.read_bytes())
     change(facts_of_part)
     path.write_text(json.dumps(facts_of_part))
-    first = pack(bag, tmp_path)
-    if first.code:
-        refused(first, 1, "damaged")
-        assert pack(bag, tmp_path).code == 0
+    assert pack(bag, tmp_path).code == 0
     mp4ds.pack(bag, tmp_path / "whole", PackOptions(codec="h264"))
     assert facts(tmp_path / "out") == facts(tmp_path / "whole")

@@ -188,7 +188,7 @@ def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
     code = f"mp4ds.pack({str(source)!r}, {str(dataset)!r})"
     loaded = python(f"import mp4ds, sys; {code}; print(*sys.modules)").split()
     assert (dataset / "dataset.yaml").is_file()
-    assert {"mp4ds.bags.ros1", "mp4ds.packing.writer"} <= set(loaded)
+    assert {"mp4ds.bags.ros1", "mp4ds.packing.packer"} <= set(loaded)
     others = [
         *("click", "rich", "jsonschema", "google.protobuf", "sqlite3", "fsspec", "PIL"),
         *("rosbags.rosbag2", "mp4ds.bags.rosbag2", "mp4ds.bags.convert"),

@@ -259,11 +259,8 @@ def test_what_cannot_have_it_later_on_is_lossless(
     window: int | None,
     tmp_path: Path,
     compare: Callable[..., list[str]],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The first images have it, later ones do not: with parts, only theirs are lossless."""
-    monkeypatch.setattr("mp4ds.packing.survey._PLACES", 0)
-    monkeypatch.setattr("mp4ds.packing.survey._RUN", WINDOW)
     noises = [0.0, 0.0, 30.0, 0.0, 0.0, 0.0]
     paths = recording(tmp_path, noises)
     options = PackOptions(

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
 
+from mp4ds.bags.protocols import BagReader, with_own_payload
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.fields import MAX_CAMERA_INFOS
 from mp4ds.format.models import Calibration, CameraInfo, ChannelModel
@@ -16,11 +19,13 @@ from mp4ds.messages.serializations import (
     kind_of,
 )
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
-from mp4ds.packing.inspection import CameraMessage
+from mp4ds.packing.inspection import ColumnsWriter, HeaderTable, MessageInspector
 from mp4ds.packing.options import TopicSummary
-from mp4ds.packing.writer import ColumnsWriter, HeaderTable
 from mp4ds.plan import INFO_NAMES, TRANSPORTS
-from mp4ds.records import Channel, Message
+from mp4ds.records import Channel, Excerpt, Message
+
+Pairs = Mapping[int, int]
+"""Id of a calibration channel -> id of the channel of its images."""
 
 INFO_WINDOW = 50
 """Number of latest stamps of a calibration channel that are compared."""
@@ -61,8 +66,8 @@ def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[in
     Raises:
         OptionError: A topic is unknown or of the wrong kind, or is paired with two others.
     """
-    images = _by_topic(filter(is_camera, channels))
-    infos = _by_topic(filter(is_calibration, channels))
+    images = by_topic(filter(is_camera, channels))
+    infos = by_topic(filter(is_calibration, channels))
     known = {channel.topic: channel.type_name for channel in channels}
     pairs: dict[int, int] = {}
     image_of: dict[str, str] = {}
@@ -88,7 +93,8 @@ def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[in
     return pairs
 
 
-def _by_topic(channels: Iterable[Channel]) -> dict[str, list[Channel]]:
+def by_topic(channels: Iterable[Channel]) -> dict[str, list[Channel]]:
+    """The channels of each topic, by their ids."""
     found: dict[str, list[Channel]] = {}
     for channel in sorted(channels, key=lambda channel: channel.id):
         found.setdefault(channel.topic, []).append(channel)
@@ -159,7 +165,7 @@ def pair_camera_infos(
     for image in filter(is_camera, channels):
         for rank, namespace in enumerate(_namespaces(image)):
             beside.setdefault(namespace, []).append((rank, image))
-    infos = _by_topic(filter(is_calibration, channels))
+    infos = by_topic(filter(is_calibration, channels))
     found = [
         ((INFO_NAMES.index(_leaf(topic)), rank, *_preference(image, sizes or {})), own[0], image)
         for topic, own in infos.items()
@@ -259,6 +265,8 @@ class StampPairing:
         self._infos: dict[int, _Track] = {}
         self._images: dict[int, _Track] = {}
         self._overflow = False
+        self._forms: dict[int, MessageSplitter] = {}
+        self._sizes: dict[int, tuple[int, int]] = {}  # of coded images, as of their first
 
     def add(self, channel: Channel, parts: Parts, *, size: tuple[int, int] = (0, 0)) -> None:
         """Take a message.
@@ -284,7 +292,19 @@ class StampPairing:
         told = parts.fields.width, parts.fields.height
         track.size = size if 0 in told else told
 
-    def decide(self, paired: Mapping[int, int], *, final: bool = True) -> dict[int, int]:
+    def take(self, message: Message) -> None:
+        """Take a message as recorded; one that cannot be parsed is left out."""
+        channel = message.channel
+        if channel.id not in self._forms:
+            self._forms[channel.id] = MessageSplitter(channel)
+        with suppress(Refused):
+            _, parts = self._forms[channel.id].split(message)
+            if isinstance(parts.fields, CodedFields) and channel.id not in self._sizes:
+                key = MessageInspector(channel).inspect(message).key
+                self._sizes[channel.id] = key.width, key.height
+            self.add(channel, parts, size=self._sizes.get(channel.id, (0, 0)))
+
+    def decide(self, paired: Pairs, *, final: bool = True) -> dict[int, int]:
         """Pair what was added so far.
 
         Args:
@@ -359,23 +379,68 @@ def _image_sizes(calibration: CalibrationFields) -> Iterator[tuple[float, float]
             yield width / max(1, calibration.binning_x), height / max(1, calibration.binning_y)
 
 
-# ---------------------------------------------------------------- calibrations
+# ---------------------------------------------------------------- all of them
+
+_PAIRING_MESSAGES = 5_000
+_DECIDED_EVERY = 100
+
+
+def find_pairs(reader: BagReader, chosen: Sequence[str], channels: Sequence[Channel]) -> Pairs:
+    """Pair calibrations with images before anything is packed, so that all parts agree.
+
+    Only where names leave a calibration topic unpaired are the first messages read.
+
+    Args:
+        reader: The recording.
+        chosen: Pairs that the user names, ``IMAGE=INFO``.
+        channels: What is packed of it.
+
+    Raises:
+        OptionError: A chosen pair is not possible.
+    """
+    pairs = pair_camera_infos(channels, chosen=choose_pairs(chosen, channels))
+    infos = [channel for channel in channels if is_calibration(channel)]
+    if not any(map(is_camera, channels)) or all(channel.id in pairs for channel in infos):
+        return pairs
+    pairing = StampPairing()
+    ids = {channel.id for channel in channels if is_camera(channel) or is_calibration(channel)}
+    topics = frozenset(channel.topic for channel in channels if channel.id in ids)
+    records = reader.records(Excerpt(topics=topics, others=False))
+    for number, record in enumerate(islice(records, _PAIRING_MESSAGES)):
+        if isinstance(record, Message) and record.channel.id in ids:
+            pairing.take(record)
+        if number % _DECIDED_EVERY == 0:
+            pairs.update(pairing.decide(pairs, final=False))
+            if all(channel.id in pairs for channel in infos):
+                return pairs
+    return {**pairs, **pairing.decide(pairs)}
+
 
 _MAX_PENDING = 1000
 """Calibrations of a topic that may wait for their stream; with more, all are kept verbatim."""
 
+Identity = tuple[object, ...]
+"""Of a channel of images, whose first stream takes its calibrations."""
 
-class CameraInfoWriter:
-    """The calibration messages of one channel."""
 
-    def __init__(self, channel: Channel) -> None:
-        self.channel = channel
+class _InfoChannel:
+    """The calibration messages of one channel.
+
+    Attributes:
+        images: The channel of their images.
+        pending: Messages, with ordinals, that wait for a stream of the images.
+    """
+
+    def __init__(self, channel: Channel, images: Identity) -> None:
+        self.images = images
+        self.pending: list[tuple[Message, int]] = []
+        self._channel = channel
         self._forms = MessageSplitter(channel)
         self._columns = ColumnsWriter()
         self._heads: HeaderTable[Calibration] | None = None
 
     def accept(self, message: Message, ordinal: int) -> None:
-        """Accept a message.
+        """Put a message into the stream.
 
         Args:
             message: The message.
@@ -407,7 +472,7 @@ class CameraInfoWriter:
         if self._heads is None:
             return None
         return CameraInfo(
-            channel=ChannelModel.from_record(self.channel),
+            channel=ChannelModel.from_record(self._channel),
             wire=self._heads.form.wire,
             messages=len(self._columns),
             calibrations=self._heads.items,
@@ -415,166 +480,88 @@ class CameraInfoWriter:
         )
 
 
-Identity = tuple[object, ...]
-"""Of a channel of images, whose first stream takes its calibrations."""
-
-
-@dataclass
-class _InfoChannel:
-    """A calibration channel whose images have a stream, or may still have one."""
-
-    writer: CameraInfoWriter
-    owner: Identity | None = None
-    pending: list[tuple[Message, int]] = field(default_factory=list)
-
-
-def unpaired_infos(channels: Sequence[Channel], pairs: Mapping[int, int]) -> set[int]:
-    """Ids of the calibration channels that stamps may pair with images."""
-    if not any(map(is_camera, channels)):
-        return set()
-    return {channel.id for channel in filter(is_calibration, channels)} - set(pairs)
-
-
 class Calibrations:
     """Hands calibrations to the streams of their images.
 
     Args:
         channels: The recording's, as far as they are packed.
-        chosen: Pairs that the user names, ``IMAGE=INFO``.
-        surveyed: Pairs already found by stamps, by id; None to compare stamps here.
+        pairs: Of `find_pairs`.
         topic_of: The summary of a channel's topic.
         keep: Stores messages that belong to no stream.
-
-    Raises:
-        OptionError: A chosen pair is not possible.
     """
 
     def __init__(
         self,
         channels: Sequence[Channel],
-        chosen: Sequence[str],
-        surveyed: Mapping[int, int] | None = None,
-        *,
+        pairs: Pairs,
         topic_of: Callable[[Channel], TopicSummary],
         keep: Callable[[Message], None],
     ) -> None:
         self._topic_of = topic_of
         self._keep = keep
         self._channels = {channel.id: channel for channel in channels}
-        self._pairs = pair_camera_infos(channels, chosen=choose_pairs(chosen, channels))
-        self._by_stamp = None
-        if surveyed is not None:
-            self._pairs.update(surveyed)
-        elif unpaired_infos(channels, self._pairs):
-            self._by_stamp = StampPairing()
-        self._forms: dict[int, MessageSplitter] = {}
-        self._infos: dict[int, _InfoChannel | None] = {}
+        self._pairs = dict(pairs)
         self._counts: Counter[Identity] = Counter()
-        self._streams: set[Identity] = set()
+        self._infos: dict[int, _InfoChannel | None] = {}  # None: they are kept
+        self._streams: dict[Identity, _InfoChannel | None] = {}  # of which images, with whose
 
-    def take(self, message: Message) -> None:
-        """Add a calibration to its stream, or keep it if it belongs to none."""
-        channel = message.channel
-        self._meet(channel)
-        # its position among those of all channels with the same identity
-        ordinal = self._counts[channel.identity]
-        self._counts[channel.identity] += 1
-        if channel.id not in self._infos:
-            self._infos[channel.id] = self._new(channel)
-        state = self._infos[channel.id]
-        if state is None:
-            self._keep(message)
-        elif state.owner is not None:
-            self._add(state, message, ordinal)
-        elif len(state.pending) < _MAX_PENDING:
-            # a copy: a view would keep the reader's whole chunk in memory
-            state.pending.append((replace(message, data=bytes(message.data)), ordinal))
-            self._pair_by_stamp(message, state)
-        else:
-            self._give_up(channel.id, state)
-            self._keep(message)
-
-    def saw(self, channel: Channel, seen: CameraMessage) -> None:
-        """Note an image's stamp, for calibrations that names leave unpaired."""
-        self._meet(channel)
-        if self._by_stamp is not None:
-            size = seen.key.width, seen.key.height
-            self._by_stamp.add(channel, seen.parts, size=size)
-
-    def _meet(self, channel: Channel) -> None:
+    def meet(self, channel: Channel) -> None:
         """Pair a channel by its name if it was not known at the beginning."""
         if channel.id not in self._channels:
             self._channels[channel.id] = channel
             self._pairs = pair_camera_infos(list(self._channels.values()), chosen=self._pairs)
 
+    def take(self, message: Message) -> None:
+        """Add a calibration to its stream, or keep it if it belongs to none."""
+        channel = message.channel
+        # its position among those of all channels with the same identity
+        ordinal = self._counts[channel.identity]
+        self._counts[channel.identity] += 1
+        if channel.id not in self._infos:
+            images = self._channels.get(self._pairs.get(channel.id, -1))
+            new = _InfoChannel(channel, images.identity) if images else None
+            self._infos[channel.id] = new
+            self._settle()
+        if (info := self._infos[channel.id]) is None:
+            self._keep(message)
+        elif self._streams.get(info.images) is info:
+            self._add(info, message, ordinal)
+        elif len(info.pending) < _MAX_PENDING:
+            info.pending.append((with_own_payload(message), ordinal))
+        else:
+            self._give_up(channel.id, info)
+            self._keep(message)
+
     def adopt(self, images: Identity) -> None:
         """Take the calibrations that waited for the first stream of a channel of images."""
-        self._streams.add(images)
+        self._streams[images] = None
         self._settle()
+
+    def _settle(self) -> None:
+        for info in self._infos.values():
+            # a stream has the calibrations of one channel
+            if info and info.images in self._streams and self._streams[info.images] is None:
+                self._streams[info.images] = info
+                pending, info.pending = info.pending, []
+                for message, ordinal in pending:
+                    self._add(info, message, ordinal)
 
     def finish(self) -> dict[Identity, CameraInfo]:
         """The calibrations of each stream; those whose stream never came are kept."""
-        if self._by_stamp is not None:
-            self._pairs.update(self._by_stamp.decide(self._pairs))
-            self._settle()
-        found: dict[Identity, CameraInfo] = {}
-        for info_id, state in list(self._infos.items()):
-            if state is None:
-                continue
-            if state.owner is None:
-                self._give_up(info_id, state)
-            elif model := state.writer.to_model():
-                found[state.owner] = model
-        return found
+        for info_id, info in self._infos.items():
+            if info is not None:
+                self._give_up(info_id, info)
+        models = {images: info and info.to_model() for images, info in self._streams.items()}
+        return {images: model for images, model in models.items() if model}
 
-    def _new(self, channel: Channel) -> _InfoChannel | None:
-        if channel.id not in self._pairs and self._by_stamp is None:
-            return None
-        return _InfoChannel(CameraInfoWriter(channel), self._owner_of(channel.id))
-
-    def _owner_of(self, info_id: int) -> Identity | None:
-        image_id = self._pairs.get(info_id)
-        if image_id is None:
-            return None
-        images = self._channels[image_id].identity
-        # a stream has the calibrations of one channel
-        owned = any(state and state.owner == images for state in self._infos.values())
-        return images if images in self._streams and not owned else None
-
-    def _pair_by_stamp(self, message: Message, state: _InfoChannel) -> None:
-        channel = message.channel
-        if self._by_stamp is None or channel.id in self._pairs:
-            return
-        forms = self._forms.setdefault(channel.id, MessageSplitter(channel))
+    def _add(self, info: _InfoChannel, message: Message, ordinal: int) -> None:
         try:
-            self._by_stamp.add(channel, forms.split(message)[1])
-        except Refused:
-            return  # it is kept verbatim when it is taken or given up
-        if len(state.pending) % INFO_WINDOW == 0:
-            self._pairs.update(self._by_stamp.decide(self._pairs, final=False))
-            self._settle()
-
-    def _settle(self) -> None:
-        """Assign owners to channels without one, where known."""
-        for info_id, state in self._infos.items():
-            if state is None or state.owner is not None:
-                continue
-            state.owner = self._owner_of(info_id)
-            if state.owner is not None:
-                pending, state.pending = state.pending, []
-                for message, ordinal in pending:
-                    self._add(state, message, ordinal)
-
-    def _add(self, state: _InfoChannel, message: Message, ordinal: int) -> None:
-        topic = self._topic_of(message.channel)
-        try:
-            state.writer.accept(message, ordinal)
-            topic.frames += 1
+            info.accept(message, ordinal)
         except Refused as reason:
-            topic.count_verbatim(str(reason), ordinal)
+            self._topic_of(message.channel).count_verbatim(str(reason), ordinal)
             self._keep(message)
 
-    def _give_up(self, info_id: int, state: _InfoChannel) -> None:
-        for message, _ in state.pending:
+    def _give_up(self, info_id: int, info: _InfoChannel) -> None:
+        for message, _ in info.pending:
             self._keep(message)
         self._infos[info_id] = None

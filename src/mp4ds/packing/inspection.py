@@ -1,24 +1,42 @@
-"""Determines what a camera message holds, and to which stream it belongs."""
+"""What a message holds, to which stream it belongs, and what columns and headers it becomes."""
 
 from __future__ import annotations
 
+import base64
 import zlib
+from array import array
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from typing import Generic, TypeVar
 
+import numpy as np
+
+from mp4ds.dataset.columns import columns_model
 from mp4ds.errors import Refused
-from mp4ds.format.fields import Body
+from mp4ds.format.fields import MAX_VARIANTS, Body, Columns
 from mp4ds.messages import depth, jpeg, png
 from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, row_padding
 from mp4ds.messages.layouts import why_not
 from mp4ds.messages.png import PNG_ENCODINGS
 from mp4ds.messages.serializations import MessageSplitter
-from mp4ds.messages.wire import CodedFields, Form, ImageFields, Parts
+from mp4ds.messages.wire import (
+    CodedFields,
+    Form,
+    ImageFields,
+    Parts,
+    Template,
+    WireError,
+    prove,
+)
 from mp4ds.records import Channel, Message
+from mp4ds.times import INT64_MAX, INT64_MIN
 from mp4ds.video.codecs import CODECS, packet_codec
 from mp4ds.video.coded import StreamParser
 from mp4ds.video.decoder import jpeg_pixels
+
+_ModelT = TypeVar("_ModelT")
 
 _MAX_PNG_REFUSALS = 20  # in a row
 
@@ -70,18 +88,20 @@ class CameraMessage:
     """What a stream needs to know about a camera message.
 
     Attributes:
-        key: Its stream's.
+        message: As recorded; its payload must stay as it is while this is in use.
         form: How it is serialized.
         parts: Its parts.
+        key: Its stream's.
         wrap: What its body has besides the packet or pixels.
         pixels: Its pixels, shape as `pixel_view` gives it; None for a packet.
         keyframe: Whether decoding can begin at its packet.
         parameters: What a decoder needs before the packet.
     """
 
-    key: StreamKey
+    message: Message
     form: Form
     parts: Parts
+    key: StreamKey
     wrap: BodyFraming = BodyFraming()
     pixels: Pixels | None = None
     keyframe: bool = True
@@ -113,9 +133,9 @@ class MessageInspector:
         form, parts = self._forms.split(message)
         fields = parts.fields
         if isinstance(fields, ImageFields):
-            return _raw_image(form, parts, fields)
+            return _raw_image(message, form, parts, fields)
         if isinstance(fields, CodedFields):
-            return self._kind_of(parts.body, fields)(form, parts)
+            return self._kind_of(parts.body, fields)(message, form, parts)
         raise Refused("it holds no image")
 
     def leave_out(self, seen: CameraMessage) -> None:
@@ -125,49 +145,50 @@ class MessageInspector:
 
     def _kind_of(
         self, body: memoryview, fields: CodedFields
-    ) -> Callable[[Form, Parts], CameraMessage]:
+    ) -> Callable[[Message, Form, Parts], CameraMessage]:
         if self._is_packets:
             codec = packet_codec(fields.format)
             if codec != "mjpeg":
-                return lambda form, parts: self._packet(form, parts, codec)
+                return partial(self._packet, codec)
         elif bytes(body[: len(png.SIGNATURE)]) == png.SIGNATURE:
             return self._png_image
         elif "compressedDepth" in fields.format:
             return self._depth_image
         return self._jpeg_image
 
-    def _packet(self, form: Form, parts: Parts, codec: str) -> CameraMessage:
+    def _packet(self, codec: str, message: Message, form: Form, parts: Parts) -> CameraMessage:
         if codec not in self._parsers:
             self._parsers[codec] = CODECS[codec].parser()
         parser = self._parsers[codec]
         picture = parser.picture(parts.body)
         return CameraMessage(
-            _coded_key(form, "packet", codec, "rgb8", picture.width, picture.height),
+            message,
             form,
             parts,
+            _coded_key(form, "packet", codec, "rgb8", picture.width, picture.height),
             BodyFraming(framing=picture.framing),
             keyframe=picture.keyframe,
             parameters=parser.parameters,
         )
 
-    def _jpeg_image(self, form: Form, parts: Parts) -> CameraMessage:
+    def _jpeg_image(self, message: Message, form: Form, parts: Parts) -> CameraMessage:
         found = jpeg.parse(parts.body)
         encoding = "mono8" if found.components == 1 else "rgb8"
         if not self._transcode:
             key = _coded_key(form, "packet", "mjpeg", encoding, found.width, found.height)
-            return CameraMessage(key, form, parts)
+            return CameraMessage(message, form, parts, key)
         _, pixels = jpeg_pixels(parts.body, (found.width, found.height))
         key = _coded_key(form, "jpeg", "", encoding, found.width, found.height)
-        return CameraMessage(key, form, parts, pixels=pixels)
+        return CameraMessage(message, form, parts, key, pixels=pixels)
 
-    def _png_image(self, form: Form, parts: Parts) -> CameraMessage:
+    def _png_image(self, message: Message, form: Form, parts: Parts) -> CameraMessage:
         with self._png_trial():
             pixels, self._png = png.decode(parts.body, self._png)
         height, width = pixels.shape[:2]
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         encoding = PNG_ENCODINGS[pixels.itemsize, channels]
         key = _coded_key(form, "png", "", encoding, width, height)
-        return CameraMessage(key, form, parts, BodyFraming(png=self._png), pixels=pixels)
+        return CameraMessage(message, form, parts, key, BodyFraming(png=self._png), pixels=pixels)
 
     @contextmanager
     def _png_trial(self) -> Iterator[None]:
@@ -181,14 +202,14 @@ class MessageInspector:
             raise
         self._png_refusals = 0
 
-    def _depth_image(self, form: Form, parts: Parts) -> CameraMessage:
+    def _depth_image(self, message: Message, form: Form, parts: Parts) -> CameraMessage:
         with self._png_trial():
             image = depth.decode_depth(parts.body, self._png)
         self._png = image.recipe or self._png
         height, width = image.pixels.shape
         key = _coded_key(form, "png" if image.recipe else "rvl", "", "16UC1", width, height)
         wrap = BodyFraming(prefix=image.header, png=image.recipe)
-        return CameraMessage(key, form, parts, wrap, pixels=image.pixels)
+        return CameraMessage(message, form, parts, key, wrap, pixels=image.pixels)
 
 
 def depends_on_others(channel: Channel, message: Message) -> bool:
@@ -227,7 +248,7 @@ def _coded_key(
     return StreamKey(form.wire, body, codec, encoding, width, height, step)
 
 
-def _raw_image(form: Form, parts: Parts, fields: ImageFields) -> CameraMessage:
+def _raw_image(message: Message, form: Form, parts: Parts, fields: ImageFields) -> CameraMessage:
     reason = why_not(
         fields.encoding,
         width=fields.width,
@@ -244,4 +265,101 @@ def _raw_image(form: Form, parts: Parts, fields: ImageFields) -> CameraMessage:
     is_bigendian = fields.is_bigendian
     pixels = pixel_view(parts.body, encoding, **size, is_bigendian=bool(is_bigendian))
     key = StreamKey(form.wire, "pixels", "", fields.encoding, **size, is_bigendian=is_bigendian)
-    return CameraMessage(key, form, parts, wrap, pixels=pixels)
+    return CameraMessage(message, form, parts, key, wrap, pixels=pixels)
+
+
+# ---------------------------------------------------------------- columns and headers
+
+
+class ColumnsWriter:
+    """The growing columns of one stream or of its camera_info."""
+
+    def __init__(self) -> None:
+        self._columns = {name: array("q") for name in Columns.model_fields}
+
+    def __len__(self) -> int:
+        return len(self._columns["log_time"])
+
+    @staticmethod
+    def check(message: Message, parts: Parts) -> None:
+        """Refuse times that a column cannot hold.
+
+        Raises:
+            Refused: A time does not fit into a signed 64-bit integer.
+        """
+        for value in (message.log_time, message.publish_time, parts.pts or 0):
+            if not INT64_MIN <= value <= INT64_MAX:
+                raise Refused(f"time {value} ns does not fit into 64 bits with sign")
+
+    def append(self, message: Message, parts: Parts, *, variant: int, ordinal: int) -> None:
+        """Append one message's values, already checked."""
+        values = {
+            "log_time": message.log_time,
+            "publish_time": message.publish_time,
+            "sequence": message.sequence,
+            "stamp": parts.stamp,
+            "seq": parts.seq,
+            "pts": parts.pts,
+            "variant": variant,
+            "ordinal": ordinal,
+        }
+        for name, value in values.items():
+            if value is not None:
+                self._columns[name].append(value)
+
+    def to_model(self) -> Columns:
+        """The columns as the sidecar holds them."""
+        found = self._columns.items()
+        return columns_model({name: np.frombuffer(own, np.int64) for name, own in found if own})
+
+
+class HeaderTable(Generic[_ModelT]):
+    """Numbers the distinct blanks of a stream's messages.
+
+    Args:
+        form: Of all messages.
+    """
+
+    def __init__(self, form: Form) -> None:
+        self.form = form
+        self.items: list[_ModelT] = []
+        self._templates: dict[bytes, Template] = {}
+        self._numbers: dict[tuple[bytes, object], int] = {}
+
+    def number(
+        self,
+        parts: Parts,
+        data: memoryview,
+        *,
+        describe: Callable[[str | None], _ModelT],
+        extra: object = None,
+    ) -> int:
+        """The number of a message's header, after rebuilding and comparing the message.
+
+        Args:
+            parts: Of the message.
+            data: The message.
+            describe: Makes the model of a new header, from its template or None for a plain one.
+            extra: What else distinguishes headers.
+
+        Raises:
+            Refused: It does not rebuild, or there are too many.
+        """
+        blank = parts.blank
+        try:
+            template = self._templates.get(blank) or self.form.template(blank)
+            exact = prove(template, parts, data)
+        except WireError as error:
+            raise Refused(f"its header does not rebuild: {error}") from None
+        if not exact:
+            raise Refused("its header does not rebuild")
+        known = self._numbers.get((blank, extra))
+        if known is not None:
+            return known
+        if len(self.items) == MAX_VARIANTS:
+            raise Refused(f"more than {MAX_VARIANTS} different message headers")
+        plain = self.form.plain(parts.frame_id, parts.fields)
+        self.items.append(describe(None if plain == blank else base64.b64encode(blank).decode()))
+        self._templates[blank] = template
+        self._numbers[blank, extra] = len(self.items) - 1
+        return len(self.items) - 1

@@ -27,35 +27,22 @@ from mp4ds.errors import (
     path_text,
 )
 from mp4ds.files.outputs import is_seen, staged
-from mp4ds.format.manifest import Manifest
-from mp4ds.format.models import StreamSidecar
 from mp4ds.format.sidecars import MANIFEST_NAME
-from mp4ds.packing.manifest import (
-    PartRecord,
-    PartStream,
-    dataset_files,
-    folder_size,
-    summarize,
-    with_latched,
-)
+from mp4ds.packing.manifest import Digest, PartRecord, dataset_files, folder_size, summarize
 from mp4ds.packing.options import PackOptions, PackProgress, PackSummary, TopicSummary
 from mp4ds.packing.parts import (
     FACTS_NAME,
-    PROGRESS_NAME,
     SHARED,
-    Digest,
     PartFacts,
     PartPacker,
     PartsFolder,
     PlanNote,
-    Topics,
     digest_source,
-    parse_topics,
+    parse_facts,
     part_facts,
 )
 from mp4ds.packing.planning import Piece, Plan
 from mp4ds.packing.processes import CallError, call_error
-from mp4ds.plan import FileNames
 
 Report = Callable[[PackProgress], None]
 
@@ -91,7 +78,7 @@ class PartedPack:
 
     def __post_init__(self) -> None:
         self.folder = PartsFolder(self.target)
-        self._done: dict[str, Topics] = {}
+        self._done: dict[str, PartFacts] = {}
         self._before = 0
         self._written = 0
         self._next_report = 0.0
@@ -128,7 +115,8 @@ class PartedPack:
         """Note that the call that packs a piece has ended."""
         place = self.folder.part(piece)
         if error is None and is_seen(lambda: part_facts(place) is not None, self.folder.path):
-            self._note_part(piece, part_facts(place))
+            if facts := part_facts(place):
+                self._note_part(piece, facts)
         elif error is None:
             gone = f"its part did not appear in {self.folder.path}; {SHARED}"
             self.failures.append((piece.name, CallError(gone)))
@@ -136,10 +124,9 @@ class PartedPack:
             self.failures.append((piece.name, call_error(error)))
         self.tell(now=error is not None)
 
-    def _note_part(self, piece: Piece, facts: PartFacts | None) -> None:
-        place = self.folder.part(piece)
-        self._done[piece.name] = facts.messages() if facts else {}
-        self._written += folder_size(place)
+    def _note_part(self, piece: Piece, facts: PartFacts) -> None:
+        self._done[piece.name] = facts
+        self._written += folder_size(self.folder.part(piece))
 
     def refuse_failures(self) -> None:
         """Report the pieces that failed.
@@ -177,8 +164,8 @@ class PartedPack:
             return
         self._next_report = clock + _REPORT_SECONDS
         messages, size = Counter[str](), 0
-        for topics in (*self._done.values(), *self._begun()):
-            for topic, (count, length) in topics.items():
+        for facts in (*self._done.values(), *self._begun()):
+            for topic, (count, length) in facts.topics.items():
                 messages[topic] += count
                 size += length
         frames = self.plan.frames
@@ -201,11 +188,11 @@ class PartedPack:
             )
         )
 
-    def _begun(self) -> Iterator[Topics]:
+    def _begun(self) -> Iterator[PartFacts]:
         """What is packed of parts that are not done."""
-        for path in self.folder.path.glob(f".*/{PROGRESS_NAME}"):
+        for path in self.folder.path.glob(f".*/{FACTS_NAME}"):
             with suppress(OSError, ValueError):  # it may be just then written, or removed
-                yield parse_topics(path.read_bytes())
+                yield parse_facts(path.read_bytes())
 
     def finish(self, digests: Sequence[Digest]) -> PackSummary:
         """Put the parts together, and remove them.
@@ -234,33 +221,48 @@ class PartedPack:
         return summary
 
     def _join(self, made: Path, digests: Sequence[Digest]) -> PackSummary:
-        plan = self.plan
+        plan, whole = self.plan, PartRecord(made)
         places = [self.folder.part(piece) for piece in plan.pieces]
         with ExitStack() as stack:
             reader = stack.enter_context(plan.open())
             with _redone_if_damaged(places):
-                facts = list(map(_whole_facts, places))
+                for place in places:
+                    _add_facts(whole, place)
                 parts = [stack.enter_context(Dataset(place)) for place in places]
-                _check_facts(parts, facts)
                 for source in plan.sources:
                     source.check()
-                origin = plan.origin(reader, digests)
-                manifests = [part.manifest for part in parts if part.manifest]
-                losses = [item.to_record() for one in manifests for item in one.losses]
-                left_out = [topic for one in manifests for topic in one.topics_left_out]
-                manifest, sidecars = concat(
+                for manifest in (part.manifest for part in parts):
+                    if manifest:
+                        whole.losses += [entry.to_record() for entry in manifest.losses]
+                        whole.left_out |= dict.fromkeys(manifest.topics_left_out)
+                concat(
                     parts,
                     made,
-                    changes=origin.fields(reader, losses, left_out),
+                    changes=plan.origin(reader, digests).fields(whole),
                     report=lambda name: self.tell("joining", name, now=True),
                 )
                 # last, since damage of a part would be taken for that of the index
                 _check_index(reader, parts, plan.options.selected)
-            whole = _joined(made, manifest, sidecars, facts)
-            whole.losses, whole.left_out = losses, dict.fromkeys(left_out)
             size = sum(source.size for source in plan.sources)
             source_bytes = None if plan.options.slice else size
-            return with_latched(summarize(whole, self.target, source_bytes, origin), reader)
+            return summarize(whole, self.target, source_bytes, too_large=reader.slice.left_out)
+
+
+def _add_facts(whole: PartRecord, place: Path) -> None:
+    """Add what became of a part.
+
+    Raises:
+        FormatError: It is damaged, or gone.
+    """
+    facts = part_facts(place)
+    if facts is None:
+        raise FormatError("file-missing", place / MANIFEST_NAME, "or another file is gone")
+    whole.skipped |= facts.skipped
+    for name, (messages, size) in facts.topics.items():
+        topic = whole.topics.setdefault(name, TopicSummary(name, ""))
+        topic.messages += messages
+        topic.raw_bytes += size
+        topic.notes += [note for note in facts.notes.get(name, ()) if note not in topic.notes]
 
 
 @contextmanager
@@ -283,22 +285,6 @@ def _redone_if_damaged(places: Sequence[Path]) -> Iterator[None]:
                     "part",
                 ) from None
         raise
-
-
-def _check_facts(parts: Sequence[Dataset], facts: Sequence[PartFacts]) -> None:
-    """Refuse parts whose facts are not those of their datasets.
-
-    Raises:
-        FormatError: Names one; it is made again.
-    """
-    for part, told in zip(parts, facts, strict=True):
-        found = Counter[str]()
-        counts = part.counts()
-        for channel in part.channels:
-            found[channel.topic] += counts.get(channel.id, 0)
-        if +found != +Counter({topic.topic: topic.messages for topic in told.topics}):
-            (part.path / FACTS_NAME).unlink()
-            raise FormatError("file-missing", part.path, "was damaged after it was made")
 
 
 def _check_index(
@@ -332,39 +318,6 @@ def _check_index(
                 f"is damaged: its index lists {due[key]} messages on {channel.topic}, but "
                 f"{found[key]} were found",
             )
-
-
-def _joined(
-    folder: Path, manifest: Manifest, sidecars: Sequence[StreamSidecar], facts: Sequence[PartFacts]
-) -> PartRecord:
-    """What became of each topic in all parts together."""
-    topics: dict[str, TopicSummary] = {}
-    skipped: dict[str, int] = {}
-    for part in facts:
-        skipped |= part.skipped
-        for topic in part.topics:
-            if topic.topic in topics:
-                topics[topic.topic].extend(topic, topics[topic.topic].messages)
-            else:
-                topics[topic.topic] = topic
-    names = FileNames()
-    streams = [
-        PartStream(Path(entry.sidecar).stem, sidecar, names.name_for(entry.topic)[1])
-        for entry, sidecar in zip(manifest.streams, sidecars, strict=True)
-    ]
-    return PartRecord(folder, topics, streams, skipped=skipped)
-
-
-def _whole_facts(place: Path) -> PartFacts:
-    """What became of a part.
-
-    Raises:
-        FormatError: It is damaged, or gone.
-    """
-    facts = part_facts(place)
-    if facts is None:
-        raise FormatError("file-missing", place / MANIFEST_NAME, "or another file is gone")
-    return facts
 
 
 @contextmanager

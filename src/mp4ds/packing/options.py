@@ -23,7 +23,7 @@ from mp4ds.options import (
     latched,
     option,
 )
-from mp4ds.plan import MAX_GOP, Purpose, QualitySetting, parse_purpose, parse_quality
+from mp4ds.plan import LOSSLESS, MAX_GOP, Purpose, QualitySetting, parse_purpose, parse_quality
 from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
 from mp4ds.video.codecs import ARCHIVE_GOP, LOSSLESS_GOP, LOSSY_GOP, LOSSY_TRAINING_GOP
 
@@ -143,14 +143,24 @@ class PackOptions(SliceOptions, TopicOptions):
     )
 
     @property
+    def goal(self) -> QualitySetting:
+        """The quality, lossless by default."""
+        return self.quality or parse_quality(LOSSLESS)
+
+    @property
+    def is_fast(self) -> bool:
+        """Whether to encode in the least time, with nothing tried."""
+        return self.purpose is not None and self.purpose.is_speed
+
+    @property
     def group_frames(self) -> int:
         """Maximum key frame interval, frames.
 
         Raises:
             OptionError: `purpose` and `gop` contradict each other.
         """
-        is_lossless = self.quality is None or self.quality.lossless
-        if self.purpose is None or self.purpose.is_speed:
+        is_lossless = self.goal.lossless
+        if self.purpose is None or self.is_fast:
             return self.gop or (LOSSLESS_GOP if is_lossless else LOSSY_GOP)
         if self.gop is not None:
             raise OptionError(
@@ -232,23 +242,6 @@ class TopicSummary:
             reason = OTHER_REASONS
         count, first = self.verbatim.get(reason, (0, number))
         self.verbatim[reason] = (count + 1, first)
-
-    def extend(self, later: TopicSummary, before: int) -> None:
-        """Add the result for later messages.
-
-        Args:
-            later: The result for these messages alone.
-            before: Number of the topic's messages before them.
-        """
-        self.messages += later.messages
-        self.frames += later.frames
-        self.raw_bytes += later.raw_bytes
-        for reason, (count, number) in later.verbatim.items():
-            if reason not in self.verbatim and len(self.verbatim) >= MAX_REASONS:
-                reason = OTHER_REASONS
-            known, first = self.verbatim.get(reason, (0, before + number))
-            self.verbatim[reason] = (known + count, first)
-        self.notes.extend(note for note in later.notes if note not in self.notes)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ machines, which are kept until all are done, and then put together.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -42,14 +41,13 @@ from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest, load_stream
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import ENCODING
+from mp4ds.packing.calibrations import by_topic
 from mp4ds.packing.long_packs import PartedPack, Report, pack_parts
 from mp4ds.packing.manifest import (
     PartRecord,
     dataset_files,
     folder_size,
     summarize,
-    topic_summaries,
-    with_latched,
     write_manifest,
 )
 from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
@@ -70,8 +68,6 @@ from mp4ds.video.codecs import DEFAULT_LOSSY, check_codec, fastest_preset
 from mp4ds.video.scores import find_ffmpeg
 
 # ---------------------------------------------------------------- in one pass
-
-_REPORT_SECONDS = 0.1
 
 
 def _pack_in_one_pass(parted: PartedPack, exact: Exact) -> PackSummary:
@@ -97,34 +93,29 @@ def _pack_in_one_pass(parted: PartedPack, exact: Exact) -> PackSummary:
 
 def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> PackSummary:
     plan, report = parted.plan, parted.report
+    is_slice = bool(plan.options.slice)
     total = sum(map(source_size, reader.files))
     stats = reader.stats()
-    counts: dict[str, int | None] = {}
-    for channel in filter(is_camera, reader.channels):
-        count = stats[channel.id].count if channel.id in stats else None
-        known = counts.get(channel.topic, 0)
-        counts[channel.topic] = None if count is None or known is None else known + count
-    next_report = 0.0
     due = sum(item.count for item in stats.values())
-
-    def share(part: PartRecord) -> float:
-        if plan.options.slice:
-            return sum(topic.messages for topic in part.topics.values()) / max(1, due)
-        hasher.advance(reader.position)
-        return reader.position / max(1, total)
+    cameras = [channel for channel in reader.channels if is_camera(channel)]
+    counts: dict[str, int | None] = {
+        topic: None
+        if any(channel.id not in stats for channel in own)
+        else sum(stats[channel.id].count for channel in own)
+        for topic, own in by_topic(cameras).items()
+    }
 
     def progress(part: PartRecord, *, done: bool = False) -> None:
-        nonlocal next_report
-        packed = share(part)
-        now = time.monotonic()
-        if report is None or (now < next_report and not done):
-            return
-        next_report = now + _REPORT_SECONDS
-        report(
-            PackProgress(
+        if is_slice:
+            share = sum(topic.messages for topic in part.topics.values()) / max(1, due)
+        else:
+            hasher.advance(reader.position)
+            share = reader.position / max(1, total)
+        if report is not None:
+            state = PackProgress(
                 dataset=parted.target,
                 phase="packing",
-                done=1.0 if done else min(1.0, packed),
+                done=1.0 if done else min(1.0, share),
                 bytes_read=sum(topic.raw_bytes for topic in part.topics.values()),
                 bytes_total=total,
                 bytes_written=folder_size(folder),
@@ -134,20 +125,19 @@ def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> 
                     if name in counts
                 },
             )
-        )
+            report(state)
 
     (piece,) = plan.pieces
     with unchanged(plan.sources), SourceHasher(reader.files) as hasher:
         part = Packer(reader, folder, plan, piece, exact, progress).run()
-        if plan.options.slice:  # little of it was read
+        if is_slice:  # little of it was read
             digests = [digest_source(source) for source in plan.hashed]
         else:
             digests = [hasher.digest(number) for number in range(len(reader.files))]
-    origin = plan.origin(reader, digests)
-    write_manifest(part, reader, origin, str(plan.options.quality))
+    write_manifest(part, plan.origin(reader, digests), str(plan.options.quality))
     progress(part, done=True)
-    source_bytes = None if plan.options.slice else total
-    return with_latched(summarize(part, parted.target, source_bytes, origin), reader)
+    source_bytes = None if is_slice else total
+    return summarize(part, parted.target, source_bytes, too_large=reader.slice.left_out)
 
 
 # ---------------------------------------------------------------- pack
@@ -261,25 +251,14 @@ def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
             is_cut = options.slice and selected(stream.topic)
             if is_cut and stream.sidecar.digests is None:  # nothing else shows that it is damaged
                 stream.verify_video()
-        manifest = copy_part(dataset, folder, part=part, selected=selected, about=about)
+        copy_part(dataset, folder, part=part, selected=selected, about=about)
         if options.slice:
             for problem in validate(folder, deep=True):
                 raise FormatError(problem.code, dataset.path, f"is damaged: {problem}")
-        with Dataset(folder) as made:
-            topics = topic_summaries(made)
-            early = dict(made.latched_before) if options.slice else {}
-        return PackSummary(
-            dataset=target,
-            topics=topics,
-            source_bytes=folder_size(dataset.path),
-            dataset_bytes=folder_size(folder),
-            messages_bytes=sum(item.size for item in manifest.files if item.name[-5:] == ".mcap"),
-            left_out=[item.topic for item in dataset.channels if not selected(item.topic)],
-            skipped={},
-            is_copy=True,
-            latched=early,
-            latched_left_out=list(filter(selected, part.left_out)),
-        )
+        left_out = [item.topic for item in dataset.channels if not selected(item.topic)]
+        made = PartRecord(folder, left_out=dict.fromkeys(left_out))
+        summary = summarize(made, target, 0, is_copy=True, too_large=part.left_out)
+        return replace(summary, source_bytes=folder_size(dataset.path))
 
 
 def _pack_to_store(

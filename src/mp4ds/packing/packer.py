@@ -2,38 +2,53 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+import base64
+import time
+from array import array
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
+import xxhash
+
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.columns import digests_model
 from mp4ds.errors import Refused
-from mp4ds.format.models import CameraInfo
+from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, exceeds_padding
+from mp4ds.format.models import (
+    CameraInfo,
+    ChannelModel,
+    Header,
+    Image,
+    PngFile,
+    StreamSidecar,
+    VideoModel,
+    video_facts,
+)
+from mp4ds.format.sidecars import dump_document
+from mp4ds.messages.png import PngRecipe, zlib_fingerprint
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
+from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.calibrations import Calibrations, Identity
-from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
-from mp4ds.packing.manifest import PartRecord, PartStream, declare_rest
-from mp4ds.packing.options import TopicSummary
-from mp4ds.packing.planning import Piece, Plan
-from mp4ds.packing.survey import (
-    MAX_STREAMS_PER_CHANNEL,
-    SAMPLES,
-    Decision,
-    StreamSettings,
-    Survey,
-    decide,
-    needs_trial,
-    rate_of,
+from mp4ds.packing.inspection import (
+    CameraMessage,
+    ColumnsWriter,
+    HeaderTable,
+    MessageInspector,
+    StreamKey,
 )
-from mp4ds.packing.tracks import TrackPlan
-from mp4ds.packing.writer import OutOfReach, StreamWriter
+from mp4ds.packing.manifest import PartRecord
+from mp4ds.packing.planning import Piece, Plan
+from mp4ds.packing.survey import MAX_STREAMS_PER_CHANNEL, SAMPLES, Decision, decide, needs_trial
+from mp4ds.packing.tracks import TrackPlan, open_track
 from mp4ds.plan import FileNames
-from mp4ds.records import Attachment, Channel, Message, Record
+from mp4ds.records import Attachment, Channel, Message
+from mp4ds.times import PresentationClock
 
 Exact = Mapping[tuple[int, StreamKey], str]
 """Channel id and key of streams that no longer need to reach a score -> why."""
@@ -45,6 +60,7 @@ NOT_SURVEYED = (
 
 # ---------------------------------------------------------------- threads
 
+_REPORT_SECONDS = 0.2
 _AHEAD = 2  # jobs of a thread that may wait: each holds an image
 
 
@@ -97,23 +113,182 @@ class StreamThreads:
             raise self._error
 
 
-# ---------------------------------------------------------------- cameras
+# ---------------------------------------------------------------- streams
 
 
-@dataclass(frozen=True, slots=True)
-class _Item:
-    """A message of a camera channel.
+class OutOfReach(Exception):  # noqa: N818 - no failure: packing starts anew without that score
+    """A stream that was started cannot reach the requested score.
 
-    Attributes:
-        ordinal: Its position among the channel's messages.
-        number: Its position among the topic's messages.
-        seen: What it holds.
+    Args:
+        stream: Identifies it among the streams of a pack.
+        reason: What was tried.
     """
 
-    message: Message
-    ordinal: int
-    number: int
-    seen: CameraMessage
+    def __init__(self, stream: tuple[int, StreamKey], reason: str) -> None:
+        super().__init__(stream, reason)
+        self.stream, self.reason = stream, reason
+
+
+class StreamWriter:
+    """One stream being written: accepts messages in order, then makes its sidecar.
+
+    `accept` decides at once and keeps the columns; the job that it returns does the costly
+    work and may run in another thread, in order with the stream's other jobs.
+
+    Args:
+        stem: Path of video and sidecar, without ending.
+        number: Of the stream.
+        seen: The first of its messages.
+        plan: How the video is made.
+        threads: Of an encoder.
+        rate: Frames per second, where known.
+
+    Raises:
+        Refused: The encoder does not take such pictures.
+    """
+
+    def __init__(
+        self,
+        stem: Path,
+        number: int,
+        seen: CameraMessage,
+        plan: TrackPlan,
+        threads: int,
+        rate: float | None,
+    ) -> None:
+        self.number = number
+        self.channel = seen.message.channel
+        self.camera_info: CameraInfo | None = None
+        self.video_path, self._sidecar_path = Path(f"{stem}.mp4"), Path(f"{stem}.yaml")
+        self._plan = plan
+        self._columns = ColumnsWriter()
+        self._heads = HeaderTable[Header](seen.form)
+        self._digests = array("Q")
+        self._clock = PresentationClock()
+        self._track = open_track(plan, self.video_path, seen, threads, rate)
+        self._key = seen.key
+
+    @property
+    def note(self) -> str:
+        """What the user should know of how the video is made; empty if nothing."""
+        return self._track.note
+
+    @property
+    def frames(self) -> int:
+        """Messages accepted so far."""
+        return len(self._columns)
+
+    def accept(self, seen: CameraMessage, ordinal: int) -> Callable[[], None]:
+        """Take a message whose key is this stream's.
+
+        Args:
+            seen: The message; its payload must stay as it is until the job has run.
+            ordinal: Its place among the channel's messages.
+
+        Returns:
+            The job that writes its frame, and raises what `finish` does.
+
+        Raises:
+            Refused: The stream cannot carry it exactly; nothing was changed.
+        """
+        message, parts = seen.message, seen.parts
+        self._columns.check(message, parts)
+        if self.frames == MAX_FRAMES:
+            raise Refused(f"more than {MAX_FRAMES} messages")
+        if refusal := self._track.refuses(seen):
+            raise Refused(refusal)
+        variant = self._heads.number(
+            parts,
+            memoryview(message.data),
+            describe=lambda template: self._header(seen, template),
+            extra=seen.wrap,
+        )
+        self._columns.append(message, parts, variant=variant, ordinal=ordinal)
+        tick = self._clock.tick(parts.stamp, message.log_time)
+
+        def write() -> None:
+            if self._plan.is_exact:
+                self._digests.append(xxhash.xxh64_intdigest(message.data))
+            try:
+                self._track.write(seen, tick)
+            except Refused as reason:
+                raise self._out_of_reach(reason) from None
+
+        return write
+
+    def finish(self) -> StreamSidecar:
+        """Complete the video and write the sidecar; all jobs must have run.
+
+        Returns:
+            The sidecar.
+
+        Raises:
+            OutOfReach: The video cannot have the score that was asked for.
+            OSError: It cannot be written.
+        """
+        try:
+            self._track.close()
+        except Refused as reason:
+            raise self._out_of_reach(reason) from None
+        key, made = self._key, self._track.describe()
+        video = {**made, **video_facts(self.video_path, made["codec"])}
+        sidecar = StreamSidecar(
+            mp4ds=FORMAT_VERSION,
+            kind="stream",
+            profile=self._plan.profile,
+            frames=self.frames,
+            channel=ChannelModel.from_record(self.channel),
+            wire=key.wire,
+            body=key.body,
+            image=Image(
+                encoding=key.encoding,
+                width=key.width,
+                height=key.height,
+                step=key.step,
+                is_bigendian=key.is_bigendian,
+            ),
+            headers=self._heads.items,
+            video=VideoModel.model_validate(video),
+            camera_info=self.camera_info,
+            columns=self._columns.to_model(),
+            digests=digests_model(self._digests) if self._plan.is_exact else None,
+        )
+        self._sidecar_path.write_bytes(dump_document(sidecar))
+        return sidecar
+
+    def _out_of_reach(self, reason: Refused) -> OutOfReach:
+        return OutOfReach((self.channel.id, self._key), str(reason))
+
+    def _header(self, seen: CameraMessage, template: str | None) -> Header:
+        """The model of a message's header.
+
+        Raises:
+            Refused: The headers would become too large.
+        """
+        fields, wrap = seen.parts.fields, seen.wrap
+        padding = None if wrap.padding is None else base64.b64encode(wrap.padding).decode()
+        if exceeds_padding((padding, *(head.padding for head in self._heads.items))):
+            raise Refused("too much padding between rows, different in each image")
+        return Header(
+            frame_id=seen.parts.frame_id,
+            format=fields.format if isinstance(fields, CodedFields) else None,
+            template=template,
+            framing=wrap.framing,
+            prefix=wrap.prefix.hex(),
+            png=_png_file(wrap.png) if wrap.png else None,
+            padding=padding,
+        )
+
+    def abandon(self) -> None:
+        """Stop writing; the caller removes the files."""
+        self._track.abandon()
+
+
+def _png_file(recipe: PngRecipe) -> PngFile:
+    return PngFile.model_validate({**asdict(recipe), "deflate": zlib_fingerprint()})
+
+
+# ---------------------------------------------------------------- cameras
 
 
 @dataclass
@@ -131,115 +306,35 @@ class _Route:
     refusal: str = ""
 
 
-@dataclass
-class _CameraChannel:
-    """A camera channel being packed."""
-
-    inspector: MessageInspector
-    count: int = 0
-    routes: dict[StreamKey, _Route] = field(default_factory=dict)
-    held: list[_Item] = field(default_factory=list)
-    is_surveyed: bool = False
-
-
-class CameraRouter:
-    """Routes the images of all camera channels into streams.
+class _Camera:
+    """A camera channel being packed.
 
     Args:
-        reader: The recording.
-        folder: Where the streams' files are made.
-        settings: How to encode.
-        calibrations: Notified of new streams.
-        survey: Earlier decisions; None to decide here.
-        topic_of: The summary of a channel's topic.
-        keep: Stores what no stream can carry exactly.
-        exact: Streams that must be lossless although a score is asked for, and why.
+        packer: What it is packed by.
+        channel: The channel; others of the recording may equal it.
     """
 
-    def __init__(
-        self,
-        reader: BagReader,
-        folder: Path,
-        settings: StreamSettings,
-        calibrations: Calibrations,
-        survey: Survey | None,
-        *,
-        topic_of: Callable[[Channel], TopicSummary],
-        keep: Callable[[Message], None],
-        exact: Exact,
-    ) -> None:
-        self._reader = reader
-        self._folder = folder
-        self._settings = settings
-        self._calibrations = calibrations
-        self._survey = survey
-        self._topic_of = topic_of
-        self._keep = keep
-        self._exact = exact
-        self._names = FileNames()
-        self._channels: dict[tuple[object, ...], _CameraChannel] = {}
-        self._streams: list[StreamWriter] = []
-        self._firsts: dict[Identity, StreamWriter] = {}  # of each channel
-        self._renamed: set[str] = set()
+    def __init__(self, packer: Packer, channel: Channel) -> None:
+        plan = packer.plan
+        self._packer = packer
+        self._channel = channel
+        self._topic = packer.part.topic(channel)
+        self._inspector = MessageInspector(channel, transcode=plan.options.transcode)
+        # measured in each part of a recording by itself, it would make their videos differ
+        stats = None if plan.options.is_fast else packer.reader.stats().get(channel.id)
+        self._rate = stats.rate if stats else None
+        self._count = 0
+        self._held: list[tuple[CameraMessage, int, int]] = []  # with ordinal, and number in topic
+        decisions = packer.decisions.get(channel.id)
+        self._is_surveyed = decisions is not None
+        self._routes = {item.key: self._route(item) for item in decisions or ()}
+        self.first: StreamWriter | None = None
 
-    def take(self, message: Message, threads: StreamThreads) -> None:
-        """Encode an image, hold it back, or keep it with the reason why no stream accepts it."""
-        channel = message.channel
-        state = self._state_of(channel)
-        ordinal, number = state.count, self._topic_of(channel).messages - 1
-        state.count += 1
-        try:
-            seen = state.inspector.inspect(message)
-        except Refused as reason:
-            self._settle(state, threads)
-            self._keep_verbatim(message, number, str(reason))
-            return
-        self._calibrations.saw(channel, seen)
-        item = _Item(message, ordinal, number, seen)
-        if state.is_surveyed:
-            state.routes.setdefault(seen.key, _Route([], refusal=NOT_SURVEYED))
-        if seen.key in state.routes and not state.held:
-            self._write(state, item, threads)
-            return
-        state.held.append(item)
-        held = Counter(other.seen.key for other in state.held)
-        enough = held[seen.key] == SAMPLES or len(state.held) == 2 * SAMPLES
-        if enough or not needs_trial(seen, self._settings):
-            self._settle(state, threads)
-
-    def _state_of(self, channel: Channel) -> _CameraChannel:
-        if channel.identity not in self._channels:
-            inspector = MessageInspector(channel, transcode=self._settings.options.transcode)
-            state = self._channels[channel.identity] = _CameraChannel(inspector)
-            decisions = self._survey.decisions.get(channel.id) if self._survey else None
-            if decisions is not None:
-                state.is_surveyed = True
-                state.routes = {item.key: self._route(channel, item) for item in decisions}
-        return self._channels[channel.identity]
-
-    def settle(self, threads: StreamThreads) -> None:
-        """Write everything held back: the recording has ended."""
-        for state in self._channels.values():
-            self._settle(state, threads)
-
-    def _settle(self, state: _CameraChannel, threads: StreamThreads) -> None:
-        """Decide how to encode the held images, and write them in order."""
-        held, state.held = state.held, []
-        for key in dict.fromkeys(item.seen.key for item in held):
-            if key not in state.routes:
-                samples = [item.seen for item in held if item.seen.key == key]
-                state.routes[key] = self._plan(samples, held[0].message.channel)
-        for item in held:
-            self._write(state, item, threads)
-
-    def _plan(self, samples: list[CameraMessage], channel: Channel) -> _Route:
-        return self._route(channel, decide(samples, self._settings, self._rate(channel)))
-
-    def _route(self, channel: Channel, decision: Decision) -> _Route:
-        reason = self._exact.get((channel.id, decision.key))
+    def _route(self, decision: Decision) -> _Route:
+        reason = self._packer.exact.get((self._channel.id, decision.key))
         if reason is None:
             return _Route(list(decision.plans), refusal=decision.refusal)
-        kept = "partly kept lossless" if self._survey else "kept lossless"
+        kept = "partly kept lossless" if self._is_surveyed else "kept lossless"
         plans = [
             replace(plan, note=f"{kept}: {reason}")
             for plan in decision.plans
@@ -247,36 +342,61 @@ class CameraRouter:
         ]
         return _Route(plans, refusal="" if plans else reason)
 
-    def _rate(self, channel: Channel) -> float | None:
-        # measured in each part of a recording by itself, it would make their videos differ
-        return None if self._settings.is_fast else rate_of(self._reader, channel)
+    def take(self, message: Message) -> None:
+        """Encode an image, hold it back, or keep it with the reason why no stream accepts it."""
+        ordinal, number = self._count, self._topic.messages - 1
+        self._count += 1
+        try:
+            seen = self._inspector.inspect(message)
+        except Refused as reason:
+            self.settle()
+            self._keep_verbatim(message, number, str(reason))
+            return
+        if self._is_surveyed:
+            self._routes.setdefault(seen.key, _Route([], refusal=NOT_SURVEYED))
+        if seen.key in self._routes and not self._held:
+            self._write(seen, ordinal, number)
+            return
+        self._held.append((seen, ordinal, number))
+        held = sum(other.key == seen.key for other, *_ in self._held)
+        enough = held == SAMPLES or len(self._held) == 2 * SAMPLES
+        if enough or not needs_trial(seen, self._packer.plan.options):
+            self.settle()
 
-    def _write(self, state: _CameraChannel, item: _Item, threads: StreamThreads) -> None:
-        route = state.routes[item.seen.key]
+    def settle(self) -> None:
+        """Decide how to encode the held images, and write them in order."""
+        held, self._held = self._held, []
+        plan = self._packer.plan
+        for key in dict.fromkeys(seen.key for seen, *_ in held):
+            if key not in self._routes:
+                samples = [seen for seen, *_ in held if seen.key == key]
+                decision = decide(samples, plan.options, plan.threads, self._rate)
+                self._routes[key] = self._route(decision)
+        for item in held:
+            self._write(*item)
+
+    def _write(self, seen: CameraMessage, ordinal: int, number: int) -> None:
+        route = self._routes[seen.key]
         reason = route.refusal
-        for stream in self._candidates(state, route, item):
-            number = self._streams.index(stream)
+        for stream in self._candidates(route, seen):
             try:
-                job = stream.accept(item.message, item.seen, item.ordinal)
+                job = stream.accept(seen, ordinal)
             except Refused as refusal:
                 reason = str(refusal)
                 continue
-            self._topic_of(item.message.channel).frames += 1
-            if stream.frames == 1:
-                self._firsts.setdefault(stream.channel.identity, stream)
-                self._calibrations.adopt(stream.channel.identity)
-            threads.submit(number, job)
+            if self.first is None:
+                self.first = stream
+                self._packer.calibrations.adopt(self._channel.identity)
+            self._packer.threads.submit(stream.number, job)
             return
-        state.inspector.leave_out(item.seen)
-        self._keep_verbatim(item.message, item.number, route.refusal or reason)
+        self._inspector.leave_out(seen)
+        self._keep_verbatim(seen.message, number, route.refusal or reason)
 
-    def _candidates(
-        self, state: _CameraChannel, route: _Route, item: _Item
-    ) -> Iterator[StreamWriter]:
+    def _candidates(self, route: _Route, seen: CameraMessage) -> Iterator[StreamWriter]:
         """The streams that may accept a message; the next one is made when the others refuse."""
         yield from route.streams
         while route.plans and not route.refusal:
-            made = sum(len(other.streams) for other in state.routes.values())
+            made = sum(len(other.streams) for other in self._routes.values())
             if made == MAX_STREAMS_PER_CHANNEL:
                 route.refusal = (
                     f"more than {MAX_STREAMS_PER_CHANNEL} sizes or encodings on one topic"
@@ -284,59 +404,19 @@ class CameraRouter:
                 return
             plan = route.plans.pop(0)
             try:
-                stream = self._new_stream(item, plan)
+                stream = self._packer.new_stream(seen, plan, self._rate)
             except Refused as reason:
                 if not route.plans and not route.streams:
                     route.refusal = str(reason)
                 continue
+            if stream.note:
+                self._topic.notes.append(stream.note)
             route.streams.append(stream)
             yield stream
 
-    def _new_stream(self, item: _Item, plan: TrackPlan) -> StreamWriter:
-        channel = item.message.channel
-        stem, renamed = self._names.name_for(channel.topic)
-        stream = StreamWriter(
-            stem,
-            self._folder,
-            channel=channel,
-            seen=item.seen,
-            plan=plan,
-            threads=self._settings.threads,
-            rate=self._rate(channel),
-        )
-        self._streams.append(stream)
-        if renamed:
-            self._renamed.add(stem)
-        if stream.note:
-            self._topic_of(channel).notes.append(stream.note)
-        return stream
-
     def _keep_verbatim(self, message: Message, number: int, reason: str) -> None:
-        self._topic_of(message.channel).count_verbatim(reason, number)
-        self._keep(message)
-
-    def finish(self, infos: Mapping[Identity, CameraInfo]) -> list[PartStream]:
-        """Complete all videos and write their sidecars; all jobs must have run.
-
-        Args:
-            infos: The calibrations of each channel, for its first stream.
-        """
-        for identity, info in infos.items():
-            self._firsts[identity].camera_info = info
-        finished = []
-        for stream in self._streams:
-            if not stream.frames:
-                stream.abandon()
-                stream.video_path.unlink(missing_ok=True)
-                continue
-            stem = stream.video_path.stem
-            finished.append(PartStream(stem, stream.finish(), stem in self._renamed))
-        return finished
-
-    def abandon(self) -> None:
-        """Close all videos as they are; the caller removes them."""
-        for stream in self._streams:
-            stream.abandon()
+        self._topic.count_verbatim(reason, number)
+        self._packer.keep(message)
 
 
 # ---------------------------------------------------------------- packer
@@ -369,9 +449,16 @@ class Packer:
         plan: How.
         piece: What.
         exact: Streams that must be lossless although a score is asked for, and why.
-        progress: Called after each record with what was packed so far.
+        progress: Called several times a second with what was packed so far.
+
+    Attributes:
+        part: What was packed so far.
+        decisions: How images of each surveyed channel are stored, by its id.
+        calibrations: Notified of new streams.
+        threads: Run the jobs of streams; while `run` reads.
     """
 
+    threads: StreamThreads
     _verbatim: McapWriter  # messages.mcap, open while `run` reads
 
     def __init__(
@@ -383,33 +470,21 @@ class Packer:
         exact: Exact,
         progress: Callable[[PartRecord], None],
     ) -> None:
-        self._reader = reader
+        self.reader, self.plan, self.exact = reader, plan, exact
+        self.decisions = {} if piece.decides_itself else plan.decisions
+        self.part = PartRecord(folder)
         self._excerpt = piece.excerpt
         self._selected = plan.options.selected
-        self._threads = plan.workers if plan.workers > 1 else 0
         # that of a part is read once more, as parts are put together
         self._compression = "zstd" if piece.is_all else "lz4"
         self._progress = progress
         self._transforms = TransformCollector()
-        self._part = PartRecord(folder)
-        survey = plan.survey_for(piece)
-        self._calibrations = Calibrations(
-            [channel for channel in reader.channels if self._selected(channel.topic)],
-            plan.options.camera_info,
-            survey.pairs if survey else None,
-            topic_of=self._part.topic,
-            keep=self._keep,
-        )
-        self._cameras = CameraRouter(
-            reader,
-            folder,
-            plan.streams,
-            self._calibrations,
-            survey,
-            topic_of=self._part.topic,
-            keep=self._keep,
-            exact=exact,
-        )
+        channels = [channel for channel in reader.channels if self._selected(channel.topic)]
+        self.calibrations = Calibrations(channels, plan.pairs, self.part.topic, self.keep)
+        self._names = FileNames()
+        self._streams: list[StreamWriter] = []
+        self._cameras: dict[Identity, _Camera] = {}
+        self._takers: dict[int, Callable[[Message], None] | None] = {}
 
     def run(self) -> PartRecord:
         """Pack everything of the excerpt.
@@ -419,57 +494,117 @@ class Packer:
             OutOfReach: A stream cannot have the score that was asked for.
             OSError: It cannot be written.
         """
-        part = self._part
+        part = self.part
         try:
             with McapWriter(
-                part.messages_path,
-                profile=self._reader.profile,
-                compression=self._compression,
+                part.messages_path, profile=self.reader.profile, compression=self._compression
             ) as self._verbatim:
                 self._read()
-                part.streams = self._cameras.finish(self._calibrations.finish())
+                self._finish_streams()
                 if self._excerpt.others:
-                    declare_rest(part, self._reader, self._selected, self._verbatim)
+                    self._declare_rest()
         except BaseException:
-            self._cameras.abandon()
+            for stream in self._streams:
+                stream.abandon()  # the caller removes the files
             raise
         part.transforms = self._transforms.transforms
         return part
 
     def _read(self) -> None:
-        with StreamThreads(self._threads) as threads:
-            for record in self._reader.records(self._excerpt):
-                self._take(record, threads)
-                self._progress(self._part)
-            self._cameras.settle(threads)
+        part, next_time = self.part, time.monotonic() + _REPORT_SECONDS
+        with StreamThreads(self.plan.workers if self.plan.workers > 1 else 0) as self.threads:
+            for record in self.reader.records(self._excerpt):
+                if isinstance(record, Message):
+                    self._take(record)
+                elif isinstance(record, Attachment):
+                    self._verbatim.add_attachment(record)
+                else:
+                    self._verbatim.add_metadata(record)
+                if time.monotonic() >= next_time:
+                    self._progress(part)
+                    next_time = time.monotonic() + _REPORT_SECONDS
+            for camera in self._cameras.values():
+                camera.settle()
         if self._excerpt.others:
-            self._part.skipped = dict(self._reader.skipped)
-            self._part.losses = list(self._reader.losses)
+            part.skipped = dict(self.reader.skipped)
+            part.losses = list(self.reader.losses)
 
-    def _take(self, record: Record, threads: StreamThreads) -> None:
-        part = self._part
-        if isinstance(record, Attachment):
-            self._verbatim.add_attachment(record)
+    def _take(self, message: Message) -> None:
+        channel, log_time = message.channel, message.log_time
+        if channel.id not in self._takers:
+            self._takers[channel.id] = self._taker(channel)
+        take = self._takers[channel.id]
+        if take is None:
             return
-        if not isinstance(record, Message):
-            self._verbatim.add_metadata(record)
-            return
-        channel = record.channel
-        if not self._selected(channel.topic):
-            part.left_out[channel.topic] = None
-            return
-        topic = part.topic(channel)
+        topic = self.part.topics[channel.topic]
         topic.messages += 1
-        topic.raw_bytes += len(record.data)
-        part.saw([record.log_time])
-        if is_camera(channel):
-            self._cameras.take(record, threads)
-        elif is_calibration(channel):
-            self._calibrations.take(record)
-        else:
-            self._transforms.add(channel, record.data)
-            self._keep(record)
+        topic.raw_bytes += len(message.data)
+        start, end = self.part.span or (log_time, log_time)
+        self.part.span = min(start, log_time), max(end, log_time)
+        take(message)
 
-    def _keep(self, message: Message) -> None:
+    def _taker(self, channel: Channel) -> Callable[[Message], None] | None:
+        """What takes the messages of a channel; None if they are left out."""
+        if not self._selected(channel.topic):
+            self.part.left_out[channel.topic] = None
+            return None
+        self.part.topic(channel)
+        self.calibrations.meet(channel)
+        if is_camera(channel):
+            if channel.identity not in self._cameras:
+                self._cameras[channel.identity] = _Camera(self, channel)
+            return self._cameras[channel.identity].take
+        if is_calibration(channel):
+            return self.calibrations.take
+        if self._transforms.takes(channel):
+            return self._take_transforms
+        return self.keep
+
+    def _take_transforms(self, message: Message) -> None:
+        self._transforms.add(message.channel, message.data)
+        self.keep(message)
+
+    def keep(self, message: Message) -> None:
+        """Store a message verbatim."""
         self._verbatim.add_channel(message.channel)
         self._verbatim.write(message)
+
+    def new_stream(self, seen: CameraMessage, plan: TrackPlan, rate: float | None) -> StreamWriter:
+        """Begin a stream.
+
+        Raises:
+            Refused: The encoder does not take such pictures.
+        """
+        stem = self.part.folder / self._names.name_for(seen.message.channel.topic)[0]
+        stream = StreamWriter(stem, len(self._streams), seen, plan, self.plan.threads, rate)
+        self._streams.append(stream)
+        return stream
+
+    def _finish_streams(self) -> None:
+        """Complete all videos and write their sidecars; all jobs have run."""
+        for identity, info in self.calibrations.finish().items():
+            if first := self._cameras[identity].first:
+                first.camera_info = info
+        for stream in self._streams:
+            if stream.frames:
+                self.part.streams.append(stream.finish())
+            else:
+                stream.abandon()
+                stream.video_path.unlink(missing_ok=True)
+
+    def _declare_rest(self) -> None:
+        """Keep what the recording declares besides its messages."""
+        in_videos = {
+            model.to_record(0).identity
+            for sidecar in self.part.streams
+            for model in (sidecar.channel, sidecar.camera_info and sidecar.camera_info.channel)
+            if model
+        }
+        for channel in self.reader.channels:
+            if not self._selected(channel.topic):
+                self.part.left_out[channel.topic] = None
+            elif channel.identity not in in_videos:
+                self.part.topic(channel)
+                self._verbatim.add_channel(channel)
+        for schema in self.reader.unused_schemas:
+            self._verbatim.add_schema(schema)

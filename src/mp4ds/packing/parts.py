@@ -21,8 +21,7 @@ import re
 import shutil
 import stat
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -51,27 +50,17 @@ from mp4ds.files.urls import location, spelled
 from mp4ds.format.fields import document_of, json_parser
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.options import CONTENT, ENCODING
-from mp4ds.packing.manifest import (
-    Origin,
-    PartRecord,
-    write_manifest,
-)
-from mp4ds.packing.options import PackProgress, TopicSummary
+from mp4ds.packing.manifest import Digest, Origin, PartRecord, write_manifest
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.planning import PIECE_NAME, Piece, Plan, tools
-
-Report = Callable[[PackProgress], None]
-Digest = tuple[int, str]
 
 _SUFFIX = ".mp4ds-part"
 _PLAN_NAME = "plan.json"
 FACTS_NAME = "part.json"
-PROGRESS_NAME = "progress.json"
 _ANEW = "Start over with `restart`."
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAMED = 3
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
-_TELL_SECONDS = 0.5
 SHARED = "all machines must share the dataset's folder"
 
 _BEGUN = re.compile(rf"\.({PIECE_NAME})\.[a-z0-9_]{{8}}")  # a part in progress
@@ -79,9 +68,6 @@ _NAMES = re.compile(  # from the folder on; of folders, with a slash at the end
     rf"lock|plan\.json|\.plan\.json\.[^/]+\.part|({PIECE_NAME}|{_BEGUN.pattern})/(.*/)?[^/]*",
     re.DOTALL,
 )
-
-Topics = Mapping[str, tuple[int, int]]
-"""By topic, messages and bytes of what is packed."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +103,7 @@ class PlanNote:
             sources=list(plan.sources),
             options=json.loads(json.dumps(options, default=str)),
             tools=dict(plan.tools),
-            decisions=plan.survey.texts if plan.survey else [],
+            decisions=plan.texts,
         )
 
     def check_sources(self, paths: Sequence[Path]) -> None:
@@ -365,29 +351,37 @@ class PartsFolder:
 
 @dataclass(frozen=True)
 class PartFacts:
-    """What the manifest of a part does not tell.
+    """What the manifest of a part does not tell; of one in progress, what is packed so far.
 
     Attributes:
-        topics: What became of each topic, in the order of the recording.
+        topics: Messages and bytes of each topic, in the order of the recording.
+        notes: What else is worth knowing, by topic.
         skipped: What the source holds and no dataset can: a phrase -> how many.
     """
 
-    topics: list[TopicSummary]
+    topics: dict[str, tuple[int, int]]
+    notes: dict[str, list[str]]
     skipped: dict[str, int]
 
-    def messages(self) -> Topics:
-        """Messages and bytes of each topic."""
-        return {topic.topic: (topic.messages, topic.raw_bytes) for topic in self.topics}
+    @classmethod
+    def write(cls, part: PartRecord) -> None:
+        """Write those of a part."""
+        topics = part.topics.values()
+        facts = cls(
+            {topic.topic: (topic.messages, topic.raw_bytes) for topic in topics},
+            {topic.topic: topic.notes for topic in topics if topic.notes},
+            part.skipped,
+        )
+        (part.folder / FACTS_NAME).write_text(json.dumps(asdict(facts)))
 
 
-_parse_facts = json_parser(PartFacts)
-parse_topics = json_parser(dict[str, tuple[int, int]])
+parse_facts = json_parser(PartFacts)
 
 
 def part_facts(part: Path) -> PartFacts | None:
     """What became of a part; None if it is not there, or not whole."""
     try:
-        facts: PartFacts = _parse_facts((part / FACTS_NAME).read_bytes())
+        facts: PartFacts = parse_facts((part / FACTS_NAME).read_bytes())
         files = load_manifest(part / MANIFEST_NAME).files
         found = [(part / entry.name).lstat() for entry in files]
     except (OSError, ValueError):
@@ -446,22 +440,15 @@ class PartPacker:
             path.unlink()
         if self._reader is None:
             self._reader = self._plan.open()
-        next_time = 0.0
 
         def tell(part: PartRecord) -> None:
-            nonlocal next_time
-            now = time.monotonic()
-            if now >= next_time:
-                next_time = now + _TELL_SECONDS
-                with suppress(OSError):
-                    topics = PartFacts(list(part.topics.values()), {}).messages()
-                    (into / PROGRESS_NAME).write_text(json.dumps(topics))
+            with suppress(OSError):
+                PartFacts.write(part)
 
         part = Packer(self._reader, into, self._plan, piece, exact, tell).run()
-        (into / PROGRESS_NAME).unlink(missing_ok=True)
-        facts = PartFacts(list(part.topics.values()), part.skipped)
-        (into / FACTS_NAME).write_text(json.dumps(asdict(facts)))
-        write_manifest(part, self._reader, Origin(), str(self._plan.options.quality))
+        PartFacts.write(part)
+        origin = Origin(self._reader.format, self._reader.profile, self._reader.library)
+        write_manifest(part, origin, str(self._plan.options.quality))
 
     def close(self) -> None:
         """Close the recording."""

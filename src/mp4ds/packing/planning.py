@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,17 +21,17 @@ from mp4ds.dataset.collections import available_cores
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.recording import DatasetReader
 from mp4ds.errors import OptionError, SourceError, advising
-from mp4ds.files.sources import SourceState, source_name, source_size
+from mp4ds.files.sources import SourceState
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about
-from mp4ds.messages.serializations import is_calibration, is_camera
+from mp4ds.messages.serializations import is_camera
 from mp4ds.options import WHOLE, Slice
-from mp4ds.packing.calibrations import choose_pairs, pair_camera_infos, unpaired_infos
+from mp4ds.packing.calibrations import find_pairs
 from mp4ds.packing.inspection import depends_on_others
 from mp4ds.packing.manifest import Origin
 from mp4ds.packing.options import ImageFolder, PackOptions
-from mp4ds.packing.survey import StreamSettings, Survey, survey_channel, survey_pairs
+from mp4ds.packing.survey import Decision, survey_channel
 from mp4ds.packing.tracks import TrackPlan
 from mp4ds.records import EVERYTHING, Channel, Excerpt
 from mp4ds.registry import plugin
@@ -62,6 +62,11 @@ class Piece:
         """Whether it is the whole recording."""
         return self.excerpt == EVERYTHING
 
+    @property
+    def decides_itself(self) -> bool:
+        """Whether how its images are stored concerns no other piece."""
+        return self.is_all or self.is_solo
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -73,11 +78,13 @@ class Plan:
         options: As completed from the recordings.
         about: The description of the recording, if there is one.
         pieces: In the order of their time; a single one for a short recording, or without an index.
+        pairs: Calibration channels and those of their images, by id.
         frames: Messages of each topic of images, if there are several pieces.
         threads: Of each encoder.
         workers: Streams that a process encodes in parallel.
         tools: Versions of what packs: parts made by different ones may not fit together.
-        survey: What all pieces agree on; None before it is made, and for a single piece.
+        decisions: How images of a camera channel, by its id, are stored in all pieces; none before
+            `surveyed`, and for a single piece.
     """
 
     paths: Sequence[str]
@@ -85,11 +92,12 @@ class Plan:
     options: PackOptions
     about: About | None
     pieces: Sequence[Piece]
+    pairs: Mapping[int, int]
     frames: Mapping[str, int]
     threads: int
     workers: int
     tools: Mapping[str, str]
-    survey: Survey | None = None
+    decisions: Mapping[int, Sequence[Decision]] = field(default_factory=dict)
 
     @property
     def is_divided(self) -> bool:
@@ -97,9 +105,16 @@ class Plan:
         return not self.pieces[0].is_all
 
     @property
-    def streams(self) -> StreamSettings:
-        """How streams are encoded."""
-        return StreamSettings(self.options, self.threads)
+    def texts(self) -> list[list[str]]:
+        """What pieces agree on, in words: the same for equal plans, in every process."""
+        if not self.decisions:
+            return []
+        pairs = [[f"{info} belongs to {image}"] for info, image in sorted(self.pairs.items())]
+        return pairs + [
+            [str(channel), *item.texts]
+            for channel, items in sorted(self.decisions.items())
+            for item in items
+        ]
 
     def open(self) -> BagReader:
         """The recording, open.
@@ -114,12 +129,6 @@ class Plan:
             images=options.images,
             asked=options.slice,
         )
-
-    def survey_for(self, piece: Piece) -> Survey | None:
-        """What a piece is told; None if it decides everything itself."""
-        if piece.is_all or self.survey is None:
-            return None
-        return Survey(pairs=self.survey.pairs) if piece.is_solo else self.survey
 
     @property
     def hashed(self) -> list[SourceState]:
@@ -145,13 +154,8 @@ class Plan:
                 "consists of different files than when packing began",
                 "Start over with `restart`.",
             )
-        folder = reader.path if reader.path.is_dir() else None
-        known = iter(digests)
-        listed: list[tuple[str, int, str | None]] = []
-        for path in reader.files:
-            size, sha256 = next(known) if self._is_hashed(path) else (source_size(path), None)
-            listed.append((source_name(path, folder), size, sha256))
-        return Origin.of(reader.files, listed, self.about, reader.slice.span)
+        is_hashed = [self._is_hashed(path) for path in reader.files]
+        return Origin.of(reader, digests, is_hashed, self.about)
 
 
 def tools() -> dict[str, str]:
@@ -234,7 +238,7 @@ def processes_for(plan: Plan) -> int:
     """Processes that pack at a time: as requested, or as many as cores and memory serve."""
     encoders = sum(
         decision.key.width * decision.key.height * _bytes_a_pixel(track)
-        for decisions in (plan.survey or Survey()).decisions.values()
+        for decisions in plan.decisions.values()
         for decision in decisions
         for track in decision.plans[:1]
     )
@@ -329,12 +333,10 @@ def divide(
     """
     selected = options.selected
     selected.check(channel.topic for channel in reader.channels)
-    pieces: list[Piece] = []
-    cameras = [channel for channel in reader.channels if is_camera(channel)]
-    packed = [channel for channel in cameras if selected(channel.topic)]
-    if reader.is_indexed:
-        channels = [channel for channel in reader.channels if selected(channel.topic)]
-        pieces = _pieces(reader, channels, options)
+    channels = [channel for channel in reader.channels if selected(channel.topic)]
+    packed = [channel for channel in channels if is_camera(channel)]
+    pairs = find_pairs(reader, options.camera_info, channels)
+    pieces = _pieces(reader, channels, pairs, options) if reader.is_indexed else []
     cores = max(1, available_cores() // recordings)
     frames = Counter[str]()
     if len(pieces) > 1:
@@ -349,7 +351,7 @@ def divide(
         pieces = [Piece("all", EVERYTHING)]
         if recordings == 1:
             cores = options.jobs or cores
-        workers = min(cores, len(cameras) or 1)
+        workers = min(cores, len(list(filter(is_camera, reader.channels))) or 1)
         threads = max(1, -(-cores // workers))
     return Plan(
         paths=list(map(spelled, paths)),
@@ -357,6 +359,7 @@ def divide(
         options=options,
         about=None if options.about is None else load_about(options.about),
         pieces=pieces,
+        pairs=pairs,
         frames=dict(frames),
         threads=threads,
         workers=workers,
@@ -364,11 +367,12 @@ def divide(
     )
 
 
-def _pieces(reader: BagReader, channels: Sequence[Channel], options: PackOptions) -> list[Piece]:
+def _pieces(
+    reader: BagReader, channels: Sequence[Channel], pairs: Mapping[int, int], options: PackOptions
+) -> list[Piece]:
     """The pieces of an indexed recording; fewer than two where it is packed at once."""
     cameras = [channel for channel in channels if is_camera(channel)]
     free = _independent(reader, channels)
-    pairs = pair_camera_infos(channels, chosen=choose_pairs(options.camera_info, channels))
     if not free:
         return []
     window = options.window or GOPS_PER_WINDOW * options.group_frames
@@ -417,13 +421,9 @@ def surveyed(plan: Plan, reader: BagReader, known: Collection[str] = ()) -> Plan
     if not plan.is_divided:
         return plan
     channels = [channel for channel in reader.channels if plan.options.selected(channel.topic)]
-    free = _independent(reader, channels)
-    pairs = pair_camera_infos(channels, chosen=choose_pairs(plan.options.camera_info, channels))
-    found: dict[int, int] = {}
-    if unpaired_infos(channels, pairs):
-        infos = [channel for channel in channels if is_calibration(channel)]
-        found = survey_pairs(reader, free, infos, pairs)
     starts = [piece.excerpt.start for piece in plan.pieces if not piece.is_solo]
-    settings = replace(plan.streams, threads=1, known=frozenset(known))
-    decisions = {channel.id: survey_channel(reader, channel, starts, settings) for channel in free}
-    return replace(plan, survey=Survey(decisions, found))
+    decisions = {
+        channel.id: survey_channel(reader, channel, starts, plan.options, known)
+        for channel in _independent(reader, channels)
+    }
+    return replace(plan, decisions=decisions)

@@ -11,7 +11,6 @@ import re
 import stat
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, Literal
@@ -26,7 +25,7 @@ from mp4ds.files.outputs import check_target, is_mine, lock, staged, work_folder
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.format.fields import Gop, Model, Profile
 from mp4ds.format.manifest import About, LossEntry
-from mp4ds.packing.manifest import dataset_files, summary_of
+from mp4ds.packing.manifest import PartRecord, dataset_files, summarize
 from mp4ds.packing.options import PackOptions, PackSummary
 from mp4ds.plan import SPEED
 from mp4ds.records import Loss, bounded
@@ -159,12 +158,13 @@ class SpoolFolder:
             datasets = [stack.enter_context(Dataset(part)) for part in parts]
             manifests = [one.manifest for one in datasets if one.manifest]
             known = [entry.to_record() for one in manifests for entry in one.losses]
+            lost = bounded([*losses, *known])
             changes = {
                 "about": about,
                 "format": self.settings().format,
                 "library": "",
                 "sources": [],
-                "losses": list(map(LossEntry.from_record, bounded([*losses, *known]))),
+                "losses": list(map(LossEntry.from_record, lost)),
             }
             try:
                 concat(datasets, made, changes=changes)
@@ -172,7 +172,7 @@ class SpoolFolder:
                 raise SourceError(self.path, f"cannot be joined: {reason}") from None
             for problem in validate(made) if is_foreign else ():
                 raise FormatError(problem.code, self.path, str(problem))
-            return replace(summary_of(made), dataset=target)
+            return summarize(PartRecord(made, losses=list(lost)), target, 0, is_copy=True)
 
     def remove(self, count: int) -> None:
         """Remove the folder with all parts; files that somebody else put there stay."""

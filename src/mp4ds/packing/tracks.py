@@ -452,13 +452,18 @@ class WindowCoder:
         """
         return find_ffmpeg() if self.target.metric == "vmaf" else None
 
-    def maker(self) -> PlaneMaker:
-        """Makes planes of pictures."""
+    @cached_property
+    def _maker(self) -> PlaneMaker:
         return PlaneMaker(self.coding.layout.pixel_format)
 
     def spool(self, path: Path) -> PlaneSpool:
         """Keeps planes in a file."""
         return PlaneSpool(path, *self.coded_size)
+
+    def keep(self, seen: CameraMessage, spool: PlaneSpool) -> None:
+        """Add the planes of an image to a spool."""
+        if seen.pixels is not None:
+            spool.append(self._maker.make(self.coding.layout.to_picture(seen.pixels)))
 
     def encode(
         self, frames: PlaneSpool, ticks: Sequence[int], crf: int, path: Path
@@ -535,7 +540,6 @@ class _ScoredTrack(Track):
         self.note = note
         self._path = path
         self._coder = coder
-        self._maker = coder.maker()
         self._most = window_frames(coder.coding.gop)
         codec, target = coder.coding.recipe.codec, coder.target
         self._control = CrfControl(
@@ -557,10 +561,8 @@ class _ScoredTrack(Track):
         return _refuses(self._coder.coding, seen)
 
     def write(self, seen: CameraMessage, tick: int) -> None:
-        if seen.pixels is not None:
-            picture = self._coder.coding.layout.to_picture(seen.pixels)
-            self._spool.append(self._maker.make(picture))
-            self._ticks.append(tick)
+        self._coder.keep(seen, self._spool)
+        self._ticks.append(tick)
         if len(self._spool) == self._most:
             self._finish_window()
 

@@ -6,22 +6,20 @@ Nothing is re-encoded: the video's packets get the times of the YAML, which the 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.mcap import McapWriter
-from mp4ds.bags.protocols import Format
 from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.outputs import digest_file, staged
 from mp4ds.files.sources import SourceState, unchanged
 from mp4ds.files.urls import location, remote
+from mp4ds.format.manifest import Source
 from mp4ds.format.models import ChannelModel, StreamSidecar, video_facts
 from mp4ds.format.sidecars import dump_document, load_stream
 from mp4ds.packing.manifest import (
     Origin,
     PartRecord,
-    PartStream,
     dataset_files,
     summarize,
     write_manifest,
@@ -34,15 +32,6 @@ from mp4ds.video.packets import PacketReader, join_segments
 _PROFILE = "ros1"  # that tool reads bags
 _ANY = "video.mp4"
 _MAX_STAMP = 2**32 * 10**9 - 1
-
-
-@dataclass(frozen=True)
-class _Bag:
-    """What is known about the original bag."""
-
-    format: Format = "bag"
-    profile: str = _PROFILE
-    library: str = ""
 
 
 def import_ros_mp4(
@@ -89,11 +78,13 @@ def import_ros_mp4(
         _check(source, described, old)
         folder.mkdir()
         part = _part_of(source, old, folder)
-        paths = (source, described)
-        digests = [(path.name, *digest_file(path)) for path in paths]
-        origin = Origin.of(paths, digests)
-        write_manifest(part, _Bag(), origin, old.profile)
-        return summarize(part, target, sum(size for _, size, _ in digests), origin)
+        sources = [
+            Source(name=path.name, size=size, sha256=sha256)
+            for path in (source, described)
+            for size, sha256 in [digest_file(path)]
+        ]
+        write_manifest(part, Origin("bag", _PROFILE, sources=sources), old.profile)
+        return summarize(part, target, sum(item.size for item in sources))
 
 
 def _local(path: Path | str) -> Path:
@@ -140,14 +131,14 @@ def _part_of(video: Path, old: StreamSidecar, folder: Path) -> PartRecord:
         }
     )
     (folder / f"{stem}.yaml").write_bytes(dump_document(new))
-    part = PartRecord(folder, streams=[PartStream(stem, new)])
+    part = PartRecord(folder, streams=[new])
     with McapWriter(part.messages_path, profile=_PROFILE):
         pass
     topic = part.topic(channel)
-    topic.messages = topic.frames = len(stamps)
+    topic.messages = len(stamps)
     topic.raw_bytes = len(stamps) * new.image.step * new.image.height
     topic.notes.append("its times are record times in float seconds, not exact header stamps")
-    part.saw(stamps)
+    part.span = min(stamps), max(stamps)
     return part
 
 
