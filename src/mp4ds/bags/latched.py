@@ -170,8 +170,8 @@ def _is_tf_static(channel: Channel) -> bool:
     return channel.topic.rpartition("/")[2] == _TF_STATIC
 
 
-Read = Callable[[frozenset[str], int], Iterable[Record]]
-"""Yields the earlier messages of some topics, of each video at least so many of the last."""
+Read = Callable[[frozenset[str]], Iterable[Record]]
+"""Yields the earlier messages of some topics."""
 
 
 def latched_before(
@@ -195,7 +195,7 @@ def latched_before(
     topics = frozenset(channel.topic for channel in own.values())
     left_out: dict[str, None] = {}
     size = 0
-    for number, message in enumerate(read(topics, max(map(latched_depth, own.values())))):
+    for number, message in enumerate(read(topics)):
         if not isinstance(message, Message) or message.channel.id not in kept:
             continue
         data = bytes(message.data)  # a view would keep a whole chunk
@@ -236,7 +236,7 @@ def take_slice(reader: BagReader, asked: Slice) -> None:
             if channel.id in times and len(in_span(times[channel.id], before))
         ]
 
-        def read(topics: frozenset[str], _: int) -> Iterable[Record]:
+        def read(topics: frozenset[str]) -> Iterable[Record]:
             return reader.records(replace(before, topics=topics))
 
         latched = latched_before(sent, read)

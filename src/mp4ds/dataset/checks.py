@@ -22,7 +22,6 @@ from mp4ds.dataset.channels import Part
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import MessagesFile, recorded_storage
-from mp4ds.dataset.salvage import damages_of
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError, VideoError
 from mp4ds.files.urls import location
@@ -342,8 +341,8 @@ def _check_frames(stream: Stream, report: _Report) -> Iterator[Problem]:
         if number % _TELL_EVERY == 0:
             report(f"decoding {stream.video_path.name}", number / len(stream))
 
-    for damage in damages_of(stream, tell):
-        yield Problem.of(damage.error)
+    for error, *_ in stream.damages(tell):
+        yield Problem.of(error)
 
 
 def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
@@ -364,7 +363,8 @@ def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
 
 def _check_verbatim(dataset: Dataset, manifest: Manifest) -> Iterator[Problem]:
     """Check that there are as many messages of each topic as are listed as stored verbatim."""
-    totals = Counter({item.topic: dataset.recorded_count(item.topic) for item in manifest.verbatim})
+    topics = {item.topic for item in manifest.verbatim}
+    totals = Counter({topic: len(dataset.recorded_times(topic)) for topic in topics})
     recorded = dict(totals)
     for stream in dataset.streams:
         totals[stream.topic] += len(stream)

@@ -31,6 +31,18 @@ class DecodedColumns:
     variant: NDArray[np.int64]
     ordinal: NDArray[np.int64]
 
+    @classmethod
+    def of_frames(
+        cls,
+        stamp: NDArray[np.int64],
+        log_time: NDArray[np.int64],
+        ordinal: NDArray[np.int64] | None = None,
+    ) -> DecodedColumns:
+        """Those of frames without a sidecar."""
+        zeros = np.broadcast_to(np.int64(0), stamp.shape)
+        numbers = np.arange(len(stamp)) if ordinal is None else ordinal
+        return cls(log_time, log_time, zeros, stamp, None, None, zeros, numbers)
+
     def slots(self, index: int) -> Slots:
         """The values that fill a message's blank."""
         return Slots(

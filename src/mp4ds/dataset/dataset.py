@@ -22,12 +22,11 @@ from mp4ds.dataset.channels import (
     by_time,
     channel_groups,
 )
-from mp4ds.dataset.columns import Choice, everything, last_of, within
-from mp4ds.dataset.images import Images, VideoImages
-from mp4ds.dataset.messages import MessagesFile, RecordedMessage, SalvagedMessages, as_recorded
+from mp4ds.dataset.columns import Choice, everything, within
+from mp4ds.dataset.images import Images, VerbatimImages, VideoImages, verbatim_images
+from mp4ds.dataset.messages import MessagesFile, RecordedMessage, as_recorded
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.verbatim import VerbatimImages, verbatim_images
 from mp4ds.errors import (
     OptionError,
     SourceError,
@@ -288,15 +287,10 @@ class Dataset:
         """Number of messages in messages.mcap by channel id, from its index."""
         return self._file.counts
 
-    def recorded_count(self, topic: str) -> int:
-        """Number of a topic's messages in messages.mcap, from its index."""
-        channels, counts = self._file.channels, self._file.counts
-        return sum(counts.get(channel.id, 0) for channel in channels if channel.topic == topic)
-
     @property
     def salvaged_topics(self) -> list[str]:
         """Topics of which messages are left in a damaged messages.mcap."""
-        if not isinstance(self._file, SalvagedMessages):
+        if not self._file.is_salvaged:
             return []
         return [item.topic for item in self._file.channels if self._file.counts.get(item.id)]
 
@@ -461,25 +455,6 @@ class Dataset:
             return by_time(recorded, *parts)
         channels = (self._group_messages(group, read, ahead) for group in groups)
         return by_time(ahead(self._verbatim_records(topics)), *channels)
-
-    def before(self, time_ns: int, topics: Collection[str], frames: int) -> Iterator[Message]:
-        """Messages of some topics before a log time, in its order; of a video the last few.
-
-        Args:
-            time_ns: Nanoseconds.
-            topics: Which topics.
-            frames: How many of each video at most.
-        """
-        wanted = frozenset(topics)
-        choice = last_of(time_ns, frames)
-        groups = [group for group in self._groups if group.channel.topic in wanted]
-        recorded = self.recorded_messages(Excerpt(end=time_ns, topics=wanted))
-
-        def read(part: Part, channel: Channel) -> Iterator[tuple[int, Message]]:
-            return part.messages(channel, choice)
-
-        parts = [part for group in groups for part in group.parts_of(read)]
-        return by_time(recorded, *parts)
 
     def times(self, topics: Collection[str] | None = None) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame.

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.dataset.columns import DecodedColumns
 from mp4ds.dataset.views import Crop, Resize, View, view_of
-from mp4ds.errors import FormatError
+from mp4ds.errors import FormatError, Refused, VideoError
 from mp4ds.format.models import Calibration
-from mp4ds.messages.depth import metres_of
-from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels
+from mp4ds.messages import depth, png
+from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, pixel_view
+from mp4ds.messages.layouts import why_not
+from mp4ds.messages.serializations import MessageSplitter
+from mp4ds.messages.wire import CodedFields, ImageFields, Parts
 from mp4ds.options import seconds_text
-from mp4ds.records import Channel
+from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.video.access import FrameReader, open_file_frames
 from mp4ds.video.decoder import VideoFile
+from mp4ds.video.images import coded_pixels
 from mp4ds.video.pixels import Scale
 
 Integers = NDArray[np.int64]
@@ -29,9 +37,12 @@ class Images(ABC):
 
     Attributes:
         topic: Topic of the images.
-        channel: Their channel; None of a third-party video.
+        channel: Their channel, whose id has no meaning; None of a third-party video.
         path: Their file: a sidecar, a video without one, or messages.mcap.
         video_path: The file with the images: a video, or messages.mcap.
+        encoding: ROS image encoding of the frames as recorded.
+        image_size: Width and height of the images, pixels.
+        are_jpeg_files: Whether the messages hold JPEG files that are stored as they are.
         shows_colours: Whether the decoder can make RGB directly, in any size; see
             `mp4ds.video.pixels.shows_colours`.
     """
@@ -40,6 +51,9 @@ class Images(ABC):
     channel: Channel | None
     path: Path
     video_path: Path
+    encoding: str
+    image_size: tuple[int, int]
+    are_jpeg_files = False
     shows_colours = False
 
     def __repr__(self) -> str:
@@ -47,33 +61,23 @@ class Images(ABC):
         frames = f"{len(self)} frame{'s' * (len(self) != 1)}"
         return f"<{type(self).__name__} {self.topic!r}: {frames}, {size} {encoding}>"
 
-    @abstractmethod
-    def __len__(self) -> int: ...
-
     @property
     @abstractmethod
+    def columns(self) -> DecodedColumns:
+        """One value per frame."""
+
+    def __len__(self) -> int:
+        return len(self.columns.stamp)
+
+    @property
     def stamps(self) -> Integers:
         """Header stamps, nanoseconds, shape (frames,)."""
+        return self.columns.stamp
 
     @property
-    @abstractmethod
     def log_times(self) -> Integers:
         """Log times, nanoseconds, shape (frames,)."""
-
-    @property
-    @abstractmethod
-    def ordinals(self) -> Integers:
-        """Numbers among the messages of the channel, increasing, shape (frames,)."""
-
-    @property
-    @abstractmethod
-    def encoding(self) -> str:
-        """ROS image encoding of the frames as recorded."""
-
-    @property
-    @abstractmethod
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the images, pixels."""
+        return self.columns.log_time
 
     @property
     def calibrations(self) -> Sequence[Calibration]:
@@ -95,11 +99,6 @@ class Images(ABC):
             is_wanted: Count only these, shape (frames,); None: all.
         """
         return len(self) if is_wanted is None else int(is_wanted.sum())
-
-    @property
-    def are_jpeg_files(self) -> bool:
-        """Whether the messages hold JPEG files."""
-        return False
 
     # ------------------------------------------------------------ pictures
 
@@ -184,7 +183,9 @@ class Images(ABC):
             self.write_pixels(picture, made)
             return made
         pixels = self.recorded_pixels(picture)
-        view.give(metres_of(pixels, self.depth_header(index)) if view.in_metres else pixels, made)
+        if view.in_metres:
+            pixels = depth.metres_of(pixels, self.depth_header(index))
+        view.give(pixels, made)
         return made
 
     # ------------------------------------------------------------ damage
@@ -243,6 +244,7 @@ class VideoImages(Images):
     """
 
     channel = None
+    encoding = "rgb8"
     shows_colours = True
 
     def __init__(self, path: Path, track: int | None = None) -> None:
@@ -250,38 +252,243 @@ class VideoImages(Images):
         self.topic = path.stem
         self._track = track
         with VideoFile(path, track) as file:
-            self._codec, self._size, self._times = file.codec, file.size, file.times
-
-    def __len__(self) -> int:
-        return len(self._times)
+            self._codec, self.image_size, times = file.codec, file.size, file.times
+        self._columns = DecodedColumns.of_frames(times, times)
 
     @property
-    def stamps(self) -> Integers:
-        """Presentation times, nanoseconds, shape (frames,)."""
-        return self._times
-
-    @property
-    def log_times(self) -> Integers:
-        """Presentation times, nanoseconds, shape (frames,)."""
-        return self._times
-
-    @property
-    def ordinals(self) -> Integers:
-        """Numbers of the frames."""
-        return np.arange(len(self))
-
-    @property
-    def encoding(self) -> str:
-        """``rgb8``."""
-        return "rgb8"
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the frames, pixels."""
-        return self._size
+    def columns(self) -> DecodedColumns:
+        """One value per frame; all times are presentation times."""
+        return self._columns
 
     def open_reader(self) -> FrameReader:
         """A separate decoder for frames by number."""
+        size, track = self.image_size, self._track
         return open_file_frames(
-            self.path, codec=self._codec, size=self._size, frames=len(self), track=self._track
+            self.path, codec=self._codec, size=size, frames=len(self), track=track
         )
+
+
+# ---------------------------------------------------------------- in messages.mcap
+
+Recorded = Callable[[Excerpt], Iterator[Message]]
+"""Yields the messages of a channel within an excerpt, by log time."""
+
+_JPEG = b"\xff\xd8\xff"
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What a message shows.
+
+    Attributes:
+        encoding: ROS image encoding.
+        pixels: Shape `Encoding.shape`, native byte order.
+        header: Of quantised depths, what gives them in metres; else empty.
+        file: The message's JPEG file; None if it has none.
+    """
+
+    encoding: str
+    pixels: Pixels
+    header: bytes = b""
+    file: memoryview | None = None
+
+    @property
+    def kind(self) -> tuple[str, tuple[int, ...], bool]:
+        """What frames have in common that are together in one `VerbatimImages`."""
+        return self.encoding, self.pixels.shape, self.file is not None
+
+
+def shown_by(channel: Channel, parts: Parts) -> Shown:
+    """What a camera message shows, whether or not it could be rebuilt from a video.
+
+    Raises:
+        Refused: It has no picture of its own; says why.
+    """
+    fields = parts.fields
+    if isinstance(fields, ImageFields):
+        return _raw(parts.body, fields)
+    if not isinstance(fields, CodedFields):
+        raise Refused("it holds no image")
+    if not channel.type_name.endswith("CompressedImage"):
+        raise Refused("it is a packet of a video, which cannot be decoded on its own")
+    if "compressedDepth" in fields.format and bytes(parts.body[:8]) != png.SIGNATURE:
+        header, body = bytes(parts.body[: depth.HEADER_BYTES]), parts.body[depth.HEADER_BYTES :]
+        is_png = bytes(body[:8]) == png.SIGNATURE
+        pixels: Pixels = png.pixels_of(body) if is_png else depth.decode_rvl(body)
+        if pixels.dtype != np.uint16 or pixels.ndim != 2:
+            raise Refused("its depth image is not grey with 16 bits")
+        is_inverse = depth.is_quantised(fields.format, header)
+        return Shown("16UC1", pixels, header if is_inverse else b"")
+    encoding, pixels = coded_pixels(parts.body)
+    is_jpeg = bytes(parts.body[: len(_JPEG)]) == _JPEG
+    return Shown(encoding, pixels, file=parts.body if is_jpeg else None)
+
+
+def _raw(body: memoryview, fields: ImageFields) -> Shown:
+    encoding = ENCODINGS.get(fields.encoding)
+    size = {"width": fields.width, "height": fields.height, "step": fields.step}
+    due = encoding.size(fields.step, fields.height) if encoding else 0
+    if reason := why_not(fields.encoding, **size, size=min(len(body), due)):
+        raise Refused(reason)
+    is_bigendian = bool(fields.is_bigendian)
+    view = pixel_view(body, ENCODINGS[fields.encoding], **size, is_bigendian=is_bigendian)
+    return Shown(fields.encoding, view.astype(view.dtype.newbyteorder("="), copy=False))
+
+
+_Entry = tuple[int, int, int, int, str]
+"""Of a message that is a frame: its ordinal among the messages of its channel; log time; how many
+messages of the channel in messages.mcap have this log time and come before; stamp; frame ID."""
+
+
+class VerbatimImages(Images):
+    """Images of a channel in messages.mcap, all of one size and encoding.
+
+    Args:
+        path: messages.mcap.
+        channel: Their channel.
+        kind: See `Shown.kind`.
+        entries: Their messages, by ordinal.
+        recorded: Reads messages of the channel.
+        calibrated: A stream of the topic that has its calibrations, if any.
+    """
+
+    channel: Channel
+
+    def __init__(
+        self,
+        path: Path,
+        channel: Channel,
+        kind: tuple[str, tuple[int, ...], bool],
+        entries: Sequence[_Entry],
+        recorded: Recorded,
+        calibrated: Images | None,
+    ) -> None:
+        self.path = self.video_path = path
+        self.channel, self.topic = channel, channel.topic
+        self.encoding, (rows, width, *_), self.are_jpeg_files = kind
+        self.image_size = width, int(rows / ENCODINGS[self.encoding].rows)
+        self._recorded, self._calibrated = recorded, calibrated
+        numbers = np.array([entry[:4] for entry in entries], np.int64).reshape(-1, 4)
+        ordinals, log_times, self._ties, stamps = numbers.T
+        self._columns = DecodedColumns.of_frames(stamps, log_times, ordinals)
+        self._frame_ids = [entry[4] for entry in entries]
+        self._last: tuple[int, Shown] | None = None
+
+    @property
+    def columns(self) -> DecodedColumns:
+        """One value per frame."""
+        return self._columns
+
+    @property
+    def calibrations(self) -> Sequence[Calibration]:
+        """Those of the topic's streams; none if they are in messages.mcap, too."""
+        return self._calibrated.calibrations if self._calibrated else []
+
+    def calibration_at(self, log_time: int) -> Calibration | None:
+        """The calibration that applied at a log time, nanoseconds; None if unknown."""
+        return self._calibrated.calibration_at(log_time) if self._calibrated else None
+
+    def frame_id(self, index: int) -> str:
+        """The coordinate frame of a frame's header; empty if unknown."""
+        return self._frame_ids[index]
+
+    def shown(self, index: int) -> Shown:
+        """What a message shows.
+
+        Args:
+            index: 0 <= index < frames.
+
+        Raises:
+            VideoError: ``decode-failed``: it cannot be decoded.
+            FormatError: messages.mcap is damaged.
+        """
+        time, tie = int(self.log_times[index]), int(self._ties[index])
+        span = Excerpt(time, time + 1, frozenset([self.topic]), others=False)
+        message = next(islice(self._recorded(span), tie, None), None)
+        if message is None:
+            error = VideoError("decode-failed", self.path, "was not found", frame=index)
+            raise self.named(error)
+        return self._shown(index, MessageSplitter(self.channel), message)
+
+    def all_shown(self) -> Iterator[tuple[int, Shown]]:
+        """What all messages show, each with its number, in one pass: by log time.
+
+        Raises:
+            VideoError: ``decode-failed``: one cannot be decoded.
+            FormatError: messages.mcap is damaged.
+        """
+        places = zip(self.log_times.tolist(), self._ties.tolist(), strict=True)
+        numbers = {place: number for number, place in enumerate(places)}
+        splitter, ties = MessageSplitter(self.channel), Counter[int]()
+        for message in self._recorded(Excerpt(topics=frozenset([self.topic]), others=False)):
+            index = numbers.get((message.log_time, ties[message.log_time]))
+            ties[message.log_time] += 1
+            if index is not None:
+                yield index, self._shown(index, splitter, message)
+
+    def _shown(self, index: int, splitter: MessageSplitter, message: Message) -> Shown:
+        with self.naming_frames():
+            try:
+                _, parts = splitter.split(message)
+                return shown_by(self.channel, parts)
+            except Refused as error:
+                raise VideoError("decode-failed", self.path, str(error), frame=index) from None
+
+    # ------------------------------------------------------------ as a decoder
+
+    def open_reader(self) -> FrameReader:
+        """A reader that gives the pixels as recorded; they are decoded by `picture`."""
+        return FrameReader(None, lambda: self)
+
+    def picture(self, index: int, scale: Scale | None = None) -> Picture:
+        """The pixels of a frame, as recorded."""
+        self._last = index, self.shown(index)
+        return (self._last[1].pixels,)
+
+    def close(self) -> None:
+        """Nothing stays open."""
+
+    def depth_header(self, index: int) -> bytes:
+        """What gives the quantised depths of a frame in metres; empty for all others."""
+        number, shown = self._last or (-1, None)
+        return shown.header if shown and number == index else self.shown(index).header
+
+
+def verbatim_images(
+    path: Path,
+    channel: Channel,
+    numbered: Iterable[tuple[int, Message]],
+    recorded: Recorded,
+    calibrated: Images | None,
+) -> tuple[list[VerbatimImages], Counter[str]]:
+    """The frames that the messages of a channel in messages.mcap are; each is decoded once.
+
+    Args:
+        path: messages.mcap.
+        channel: A camera channel.
+        numbered: All its messages there, each with its ordinal, increasing.
+        recorded: Reads messages of the channel.
+        calibrated: A stream of the topic that has its calibrations, if any.
+
+    Returns:
+        The frames of each size and encoding, and how many messages have no picture, by reason.
+    """
+    splitter, ties = MessageSplitter(channel), Counter[int]()
+    entries: dict[tuple[str, tuple[int, ...], bool], list[_Entry]] = {}
+    without = Counter[str]()
+    for ordinal, message in numbered:
+        time = message.log_time
+        try:
+            _, parts = splitter.split(message)
+            kind = shown_by(channel, parts).kind
+        except Refused as error:
+            without[str(error)] += 1
+        else:
+            entry = ordinal, time, ties[time], parts.stamp, parts.frame_id
+            entries.setdefault(kind, []).append(entry)
+        ties[time] += 1
+    made = [
+        VerbatimImages(path, channel, kind, found, recorded, calibrated)
+        for kind, found in entries.items()
+    ]
+    return made, without

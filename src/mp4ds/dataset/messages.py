@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,10 +39,12 @@ class MessagesFile:
 
     Args:
         path: The file; None if there is none.
+        salvage: Whether to read what can be read if it is damaged.
     """
 
-    def __init__(self, path: Path | None) -> None:
+    def __init__(self, path: Path | None, *, salvage: bool = False) -> None:
         self.path = path
+        self.is_salvaged = salvage
 
     def verify(self, manifest: Manifest) -> None:
         """Check it against its SHA-256: not all of its contents have their own checksum.
@@ -50,27 +52,24 @@ class MessagesFile:
         Raises:
             FormatError: See `verify_file`.
         """
-        if self.path is None:
-            return
-        verify_file(self.path, manifest.file(self.path.name))
-
-    @staticmethod
-    def _check_there(path: Path) -> None:
-        if not path.is_file():
-            raise FormatError("file-missing", path, "does not exist")
+        if self.path is not None:
+            verify_file(self.path, manifest.file(self.path.name))
 
     @cached_property
-    def _reader(self) -> McapReader | None:
+    def _reader(self) -> McapReader | McapSalvage | None:
         """The reader; keeps no file open between passes.
 
         Raises:
             FormatError: ``file-missing``, or ``messages-unreadable``: it is damaged, or does not
-                list all its messages.
+                list all its messages; if it is salvaged, nothing of it can be read.
         """
         if self.path is None:
             return None
-        self._check_there(self.path)
+        if not self.path.is_file():
+            raise FormatError("file-missing", self.path, "does not exist")
         with _damage_told():
+            if self.is_salvaged:
+                return McapSalvage(self.path)
             reader = McapReader(self.path)
         if not reader.has_whole_index:
             raise FormatError(
@@ -95,29 +94,51 @@ class MessagesFile:
         """Definitions that no channel refers to."""
         return self._reader.unused_schemas if self._reader else ()
 
+    @property
+    def losses(self) -> Sequence[Loss]:
+        """What is lost of it if it is salvaged, once its messages are counted."""
+        return self._reader.losses if self._reader else ()
+
     @cached_property
     def counts(self) -> Mapping[int, int]:
-        """Number of messages by channel id, from its index."""
+        """Number of messages that can be read by channel id."""
+        if self.is_salvaged:  # its index may list more
+            return {key: len(times) for key, times in self.times().items()}
         stats = self._reader.stats() if self._reader else {}
         return {key: item.count for key, item in stats.items()}
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Sorted log times, nanoseconds, by channel id."""
+        """Sorted log times of the messages that can be read, nanoseconds, by channel id."""
+        if self.is_salvaged:
+            return self._salvaged_times
         with _damage_told():
             return self._reader.times() if self._reader else {}
 
+    @cached_property
+    def _salvaged_times(self) -> Mapping[int, NDArray[np.int64]]:
+        with _damage_told():
+            return times_of(self._reader.records() if self._reader else ())
+
     def in_file_order(self) -> Iterator[Record]:
         """All its records, in file order."""
-        return _intact(self._reader.as_it_stands() if self._reader else ())
+        if isinstance(self._reader, McapReader):
+            return _intact(self._reader.as_it_stands())
+        return self._records(EVERYTHING)
 
     def others(self) -> Iterator[Record]:
         """The attachments and metadata records in it."""
-        return _intact(self._reader.records(Excerpt(start=0, end=0)) if self._reader else ())
+        return self._records(Excerpt(start=0, end=0))
 
     def in_time(self, excerpt: Excerpt) -> Iterator[Message]:
         """The messages of an excerpt, by log time."""
-        records = self._reader.records(replace(excerpt, others=False)) if self._reader else ()
-        return (record for record in _intact(records) if isinstance(record, Message))
+        records = self._records(replace(excerpt, others=False))
+        return (record for record in records if isinstance(record, Message))
+
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
+        reader = self._reader
+        if isinstance(reader, McapSalvage):
+            reader = McapSalvage(reader.path)  # one reads once at a time
+        return _intact(reader.records(excerpt) if reader else ())
 
 
 @contextmanager
@@ -132,69 +153,6 @@ def _damage_told() -> Iterator[None]:
 def _intact(items: Iterable[_Item]) -> Iterator[_Item]:
     with _damage_told():
         yield from items
-
-
-class SalvagedMessages(MessagesFile):
-    """What can be read of a damaged messages.mcap; it is read once when this is made.
-
-    Args:
-        path: The file.
-
-    Attributes:
-        losses: What is lost of it.
-
-    Raises:
-        FormatError: ``file-missing`` or ``messages-unreadable``: nothing of it can be read.
-    """
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._check_there(path)
-        with _damage_told():
-            self._salvage = McapSalvage(path)
-            self._times = times_of(self._salvage.records())
-        self.losses: Sequence[Loss] = self._salvage.losses
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """Its channels, as far as they are known."""
-        return self._salvage.channels
-
-    @property
-    def profile(self) -> str:
-        """MCAP profile of the recording; empty if unknown."""
-        return self._salvage.profile
-
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """Definitions that no channel refers to."""
-        return self._salvage.unused_schemas
-
-    @cached_property
-    def counts(self) -> Mapping[int, int]:
-        """Number of messages that can be read, by channel id."""
-        return {key: len(times) for key, times in self._times.items()}
-
-    def times(self) -> Mapping[int, NDArray[np.int64]]:
-        """Sorted log times of the messages that can be read, nanoseconds, by channel id."""
-        return self._times
-
-    def in_file_order(self) -> Iterator[Record]:
-        """All that can be read."""
-        return self._records(EVERYTHING)
-
-    def others(self) -> Iterator[Record]:
-        """The attachments and metadata records."""
-        return self._records(Excerpt(start=0, end=0))
-
-    def in_time(self, excerpt: Excerpt) -> Iterator[Message]:
-        """The messages of an excerpt."""
-        records = self._records(replace(excerpt, others=False))
-        return (record for record in records if isinstance(record, Message))
-
-    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
-        # by a reader of its own: one reads once at a time
-        return McapSalvage(self._salvage.path).records(excerpt)
 
 
 def recorded_format(file: MessagesFile) -> Format:
@@ -259,38 +217,35 @@ def as_recorded(messages: Iterable[Message], path: Path) -> Iterator[RecordedMes
         messages: Of any channels.
         path: Where they are from, for errors.
     """
-    topics: dict[int, _Topic] = {}
+    decoders: dict[int, Callable[[memoryview], Any]] = {}
     for message in messages:
         channel = message.channel
-        topic = topics.setdefault(channel.id, _Topic(channel, path))
+        decode = decoders.setdefault(channel.id, _decoder(channel, path))
         yield RecordedMessage(
             topic=channel.topic,
             type_name=channel.type_name,
             log_time_ns=message.log_time,
             publish_time_ns=message.publish_time,
             raw=memoryview(message.data).toreadonly(),
-            decode=topic.decode,
+            decode=decode,
         )
 
 
-class _Topic:
-    """Decodes the messages of a channel; creates the decoder for the first one."""
+def _decoder(channel: Channel, path: Path) -> Callable[[memoryview], Any]:
+    """Decodes the messages of a channel; the library's decoder is made for the first one."""
 
-    def __init__(self, channel: Channel, path: Path) -> None:
-        self._channel = channel
-        self._path = path
-
-    @cached_property
-    def _decoder(self) -> Callable[[memoryview], Any]:
+    @cache
+    def made() -> Callable[[memoryview], Any]:
         # rosbags is slow to import, and not everyone decodes messages
         from mp4ds.bags.convert import decoder_of
 
-        return decoder_of(self._channel)
+        return decoder_of(channel)
 
-    def decode(self, raw: memoryview) -> Any:
+    def decode(raw: memoryview) -> Any:
         try:
-            return self._decoder(raw)
+            return made()(raw)
         except WireError as error:
-            raise SourceError(
-                self._path, f"a message of {self._channel.topic} cannot be decoded: {error}"
-            ) from None
+            problem = f"a message of {channel.topic} cannot be decoded: {error}"
+            raise SourceError(path, problem) from None
+
+    return decode

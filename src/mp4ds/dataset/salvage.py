@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.messages import MessagesFile, SalvagedMessages, recorded_format
+from mp4ds.dataset.messages import MessagesFile, recorded_format
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import FormatError, SourceError, SourceNotFoundError, VersionError
 from mp4ds.files.outputs import digest_file
@@ -24,74 +24,6 @@ from mp4ds.records import Loss
 
 _FORMAT = re.compile(rb"^format: (bag|rosbag2|mcap)\r?$", re.MULTILINE)
 _ALTERED = "does not match its SHA-256"
-
-
-class Damage:
-    """Frames of a stream, one after another, that cannot be read for the same reason.
-
-    Args:
-        stream: The stream.
-        error: Of the first of them; without a number if none can be read.
-    """
-
-    def __init__(self, stream: Stream, error: FormatError) -> None:
-        self._stream = stream
-        self._error = error
-        self.last = error.frame
-
-    def takes(self, error: FormatError) -> bool:
-        """Whether an error says the same of the next frame, which then belongs to it."""
-        if self.last is None or error.frame != self.last + 1 or error.code != self._error.code:
-            return False
-        self.last = error.frame
-        return True
-
-    @property
-    def error(self) -> FormatError:
-        """The error that names them all, by number, topic and times."""
-        return self._stream.named(self._error, self.last)
-
-    @property
-    def frames(self) -> tuple[int, int]:
-        """Numbers of the first and the last of them."""
-        if self._error.frame is None or self.last is None:
-            return 0, len(self._stream) - 1
-        return self._error.frame, self.last
-
-    @property
-    def loss(self) -> Loss:
-        """What is lost by it."""
-        first, last = self.frames
-        times = self._stream.log_times
-        return Loss(
-            self._stream.video_path.name,
-            None,
-            None,
-            self._error.what,
-            last - first + 1,
-            (self._stream.topic,),
-            int(times[first]),
-            int(times[last]),
-            (first, last),
-        )
-
-
-def damages_of(stream: Stream, report: Callable[[int], None] = lambda _: None) -> Iterator[Damage]:
-    """What cannot be read of a stream: every frame is decoded, rebuilt and compared.
-
-    Args:
-        stream: The stream.
-        report: Called with the number of each frame.
-    """
-    found: Damage | None = None
-    for error in stream.damages(report):
-        if found and found.takes(error):
-            continue
-        if found:
-            yield found
-        found = Damage(stream, error)
-    if found:
-        yield found
 
 
 HOW_TO_SALVAGE = (
@@ -195,11 +127,14 @@ def examine(stream: Stream) -> list[Loss]:
     if video.sha256 is not None and digest_file(stream.video_path)[1] == video.sha256:
         return []
     sound = np.ones(count, np.bool_)
-    losses = []
-    for damage in damages_of(stream):
-        first, last = damage.frames
+    losses, times = [], stream.log_times
+    for damage, first, last in stream.damages():
         sound[first : last + 1] = False
-        losses.append(damage.loss)
+        span, ends = (int(times[first]), int(times[last])), (first, last)
+        lost, topics = last - first + 1, (stream.topic,)
+        losses.append(
+            Loss(stream.video_path.name, None, None, damage.what, lost, topics, *span, ends)
+        )
     if stream.sidecar.digests is None and sound.any() and video.sha256 is not None:
         problem = f"{_ALTERED}, and frames of a lossy video have no digests: some may be altered"
         losses.append(Loss(stream.video_path.name, None, None, problem, 0, (stream.topic,)))
@@ -301,7 +236,8 @@ class _Opening:
         except FormatError:
             pass  # it is read below as far as possible
         try:
-            salvaged = SalvagedMessages(path)
+            salvaged = MessagesFile(path, salvage=True)
+            _ = salvaged.counts  # reads it once
         except FormatError as error:
             self.losses.append(Loss(MESSAGES_NAME, None, None, error.problem))
             return MessagesFile(None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,8 @@ class Stream(Images):
         FormatError: The sidecar or its video breaks a rule of the format.
     """
 
+    channel: Channel
+
     def __init__(
         self,
         path: Path,
@@ -55,18 +58,14 @@ class Stream(Images):
         self.sound: NDArray[np.bool_] | None = None
         self._jpeg_quality = jpeg_quality
         self.sidecar = sidecar or load_stream(path)
-        self.topic = self.sidecar.channel.topic
+        self.channel = self.sidecar.channel.to_record(0)
+        self.topic = self.channel.topic
         self.video_path = path.parent / self.sidecar.video.file
-
-    @cached_property
-    def channel(self) -> Channel:  # type: ignore[override]
-        """The channel of the images; its id has no meaning."""
-        return self.sidecar.channel.to_record(0)
-
-    @property
-    def ordinals(self) -> NDArray[np.int64]:
-        """Numbers among the messages of the channel, shape (frames,)."""
-        return self.columns.ordinal
+        image = self.sidecar.image
+        self.encoding, self.image_size = image.encoding, (image.width, image.height)
+        is_packet = self.sidecar.body == "packet"
+        self.are_jpeg_files = is_packet and self.sidecar.video.codec == "mjpeg"
+        self.shows_colours = self.sidecar.shows_colours
 
     @property
     def topics(self) -> list[str]:
@@ -112,26 +111,6 @@ class Stream(Images):
         )
 
     @property
-    def stamps(self) -> NDArray[np.int64]:
-        """Header stamps, nanoseconds, shape (frames,)."""
-        return self.columns.stamp
-
-    @property
-    def log_times(self) -> NDArray[np.int64]:
-        """Log times, nanoseconds, shape (frames,)."""
-        return self.columns.log_time
-
-    @property
-    def encoding(self) -> str:
-        """ROS image encoding of the frames as recorded."""
-        return self.sidecar.image.encoding
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the images, pixels."""
-        return self.sidecar.image.width, self.sidecar.image.height
-
-    @property
     def calibrations(self) -> Sequence[Calibration]:
         """All calibrations, in the order in which they were first seen."""
         return self.sidecar.camera_info.calibrations if self.sidecar.camera_info else []
@@ -152,11 +131,6 @@ class Stream(Images):
 
     def __len__(self) -> int:
         return self.sidecar.frames
-
-    @property
-    def are_jpeg_files(self) -> bool:
-        """Whether the messages hold JPEG files that are in the video as they are."""
-        return self.sidecar.body == "packet" and self.sidecar.video.codec == "mjpeg"
 
     # ------------------------------------------------------------ pictures
 
@@ -198,11 +172,6 @@ class Stream(Images):
     def pictures(self, scale: Scale | None) -> Iterator[Picture]:
         """All pictures in order, from a separate decoder that uses all cores."""
         return (picture for _, picture in self.pictures_at(everything, scale))
-
-    @property
-    def shows_colours(self) -> bool:  # type: ignore[override]
-        """Whether the decoder can make RGB directly, in any size."""
-        return self.sidecar.shows_colours
 
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
         """Write the pixels of a picture, as recorded."""
@@ -356,44 +325,55 @@ class Stream(Images):
         marks = [mark for mark in (is_wanted, self.sound) if mark is not None]
         return int(np.logical_and.reduce(marks).sum()) if marks else len(self)
 
-    def damages(self, report: Callable[[int], None] = lambda _: None) -> Iterator[FormatError]:
-        """What is wrong with the frames: all are decoded, rebuilt and compared.
+    def damages(
+        self, report: Callable[[int], None] = lambda _: None
+    ) -> Iterator[tuple[FormatError, int, int]]:
+        """What cannot be read: every frame is decoded, rebuilt and compared.
 
         Args:
             report: Called with the number of each frame.
 
         Yields:
-            An error with the number of each frame that cannot be read, in order; one without a
-            number, the last, if none can.
+            An error for frames in a row that cannot be read for the same reason, which it names by
+            number, topic and times, and the first and the last of them.
         """
+        row: tuple[FormatError, int, int] | None = None
+        for error in self._damaged_frames(report):
+            # without a number, none of the frames can be read
+            first, last = (0, len(self) - 1) if error.frame is None else (error.frame,) * 2
+            if row and error.frame == row[2] + 1 and error.code == row[0].code:
+                row = row[0], row[1], last
+                continue
+            if row:
+                yield self.named(row[0], row[2]), *row[1:]
+            row = error, first, last
+        if row:
+            yield self.named(row[0], row[2]), *row[1:]
+
+    def _damaged_frames(self, report: Callable[[int], None]) -> Iterator[FormatError]:
+        is_packet = self.sidecar.body == "packet"
         try:
-            if self.sidecar.body == "packet":
-                yield from self._damages_of_packets(report)
-            else:
-                yield from self._damages_of_pictures(report)
+            rebuilder = self.rebuilder
+            with ExitStack() as files:
+                frames: Iterable[tuple[int, Picture | None]]
+                if is_packet:
+                    reader = files.enter_context(self._open_packets())
+                    frames = ((index, None) for index in range(len(self)))
+                else:
+                    frames = self.decodable_pictures()
+                for index, picture in frames:
+                    report(index)
+                    try:
+                        if is_packet:
+                            rebuilder.packet_payload(index, reader.packet(index))
+                        elif picture is None:
+                            raise self._undecodable(index)
+                        else:
+                            rebuilder.payload(index, picture)
+                    except FormatError as error:
+                        yield error
         except FormatError as error:
             yield error
-
-    def _damages_of_packets(self, report: Callable[[int], None]) -> Iterator[FormatError]:
-        rebuilder = self.rebuilder
-        with self._open_packets() as reader:
-            for index in range(len(self)):
-                report(index)
-                try:
-                    rebuilder.packet_payload(index, reader.packet(index))
-                except FormatError as error:
-                    yield error
-
-    def _damages_of_pictures(self, report: Callable[[int], None]) -> Iterator[FormatError]:
-        rebuilder = self.rebuilder
-        for index, picture in self.decodable_pictures():
-            report(index)
-            try:
-                if picture is None:
-                    raise self._undecodable(index)
-                rebuilder.payload(index, picture)
-            except FormatError as error:
-                yield error
 
     def recorded_pictures(
         self, choice: Choice = everything, scale: Scale | None = None

@@ -246,7 +246,9 @@ class Topic:
         owners, times = [], []
         for numbers in channels.values():
             own = [self.parts[number] for number in numbers]
-            order = np.argsort(np.concatenate([part.ordinals for part in own]), kind="stable")
+            order = np.argsort(
+                np.concatenate([part.columns.ordinal for part in own]), kind="stable"
+            )
             owners.append(np.repeat(numbers, list(map(len, own)))[order])
             log_times = np.concatenate([part.log_times for part in own])[order]
             times.append(np.maximum.accumulate(log_times))

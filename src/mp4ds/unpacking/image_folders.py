@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.columns import marked
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.images import Images
+from mp4ds.dataset.images import Images, VerbatimImages
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.verbatim import VerbatimImages
 from mp4ds.dataset.views import View
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import csv_cell

@@ -25,7 +25,7 @@ from mp4ds.bags.types import (
     ros2_version,
     types_of,
 )
-from mp4ds.dataset.columns import DecodedColumns, everything
+from mp4ds.dataset.columns import DecodedColumns, everything, last_of
 from mp4ds.dataset.dataset import Ahead, Dataset
 from mp4ds.errors import ConversionError, OptionError, Refused
 from mp4ds.plugins.playing.options import KINDS, PlayOptions, Wanted, rooted
@@ -342,8 +342,9 @@ class _Part:
         kept = {item.id: LatchedMessages[Message](item) for item in filter(has_late, channels)}
         topics = {item.topic for item in channels if item.id in kept}
         most = max((latched_depth(item) for item in channels if item.id in kept), default=1)
-        for message in self._dataset.before(time_ns, topics, most) if topics else ():
-            if message.channel.id in kept:
+        earlier = self._dataset.records(end=time_ns, choose=last_of(time_ns, most), topics=topics)
+        for message in earlier if topics else ():
+            if isinstance(message, Message) and message.channel.id in kept:
                 kept[message.channel.id].add(message.data, message)
         messages = sorted(chain.from_iterable(kept.values()), key=lambda item: item.log_time)
         return map(self._as_published, messages)
