@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
+
+from remote_servers import Many, Quiet, serving
 
 REPOSITORY = "someone/drives"
 _COMMIT = "0" * 40
@@ -68,9 +68,7 @@ def hub_server(folder: Path) -> Iterator[Hub]:
     """A hub whose repository is a folder."""
     hub = Hub(folder)
 
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
+    class Handler(Quiet):
         def do_POST(self) -> None:
             data = self.rfile.read(int(self.headers["Content-Length"]))
             is_json = "json" in self.headers["Content-Type"]
@@ -117,16 +115,5 @@ def hub_server(folder: Path) -> Iterator[Hub]:
             if self.command != "HEAD":
                 self.wfile.write(data)
 
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    hub.url = f"http://127.0.0.1:{server.server_port}"
-    try:
+    with serving(Many(("127.0.0.1", 0), Handler)) as hub.url:
         yield hub
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()

@@ -104,6 +104,35 @@ def _without_server(start_response: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @contextmanager
+def serving(server: Any) -> Iterator[str]:
+    """The URL of an HTTP server of this machine, which runs meanwhile in a thread."""
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+class Many(ThreadingHTTPServer):
+    """A server of many requests at once."""
+
+    daemon_threads = True
+    request_queue_size = 128
+
+
+class Quiet(BaseHTTPRequestHandler):
+    """Answers without telling of it."""
+
+    protocol_version = "HTTP/1.1"
+
+    def log_message(self, *_: Any) -> None:
+        """Nothing."""
+
+
+@contextmanager
 def s3_server() -> Iterator[Server]:
     """An S3 that knows any credentials."""
     server = Server("")
@@ -122,15 +151,8 @@ def s3_server() -> Iterator[Server]:
         return [] if environ["REQUEST_METHOD"] == "HEAD" else [body]
 
     running = make_server("127.0.0.1", 0, app, threaded=True, request_handler=_Quiet)
-    thread = threading.Thread(target=running.serve_forever, daemon=True)
-    thread.start()
-    server.url = f"http://127.0.0.1:{running.server_port}"
-    try:
+    with serving(running) as server.url:
         yield server
-    finally:
-        running.shutdown()
-        thread.join()
-        running.server_close()
 
 
 @contextmanager
@@ -143,9 +165,7 @@ def web_server(folder: Path, *, ranges: bool = True) -> Iterator[Server]:
     """
     server = Server("")
 
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
+    class Handler(Quiet):
         def do_HEAD(self) -> None:
             self._answer(body=False)
 
@@ -197,20 +217,5 @@ def web_server(folder: Path, *, ranges: bool = True) -> Iterator[Server]:
                     start += len(block)
                     server.sent += len(block)
 
-        def log_message(self, *_: Any) -> None:
-            pass
-
-    class Many(ThreadingHTTPServer):
-        daemon_threads = True
-        request_queue_size = 128
-
-    running = Many(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=running.serve_forever, daemon=True)
-    thread.start()
-    server.url = f"http://127.0.0.1:{running.server_port}"
-    try:
+    with serving(Many(("127.0.0.1", 0), Handler)) as server.url:
         yield server
-    finally:
-        running.shutdown()
-        thread.join()
-        running.server_close()

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import mp4ds
+from commands import program
 from hub_server import REPOSITORY, Hub, hub_server
 from mp4ds.plugins.demo import demo
-from waiting import WATCHDOG_S
 
 HOME = f"hf://datasets/{REPOSITORY}"
 
@@ -41,17 +38,7 @@ def hub(drives: Path) -> Iterator[Hub]:
 def run(hub: Hub, *words: str, folder: Path) -> str:
     """What a program prints that takes the stand-in for the hub."""
     told = {"HF_ENDPOINT": hub.url, "HF_HUB_DISABLE_TELEMETRY": "1", "HF_HOME": str(folder)}
-    done = subprocess.run(
-        [sys.executable, *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        env={**os.environ, **told},
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    return program(*words, cwd=folder, env=told).out
 
 
 def test_frames_are_fetched_by_ranges(hub: Hub, drives: Path, tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mp4ds
+from commands import call, refused
 from in_parts import InlineExecutor, leftovers, use
 from mp4ds.bags.formats import open_sources
-from mp4ds.cli import commands
 from mp4ds.errors import OptionError, PartsFailedError, RemoteError, SourceError
 from mp4ds.files.ranges import BLOCK, KEPT_BYTES, Blocks, RemoteFile
 from mp4ds.files.urls import RemotePath, location
@@ -351,7 +351,9 @@ def dataset_url(
             yield f"{web.url}/{packed_bag.name}", packed_bag, web
 
 
-def test_a_dataset_is_open_there(dataset_url: tuple[str, Path, Server]) -> None:
+def test_a_dataset_is_used_there_as_here(
+    dataset_url: tuple[str, Path, Server], tmp_path: Path, compare: Compare
+) -> None:
     url, here, _ = dataset_url
     with mp4ds.open(url) as there, mp4ds.open(here) as local:
         assert there.topics == local.topics
@@ -362,21 +364,11 @@ def test_a_dataset_is_open_there(dataset_url: tuple[str, Path, Server]) -> None:
                 assert bytes(ours.data) == bytes(theirs.data)  # type: ignore[union-attr]
     with mp4ds.open(f"{url}/cam_image_raw.mp4") as alone:
         assert len(alone[TOPIC]) == 8
-
-
-def test_a_dataset_is_valid_there(dataset_url: tuple[str, Path, Server]) -> None:
-    url, here, _ = dataset_url
     assert mp4ds.validate(url, deep=True) == []
     assert mp4ds.validate(f"{url}/cam_image_raw.yaml", deep=True) == []
-    there = info(url)
-    assert there.kind == "dataset"
-    assert (there.topics, there.bytes) == (info(here).topics, info(here).bytes)
-
-
-def test_a_dataset_is_unpacked_from_there(
-    dataset_url: tuple[str, Path, Server], tmp_path: Path, compare: Compare
-) -> None:
-    url, here, _ = dataset_url
+    facts = info(url)
+    assert facts.kind == "dataset"
+    assert (facts.topics, facts.bytes) == (info(here).topics, info(here).bytes)
     mp4ds.unpack(url, "bag", tmp_path / "again.bag")
     mp4ds.unpack(here, "bag", tmp_path / "local.bag")
     assert compare([tmp_path / "again.bag"], tmp_path / "local.bag") == []
@@ -406,41 +398,23 @@ def test_problems_of_a_dataset_are_found_there(
 # ---------------------------------------------------------------- failures
 
 
-def run(*arguments: str) -> tuple[int, str]:
-    """Exit code of a command, and what it says on stderr."""
-    from click.testing import CliRunner
-
-    result = CliRunner().invoke(commands, list(arguments))
-    assert result.exception is None or isinstance(result.exception, SystemExit)
-    assert "Traceback" not in result.output
-    return result.exit_code, result.output
-
-
 @pytest.mark.parametrize("command", [["info"], ["validate"], ["pack", "-o", "x"]])
-def test_what_is_not_there(command: list[str], folder_url: str, s3: Server, web: Server) -> None:
+def test_what_is_not_there_or_refused(
+    command: list[str], folder_url: str, s3: Server, web: Server
+) -> None:
     for url in (f"{folder_url}/none.bag", "s3://nobody/none.bag", f"{web.url}/none.bag"):
-        code, said = run(*command, url)
-        assert code == 2
-        assert f"{url}: no such file or folder. Check the path." in said
-
-
-@pytest.mark.parametrize("command", [["info"], ["validate"], ["pack", "-o", "x"]])
-def test_what_is_refused(command: list[str], s3: Server, web: Server) -> None:
+        refused(call(*command, url), 2, f"{url}: no such file or folder. Check the path.")
     for server, url in ((s3, "s3://bucket/x.bag"), (web, f"{web.url}/x.bag")):
         server.fails = lambda _: 403
-        code, said = run(*command, url)
-        assert code == 2
-        assert f"{url}: cannot be read: access denied: " in said
-        assert "403" in said
+        refused(call(*command, url), 2, f"{url}: cannot be read: access denied: ", "403")
 
 
 def test_a_connection_that_is_closed_early(web: Server, tmp_path: Path) -> None:
     write_bag(tmp_path / "web" / "early.bag", scene("mono8"))
     web.breaks_off = True
-    code, said = run("info", f"{web.url}/early.bag")
-    assert code == 1
-    assert "could not be read: the server closed the connection before it had sent all. " in said
-    assert not re.search(r"\b400\b", said)  # nor a port with these digits
+    said = call("info", f"{web.url}/early.bag")
+    refused(said, 1, "could not be read: the server closed the connection before it had sent all. ")
+    assert not re.search(r"\b400\b", said.err)  # nor a port with these digits
 
 
 def test_without_credentials(s3: Server, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -449,17 +423,14 @@ def test_without_credentials(s3: Server, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.delenv("AWS_ACCESS_KEY_ID")
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     s3fs.S3FileSystem.clear_instance_cache()
-    code, said = run("info", "s3://bucket/x.bag")
+    said = call("info", "s3://bucket/x.bag")
     s3fs.S3FileSystem.clear_instance_cache()
-    assert code == 2
-    assert "access denied: Unable to locate credentials" in said
+    refused(said, 2, "access denied: Unable to locate credentials")
 
 
 def test_a_server_that_is_not_there() -> None:
-    code, said = run("info", "http://127.0.0.1:9/x.bag")
-    assert code == 1
-    assert "http://127.0.0.1:9/x.bag: could not be read: " in said
-    assert "Check the network" in said
+    url = "http://127.0.0.1:9/x.bag"
+    refused(call("info", url), 1, f"{url}: could not be read: ", "Check the network")
 
 
 @pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "drive.db3"])
@@ -543,9 +514,9 @@ def test_secrets_are_not_told(tmp_path: Path, web: Server) -> None:
     url = f"{web.url}/x.bag?{SECRET}"
     for fails in (lambda _: None, lambda _: 403, lambda _: 500):
         web.fails = fails
-        _, said = run("info", url)
-        assert "x.bag" in said
-        assert "4711" not in said
+        said = call("info", url)
+        assert "x.bag" in said.err
+        assert "4711" not in said.out + said.err
 
 
 def test_a_signed_address_goes_on_while_it_is_the_same(

@@ -15,8 +15,8 @@ import pytest
 from PIL import Image
 
 import mp4ds
+from commands import call
 from in_parts import InlineExecutor, facts, use
-from mp4ds.cli import commands
 from mp4ds.errors import (
     OptionError,
     PartsFailedError,
@@ -377,12 +377,10 @@ def test_from_a_url_to_a_url(
 
 
 def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -> None:
-    from click.testing import CliRunner
-
     def run(*arguments: str) -> Any:
-        result = CliRunner().invoke(commands, [*arguments, "--json"])
-        assert result.exit_code == 0, result.output
-        return json.loads(result.stdout)
+        result = call(*arguments, "--json")
+        assert result.code == 0, result.err
+        return json.loads(result.out)
 
     recording, dataset = put(source), f"{folder_url}/dataset"
     assert run("info", recording)["path"] == recording
