@@ -11,7 +11,7 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -27,7 +27,6 @@ from mp4ds.cli.output import be_json
 from mp4ds.cli.progress import (
     Events,
     Log,
-    Pace,
     duration_text,
     pack_progress,
     rows_of,
@@ -39,7 +38,6 @@ from test_terminal import Screen
 from waiting import WATCHDOG_S, until
 
 HOUR = 3600.0
-Work = Callable[[float], float]  # share done after so many seconds
 HOSTILE = "/cam\x1b[31m\n\r\t\u202e\x00\x9b2J"
 
 
@@ -84,41 +82,61 @@ class Clock:
         return self.start + timedelta(seconds=self.seconds - 1000.0)
 
 
+Report = tuple[float, Sequence[PackProgress]]
+"""After so many seconds, the states of all packs."""
+
+
+def logged(reports: Iterable[Report], outcome: str = "done") -> list[str]:
+    """The lines of a log."""
+    clock, stream = Clock(), io.StringIO()
+    log = Log(stream, clock=clock, now=clock.now)
+    for seconds, states in reports:
+        clock.seconds = 1000.0 + seconds
+        log.show(rows_of({state.dataset: state for state in states}))
+    log.end(outcome)
+    return stream.getvalue().splitlines()
+
+
+def events_of(reports: Iterable[Report], outcome: str = "done") -> list[dict[str, Any]]:
+    """The events of packs, each as the schema has it."""
+    clock, stream = Clock(), io.StringIO()
+    events = Events(stream, clock=clock, now=clock.now)
+    for seconds, states in reports:
+        clock.seconds = 1000.0 + seconds
+        for state in states:
+            events.take(state)
+    events.end(outcome)
+    return parsed(stream.getvalue())
+
+
 # ---------------------------------------------------------------- where it stands
 
 
-def states_of(*states: PackProgress) -> dict[Path, PackProgress]:
-    return {state.dataset: state for state in states}
+def share_told(*states: PackProgress) -> Any:
+    return share_of({state.dataset: state for state in states})
 
 
 def test_parts_tell_where_the_work_does_not() -> None:
-    assert share_of(states_of(told(None, tasks_done=119))) == pytest.approx(119 / 240)
+    assert share_told(told(None, tasks_done=119)) == pytest.approx(119 / 240)
 
 
 def test_datasets_count_by_their_size() -> None:
     joining = told(1.0, dataset="a", gigabytes=10, phase="joining")
-    job = states_of(joining, told(0.5, dataset="b", gigabytes=30))
-    assert share_of(job) == pytest.approx(25 / 40)
+    assert share_told(joining, told(0.5, dataset="b", gigabytes=30)) == pytest.approx(25 / 40)
 
 
 @pytest.mark.parametrize("before", [0.0, 0.8])
 def test_the_time_left_is_by_what_this_run_did(before: float) -> None:
-    clock = Clock()
-    pace = Pace(clock)
-    for n in range(401):
-        clock.seconds = 1000.0 + n
-        left = pace.left(before + n * (1 - before) / 1000)
-        assert n > 2 or left is None
-    assert left == pytest.approx(600, abs=5)
+    reports = ((n, [told(before + n * (1 - before) / 1000)]) for n in range(401))
+    left = [event["seconds_left"] for event in events_of(reports)[1:-1]]
+    assert left[:3] == [None] * 3
+    assert left[-1] == pytest.approx(600, abs=5)
 
 
-@pytest.mark.parametrize("shares", [[None] * 9, [0.0] * 9, [0.5] * 9])
-def test_no_time_left_is_told_that_is_not_known(shares: list[float | None]) -> None:
-    clock = Clock()
-    pace = Pace(clock)
-    for share in shares:
-        clock.seconds += 1
-        assert pace.left(share) is None
+@pytest.mark.parametrize("share", [None, 0.0, 0.5])
+def test_no_time_left_is_told_that_is_not_known(share: float | None) -> None:
+    found = events_of((n, [told(share, parts=0)]) for n in range(9))
+    assert {event["seconds_left"] for event in found[1:-1]} == {None}
 
 
 # ---------------------------------------------------------------- anything at all
@@ -177,66 +195,57 @@ def test_whatever_is_told_nothing_silly_is_shown(
 # ---------------------------------------------------------------- log files
 
 
-def logged(work: Work, seconds: float, *, outcome: str = "done", step: float = 0.5) -> list[str]:
-    """The lines of a pack."""
-    clock, stream = Clock(), io.StringIO()
-    log = Log(stream, clock=clock, now=clock.now)
-    for n in range(int(seconds / step) + 1):
-        clock.seconds = 1000.0 + n * step
-        log.show(rows_of(states_of(told(work(n * step)))))
-    log.end(outcome)
-    return stream.getvalue().splitlines()
+def half_seconds(whole: float) -> Iterator[Report]:
+    """A pack that takes so long, looked at twice a second."""
+    return ((n / 2, [told(min(1.0, n / 2 / whole))]) for n in range(int(2 * whole) + 1))
 
 
-def test_a_short_pack_logs_nothing() -> None:
-    assert logged(lambda now: now / 9.9, 9.9) == []
-    assert logged(lambda now: now / 9.9, 9.9, outcome="failed") == []
+@pytest.mark.parametrize("outcome", ["done", "failed"])
+def test_a_short_pack_logs_nothing(outcome: str) -> None:
+    assert logged(half_seconds(9.9), outcome) == []
+
+
+def at(seconds: int) -> str:
+    """The time of day after so many seconds, here."""
+    return f"{(Clock.start + timedelta(seconds=seconds)).astimezone():%H:%M:%S}"
 
 
 def test_the_log_of_a_pack() -> None:
-    lines = logged(lambda now: now / 300, 300)
+    lines = logged(half_seconds(300))
     assert lines[0] == (
-        "12:00:10 packing drive: 3 % | parts 8/240  1.7 GB -> 166.7 MB | /cam0 1200/36000, "
+        f"{at(10)} packing drive: 3 % | parts 8/240  1.7 GB -> 166.7 MB | /cam0 1200/36000, "
         "/cam1 1200/36000 | 5 min left"
     )
     assert lines[-1] == (
-        "12:05:00 packing drive: done after 5 min | parts 240/240  50.0 GB -> 5.0 GB"
+        f"{at(300)} packing drive: done after 5 min | parts 240/240  50.0 GB -> 5.0 GB"
     )
 
 
 def test_the_log_of_several_datasets() -> None:
-    clock, stream = Clock(), io.StringIO()
-    log = Log(stream, clock=clock, now=clock.now)
-    for n in range(1, 12):
-        clock.seconds = 1000.0 + n
-        a = told(1.0, dataset="a", phase="joining", note="cam0.mp4")
-        log.show(rows_of(states_of(a, told(n / 100, dataset="b", failed=1))))
-    (line,) = stream.getvalue().splitlines()
+    a = told(1.0, dataset="a", phase="joining", note="cam0.mp4")
+    line, _ = logged((n, [a, told(n / 100, dataset="b", failed=1)]) for n in range(1, 12))
     assert re.search(r"packing 2 datasets: 55 % \| parts 264/480  1 failed  ", line)
     assert "a joining cam0.mp4  parts 240/240  50.0 GB -> 5.0 GB, b parts 24/240" in line
 
 
 def test_hostile_names_reach_no_log() -> None:
-    clock, stream = Clock(), io.StringIO()
-    log = Log(stream, clock=clock, now=clock.now)
     topics = {HOSTILE + "\udcff" + str(n) + "x" * n: (n, None) for n in range(1000)}
-    for n in range(20):
-        clock.seconds = 1000.0 + n
-        log.show(rows_of(states_of(told(0.1, dataset=HOSTILE, topics=topics, note=HOSTILE))))
-    (line,) = stream.getvalue().splitlines()
+    state = told(0.1, dataset=HOSTILE, topics=topics, note=HOSTILE)
+    line, _ = logged((n, [state]) for n in range(20))
     assert re.fullmatch(r"[ -~]{1,4000}", line)
     assert "and 980 more" in line
 
 
-@pytest.mark.parametrize("stream", [io.TextIOWrapper(io.BytesIO()), open(os.devnull)])  # noqa: SIM115, PTH123
-def test_a_pack_does_not_fail_for_want_of_a_log(stream: Any) -> None:
+@pytest.mark.parametrize("mode", ["r", "w"])
+def test_a_pack_does_not_fail_for_want_of_a_log(mode: str) -> None:
     """The stream is closed, or cannot be written to."""
-    if stream.writable():
-        stream.close()
-    log = Log(stream, clock=Clock())
-    log.show(rows_of(states_of(told(0.5))))
-    log.end("done")
-    Events(stream).take(told(0.5))
+    with open(os.devnull, mode) as stream:  # noqa: PTH123
+        if mode == "w":
+            stream.close()
+        log = Log(stream, clock=Clock())
+        log.show(rows_of({Path("/data/drive"): told(0.5)}))
+        log.end("done")
+        Events(stream).take(told(0.5))
 
 
 @pytest.mark.parametrize(
@@ -305,13 +314,7 @@ def parsed(text: str) -> list[dict[str, Any]]:
 
 
 def test_the_events_of_a_pack() -> None:
-    clock, stream = Clock(), io.StringIO()
-    events = Events(stream, clock=clock, now=clock.now)
-    for n in range(1001):
-        clock.seconds = 1000.0 + n / 10
-        events.take(told(n / 1000, note=HOSTILE))
-    events.end("done")
-    found = parsed(stream.getvalue())
+    found = events_of((n / 10, [told(n / 1000, note=HOSTILE)]) for n in range(1001))
     assert len(found) == 1 + 101 + 1
     assert found[51] == {
         "event": "progress",
@@ -336,24 +339,13 @@ def test_the_events_of_a_pack() -> None:
 
 
 def test_the_last_event_is_not_lost_and_none_is_told_twice() -> None:
-    clock, stream = Clock(), io.StringIO()
-    events = Events(stream, clock=clock, now=clock.now)
-    for n in range(5):
-        clock.seconds = 1000.0 + n / 10
-        events.take(told(n / 4))
-    events.end("done")
-    assert [event.get("done") for event in parsed(stream.getvalue())] == [None, 0.0, 1.0, None]
+    found = events_of((n / 10, [told(n / 4)]) for n in range(5))
+    assert [event.get("done") for event in found] == [None, 0.0, 1.0, None]
 
 
 def test_each_dataset_is_told_of_once_a_second() -> None:
-    clock, stream = Clock(), io.StringIO()
-    events = Events(stream, clock=clock, now=clock.now)
-    for n in range(81):
-        clock.seconds = 1000.0 + n / 8
-        for name in ("a", "b"):
-            events.take(told(n / 80, dataset=name))
-    events.end("interrupted")
-    found = parsed(stream.getvalue())[1:-1]
+    both = ((n / 8, [told(n / 80, dataset=name) for name in ("a", "b")]) for n in range(81))
+    found = events_of(both, "interrupted")[1:-1]
     for name in ("a", "b"):
         own = [event for event in found if event["dataset"].endswith(name)]
         assert len(own) == 11
@@ -361,9 +353,7 @@ def test_each_dataset_is_told_of_once_a_second() -> None:
 
 
 def test_a_pack_that_does_not_begin_has_no_events() -> None:
-    stream = io.StringIO()
-    Events(stream).end("failed")
-    assert stream.getvalue() == ""
+    assert events_of([], "failed") == []
 
 
 # ---------------------------------------------------------------- while a command runs

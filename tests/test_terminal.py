@@ -72,7 +72,7 @@ COMMANDS = {
     "export-tum": "export tum DATASET -o OUT",
     "frames": "frames DATASET -t TOPIC --at #1 -o OUT.png",
     "evaluate": "evaluate RECORDING -o OUT --codecs h264 --frames 4 --crf 30 --presets ultrafast "
-    "--target psnr_y=20 --jobs 1",
+    "--target psnr=20 --jobs 1",
 }
 
 

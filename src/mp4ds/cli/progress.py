@@ -10,12 +10,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO, TypeVar
 
 from mp4ds.cli.output import is_json, is_quiet, shown
 from mp4ds.errors import size_text
 from mp4ds.packing.options import PackProgress
 
+_LinesT = TypeVar("_LinesT", bound="_Lines")
 _NAME_WIDTH = 60
 _ROUNDING = 1e-6
 _DIGITS = 9  # digits of a share: with a float's full precision, the time left may overflow
@@ -38,32 +39,6 @@ class Row:
 
 Show = Callable[[Sequence[Row]], None]
 """Shows how far a command is: a row for all of it, and rows for its parts."""
-
-
-class Pace:
-    """Estimates the time left from what was done since the beginning.
-
-    Args:
-        clock: Seconds; does not go back.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._began: tuple[float, float] | None = None
-
-    def left(self, share: float | None) -> int | None:
-        """Seconds until all is done; None if unknown."""
-        if not share:
-            return None
-        now = self._clock()
-        self._began = self._began or (now, share)
-        began, before = self._began
-        if share <= before or now - began < _SURE_SECONDS:
-            return None
-        return int((now - began) * (1 - share) / (share - before))
-
-
-_SURE_SECONDS = 3.0
 
 
 def plain(value: object) -> str:
@@ -92,6 +67,7 @@ def duration_text(seconds: float) -> str:
 
 # ---------------------------------------------------------------- ways to show it
 
+_SURE_SECONDS = 3.0
 _LEAST_PAUSE, _MOST_PAUSE, _GROWTH = 10.0, 600.0, 0.05
 _LISTED = 20
 
@@ -109,8 +85,7 @@ def display(*, timed: bool = True) -> Iterator[Show]:
         with _bars(timed=timed) as show:
             yield show
     else:
-        log = Log(sys.stderr, timed=timed)
-        with _outcome(log.end):
+        with Log(sys.stderr, timed=timed) as log:
             yield log.show
 
 
@@ -150,11 +125,11 @@ def _bars(*, timed: bool) -> Iterator[Show]:
         yield show
 
 
-class Log:
-    """Reports by lines: after 10 s, and whenever a twentieth of the time has passed again.
+class _Lines:
+    """What a stream is told of a command, as long as anyone reads it, and how the command ends.
 
     Args:
-        stream: Where to; it does not matter whether anyone reads it.
+        stream: Where to.
         timed: Say how long it still takes.
         clock: Seconds; does not go back.
         now: The time of day.
@@ -166,76 +141,84 @@ class Log:
         *,
         timed: bool = True,
         clock: Callable[[], float] = time.monotonic,
-        now: Callable[[], datetime] = datetime.now,
+        now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
     ) -> None:
-        self._stream, self._clock, self._now = stream, clock, now
-        self._pace = Pace(clock) if timed else None
+        self._stream, self._timed, self._clock, self._now = stream, timed, clock, now
         self._began = clock()
-        self._last: Sequence[Row] = ()
-        self._next = _LEAST_PAUSE
+        self._known: tuple[float, float] | None = None  # when a share was known first, and which
+
+    def end(self, outcome: str) -> None:
+        """Tell how it ended."""
+        raise NotImplementedError
+
+    def __enter__(self: _LinesT) -> _LinesT:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        stopped = kind is not None and issubclass(kind, (KeyboardInterrupt, SystemExit))
+        self.end("interrupted" if stopped else "failed" if kind else "done")
+
+    @property
+    def _seconds(self) -> float:
+        return self._clock() - self._began
+
+    def _left(self, share: float | None) -> int | None:
+        """Seconds until all is done, by what was done since a share was known; None if unknown."""
+        if not share or not self._timed:
+            return None
+        now = self._clock()
+        self._known = self._known or (now, share)
+        began, before = self._known
+        if share <= before or now - began < _SURE_SECONDS:
+            return None
+        return int((now - began) * (1 - share) / (share - before))
+
+    def _write(self, line: str) -> None:
+        with suppress(OSError, ValueError):  # ValueError: it was closed
+            self._stream.write(line + "\n")
+            self._stream.flush()
+
+
+class Log(_Lines):
+    """Reports by lines: after 10 s, and whenever a twentieth of the time has passed again."""
+
+    _last: Sequence[Row] = ()
+    _next = _LEAST_PAUSE
 
     def show(self, rows: Sequence[Row]) -> None:
         """Take what is done, and write a line if one is due."""
         self._last = rows
         whole, *parts = rows
-        left = self._pace.left(whole.share) if self._pace else None
-        seconds = self._clock() - self._began
+        left, seconds = self._left(whole.share), self._seconds
         if seconds < self._next:
             return
         self._next = seconds + min(max(_LEAST_PAUSE, _GROWTH * seconds), _MOST_PAUSE)
         listed = ", ".join(f"{plain(one.name)} {one.text}" for one in parts[:_LISTED])
         more = f" and {len(parts) - _LISTED} more" if len(parts) > _LISTED else ""
         time_left = f"{duration_text(left)} left" if left else ""
-        self._write(percent_text(whole.share), plain(whole.text), listed + more, time_left)
+        self._tell(percent_text(whole.share), plain(whole.text), listed + more, time_left)
 
     def end(self, outcome: str) -> None:
         """Write how it ended, if there were lines before."""
-        seconds = self._clock() - self._began
-        if self._last and seconds >= _LEAST_PAUSE:
+        if self._last and self._seconds >= _LEAST_PAUSE:
             text = plain(self._last[0].text)
-            self._write(f"{outcome} after {duration_text(seconds)}", text)
+            self._tell(f"{outcome} after {duration_text(self._seconds)}", text)
 
-    def _write(self, *texts: str) -> None:
-        line = f"{self._now():%H:%M:%S} {plain(self._last[0].name)}: "
-        _write(self._stream, line + " | ".join(filter(None, texts)))
-
-
-def _write(stream: TextIO, line: str) -> None:
-    """Write a line as long as anyone reads it: no command fails for lack of a log."""
-    with suppress(OSError, ValueError):  # ValueError: it was closed
-        stream.write(line + "\n")
-        stream.flush()
+    def _tell(self, *texts: str) -> None:
+        name = plain(self._last[0].name)
+        line = " | ".join(filter(None, texts))
+        self._write(f"{self._now().astimezone():%H:%M:%S} {name}: {line}")
 
 
 @contextmanager
-def _outcome(end: Callable[[str], None]) -> Iterator[None]:
-    """Tell how the context ends."""
-    outcome = "done"
-    try:
-        yield
-    except (KeyboardInterrupt, SystemExit):
-        outcome = "interrupted"
-        raise
-    except BaseException:
-        outcome = "failed"
-        raise
-    finally:
-        end(outcome)
-
-
-class ProgressCallback(Protocol):
-    """What takes the progress of a command."""
-
-    def __call__(self, what: str, share: float | None = None) -> None:
-        """Take what is being done, and the share of all that is done, 0 to 1, where known."""
-
-
-@contextmanager
-def progress_of(doing: str) -> Iterator[ProgressCallback]:
+def progress_of(doing: str) -> Iterator[Callable[..., None]]:
     """Show the progress of a command while the context lasts.
 
     Args:
         doing: Such as ``validating``.
+
+    Yields:
+        What takes what is being done, and the share of all that is done, 0 to 1, where known.
     """
     known = [0.0]
     with display() as show:
@@ -315,54 +298,36 @@ def _amounts(*states: PackProgress) -> str:
     return "  ".join(filter(None, texts))
 
 
-class Events:
-    """Reports packs as JSON events: the first, the last, and one a second of each dataset.
+class Events(_Lines):
+    """Reports packs as JSON events: the first, the last, and one a second of each dataset."""
 
-    Args:
-        stream: Where to.
-        timed: Say how long it still takes.
-        clock: Seconds; does not go back.
-        now: The time of day, with its zone.
-    """
-
-    def __init__(
-        self,
-        stream: TextIO,
-        *,
-        timed: bool = True,
-        clock: Callable[[], float] = time.monotonic,
-        now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
-    ) -> None:
-        self._stream, self._clock, self._now = stream, clock, now
-        self._pace = Pace(clock) if timed else None
+    def __init__(self, stream: TextIO, **more: Any) -> None:
+        super().__init__(stream, **more)
         self._states: States = {}
-        self._began = clock()
-        self._written: dict[Path, float] = {}
-        self._waiting: set[Path] = set()
+        self._written: dict[Path, tuple[float, PackProgress]] = {}
 
     def take(self, state: PackProgress) -> None:
         """Take a state, and write the event if one is due."""
         if not self._states:
-            self._write("start", dataset=str(state.dataset))
+            self._event("start", dataset=str(state.dataset))
         self._states[state.dataset] = state
-        self._waiting.add(state.dataset)
         before = self._written.get(state.dataset)
-        if before is None or self._clock() - before >= _EVENT_SECONDS:
+        if before is None or self._clock() - before[0] >= _EVENT_SECONDS:
             self._report(state)
 
     def end(self, outcome: str) -> None:
         """Write what was not due yet, and how it ended."""
-        for dataset in [one for one in self._states if one in self._waiting]:
-            self._report(self._states[dataset])
+        for dataset, state in self._states.items():
+            if self._written[dataset][1] is not state:
+                self._report(state)
         if self._states:
-            self._write("end", outcome=outcome, seconds=round(self._clock() - self._began, 3))
+            self._event("end", outcome=outcome, seconds=round(self._seconds, 3))
 
     def _report(self, state: PackProgress) -> None:
-        self._written[state.dataset] = self._clock()
-        self._waiting.discard(state.dataset)
+        self._written[state.dataset] = self._clock(), state
         done = packed_share(state) if state.phase == "packing" else state.done
         share = share_of(self._states)
-        self._write(
+        self._event(
             "progress",
             dataset=str(state.dataset),
             phase=state.phase,
@@ -381,12 +346,12 @@ class Events:
                 topic: {"done": done, "total": total}
                 for topic, (done, total) in state.topics.items()
             },
-            seconds_left=self._pace.left(share) if self._pace else None,
+            seconds_left=self._left(share),
         )
 
-    def _write(self, event: str, **values: Any) -> None:
+    def _event(self, event: str, **values: Any) -> None:
         now = self._now().isoformat(timespec="milliseconds")
-        _write(self._stream, json.dumps({"event": event, "time": now, **values}))
+        self._write(json.dumps({"event": event, "time": now, **values}))
 
 
 def _rounded(share: float | None) -> float | None:
@@ -404,8 +369,7 @@ def pack_progress(*, whole: bool = True) -> Iterator[Callable[[PackProgress], No
         What takes the progress, several times a second.
     """
     if is_json():
-        events = Events(sys.stderr, timed=whole)
-        with _outcome(events.end):
+        with Events(sys.stderr, timed=whole) as events:
             yield events.take
         return
     states: States = {}
