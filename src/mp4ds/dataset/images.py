@@ -24,8 +24,8 @@ from mp4ds.messages.serializations import MessageSplitter
 from mp4ds.messages.wire import CodedFields, ImageFields, Parts
 from mp4ds.options import seconds_text
 from mp4ds.records import Channel, Excerpt, Message
-from mp4ds.video.access import FrameReader, open_file_frames
-from mp4ds.video.decoder import VideoFile
+from mp4ds.video.access import FrameAccess, FrameReader
+from mp4ds.video.decoder import read_video_file
 from mp4ds.video.images import coded_pixels
 from mp4ds.video.pixels import Scale
 
@@ -250,10 +250,9 @@ class VideoImages(Images):
     def __init__(self, path: Path, track: int | None = None) -> None:
         self.path = self.video_path = path
         self.topic = path.stem
-        self._track = track
-        with VideoFile(path, track) as file:
-            self._codec, self.image_size, times = file.codec, file.size, file.times
-        self._columns = DecodedColumns.of_frames(times, times)
+        self._file = file = read_video_file(path, track)
+        self.image_size = file.size
+        self._columns = DecodedColumns.of_frames(file.times, file.times)
 
     @property
     def columns(self) -> DecodedColumns:
@@ -262,9 +261,12 @@ class VideoImages(Images):
 
     def open_reader(self) -> FrameReader:
         """A separate decoder for frames by number."""
-        size, track = self.image_size, self._track
-        return open_file_frames(
-            self.path, codec=self._codec, size=size, frames=len(self), track=track
+        file, maker = self._file, self._file.maker()
+        return FrameReader(
+            lambda: FrameAccess(
+                file.path, codec=file.codec, frames=len(self), maker=maker, track=file.track
+            ),
+            file.decoder,
         )
 
 

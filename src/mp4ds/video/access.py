@@ -20,7 +20,7 @@ from mp4ds.files.ranges import expect
 from mp4ds.messages.encodings import Picture, Pixels
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded import StreamParser, UnknownStructure
-from mp4ds.video.decoder import JpegDecoder, VideoFile, maker_of
+from mp4ds.video.decoder import JpegDecoder
 from mp4ds.video.media import raise_if_scarce
 from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.pixels import PictureMaker, Scale
@@ -544,26 +544,3 @@ class FrameReader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def open_file_frames(
-    path: Path, *, codec: str, size: tuple[int, int], frames: int, track: int | None
-) -> FrameReader:
-    """The frames of a third-party video by number, as 8-bit RGB.
-
-    Args:
-        path: The video.
-        codec: As in `VideoFile`.
-        size: As in `VideoFile`.
-        frames: How many there are.
-        track: As in `VideoFile`.
-
-    Raises:
-        VideoError: It cannot be read.
-    """
-    return FrameReader(
-        lambda: FrameAccess(
-            path, codec=codec, frames=frames, maker=maker_of(path, size), track=track
-        ),
-        lambda: VideoFile(path, track),
-    )

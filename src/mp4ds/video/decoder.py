@@ -6,8 +6,9 @@ import errno
 import io
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import closing, nullcontext, suppress
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -84,11 +85,6 @@ class JpegDecoder:
             frame.time_base = packet.time_base
         return [frame]
 
-    def frames(self, packets: Iterable[Any]) -> Iterator[av.VideoFrame]:
-        """The frames of packets, in order."""
-        for packet in packets:
-            yield from self.decode(packet)
-
     def flush_buffers(self) -> None:
         """There is nothing to forget."""
 
@@ -111,6 +107,7 @@ class VideoDecoder:
         frames: Expected number of frames.
         maker: Makes pictures of its frames.
         sequential: Decode with all cores, for reading in order.
+        file: What is known of a third-party video.
 
     Raises:
         VideoError: ``video-unreadable``, ``codec-mismatch`` or ``geometry-mismatch``.
@@ -124,13 +121,18 @@ class VideoDecoder:
         frames: int,
         maker: PictureMaker,
         sequential: bool = True,
+        file: VideoFile | None = None,
     ) -> None:
         self._path = path
         self._frames = frames
         self._maker = maker
+        self._file = file
         self._jpeg = JpegDecoder(maker.coded_size) if codec == "mjpeg" else None
-        self._ticks: NDArray[np.int64] | None = None
-        self._media = Media(path)
+        # frames that the decoder has begun beyond the last that it gave
+        self._in_flight = min(os.cpu_count() or 1, _MOST_THREADS) + 1 if sequential else 1
+        self._running: Iterator[tuple[int, Picture]] | None = None
+        self._asked: tuple[int, Scale | None] = -1, None
+        self._media = Media(path, file.track if file else None)
         self._container = self._media.container
         try:
             self._media.check(codec, maker.coded_size)
@@ -159,7 +161,7 @@ class VideoDecoder:
         """
         self._seek(0, 0)
         number = 0
-        for frame in self._decoded(0):
+        for frame in self._decoded(0, is_strict=True):
             if number == self._frames:
                 raise VideoError("frame-count", self._path, f"has more than {self._frames} frames")
             yield self._maker.make(frame, number, scale)
@@ -185,7 +187,7 @@ class VideoDecoder:
         Raises:
             VideoError: ``decode-failed`` with the frame's number, or ``frame-count``.
         """
-        for index, frame in self._chosen(indices, self._decoded):
+        for index, frame in self._chosen(indices, is_strict=True):
             if frame is None:
                 raise VideoError("decode-failed", self._path, "was not found", frame=index)
             yield index, self._maker.make(frame, index, scale)
@@ -199,45 +201,11 @@ class VideoDecoder:
         recorded, and damaged videos. For the latter decode on one core: with several, an error may
         take the picture before it along.
         """
-        for index, frame in self._chosen(indices, lambda _: self._decodable(), is_strict=False):
+        for index, frame in self._chosen(indices, is_strict=False):
             yield index, None if frame is None else self._maker.make(frame, index, scale)
 
-    def _chosen(
-        self,
-        indices: Iterable[int],
-        decode: Callable[[int], Iterator[av.VideoFrame]],
-        *,
-        is_strict: bool = True,
-    ) -> Iterator[tuple[int, av.VideoFrame | None]]:
-        """The frames with some numbers; None for one that the decoder does not output.
-
-        Args:
-            indices: The numbers.
-            decode: Decodes from the key frame with a number on.
-            is_strict: Whether it is an error if a key frame cannot be sought.
-        """
-        ticks, keys = self._presentation_ticks(), self._key_numbers
-        in_flight = min(os.cpu_count() or 1, _MOST_THREADS) + 1
-        frames: Iterator[av.VideoFrame] = iter(())
-        frame: av.VideoFrame | None = None
-        due = -in_flight - 1
-        for index in indices:
-            at = int(np.searchsorted(keys, index, side="right"))
-            key = int(keys[at - 1]) if at else 0
-            if key > due + in_flight:  # the decoder has begun the frames up to there
-                with nullcontext() if is_strict else suppress(VideoError):
-                    self._seek(int(ticks[index]), index)
-                frames, frame = decode(key), None
-            tick = int(ticks[index])
-            while frame is None or frame.pts is None or frame.pts < tick:
-                frame = next(frames, None)
-                if frame is None:
-                    break
-            due = index + 1
-            yield index, frame if frame is not None and frame.pts == tick else None
-
     def picture(self, index: int, scale: Scale | None = None) -> Picture:
-        """One picture, by seeking to the key frame before it.
+        """One picture; the next ones continue decoding, others seek to the key frame before them.
 
         Args:
             index: 0 <= index < frames.
@@ -246,7 +214,51 @@ class VideoDecoder:
         Raises:
             VideoError: It cannot be decoded.
         """
-        return next(self.pictures_at([index], scale))[1]
+        last, as_before = self._asked
+        self._asked = index, scale
+        if self._running is None or index <= last or scale != as_before:
+            self._running = self.pictures_at(iter(lambda: self._asked[0], None), scale)
+        try:
+            return next(self._running)[1]
+        except BaseException:
+            self._running = None
+            raise
+
+    def _chosen(
+        self, indices: Iterable[int], *, is_strict: bool
+    ) -> Iterator[tuple[int, av.VideoFrame | None]]:
+        """The frames with some numbers; None for one that the decoder does not output.
+
+        Args:
+            indices: The numbers.
+            is_strict: Whether it is an error if a key frame cannot be sought, or a frame decoded.
+        """
+        ticks, keys = self._index
+        frames: Iterator[av.VideoFrame] = iter(())
+        frame: av.VideoFrame | None = None
+        due = -self._in_flight - 1
+        for index in indices:
+            tick = int(ticks[index])
+            group = int(np.searchsorted(keys, index, side="right")) - 1
+            if (keys[group] if group >= 0 else 0) > due + self._in_flight:
+                frames, frame = self._decoded_from(group, index, is_strict=is_strict), None
+            frame = _shown_from(tick, frame, frames)
+            # of others, a key frame is sought by decoding time, which may lead to a later one
+            for earlier in range(group - 1, group - 1 - _TRIES, -1) if self._file else ():
+                if earlier < -1 or (frame is not None and frame.pts == tick):
+                    break
+                frames = self._decoded_from(earlier, index, is_strict=is_strict)
+                frame = _shown_from(tick, None, frames)
+            due = index + 1
+            yield index, frame if frame is not None and frame.pts == tick else None
+
+    def _decoded_from(self, group: int, index: int, *, is_strict: bool) -> Iterator[av.VideoFrame]:
+        """The frames from a key frame on, of which one is wanted; -1: from the first."""
+        ticks, keys = self._index
+        first = int(keys[group]) if group >= 0 else 0
+        with nullcontext() if is_strict else suppress(VideoError):
+            self._seek(int(ticks[first]), index)
+        return self._decoded(first, is_strict=is_strict)
 
     def _seek(self, tick: int, index: int) -> None:
         try:
@@ -256,50 +268,43 @@ class VideoDecoder:
             problem = f"cannot be reached: {reason_of(error)}"
             raise VideoError("decode-failed", self._path, problem, frame=index) from None
 
-    def _presentation_ticks(self) -> NDArray[np.int64]:
-        if self._ticks is None:
-            # without B-frames the index's decoding times are the presentation times
-            ticks = [entry.timestamp for entry in self._stream.index_entries][self._media.hidden :]
-            if len(ticks) != self._frames:
-                raise VideoError(
-                    "frame-count", self._path, f"has {len(ticks)} frames, not {self._frames}"
-                )
-            self._ticks = np.sort(np.array(ticks, dtype=np.int64))
-        return self._ticks
-
     @cached_property
-    def _key_numbers(self) -> NDArray[np.int64]:
-        keys = [entry.is_keyframe for entry in self._stream.index_entries]
-        return np.flatnonzero(keys[self._media.hidden :])
+    def _index(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Presentation ticks of the frames, and numbers of those at which decoding can begin."""
+        if self._file:
+            return self._file.ticks, self._file.keys
+        # without B-frames the index's decoding times are the presentation times
+        entries = self._stream.index_entries
+        ticks = [entry.timestamp for entry in entries][self._media.hidden :]
+        if len(ticks) != self._frames:
+            raise VideoError(
+                "frame-count", self._path, f"has {len(ticks)} frames, not {self._frames}"
+            )
+        keys = [entry.is_keyframe for entry in entries]
+        return np.sort(np.array(ticks, np.int64)), np.flatnonzero(keys[self._media.hidden :])
 
-    def _decoded(self, first: int) -> Iterator[av.VideoFrame]:
+    def _decoded(self, first: int, *, is_strict: bool) -> Iterator[av.VideoFrame]:
+        """The frames from here on; the first one's number is for errors."""
         number = first
-        try:
-            for frame in self._frames_from_here():
-                yield frame
-                number += 1
-        except _ERRORS as error:
-            raise_if_scarce(error)
-            problem = f"cannot be decoded: {reason_of(error)}"
-            raise VideoError("decode-failed", self._path, problem, frame=number) from None
-
-    def _frames_from_here(self) -> Iterator[av.VideoFrame]:
-        if self._jpeg is None:
-            yield from self._container.decode(self._stream)
-        else:
-            yield from self._jpeg.frames(self._container.demux(self._stream))
-
-    def _decodable(self) -> Iterator[av.VideoFrame]:
         try:
             for packet in self._container.demux(self._stream):
                 try:
                     frames = self._jpeg.decode(packet) if self._jpeg else packet.decode()
                 except FFmpegError as error:
                     raise_if_scarce(error)
+                    if is_strict:
+                        raise
                     continue
-                yield from (frame for frame in frames if not frame.is_corrupt)
+                for frame in frames:
+                    if is_strict or not frame.is_corrupt:
+                        yield frame
+                        number += 1
         except _ERRORS as error:
-            raise_if_scarce(error)  # what comes after that is not there
+            raise_if_scarce(error)
+            if is_strict:
+                problem = f"cannot be decoded: {reason_of(error)}"
+                raise VideoError("decode-failed", self._path, problem, frame=number) from None
+            # what comes after that is not there
 
     def close(self) -> None:
         """Close the file."""
@@ -312,6 +317,17 @@ class VideoDecoder:
         self.close()
 
 
+def _shown_from(
+    tick: int, frame: av.VideoFrame | None, frames: Iterator[av.VideoFrame]
+) -> av.VideoFrame | None:
+    """The first frame shown at a tick or later, beginning with one that was decoded already."""
+    while frame is None or frame.pts is None or frame.pts < tick:
+        frame = next(frames, None)
+        if frame is None:
+            break
+    return frame
+
+
 # ---------------------------------------------------------------- third-party videos
 
 _SECOND = 1_000_000_000
@@ -319,173 +335,104 @@ _LATEST = 2**63 // _SECOND - 1  # seconds
 _TRIES = 3
 
 
+@dataclass(frozen=True, eq=False, slots=True)
 class VideoFile:
-    """A video track of an mp4, of any known codec. A context manager.
+    """A video track of an mp4 without a sidecar, of any known codec.
+
+    Attributes:
+        path: The video.
+        track: Which video track, from 0; None: there is only one.
+        codec: Name in the registry, or ffmpeg's.
+        size: Width and height of its frames, as coded.
+        ticks: Presentation times in ticks of the track, int64, shape (frames,), in order.
+        keys: Numbers of the frames at which decoding can begin.
+        times: Presentation times, nanoseconds, rounded down, int64, shape (frames,).
+    """
+
+    path: Path
+    track: int | None
+    codec: str
+    size: tuple[int, int]
+    ticks: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    times: NDArray[np.int64]
+
+    def maker(self) -> PictureMaker:
+        """Makes 8-bit RGB of its frames, by its colour tags."""
+        return PictureMaker(
+            self.path,
+            coded_size=self.size,
+            picture_format="rgb24",
+            picture_size=self.size,
+            matrix=None,
+            full_range=False,
+        )
+
+    def decoder(self) -> VideoDecoder:
+        """A separate decoder of its frames as 8-bit RGB."""
+        return VideoDecoder(
+            self.path,
+            codec=self.codec,
+            frames=len(self.ticks),
+            maker=self.maker(),
+            sequential=False,
+            file=self,
+        )
+
+
+def read_video_file(path: Path, track: int | None = None) -> VideoFile:
+    """Find out what is in a video without a sidecar.
 
     Args:
         path: The video.
         track: Which video track, from 0; None: there is only one.
 
-    Attributes:
-        codec: Name in the registry, or ffmpeg's.
-        size: Width and height of its frames, as coded.
-        times: Presentation times, nanoseconds, rounded down, int64, shape (frames,), in order.
-
     Raises:
         VideoError: It cannot be read, or has several video tracks; lists them.
         OptionError: It has no such track.
     """
+    advice = "; `mp4ds.open` takes the number of one as `track`"
+    with closing(Media(path, track, advice)) as media:
+        context = media.track.codec_context
+        width, height = context.width, context.height
+        if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
+            raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
+        name = context.codec.canonical_name
+        codec = next((key for key, value in CODECS.items() if value.ffmpeg == name), name)
+        ticks, keys = _read_ticks(media, path, track)
+        if not len(ticks):
+            raise VideoError("video-unreadable", path, "has no frames")
+        base = media.track.time_base
+        if np.abs(ticks[[0, -1]]).max() * base >= _LATEST or base.numerator != 1:
+            raise VideoError("video-unreadable", path, "has times beyond 64 bits")
+        whole, part = np.divmod(ticks, base.denominator)
+        times = whole * _SECOND + part * _SECOND // base.denominator
+        # a key frame may be hidden: the next one shown is decoded from it
+        numbers = np.unique(np.searchsorted(ticks, keys))
+        return VideoFile(path, track, codec, (width, height), ticks, numbers, times)
 
-    def __init__(self, path: Path, track: int | None = None) -> None:
-        self._path = path
-        self._track = track
-        self._frames: Iterator[av.VideoFrame] = iter(())
-        self._last: int | None = None
-        self._media = Media(path, track, "; `mp4ds.open` takes the number of one as `track`")
-        try:
-            self._stream = self._media.track
-            context: Any = self._stream.codec_context
-            self.size: tuple[int, int] = context.width, context.height
-            name = context.codec.canonical_name
-            self.codec = next((key for key, value in CODECS.items() if value.ffmpeg == name), name)
-            if not 1 <= min(self.size) <= max(self.size) <= MAX_SIDE:
-                width, height = self.size
-                raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
-            self._stream.thread_count = 1  # threads inherited over a fork would never end
-            self._maker = maker_of(path, self.size)
-            self._ticks, self._keys = self._read_ticks()
-            if not len(self._ticks):
-                raise VideoError("video-unreadable", path, "has no frames")
-            self.times = self._nanoseconds()
-        except BaseException:
-            self.close()
-            raise
 
-    def _read_ticks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Presentation ticks of the frames, and those of the key frames."""
-        try:
-            with self._path.open("rb") as file:
-                size = self._path.stat().st_size
-                table = read_sample_table(file, size, str(self._path), self._track)
-        except Refused:
-            return self._read_packets()
-        except OSError as error:
-            raise VideoError("video-unreadable", self._path, f"cannot be read: {error}") from None
-        ticks = table.presentation[table.order]
-        return ticks, np.sort(table.presentation[table.sync])
-
-    def _read_packets(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Like `_read_ticks`, from the packets, all of which are read."""
+def _read_ticks(
+    media: Media, path: Path, track: int | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Presentation ticks of the frames, and those of the key frames."""
+    try:
+        with path.open("rb") as file:
+            table = read_sample_table(file, path.stat().st_size, str(path), track)
+        return table.presentation[table.order], np.sort(table.presentation[table.sync])
+    except Refused:  # ffmpeg reads more, though only by all packets
         ticks, keys = [], []
-        try:
-            for packet in self._media.container.demux(self._stream):
-                if packet.pts is None:
-                    continue
-                if packet.is_keyframe:
-                    keys.append(packet.pts)
-                if not packet.is_discard:
-                    ticks.append(packet.pts)
-        except (FFmpegError, OSError) as error:
-            raise_if_scarce(error)
-            raise VideoError("video-unreadable", self._path, f"cannot be read: {error}") from None
-        return np.sort(np.array(ticks, np.int64)), np.sort(np.array(keys, np.int64))
-
-    def _nanoseconds(self) -> NDArray[np.int64]:
-        base = self._stream.time_base
-        latest = np.abs(self._ticks[[0, -1]]).max()
-        if latest * base >= _LATEST or base.numerator != 1:
-            raise VideoError("video-unreadable", self._path, "has times beyond 64 bits")
-        whole, part = np.divmod(self._ticks, base.denominator)
-        times: NDArray[np.int64] = whole * _SECOND + part * _SECOND // base.denominator
-        return times
-
-    def picture(self, index: int, scale: Scale | None = None) -> Picture:
-        """One frame as 8-bit RGB; the next ones continue decoding, others seek to their key frame.
-
-        Args:
-            index: 0 <= index < frames.
-            scale: See `PictureMaker.make`.
-
-        Returns:
-            One array of shape (H, W, 3), valid until the next one is requested.
-
-        Raises:
-            VideoError: It cannot be decoded.
-        """
-        tick = int(self._ticks[index])
-        group = self._group(tick)
-        if (
-            self._last is None
-            or index <= self._last
-            or group != self._group(self._tick(self._last))
-        ):
-            self._seek(group, index)
-        self._last = None
-        frame = self._next_at(tick, index)
-        for _ in range(_TRIES):
-            if frame is not None or group < 0:
-                break
-            # sought by decoding time, which may have led to a later key frame
-            group -= 1
-            self._seek(group, index)
-            frame = self._next_at(tick, index)
-        if frame is None:
-            raise VideoError("decode-failed", self._path, "was not found", frame=index)
-        picture = self._maker.make(frame, index, scale)
-        self._last = index
-        return picture
-
-    def _tick(self, index: int) -> int:
-        return int(self._ticks[index])
-
-    def _group(self, tick: int) -> int:
-        """Number of the last key frame shown by then, or -1."""
-        return int(np.searchsorted(self._keys, tick, side="right")) - 1
-
-    def _seek(self, group: int, index: int) -> None:
-        container = self._media.container
-        try:
-            container.seek(
-                int(self._keys[group] if group >= 0 else self._ticks[0]), stream=self._stream
-            )
-            if self.codec == "mjpeg":
-                self._frames = JpegDecoder(self.size).frames(container.demux(self._stream))
-            else:
-                self._frames = container.decode(self._stream)
-        except (FFmpegError, OSError) as error:
-            raise_if_scarce(error)
-            problem = f"cannot be reached: {reason_of(error)}"
-            raise VideoError("decode-failed", self._path, problem, frame=index) from None
-
-    def _next_at(self, tick: int, index: int) -> av.VideoFrame | None:
-        try:
-            for frame in self._frames:
-                if frame.pts is not None and frame.pts >= tick:
-                    return frame if frame.pts == tick else None
-        except (FFmpegError, OSError) as error:
-            raise_if_scarce(error)
-            problem = f"cannot be decoded: {reason_of(error)}"
-            raise VideoError("decode-failed", self._path, problem, frame=index) from None
-        return None
-
-    def close(self) -> None:
-        """Close the file."""
-        self._media.close()
-
-    def __enter__(self) -> VideoFile:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def maker_of(path: Path, size: tuple[int, int]) -> PictureMaker:
-    """Makes 8-bit RGB of the frames of a third-party video, by its colour tags."""
-    return PictureMaker(
-        path,
-        coded_size=size,
-        picture_format="rgb24",
-        picture_size=size,
-        matrix=None,
-        full_range=False,
-    )
+    except OSError as error:
+        raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
+    try:
+        for packet in media.container.demux(media.track):
+            if packet.pts is None:
+                continue
+            if packet.is_keyframe:
+                keys.append(packet.pts)
+            if not packet.is_discard:
+                ticks.append(packet.pts)
+    except (FFmpegError, OSError) as error:
+        raise_if_scarce(error)
+        raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
+    return np.sort(np.array(ticks, np.int64)), np.sort(np.array(keys, np.int64))
