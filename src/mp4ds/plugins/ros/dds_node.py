@@ -53,7 +53,6 @@ from mp4ds.plugins.ros.dds_types import (
 from mp4ds.plugins.ros.node import NodeOptions, Service
 from mp4ds.plugins.ros.qos import Qos
 from mp4ds.plugins.ros.ros2 import (
-    RECEIVED,
     Ros2Node,
     described_definition,
     finite,
@@ -277,7 +276,7 @@ _SETTLE_S = 0.3
 
 _PREFIX = "rt/"
 _MOST_ENDPOINTS = 10_000
-_LOOK_NS = 50_000_000  # between two checks for new publishers of a topic that is listened to
+_LOOK_NS = 50_000_000  # between two checks for new readers
 _DESCRIBES = re.compile(r"rr/(.+)/get_type_descriptionReply")
 """DDS topic of the replies of a node that can be asked for the definitions of its types."""
 
@@ -325,10 +324,7 @@ class DdsNode(Ros2Node):
         self._found: dict[str, _Found] = {}
         self._describing: dict[Any, list[str]] = defaultdict(list)  # nodes, by participant
         self._readers: list[tuple[Any, Callable[[Any], None]]] = []
-        self._sought: list[tuple[str, Callable[[Any], None], set[str]]] = []
         self._services: list[_Server] = []
-        self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
 
     @property
     def address(self) -> str:
@@ -340,33 +336,14 @@ class DdsNode(Ros2Node):
 
     # ------------------------------------------------------------ receiving
 
-    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Subscribe to a topic as soon as it has a publisher, whatever its type."""
-        name = dds_topic(topic)
-        if name is None:
-            raise OptionError(f"{topic!r} is not a valid ROS 2 topic name.")
-        with self._lock:
-            self._sought.append((name, lambda _: on_message(None), set()))
-        self._start()
-
-    def _seek(self, name: str, on_sample: Callable[[Any], None], known: set[str]) -> None:
-        """Read what is published on a topic that is listened to."""
-        found = self._found.get(name, _Found(0.0))
-        for publisher in list(found.publishers.values()):
-            if publisher.type_name not in known:
-                known.add(publisher.type_name)
-                kind = publisher_type(self._participant, publisher)
-                qos = Qos(depth=RECEIVED, reliability=_offered_by(publisher.qos).reliability)
-                with suppress(DDSException):  # a second type: a participant can have only one
-                    self._reader(name, kind, qos, _user_data(publisher, _HASH), on_sample)
-
     def _read(
         self, topic: str, kind: str, qos: Qos, on_message: Callable[[bytes, int], object]
     ) -> Any:
         name = _PREFIX + topic.lstrip("/")
-        found = self._found.get(name)
-        if found is not None and found.kind is not None:
-            message_class, type_hash = found.kind, _user_data(_publisher_of(found, kind), _HASH)
+        found = self._found.get(name, _Found(0.0))
+        if publisher := _publisher_of(found, kind):
+            message_class = found.kind or publisher_type(self._participant, publisher)
+            type_hash = _user_data(publisher, _HASH)
         else:
             made = message_type(Channel(0, topic, "cdr", Schema(kind, "", b""), {}))
             message_class, type_hash = made.writes, made.type_hash
@@ -375,29 +352,22 @@ class DdsNode(Ros2Node):
             on_message(sample.payload, sample.sample_info.source_timestamp)
 
         try:
-            return self._reader(name, message_class, qos, type_hash, on_sample)
+            reader = DataReader(
+                self._participant,
+                Topic(self._participant, name, message_class),
+                qos=_dds_qos(qos, _told(type_hash), is_reader=True),
+            )
         except DDSException as error:
             raise Refused(f"DDS refuses the subscription: {error.msg}") from None
-
-    def _reader(
-        self, name: str, kind: Any, qos: Qos, type_hash: str, on_sample: Callable[[Any], None]
-    ) -> Any:
-        """Call back with each valid sample on a topic; returns the reader."""
-        topic = Topic(self._participant, name, kind)
-        dds_qos = _dds_qos(qos, _told(type_hash), is_reader=True)
-        reader = DataReader(self._participant, topic, qos=dds_qos)
         self._hear(reader, on_sample)
         return reader
 
     def _hear(self, reader: Any, on_sample: Callable[[Any], None]) -> None:
+        """Call back with each valid sample that a reader gets."""
         with self._lock:
             self._readers.append((reader, on_sample))
-        self._start()
-
-    def _start(self) -> None:
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="mp4ds-dds", daemon=True)
-            self._thread.start()
+            if len(self._readers) == 1:
+                self._start(self._run)
 
     def _run(self) -> None:
         waiting = WaitSet(self._participant)
@@ -405,14 +375,10 @@ class DdsNode(Ros2Node):
         any_state = SampleState.Any | ViewState.Any | InstanceState.Any
         while not self._ended.is_set():
             with self._lock:
-                readers, sought = list(self._readers), list(self._sought)
+                readers = list(self._readers)
             for reader, _ in readers[len(attached) :]:
                 attached.append(ReadCondition(reader, any_state))
                 waiting.attach(attached[-1])
-            if sought:
-                self._discover()
-            for one in sought:
-                self._seek(*one)
             waiting.wait(_LOOK_NS)
             for reader, on_sample in readers:
                 for sample in reader.take(_BATCH):
@@ -469,10 +435,7 @@ class DdsNode(Ros2Node):
             found.definition = standard_definition(kind, type_hash)
             found.definition = found.definition or announced_definition(found.kind, type_hash)
             if type_hash and not found.definition:
-                found.asking = threading.Thread(
-                    target=self._ask, args=(found, publisher, kind, type_hash), daemon=True
-                )
-                found.asking.start()
+                found.asking = self._start(self._ask, found, publisher, kind, type_hash)
         return found.asking is None or not found.asking.is_alive()
 
     def _ask(self, found: _Found, publisher: Any, kind: str, type_hash: str) -> None:
@@ -488,6 +451,11 @@ class DdsNode(Ros2Node):
         found = self._found[_PREFIX + topic.lstrip("/")]
         offered = [_offered_by(one.qos) for one in found.publishers.values()]
         return offered, _user_data(_publisher_of(found, kind), _HASH), found.definition
+
+    def _kinds_of(self, topic: str) -> Sequence[str]:
+        self._discover()
+        found = self._found.get(_PREFIX + topic.lstrip("/"), _Found(0.0))
+        return [ros_type(one.type_name) for one in found.publishers.values()]
 
     def _count_lost(self) -> None:
         for topic, reader in self._received.items():
@@ -513,10 +481,7 @@ class DdsNode(Ros2Node):
         if self._ended.is_set():
             return
         self._part()
-        self._ended.set()
-        for thread in (self._thread, *(one.asking for one in self._found.values())):
-            if thread and thread is not threading.current_thread():
-                thread.join()
+        self._end_threads()
         self._count_lost()
         self._readers.clear()
         self._received.clear()
@@ -525,7 +490,9 @@ class DdsNode(Ros2Node):
 
 
 def _publisher_of(found: _Found, kind: str) -> Any:
-    return next(one for one in found.publishers.values() if ros_type(one.type_name) == kind)
+    """One of the publishers of a type; None if there is none."""
+    known = (one for one in found.publishers.values() if ros_type(one.type_name) == kind)
+    return next(known, None)
 
 
 # ---------------------------------------------------------------- services

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
-import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,15 +26,13 @@ from rclpy.qos import (
 )
 from rosidl_runtime_py.utilities import get_message, get_service
 
-from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
+from mp4ds.errors import ConversionError, PublishError, Refused
 from mp4ds.plugins.ros.node import NodeOptions, Service
-from mp4ds.plugins.ros.qos import Qos, asked_qos
+from mp4ds.plugins.ros.qos import Qos
 from mp4ds.plugins.ros.ros2 import (
-    RECEIVED,
     Ros2Node,
     finite,
     installed_definition,
-    is_topic,
     recorded_hash,
     standard_definition,
 )
@@ -85,9 +81,7 @@ class RclpyNode(Ros2Node):
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._compared: set[str] = set()
-        self._ended = threading.Event()
-        self._threads = [threading.Thread(target=self._spin, name="mp4ds-rclpy", daemon=True)]
-        self._threads[0].start()
+        self._start(self._spin)
 
     def _spin(self) -> None:
         try:
@@ -143,31 +137,20 @@ class RclpyNode(Ros2Node):
             on_message(raw, info["source_timestamp"])
 
         message_class = _installed_class(topic, kind)
-        return self._node.create_subscription(
-            message_class, topic, callback, _profile(qos), raw=True
-        )
+        try:
+            return self._node.create_subscription(
+                message_class, topic, callback, _profile(qos), raw=True
+            )
+        except Exception as error:  # rclpy's errors have no common base
+            raise Refused(f"ROS 2 refuses the subscription: {error}") from None
 
-    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Subscribe to a topic as soon as it has a publisher."""
-        if not is_topic(topic):
-            raise OptionError(f"{topic!r} is not a valid ROS 2 topic name.")
-        thread = threading.Thread(target=self._seek, args=(topic, on_message), daemon=True)
-        self._threads.append(thread)
-        thread.start()
-
-    def _seek(self, topic: str, on_message: Callable[[int | None], None]) -> None:
+    def _kinds_of(self, topic: str) -> Sequence[str]:
         own = self._node.get_name()
-        while not self._ended.wait(_SPIN_S):
-            found = self._node.get_publishers_info_by_topic(topic)
-            others = [one for one in found if one.node_name != own]
-            if others:
-                asked = asked_qos([_offered_by(one.qos_profile) for one in others], RECEIVED)
-                try:
-                    qos = replace(asked, durability="volatile")  # no message of the past
-                    self._read(topic, others[0].topic_type, qos, lambda *_: on_message(None))
-                except (Refused, ConversionError) as error:
-                    self._node.get_logger().error(f"{topic}: {error}")
-                return
+        found = self._node.get_publishers_info_by_topic(topic)
+        return [one.topic_type for one in found if one.node_name != own]
+
+    def _complain(self, text: str) -> None:
+        self._node.get_logger().error(text)
 
     def topics(self, is_wanted: Callable[[str, str], bool]) -> Mapping[str, Sequence[str]]:
         """Topics that are published; on request, also the others."""
@@ -214,10 +197,7 @@ class RclpyNode(Ros2Node):
             return
         if self._context.ok():
             self._part()
-        self._ended.set()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join()
+        self._end_threads()
         self._executor.shutdown()
         self._node.destroy_node()
         self._context.try_shutdown()

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 import struct
+import threading
 import time
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,7 +22,7 @@ from mp4ds.bags.types import (
     ros2_version,
     types_of,
 )
-from mp4ds.errors import ConversionError, Refused
+from mp4ds.errors import ConversionError, OptionError, Refused
 from mp4ds.plugins.ros.names import SERVICE_EVENTS
 from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions, Receive
 from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, asked_qos, offered_qos, qos_text
@@ -33,6 +35,7 @@ RECEIVED = 100
 _NS = 10**9
 _LITTLE = b"\0\1\0\0"
 _PARTING_S = 3.0
+_LOOK_S = 0.05  # between two checks for publishers of a topic that is listened to
 _TOPIC = re.compile(r"/?[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*", re.ASCII)
 
 
@@ -72,6 +75,8 @@ class Ros2Node(Node):
         self._clock: Writer | None = None
         self._channels: dict[int, tuple[Channel, Writer]] = {}  # by id()
         self._shared: dict[tuple[str, Hashable, Qos], Writer] = {}
+        self._ended = threading.Event()
+        self._threads: list[threading.Thread] = []
         self._received: dict[str, Any] = {}  # subscriptions of the library, by topic
 
     @abstractmethod
@@ -97,6 +102,26 @@ class Ros2Node(Node):
     @abstractmethod
     def _announced(self, topic: str, kind: str) -> tuple[list[Qos], str, str]:
         """What publishers offer, and the hash and definition of their type, empty if unknown."""
+
+    @abstractmethod
+    def _kinds_of(self, topic: str) -> Sequence[str]:
+        """Types of a topic that other nodes publish."""
+
+    def _complain(self, text: str) -> None:
+        """Say that something does not work, where nodes say so."""
+
+    def _start(self, work: Callable[..., None], *arguments: Any) -> threading.Thread:
+        """Run something in a thread until it is done, or the node has ended."""
+        thread = threading.Thread(target=work, args=arguments, name="mp4ds-ros2", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+        return thread
+
+    def _end_threads(self) -> None:
+        self._ended.set()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join()
 
     # ------------------------------------------------------------ publishing
 
@@ -158,6 +183,24 @@ class Ros2Node(Node):
             on_time(clock_time(data))
 
         self._read(self._clock_topic, CLOCK_TYPE, CLOCK_QOS, on_message)
+
+    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
+        """Subscribe to a topic as soon as it has a publisher, whatever its type."""
+        if not is_topic(topic):
+            raise OptionError(f"{topic!r} is not a valid ROS 2 topic name.")
+        self._start(self._seek, topic, on_message)
+
+    def _seek(self, topic: str, on_message: Callable[[int | None], None]) -> None:
+        known: set[str] = set()
+        while not self._ended.wait(_LOOK_S):
+            for kind in {*self._kinds_of(topic)} - known:
+                known.add(kind)
+                asked = asked_qos(self._announced(topic, kind)[0], RECEIVED)
+                qos = replace(asked, durability="volatile")  # no message of the past
+                try:
+                    self._read(topic, kind, qos, lambda *_: on_message(None))
+                except (Refused, ConversionError) as error:  # perhaps because of another type
+                    self._complain(f"{topic}: {error}")
 
     def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> Channel:
         """Subscribe with the QoS that the publishers offer, on a channel as rosbag2 records it."""
