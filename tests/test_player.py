@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from coded_scenes import CODED
 from mp4ds.errors import OptionError
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import FollowedClock, Pace
@@ -27,6 +28,7 @@ from player_scenes import (
     run,
     running,
 )
+from sources import SOURCES
 from waiting import until
 
 FIRST = START
@@ -465,6 +467,19 @@ def test_publishing_as_jpeg(drive: tuple[Path, list[Recorded]]) -> None:
     assert len(files) == 20
     assert all(b"\xff\xd8" in sent.payload[:80] for sent in files)
     assert [sent.time_ns for sent in files] == [item[2] for item in drive[1] if item[0] == CAMERA]
+
+
+def test_pictures_that_cannot_be_decoded_are_published_as_recorded(tmp_path: Path) -> None:
+    """Though all of their channel was expected to become raw images."""
+    (tmp_path / "source").mkdir()
+    made = CODED["video-h265-lost"]()
+    mp4ds.pack(SOURCES["mcap-ros2-zstd"](tmp_path / "source", made), tmp_path / "video")
+    publisher, summary = run(
+        tmp_path / "video", RecordingPublisher("ros2"), immediate=True, publish_as="raw"
+    )
+    (reasons,) = summary.as_recorded.values()
+    recorded = [sent for sent in publisher.sent if sent.topic in summary.as_recorded]
+    assert len(recorded) == reasons["its picture cannot be decoded"] > 0
 
 
 @pytest.mark.parametrize(

@@ -340,6 +340,12 @@ class Player:
             stacklevel=2,
         )
 
+    def _is_missing(self, message: Message) -> bool:
+        """Whether the type of a message is not installed."""
+        if id(message.channel) not in self._advertised:  # of an image that could not be converted
+            self._advertise([message.channel])
+        return id(message.channel) in self._missing
+
     def _wait(self, seconds: float, state: str) -> None:
         end = time.monotonic() + seconds
         while not self._is_stopped and (left := end - time.monotonic()) > 0:
@@ -388,7 +394,7 @@ class Player:
 
     def _seconds_until(self, due: Message | None) -> tuple[float, str]:
         """How long to wait, and the state meanwhile; 0: publish the message now."""
-        if due is not None and id(due.channel) in self._missing:
+        if due is not None and self._is_missing(due):
             return 0.0, "playing"
         self._pause_before(due)
         if self._is_paused:
@@ -518,9 +524,7 @@ class Player:
                 return
         if self._playback is not None:
             next(self._playback)
-        if id(due.channel) not in self._advertised:  # of an image that could not be converted
-            self._advertise([due.channel])
-        if id(due.channel) in self._missing:
+        if self._is_missing(due):
             self._done.not_installed[due.channel.topic] += 1
         elif not (self._timeline.is_frame(due) and self._is_late(due.log_time)):
             if self._has_clock(due):
@@ -552,7 +556,7 @@ class Player:
                 self._last_frame = due.log_time
 
     def _send(self, due: Message, time_ns: int) -> None:
-        if id(due.channel) in self._missing:
+        if self._is_missing(due):
             return
         payload = due.data if self._restamper is None else self._restamper.restamped(due)
         self._node.publish(due.channel, payload, time_ns)
