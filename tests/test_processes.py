@@ -281,7 +281,7 @@ def test_an_error_of_the_caller_ends_what_runs(tmp_path: Path) -> None:
 
 
 def test_a_process_ends_when_its_caller_is_killed(tmp_path: Path) -> None:
-    """It works for nobody: its standard input is closed then."""
+    """It works for nobody: the socket of its calls is closed then."""
     caller = (
         "from mp4ds.packing.processes import ProcessExecutor\n"
         f"ProcessExecutor(1).submit(exec, {SLEEP.format(str(tmp_path))!r}).result()"

@@ -1,7 +1,7 @@
 """An executor whose calls run in processes of this machine.
 
-``python -m mp4ds.packing.processes`` is such a process: it takes calls from its standard input, and
-answers each on its standard output.
+``python -m mp4ds.packing.processes`` is such a process: it takes calls from a socket that it
+inherits, and answers each there.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -75,9 +74,7 @@ def release_memory() -> None:
 
 _STDERR_BYTES = 2_000
 _TERMINATE_SECONDS = 5.0
-_TRIES = 2
 _KEPT_BYTES = 400 * 2**20
-_IDLE_SECONDS = 60.0  # a process without calls for so long ends; starting one takes a second
 
 
 @dataclass
@@ -88,17 +85,17 @@ class _Call:
         future: Gets its result.
         function: Pickled; a process keeps the one that it was given last, with all that this holds.
         arguments: Pickled.
-        tries: How often it was begun.
+        is_again: Whether a process was killed that made it.
     """
 
     future: Future[Any]
     function: bytes
     arguments: bytes
-    tries: int = 0
+    is_again: bool = False
 
 
-class ProcessExecutor(Executor):
-    """Runs calls in processes of its own, each of them one call at a time.
+class ProcessExecutor(ThreadPoolExecutor):
+    """Runs calls in processes of its own, each of them one call at a time, waited for by a thread.
 
     Other than of a `ProcessPoolExecutor`, its processes do not import the caller's main module,
     which would have to be guarded; and where one of them is killed, its call alone is made once
@@ -112,28 +109,54 @@ class ProcessExecutor(Executor):
     """
 
     def __init__(self, processes: int, *, nice: int = 0) -> None:
-        self._most = processes
+        super().__init__(processes)
         self._nice = nice
-        self._waiting: deque[_Call] = deque()
-        self._threads: list[threading.Thread] = []
-        self._running: set[_Process] = set()
-        self._changed = threading.Condition()
-        self._is_closed = self._is_ended = False
+        self._is_ended = False
+        self._own = threading.local()  # the process of a thread
+        self._processes: set[_Process] = set()
 
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Make a call in a process, of a function that can be pickled."""
         call = _Call(Future(), pickle.dumps(fn), pickle.dumps((args, kwargs)))
-        with self._changed:
-            if self._is_closed:
-                raise RuntimeError("no more calls after shutdown")
-            self._waiting.append(call)
-            if len(self._threads) < self._most:
-                # a daemon: as this process is killed, nobody waits for a call
-                thread = threading.Thread(target=self._work, daemon=True)
-                self._threads.append(thread)
-                thread.start()
-            self._changed.notify()
+        self._hand_out(call)
         return call.future
+
+    def _hand_out(self, call: _Call) -> None:
+        turn = super().submit(self._make, call)
+        turn.add_done_callback(lambda turn: turn.cancelled() and call.future.cancel())
+
+    def _make(self, call: _Call) -> None:
+        """Make a call; in a thread."""
+        if not call.is_again and not call.future.set_running_or_notify_cancel():
+            return
+        try:
+            process = self._ready()
+        except OSError as error:
+            call.future.set_exception(error)
+            return
+        answer = process.make(call)
+        if not isinstance(answer, BaseException):
+            call.future.set_result(answer)
+            return
+        if process.was_killed and not call.is_again:
+            call.is_again = True
+            with suppress(RuntimeError):  # it takes no more calls
+                self._hand_out(call)
+                return
+        call.future.set_exception(answer)
+
+    def _ready(self) -> _Process:
+        """The process of this thread."""
+        process: _Process | None = getattr(self._own, "process", None)
+        if process is None or not process.is_ready:
+            if process is not None:
+                self._processes.discard(process)
+                process.close()
+            process = self._own.process = _Process(self._nice)
+            self._processes.add(process)
+            if self._is_ended:
+                process.terminate()
+        return process
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Take no more calls.
@@ -142,74 +165,20 @@ class ProcessExecutor(Executor):
             wait: Wait for those that were taken.
             cancel_futures: Drop those that are waiting, and end those that are running.
         """
-        with self._changed:
-            self._is_closed = True
-            if cancel_futures:
-                self._is_ended = True
-                while self._waiting:
-                    self._waiting.pop().future.cancel()
-            ended = list(self._running) if cancel_futures else []
-            self._changed.notify_all()
-        for process in ended:
-            process.terminate()
-        for process in ended:
-            process.wait_or_kill()
-        for thread in self._threads if wait else ():
-            thread.join()
+        super().shutdown(wait=False, cancel_futures=cancel_futures)
+        if cancel_futures:
+            self._is_ended = True
+            ended = list(self._processes)
+            for process in ended:
+                process.terminate()
+            for process in ended:
+                process.wait_or_kill()
+        super().shutdown(wait=wait)
+        while wait and self._processes:
+            self._processes.pop().close()
 
     def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
         self.shutdown(cancel_futures=exc_type is not None)
-
-    def _work(self) -> None:
-        """Make calls, one after another; in a thread for each process."""
-        process: _Process | None = None
-        while (call := self._next(process)) is not None:
-            try:
-                if process is None or not process.is_ready:
-                    process = self._begun()
-            except OSError as error:
-                call.future.set_exception(error)
-                continue
-            answer = process.make(call)
-            if not isinstance(answer, BaseException):
-                call.future.set_result(answer)
-            elif not (process.was_killed and self._is_tried_again(call)):
-                call.future.set_exception(answer)
-
-    def _next(self, process: _Process | None) -> _Call | None:
-        """The next call, waited for; None after the last one."""
-        with self._changed:
-            while True:
-                while not self._waiting and not self._is_closed:
-                    if not self._changed.wait(_IDLE_SECONDS):
-                        break
-                is_idle = not self._waiting or (process is not None and not process.is_ready)
-                if process is not None and is_idle:
-                    self._running.discard(process)
-                    process.close()
-                    process = None
-                if self._waiting:
-                    call = self._waiting.popleft()
-                    call.tries += 1
-                    if call.tries > 1 or call.future.set_running_or_notify_cancel():
-                        return call
-                elif self._is_closed:
-                    return None
-
-    def _begun(self) -> _Process:
-        process = _Process(self._nice)
-        with self._changed:
-            self._running.add(process)
-            if self._is_ended:
-                process.terminate()
-        return process
-
-    def _is_tried_again(self, call: _Call) -> bool:
-        with self._changed:
-            if call.tries == _TRIES or self._is_ended:
-                return False
-            self._waiting.append(call)
-            return True
 
 
 class _Process:
@@ -224,22 +193,18 @@ class _Process:
         self.is_ready = True
         self.was_killed = False
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __spec__.name, str(nice)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._stderr,
-            bufsize=0,
-            # the terminal's Ctrl-C is for this process, which ends the others
-            start_new_session=True,
-        )
-        pipes = self._process.stdin, self._process.stdout
-        fds = [os.dup(pipe.fileno()) for pipe in pipes if pipe is not None]
-        for pipe in pipes:
-            if pipe is not None:
-                pipe.close()
-        self._calls = Connection(fds[0], readable=False)
-        self._answers = Connection(fds[1], writable=False)
+        self._calls, theirs = Pipe()
+        with theirs:
+            socket = theirs.fileno()
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", __spec__.name, str(socket), str(nice)],
+                stdin=subprocess.DEVNULL,
+                stdout=self._stderr,
+                stderr=self._stderr,
+                pass_fds=[socket],
+                # the terminal's Ctrl-C is for this process, which ends the others
+                start_new_session=True,
+            )
 
     def make(self, call: _Call) -> Any:
         """Make a call; returns its result, or the error to raise."""
@@ -247,7 +212,7 @@ class _Process:
         self._stderr.truncate()  # earlier calls told nothing of this one
         try:
             self._calls.send((call.function, call.arguments))
-            result, error, self.is_ready = self._answers.recv()
+            result, error, self.is_ready = self._calls.recv()
         except (OSError, EOFError):
             self.is_ready = False
             return self._death()
@@ -282,7 +247,6 @@ class _Process:
         """Let it end: there is nothing more to do."""
         self.is_ready = False
         self._calls.close()
-        self._answers.close()
         self._process.wait()
         self._stderr.close()
 
@@ -293,12 +257,12 @@ class _Process:
 def _serve() -> None:
     """Make calls until there are no more."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    os.nice(int(sys.argv[1]))
-    answers = Connection(os.dup(1), readable=False)
-    os.dup2(2, 1)  # what libraries print is no answer
+    socket, nice = map(int, sys.argv[1:])
+    os.nice(nice)
+    caller: Connection[Any, Any] = Connection(socket)
     calls: queue.SimpleQueue[tuple[bytes, bytes] | None] = queue.SimpleQueue()
     is_busy = threading.Event()
-    threading.Thread(target=_listen, args=(calls, is_busy), daemon=True).start()
+    threading.Thread(target=_listen, args=(caller, calls, is_busy), daemon=True).start()
     function: Callable[..., Any] | None = None
     pickled = b""
     with suppress(BrokenPipeError):
@@ -316,16 +280,19 @@ def _serve() -> None:
                 error = call_error(caught).args
             release_memory()
             # memory fragmented by large encoders is only released by exiting
-            answers.send((result, error, error is None and _resident_bytes() < _KEPT_BYTES))
+            caller.send((result, error, error is None and _resident_bytes() < _KEPT_BYTES))
             is_busy.clear()
 
 
-def _listen(calls: queue.SimpleQueue[tuple[bytes, bytes] | None], is_busy: threading.Event) -> None:
+def _listen(
+    caller: Connection[Any, Any],
+    calls: queue.SimpleQueue[tuple[bytes, bytes] | None],
+    is_busy: threading.Event,
+) -> None:
     """Take calls; when the last has come, this process ends, and at once if nobody waits."""
-    source = Connection(os.dup(0), writable=False)
     with suppress(EOFError, OSError):
         while True:
-            calls.put(source.recv())
+            calls.put(caller.recv())
     calls.put(None)
     if is_busy.is_set():
         os._exit(1)
