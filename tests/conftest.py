@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from compare import compare as compare_recordings
 from mp4ds.packing.options import PackOptions
 from mp4ds.video.encoder import ordinary_scheduling
-from sources import SOURCES, load_tool, scene
+from sources import SOURCES, scene
 
 NETWORKS = {
     "test_play_ros1": "ros1",
@@ -116,7 +117,7 @@ def unsynced() -> Iterator[None]:
 @pytest.fixture
 def compare() -> Callable[..., list[str]]:
     """The independent comparison of two recordings."""
-    return load_tool("compare").compare
+    return compare_recordings
 
 
 @pytest.fixture(scope="session")

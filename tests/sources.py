@@ -11,14 +11,11 @@ Nothing here uses mp4ds, so that its tests have an independent source.
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
 from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -59,7 +56,6 @@ __all__ = [
     "build",
     "image_cdr",
     "image_ros1",
-    "load_tool",
     "odd_scene",
     "picture",
     "raw_scene",
@@ -73,14 +69,6 @@ __all__ = [
 
 # callerid and latching of a topic's publishers: not latched, latched, and told by neither.
 PUBLISHERS: list[tuple[str | None, int | None]] = [("/first", 0), ("/second", 1), (None, None)]
-
-
-def load_tool(name: str) -> ModuleType:
-    """A module of the folder ``tools``, such as ``compare``."""
-    folder = str(Path(__file__).parents[1] / "tools")
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-    return importlib.import_module(name)
 
 
 # ---------------------------------------------------------------- ROS 1 bag

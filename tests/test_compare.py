@@ -21,6 +21,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
+import compare as witness
+import compare_digest as digests
 from sources import (
     IMAGE,
     SOURCES,
@@ -29,7 +31,6 @@ from sources import (
     Scene,
     image_cdr,
     image_ros1,
-    load_tool,
     odd_scene,
     raw_scene,
     scene,
@@ -39,8 +40,6 @@ from sources import (
     write_rosbag2,
 )
 
-witness = load_tool("compare")
-digests = load_tool("compare_digest")
 WRITERS: dict[str, Callable[..., Any]] = {
     "bag": lambda path, what: write_bag(path.with_suffix(".bag"), what),
     "sqlite3": write_rosbag2,

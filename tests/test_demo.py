@@ -13,12 +13,13 @@ from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.typesys import Stores, get_typestore
 
+import compare
 import mp4ds
 from mp4ds.bags.convert import is_latched
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.rosbag2_metadata import read_bag_info
 from mp4ds.plugins.demo import demo
-from sources import load_tool, typestore
+from sources import typestore
 
 KINDS = ("drive.mcap", "drive.bag", "drive")
 COUNTS = {
@@ -70,7 +71,7 @@ def test_an_mcap_of_ros2(made: Path) -> None:
 
 
 def test_the_folder_of_rosbag2_holds_the_same(made: Path) -> None:
-    assert load_tool("compare").main([str(made / "drive.mcap"), str(made / "drive")]) == 0
+    assert compare.main([str(made / "drive.mcap"), str(made / "drive")]) == 0
     info = read_bag_info(made / "drive" / "metadata.yaml")
     assert {topic.name for topic in info.topics} == set(COUNTS)
     with Rosbag2Reader(made / "drive") as reader:
@@ -116,4 +117,4 @@ def test_the_bag_shows_the_same_scene(made: Path) -> None:
 def test_each_kind_is_packed_and_comes_back(name: str, made: Path, tmp_path: Path) -> None:
     mp4ds.pack(made / name, tmp_path / "packed")
     mp4ds.unpack(tmp_path / "packed", output=tmp_path / f"again_{name}")
-    assert load_tool("compare").main([str(made / name), str(tmp_path / f"again_{name}")]) == 0
+    assert compare.main([str(made / name), str(tmp_path / f"again_{name}")]) == 0

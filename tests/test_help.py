@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
+from commands import Result, program, refused
 from mp4ds.cli import COMMANDS, commands
-from waiting import WATCHDOG_S
 
 PANELS = ["Arguments", "What", "How", "Where", "Long jobs", "Options"]
 
 
-def run(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mp4ds", *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        env={**os.environ, "COLUMNS": "80"},
-    )
+def run(*words: str, folder: Path) -> Result:
+    return program("mp4ds", *words, cwd=folder, code=None, env={"COLUMNS": "80"})
 
 
 @pytest.mark.parametrize(
@@ -68,8 +57,7 @@ def test_images_have_no_options_of_damage_or_shares() -> None:
 
 
 def test_sentences_are_whole(tmp_path: Path) -> None:
-    done = run("--help", folder=tmp_path)
-    text = " ".join(done.stdout.split())
+    text = " ".join(run("--help", folder=tmp_path).out.split())
     assert all(does in text for _, does in COMMANDS.values())
     assert "..." not in text.replace("[ARGS]...", "")
 
@@ -79,17 +67,15 @@ def test_nothing_is_printed_but_errors(packed_bag: Path, tmp_path: Path) -> None
         for words in (["info"], ["validate"], ["unpack", "-o", f"again{place}.bag"]):
             arguments = [*words, str(packed_bag)]
             done = run(*arguments[:place], "-q", *arguments[place:], folder=tmp_path)
-            assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+            assert done == Result(0, "", "")
         assert (tmp_path / f"again{place}.bag").exists()
-    done = run("-q", "info", "nothing", folder=tmp_path)
-    assert done.returncode == 2
-    assert "no such file" in done.stderr
-    assert run("-q", "info", str(packed_bag), "--json", folder=tmp_path).stdout.startswith("{")
+    refused(run("-q", "info", "nothing", folder=tmp_path), 2, "no such file")
+    assert run("-q", "info", str(packed_bag), "--json", folder=tmp_path).out.startswith("{")
 
 
 def test_where_errors_come_from(tmp_path: Path) -> None:
-    assert "Traceback" not in run("info", "nothing", folder=tmp_path).stderr
-    assert "Traceback" in run("-v", "info", "nothing", folder=tmp_path).stderr
+    assert "Traceback" not in run("info", "nothing", folder=tmp_path).err
+    assert "Traceback" in run("-v", "info", "nothing", folder=tmp_path).err
 
 
 @pytest.mark.parametrize(
@@ -98,13 +84,5 @@ def test_where_errors_come_from(tmp_path: Path) -> None:
 )
 def test_shells_complete(words: str, number: int, expected: set[str], tmp_path: Path) -> None:
     asked = {"_MP4DS_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": str(number)}
-    done = subprocess.run(
-        [Path(sys.executable).with_name("mp4ds")],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        env={**os.environ, **asked},
-    )
-    assert set(re.findall(r"plain,(\S+)", done.stdout)) == expected
+    done = program("mp4ds", cwd=tmp_path, env=asked)
+    assert set(re.findall(r"plain,(\S+)", done.out)) == expected

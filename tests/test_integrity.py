@@ -13,11 +13,12 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
+from compare import compare
 from edits import Document, agreed, changed, digest
 from mp4ds import Mp4dsError, SourceError
 from mp4ds.unpacking.options import UnpackOptions
 from scenes import Scene
-from sources import SOURCES, load_tool, scene
+from sources import SOURCES, scene
 
 STEM = "cam_image_raw"
 FILES = (f"{STEM}.mp4", f"{STEM}.yaml", "dataset.yaml", "messages.mcap")
@@ -35,7 +36,6 @@ DAMAGED_YAML = {
 
 CHANGED_FILE = {"size-mismatch", "hash-mismatch"}
 
-compare = load_tool("compare").compare
 MakePacked = Callable[[str], tuple[list[Path], Path]]
 
 

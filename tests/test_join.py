@@ -7,7 +7,6 @@ import shutil
 import signal
 import struct
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -21,6 +20,7 @@ from chromium import Tab, played, video_player
 from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg, superframe
 from coded_tools import encode as encode_packets
 from coded_tools import scene as packet_scene
+from commands import program
 from mp4ds.errors import Mp4dsError, VideoError
 from mp4ds.video.codecs import Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder
@@ -93,7 +93,7 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Segments that another process has encoded."""
     folder = tmp_path_factory.mktemp("elsewhere")
     code = f"import test_join; test_join.make_elsewhere({str(folder)!r})"
-    subprocess.run([sys.executable, "-c", code], cwd=TESTS, check=True)
+    program("-c", code, cwd=TESTS)
     return folder
 
 
@@ -603,11 +603,6 @@ def large(path: Path, packets: int, size: int) -> Path:
     return path
 
 
-def run_apart(code: str, *arguments: str) -> str:
-    command = [sys.executable, "-c", code, *arguments]
-    return subprocess.run(command, cwd=TESTS, check=True, capture_output=True, text=True).stdout
-
-
 MEASURE = """
 import resource, sys
 from pathlib import Path
@@ -633,7 +628,7 @@ def test_memory_is_bounded(
     small = large(tmp_path / "small.mp4", 3, 2_000)
     segment = large(tmp_path / "a.mp4", packets, size)
     target = tmp_path / "j.mp4"
-    told = run_apart(MEASURE, str(small), str(segment), str(target), str(packets), str(copies))
+    told = program("-c", MEASURE, small, segment, target, packets, copies, cwd=TESTS).out
     assert target.stat().st_size > packets * size * copies
     assert int(told) < bound
 
@@ -659,7 +654,7 @@ def test_a_disk_that_is_full(short: int, tmp_path: Path) -> None:
     target = tmp_path / "j.mp4"
     join_segments([segment, segment], range(40), target)
     length = target.stat().st_size
-    told = run_apart(FULL, str(segment), str(target), str(length - short))
+    told = program("-c", FULL, segment, target, length - short, cwd=TESTS).out
     assert "File too large" in told
     assert not target.exists()
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 import mp4ds
-from commands import call
+from commands import Result, call, program
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.play import open_player
 from player_scenes import make_drive, recorded
@@ -45,15 +45,8 @@ def _ros2(monkeypatch: pytest.MonkeyPatch) -> None:
     alone_in_ros2(monkeypatch)
 
 
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        command(*arguments),
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
+def run(*arguments: str | Path) -> Result:
+    return program(*command(*arguments), code=None)
 
 
 class Terminal:
@@ -113,11 +106,11 @@ def terminal(*arguments: str | Path) -> Iterator[Terminal]:
 
 def test_plays_and_tells(drive: Path) -> None:
     done = run(drive, "--ros2", "-r", "5", "--json")
-    assert done.returncode == 0, done.stderr
-    result = json.loads(done.stdout)
+    assert done.code == 0, done.err
+    result = json.loads(done.out)
     assert result["messages"] == {"/tf": 40, "/tf_static": 2, "/camera/image_raw": 20}
     assert not result["stopped"]
-    assert re.search(r"publishing to ROS 2, domain \d+", done.stderr)
+    assert re.search(r"publishing to ROS 2, domain \d+", done.err)
 
 
 def test_keys(drive: Path) -> None:

@@ -23,6 +23,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from commands import Result, program
 from mp4ds.cli.output import be_json
 from mp4ds.cli.progress import (
     Events,
@@ -389,15 +390,12 @@ def test_a_short_pack_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_a_short_pack_does_not_import_rich() -> None:
-    program = (
+    code = (
         "import sys, mp4ds.cli.progress as p\n"
         "with p.pack_progress(): pass\n"
         "print([name for name in sys.modules if name.split('.')[0] == 'rich'])"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert (result.stdout, result.stderr) == ("[]\n", "")
+    assert program("-c", code) == Result(0, "[]\n", "")
 
 
 # ---------------------------------------------------------------- terminals
@@ -472,14 +470,9 @@ def command(*arguments: object) -> list[str]:
 
 
 def test_events_of_the_command(drives: list[Path], tmp_path: Path) -> None:
-    result = subprocess.run(
-        command(*drives, "--output", f"{tmp_path}/", "--window", "4", "--json"),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert [Path(made["dataset"]).name for made in json.loads(result.stdout)] == ["day", "night"]
-    found = parsed(result.stderr)
+    done = program(*command(*drives, "--output", f"{tmp_path}/", "--window", "4", "--json"))
+    assert [Path(made["dataset"]).name for made in json.loads(done.out)] == ["day", "night"]
+    found = parsed(done.err)
     assert found[-1]["outcome"] == "done"
     reports = found[1:-1]
     shares = [event["job_done"] for event in reports]
@@ -498,13 +491,7 @@ def test_events_of_the_command(drives: list[Path], tmp_path: Path) -> None:
 
 
 def test_events_of_a_pack_in_one_go(drives: list[Path], tmp_path: Path) -> None:
-    result = subprocess.run(
-        command(drives[0], "--output", tmp_path / "x", "--json"),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    found = parsed(result.stderr)
+    found = parsed(program(*command(drives[0], "--output", tmp_path / "x", "--json")).err)
     assert found[-2]["done"] == found[-2]["job_done"] == 1.0
     assert found[-2]["tasks_total"] == 0
 

@@ -19,12 +19,13 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
+from compare import compare
 from definitions import COMPRESSED, IMAGE
 from encoders import compressed_depth, cv, pillow
 from pictures import ENCODINGS, YUV, picture, rows_of, sample_format
 from round_trips import journey, own_target
 from scenes import START, Record, Scene, image_cdr, image_ros1, odd_scene
-from sources import SOURCES, load_tool
+from sources import SOURCES
 
 steady = settings(
     max_examples=30,
@@ -54,7 +55,7 @@ def returned(source: str, records: list[Record]) -> list[str]:
         done = journey(Path(folder), SOURCES[source], recorded, own_target(source))
         messages, frames = done.frames(records[0].topic)
         event(f"in videos: {'all' if frames == messages else 'some' if frames else 'none'}")
-        differences: list[str] = load_tool("compare").compare(done.sources, done.output)
+        differences: list[str] = compare(done.sources, done.output)
         return differences
 
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import mp4ds
+from commands import program
 from mp4ds import errors
 from mp4ds.plugins.demo import demo
 
@@ -30,15 +28,6 @@ NAMES = [
     "export", "import_ros_mp4", "open", "pack", "pack_each", "pack_share", "play", "record",
     "report", "unpack", "validate",
 ]  # fmt: skip
-
-
-def python(code: str) -> str:
-    """Standard output of a new interpreter."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(mp4ds.__file__).parents[1])}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 # ---------------------------------------------------------------- names
@@ -161,7 +150,7 @@ HEAVY = ["numpy", "av", "pydantic", "yaml", "rosbags", "mcap", "jsonschema", "cl
 
 
 def test_importing_is_cheap() -> None:
-    loaded = python("import mp4ds, sys; print(*sys.modules)").split()
+    loaded = program("-c", "import mp4ds, sys; print(*sys.modules)").out.split()
     assert [name for name in HEAVY if name in loaded] == []
 
 
@@ -177,7 +166,7 @@ def test_importing_is_cheap() -> None:
     ],
 )
 def test_what_is_used_is_imported(code: str, absent: list[str]) -> None:
-    loaded = python(f"import mp4ds, sys; {code}; print(*sys.modules)").split()
+    loaded = program("-c", f"import mp4ds, sys; {code}; print(*sys.modules)").out.split()
     assert [name for name in absent if name in loaded] == []
 
 
@@ -186,7 +175,7 @@ def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
     source, dataset = tmp_path / "short.bag", tmp_path / "dataset"
     demo(source, seconds=0.1)
     code = f"mp4ds.pack({str(source)!r}, {str(dataset)!r})"
-    loaded = python(f"import mp4ds, sys; {code}; print(*sys.modules)").split()
+    loaded = program("-c", f"import mp4ds, sys; {code}; print(*sys.modules)").out.split()
     assert (dataset / "dataset.yaml").is_file()
     assert {"mp4ds.bags.ros1", "mp4ds.packing.packer"} <= set(loaded)
     others = [
@@ -208,7 +197,7 @@ def test_importing_changes_nothing() -> None:
         "import mp4ds\n"
         "print(before == state())"
     )
-    assert python(code).strip() == "True"
+    assert program("-c", code).out == "True\n"
 
 
 def test_the_version_is_that_of_the_build() -> None:

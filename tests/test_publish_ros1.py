@@ -8,7 +8,6 @@ import re
 import shutil
 import socket
 import struct
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -19,6 +18,7 @@ import pytest
 from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag1 import Writer as BagWriter
 
+from commands import program
 from roscore import HERE, PLAY, Core, Process, python
 from roscore import _core as _core
 from roscore import roscore as roscore
@@ -403,37 +403,35 @@ def test_no_master(roscore: Core, recording: Path) -> None:
         silent.listen(8)
         mute = f"http://127.0.0.1:{silent.getsockname()[1]}"
         for uri in ("http://127.0.0.1:9", mute):
-            environment = {**roscore.environment, "ROS_MASTER_URI": uri, "PYTHONPATH": str(HERE)}
-            done = subprocess.run(script, env=environment, capture_output=True, text=True)
-            kind, sentence = json.loads(done.stdout)
+            env = {**roscore.environment, "ROS_MASTER_URI": uri, "PYTHONPATH": str(HERE)}
+            done = program(*script, env=env)
+            kind, sentence = json.loads(done.out)
             assert kind == "PublishError"
             assert sentence.startswith(f"{uri}: no ROS master answers")
             assert "ROS_MASTER_URI" in sentence
-            assert done.stderr == ""
+            assert done.err == ""
 
 
 def test_wrong_master(roscore: Core, recording: Path) -> None:
     script = python(str(HERE / "ros1_driver.py"), str(recording), "{}")
-    environment = {**roscore.environment, "ROS_MASTER_URI": "nonsense", "PYTHONPATH": str(HERE)}
-    done = subprocess.run(script, env=environment, capture_output=True, text=True)
-    assert json.loads(done.stdout)[0] == "OptionError"
-    assert done.stderr == ""
+    env = {**roscore.environment, "ROS_MASTER_URI": "nonsense", "PYTHONPATH": str(HERE)}
+    done = program(*script, env=env)
+    assert json.loads(done.out)[0] == "OptionError"
+    assert done.err == ""
 
 
 def test_no_rospy() -> None:
-    program = (
+    code = (
         "import sys; sys.modules['rospy'] = None\n"
         "from mp4ds.plugins.ros.node import NodeOptions, open_node\n"
         "from mp4ds.errors import PublishError\n"
         "try: open_node('ros1', NodeOptions('player'))\n"
         "except PublishError as error: print(error)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.startswith("ros1: No module named 'ros")
-    assert "python3-rospy" in done.stdout
-    assert "--system-site-packages" in done.stdout
+    told = program("-c", code).out
+    assert told.startswith("ros1: No module named 'ros")
+    assert "python3-rospy" in told
+    assert "--system-site-packages" in told
 
 
 def test_leaves_the_process_alone(roscore: Core) -> None:

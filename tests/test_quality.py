@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED
+from commands import call, refused
 from definitions import IMAGE
 from in_parts import InlineExecutor, leftovers, use
 from mp4ds import yamlio
@@ -357,16 +357,12 @@ def test_without_libvmaf_it_is_said_how_to_get_it(
 
 def test_the_command_tells_what_it_came_to(tmp_path: Path) -> None:
     (path,) = recording(tmp_path, [0.0])
-    command = [sys.executable, "-m", "mp4ds", "pack", str(path), "-o", str(tmp_path / "d")]
-    options = ["--quality", "psnr=40", "--codec", "h264", "--preset", "ultrafast"]
-    done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert f"{TOPIC}: psnr " in done.stdout
-    assert "(target: 40)" in done.stdout
-    wrong = [*command, "--quality", "psnr=99"]
-    done = subprocess.run(wrong, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "--quality 'psnr=99' is not known" in done.stderr
+    command = ("pack", path, "-o", tmp_path / "d", "--codec", "h264", "--preset", "ultrafast")
+    done = call(*command, "--quality", "psnr=40")
+    assert done.code == 0, done.err
+    assert f"{TOPIC}: psnr " in done.out
+    assert "(target: 40)" in done.out
+    refused(call(*command, "--quality", "psnr=99"), 2, "--quality 'psnr=99' is not known")
 
 
 @needs_vmaf

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import signal
-import subprocess
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from commands import program
 from conftest import real
 from mp4ds.bags.formats import open_reader
 from mp4ds.records import Message
@@ -127,13 +127,7 @@ def test_a_clock_that_starts_late(roscore: Core, tmp_path: Path) -> None:
 def test_without_a_master(tmp_path: Path) -> None:
     if why := missing():
         pytest.skip(why)
-    done = subprocess.run(
-        ours(tmp_path / "live", "-a"),
-        env={"PATH": "/usr/bin:/bin", "ROS_MASTER_URI": "http://127.0.0.1:1/"},
-        capture_output=True,
-        text=True,
-        stdin=subprocess.DEVNULL,
-    )
-    assert done.returncode == 1
-    assert "no ROS master answers" in done.stderr
+    env = {"PATH": "/usr/bin:/bin", "ROS_MASTER_URI": "http://127.0.0.1:1/"}
+    done = program(*ours(tmp_path / "live", "-a"), env=env, code=1)
+    assert "no ROS master answers" in done.err
     assert not list(tmp_path.iterdir())

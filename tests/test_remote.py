@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import re
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mp4ds
-from commands import call, refused
+from commands import call, program, refused
 from in_parts import InlineExecutor, leftovers, use
 from mp4ds.bags.formats import open_sources
 from mp4ds.errors import OptionError, PartsFailedError, RemoteError, SourceError
@@ -98,8 +97,7 @@ def test_nothing_of_it_is_imported_for_local_paths(packed_bag: Path) -> None:
         f"info({str(packed_bag)!r}), mp4ds.validate({str(packed_bag)!r})\n"
         "print({'fsspec', 's3fs', 'aiohttp', 'asyncio'} & set(sys.modules))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
+    assert program("-c", code).out.strip() == "set()"
 
 
 # ---------------------------------------------------------------- a file by ranges

@@ -6,13 +6,11 @@ import base64
 import hashlib
 import http.client
 import json
-import os
 import re
 import shutil
 import signal
 import socket
 import struct
-import subprocess
 import sys
 import threading
 import time
@@ -29,6 +27,7 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
+from commands import call, program, start
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.format.models import Calibration
 from mp4ds.plugins.reporting.cameras import (
@@ -658,31 +657,20 @@ def test_odd_requests_print_nothing(
 # ---------------------------------------------------------------- the command
 
 
-def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "mp4ds", *arguments]
-
-
 def test_the_command(copy: Path) -> None:
-    done = subprocess.run(command("report", str(copy)), capture_output=True, text=True, check=True)
-    assert f"{COLOUR}: plays its own video" in done.stdout
-    assert f"{DEPTH}: plays a proxy: no browser plays ffv1" in done.stdout
-    assert str(copy / "index.html") in done.stdout
+    done = call("report", copy)
+    assert f"{COLOUR}: plays its own video" in done.out
+    assert f"{DEPTH}: plays a proxy: no browser plays ffv1" in done.out
+    assert str(copy / "index.html") in done.out
     (copy / "front_image_raw.mp4").unlink()
-    told = subprocess.run(
-        command("report", str(copy), "--json"), capture_output=True, text=True, check=False
-    )
-    assert told.returncode == 1
-    assert "front_image_raw.mp4" in json.loads(told.stdout)["problems"][0]
+    told = call("report", copy, "--json")
+    assert told.code == 1
+    assert "front_image_raw.mp4" in json.loads(told.out)["problems"][0]
 
 
 def test_serving_until_interrupted(copy: Path) -> None:
-    process = subprocess.Popen(
-        command("report", str(copy), "--serve", "--output", str(copy.parent / "out put")),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
+    words = ("report", copy, "--serve", "--output", copy.parent / "out put")
+    process = start(*words, env={"PYTHONUNBUFFERED": "1"})
     try:
         assert process.stdout
         line = ""
@@ -715,21 +703,9 @@ def test_the_commands_of_its_page(tmp_path: Path) -> None:
         for line in block.splitlines()
     ]
     assert len(lines) == 8
-    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    script = "\n".join(["set -e", *lines])
-    done = subprocess.run(
-        ["bash", "-c", script],
-        cwd=tmp_path,
-        env={**os.environ, "PATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    program("bash", "-ec", "\n".join(lines), cwd=tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    shown = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert re.search(r"index\.html \[\('/left/image_raw', '(video|nothing)'\), \(", shown.stdout)
+    shown = program("-c", code, cwd=tmp_path)
+    assert re.search(r"index\.html \[\('/left/image_raw', '(video|nothing)'\), \(", shown.out)
     for name in ("still.png", "sheet.jpg", "mosaic.png", "page/index.html"):
         assert (tmp_path / name).stat().st_size > 1000

@@ -8,8 +8,6 @@ import resource
 import shutil
 import sqlite3
 import struct
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -21,6 +19,7 @@ from typing import Any
 import pytest
 import zstandard
 
+from commands import program
 from conftest import DATA, real
 from damage import INJURIES, Key, Piece, all_messages, pieces_of, sound_messages
 from mp4ds import SourceError
@@ -517,14 +516,7 @@ print(status[status.index("VmHWM:") + 1])
 
 def read_confined(path: Path) -> tuple[int, int, int]:
     """Records, losses and peak of memory in MiB of a process that may not take much of it."""
-    done = subprocess.run(
-        [sys.executable, "-c", READ, str(path), str(2 * 2**30)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    counts, peak = done.stdout.splitlines()
+    counts, peak = program("-c", READ, path, 2 * 2**30).out.splitlines()
     records, losses = counts.split()[:2]
     return int(records), int(losses), int(peak) // 1024
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 import mp4ds
-from waiting import WATCHDOG_S
+from commands import program
 
 LEFT = "/left/image_raw"
 
@@ -119,14 +118,8 @@ def paths(tmp_path_factory: pytest.TempPathFactory, packed_bag: Path) -> dict[st
 
 
 def result(script: str, path: Path) -> list[str]:
-    ran = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", BEGIN + script, str(path)],
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-    )
-    assert ran.returncode == 0, ran.stderr or ran.returncode
-    return ran.stdout.splitlines()
+    command = (sys.executable, "-W", "ignore", "-c", BEGIN + script, path)
+    return program(*command).out.splitlines()
 
 
 @pytest.mark.parametrize("kind", ["stream", "video"])

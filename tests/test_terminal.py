@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
 import re
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +14,7 @@ import pytest
 
 import commands
 import mp4ds
-from commands import Result
+from commands import Result, program
 from mp4ds.cli.progress import progress_of
 from scenes import Scene
 from sources import scene, write_mcap
@@ -122,22 +120,9 @@ def test_a_bar_shows_per_cent_and_what_is_done(monkeypatch: pytest.MonkeyPatch) 
 # ---------------------------------------------------------------- standard streams
 
 
-def run(words: str, where: str, folder: Path, first: str = "") -> subprocess.CompletedProcess[str]:
+def run(words: str, where: str, folder: Path, first: str = "") -> Result:
     """A command as a process of its own, its streams as a shell is told."""
-    return subprocess.run(
-        ["bash", "-c", f'{first}"$PYTHON" -m mp4ds {words} {where}'],
-        cwd=folder,
-        env={
-            **os.environ,
-            "PYTHON": sys.executable,
-            "PYTHONPATH": str(Path(mp4ds.__file__).parents[1]),
-        },
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
+    return program("bash", "-c", f"{first}mp4ds {words} {where}", cwd=folder, code=None)
 
 
 FULL = r"mp4ds: standard output: No space left on device[^\n]*\n"
@@ -158,9 +143,9 @@ STREAMS = {
 def test_a_standard_stream_that_takes_nothing(name: str, recording: Path, tmp_path: Path) -> None:
     words, where, code, said = STREAMS[name]
     done = run(words.replace("OUT", str(tmp_path / "out")), where, recording.parent)
-    assert done.returncode == code, done.stderr
-    assert done.stdout == ""
-    assert re.fullmatch(said, done.stderr), done.stderr
+    assert done.code == code, done.err
+    assert done.out == ""
+    assert re.fullmatch(said, done.err), done.err
     if "OUT" in words:
         assert mp4ds.validate(tmp_path / "out", deep=True) == []
 
@@ -218,18 +203,11 @@ def test_a_want_of_memory_is_no_damage(
     places = {"RECORDING": recording, "DATASET": dataset}
     places |= {f"OUT{end}": tmp_path / f"out{end}" for end in ("", ".mcap")}
     words = [str(places.get(word, word)) for word in COMMANDS[name].split()]
-    done = subprocess.run(
-        [sys.executable, "-c", WITHIN, str(mebibytes), *words],
-        env={**os.environ, "PYTHONPATH": str(Path(mp4ds.__file__).parents[1])},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    if done.returncode or mebibytes < 8:
-        assert done.returncode == 1, done.stdout
-        assert done.stdout == ""
-        assert done.stderr.endswith("mp4ds: out of memory; try fewer --jobs\n"), done.stderr
+    done = program("-c", WITHIN, mebibytes, *words, code=None)
+    if done.code or mebibytes < 8:
+        assert done.code == 1, done.out
+        assert done.out == ""
+        assert done.err.endswith("mp4ds: out of memory; try fewer --jobs\n"), done.err
         assert list(tmp_path.iterdir()) == []
 
 
@@ -244,12 +222,12 @@ def test_more_cameras_than_open_files(tmp_path: Path) -> None:
     limits = "ulimit -Sn 40; ulimit -Hn 40; "
     for parts in ("", " --gop 2 --window 2"):
         done = run(f"pack d.mcap -o d --force{parts}", "", tmp_path, limits)
-        assert done.returncode == 1
-        assert "too many files are open at once; `ulimit -n` allows more" in done.stderr
+        assert done.code == 1
+        assert "too many files are open at once; `ulimit -n` allows more" in done.err
         assert not (tmp_path / "d").exists()
     done = run("pack d.mcap -o d --restart", "", tmp_path, "ulimit -Sn 40; ")
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     assert mp4ds.validate(tmp_path / "d", deep=True) == []
     done = run("unpack d --to mcap -o again.mcap", "", tmp_path, limits)
-    assert done.returncode == 1
-    assert "too many files are open at once; `ulimit -n` allows more" in done.stderr
+    assert done.code == 1
+    assert "too many files are open at once; `ulimit -n` allows more" in done.err

@@ -10,7 +10,6 @@ import pickle
 import re
 import shutil
 import signal
-import subprocess
 import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +22,7 @@ import numpy as np
 import pytest
 
 import mp4ds
+from commands import program
 from mp4ds.packing.options import PackOptions
 from scenes import PERIOD, Scene, scene
 from sources import SOURCES
@@ -364,8 +364,7 @@ def test_wrong_options_of_streams(drives: list[Path]) -> None:
 
 def test_without_torch() -> None:
     code = "import sys; sys.modules['torch'] = None; import mp4ds.torch"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "ImportError: mp4ds.torch needs PyTorch" in done.stderr
+    assert "ImportError: mp4ds.torch needs PyTorch" in program("-c", code, code=1).err
 
 
 # ---------------------------------------------------------------- workers
@@ -720,21 +719,19 @@ def torchcodec() -> None:
 def test_torchcodec_with_the_ffmpeg_of_pyav(drives: list[Path], tmp_path: Path) -> None:
     if not list((Path(av.__file__).parents[1] / "av.libs").glob("libavcodec*")):
         pytest.skip("this PyAV has no libraries of its own")
-    env = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
-    command = [sys.executable, "-m", "mp4ds.torch.ffmpeg"]
+    env = {"XDG_CACHE_HOME": str(tmp_path)}
     for _ in range(2):
-        found = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
+        found = program(sys.executable, "-m", "mp4ds.torch.ffmpeg", env=env)
     code = (
         "import sys; from torchcodec._core import ffmpeg_major_version as major\n"
         "from mp4ds.torch import FrameDataset\n"
         f"FrameDataset(sys.argv[1], topics=['{LEFT}'], backend='torchcodec')[3]; print(major)"
     )
-    env["LD_LIBRARY_PATH"] = found.stdout.strip()
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(drives[0])], capture_output=True, text=True, env=env
+    env["LD_LIBRARY_PATH"] = found.out.strip()
+    assert (
+        int(program("-c", code, drives[0], env=env).out)
+        == av.library_versions["libavcodec"][0] - 54
     )
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout) == av.library_versions["libavcodec"][0] - 54
 
 
 @pytest.mark.usefixtures("torchcodec")
