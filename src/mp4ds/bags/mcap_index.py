@@ -235,6 +235,7 @@ class McapSummary:
         private: How many records of each private opcode it holds, and those between the chunks
             once these were looked at.
         others: Byte offsets of the attachments and metadata records, once these were looked at.
+        is_verified: Whether it matches its checksum, as far as that was compared.
     """
 
     offset: int = 0
@@ -244,6 +245,7 @@ class McapSummary:
     chunks: ChunkTable = field(default_factory=ChunkTable)
     private: Counter[int] = field(default_factory=Counter)
     others: array[int] = field(default_factory=lambda: array("Q"))
+    is_verified: bool = True
 
     def add(self, opcode: int, body: bytes) -> None:
         """Add a record.

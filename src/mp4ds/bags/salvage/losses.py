@@ -1,28 +1,21 @@
-"""The losses of a file, and what all readers of damaged files have in common."""
+"""The losses of a file, counted against what its indexes list."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from math import inf
-from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from mp4ds.bags.files import DECOMPRESSED, DamageError, OversizeError
-from mp4ds.bags.protocols import BagReader, HoldBack
-from mp4ds.bags.salvage.scan import MAX_UNPROVEN, Framing, RecordFrame, Scan, Window
-from mp4ds.errors import SourceError
 from mp4ds.records import (
     MAX_LOSSES,
     MAX_LOST_TOPICS,
-    Excerpt,
     Loss,
     Message,
-    Record,
     more_places,
 )
 
@@ -287,161 +280,8 @@ class Tally:
         return max(0, missing.total() - excess.total()), missing
 
 
-# ---------------------------------------------------------------- readers
-
-
 def lost_by(error: DamageError) -> str:
     """What is wrong with messages whose payload cannot be decompressed, a phrase."""
     if isinstance(error, OversizeError):
         return f"that decompress to too much ({DECOMPRESSED} is the limit)"
     return "whose compressed data is damaged"
-
-
-class FileSalvage(BagReader):
-    """Reads what is readable of a file, record by record, and says what is not.
-
-    It never fails because of damage. For an intact recording, it gives the same as the usual
-    reader. Messages come in log-time order if the index at the end of the file is readable, and
-    they are not too far out of it; otherwise in file order. Some doubtful messages are included: if
-    a checksum shows that a chunk is damaged but not where, the loss says so.
-
-    Unlike other readers, it reads once at a time: its state is that of the last `records`.
-
-    Args:
-        path: The file.
-        shown: Its name in losses, if it is a decompressed copy.
-        is_alone: Whether it is an error, not just a loss, if nothing can be read.
-
-    Attributes:
-        magic: The first bytes of such a file.
-        kind: What such a file is, in words.
-    """
-
-    magic: bytes
-    kind: str
-    position = 0
-    losses: Sequence[Loss] = ()
-
-    _framing: Framing
-    _index_offset: int | None = None  # where the final index begins: no message is lost from there
-    _is_timed = False  # whether the file's index tells how long messages must wait for earlier ones
-
-    def __init__(self, path: Path, *, shown: Path | None = None, is_alone: bool = True) -> None:
-        self.path = path
-        self._shown = shown or path
-        self.files = [self._shown]
-        self._is_alone = is_alone
-
-    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
-        """Everything readable, of which all but the excerpt is dropped.
-
-        Raises:
-            RuntimeError: `records` was called again before this one was exhausted.
-        """
-        self.losses = []
-        self._log = log = LossLog(self._shown.name)
-        self._tally = Tally(log, self._topic_of)
-        self._found = 0  # valid records
-        self._count: int | None = None  # messages that the file states
-        self._earliest: int | None = None  # log time from here on; None if no message follows
-        held = HoldBack()
-        given = 0
-        with Window.of_file(self.path) as window:
-            self._window = window
-            self._scan = Scan(window, self._framing, self._lose)
-            for record in self._scanned():
-                self.position = self._place(window)
-                given += isinstance(record, Message)
-                if record is None:
-                    if self._is_timed:
-                        yield from filter(excerpt.has, held.release(self._earliest))
-                elif self._is_timed and isinstance(record, Message):
-                    held.add(record)
-                elif excerpt.has(record):
-                    yield record
-                if self._log is not log:
-                    raise RuntimeError(f"{self.path} is salvaged once at a time")
-            yield from filter(excerpt.has, held.release(None))
-            self.position = self._place(window)
-        if self._is_alone and not self._found and not self.channels:
-            raise SourceError(self.path, f"holds no records of {self.kind}")
-        self.losses = log.finish(None if self._count is None else max(0, self._count - given))
-
-    @abstractmethod
-    def _scanned(self) -> Iterator[Record | None]:
-        """All records in the order of the file; None where `_earliest` may be later than before."""
-
-    def _place(self, window: Window) -> int:
-        """Bytes of the file, compressed as it may be, that were read."""
-        if self._shown == self.path:
-            return window.offset
-        return window.offset * self._shown.stat().st_size // max(1, window.size)
-
-    def _topic_of(self, channel_id: int) -> str | None:
-        channel = self._channels.get(channel_id)
-        return channel.topic if channel else None
-
-    def _begins(self) -> bool:
-        """Whether the file begins with its magic bytes, which are consumed."""
-        if bytes(self._window.peek(len(self.magic))) == self.magic:
-            self._window.skip(len(self.magic))
-            return True
-        self._scan.resync(0, f"the first bytes are not those of {self.kind}", passed=0)
-        return False
-
-    def _lose(self, offset: int, size: int, problem: str) -> None:
-        if self._index_offset is not None and offset >= self._index_offset:
-            self._log.lost(offset, size, problem).add(0, ())
-        else:
-            self._tally.lost(offset, size, problem)
-
-    def _peek_chunk(self, frame: RecordFrame) -> tuple[memoryview, bool]:
-        """What there is of a chunk, and whether it is certainly all of it."""
-        proven = self._scan.is_proven(frame)
-        size = frame.size if proven else min(frame.size, MAX_UNPROVEN)
-        return self._window.peek(size), proven
-
-    def _inside(
-        self, content: bytes | memoryview, problems: list[str]
-    ) -> Iterator[tuple[RecordFrame, bytes]]:
-        """The records of a decompressed chunk; what is wrong with it is added to `problems`."""
-        scan = Scan(
-            Window.of_content(bytes(content)),
-            self._framing,
-            lambda _offset, _size, problem: problems.append(f"in a chunk, {problem}"),
-        )
-        while frame := scan.next():
-            body = scan.body(frame)
-            if body is not None:
-                yield frame, body
-
-    def _leave_chunk(
-        self, frame: RecordFrame, used: int, problems: Sequence[str], *, proven: bool, whole: bool
-    ) -> None:
-        """Advance past a chunk, and record what is lost of it.
-
-        Args:
-            frame: The chunk.
-            used: Bytes of it up to the end of its content, as far as known.
-            problems: What is wrong with it.
-            proven: Whether it is certainly all there.
-            whole: Whether all of its content could be decompressed.
-        """
-        window, scan = self._window, self._scan
-        offset = window.offset
-        if whole and used != frame.size and scan.is_followed(used):
-            window.skip(used)  # the content is complete: the record's length is wrong
-        elif proven and (whole or scan.is_followed(frame.size)):
-            window.skip(frame.size)
-        else:
-            scan.resync(
-                offset if problems else offset + used,
-                problems[0] if problems else scan.cut_or_damaged(frame),
-                passed=used,
-                kinds=self._framing.outer,
-            )
-            return
-        if problems:
-            self._lose(offset, window.offset - offset, problems[0])
-        else:
-            self._tally.is_verified = True

@@ -29,8 +29,8 @@ from mp4ds.bags.mcap_records import (
     parse,
     unpack_chunk,
 )
-from mp4ds.bags.salvage.losses import Draft, FileSalvage, lost_by
-from mp4ds.bags.salvage.scan import Framing, RecordFrame, Scan, Window
+from mp4ds.bags.salvage.losses import Draft, lost_by
+from mp4ds.bags.salvage.scan import FileSalvage, Framing, RecordFrame, Scan, Window
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord
 
 # ---------------------------------------------------------------- finding records
@@ -200,38 +200,16 @@ class McapFraming(Framing):
 _MAX_SEARCHED = 256 * 2**20
 
 
-@dataclass
-class SalvagedSummary(McapSummary):
-    """The readable part of a summary section.
+def read_summary(path: Path) -> McapSummary:
+    """What can be read of the summary of a file; empty if its place is unknown.
 
-    Attributes:
-        is_verified: Whether it matches its checksum, if it has one.
-        is_whole: Whether all of it could be read.
-    """
-
-    is_verified: bool = True
-    is_whole: bool = True
-
-    @property
-    def doubtful(self) -> dict[int, mcap_records.Channel]:
-        """Channels by id, if the summary does not match its checksum."""
-        return {} if self.is_verified else self.channels
-
-    def finish(self) -> None:
-        """Finish after everything was added, and drop what depends on its being complete."""
-        if not self.is_whole or not self.is_verified:
-            self.chunks = ChunkTable()
-            self.statistics = None
-        self.chunks.finish()
-
-
-def read_summary(path: Path) -> SalvagedSummary:
-    """Read the summary of a file; empty if it has none or its place is unknown.
+    What depends on its being complete and correct is left out if it is not.
 
     Raises:
         SourceError: It cannot be read.
     """
-    summary = SalvagedSummary()
+    summary = McapSummary()
+    is_whole = True
     with Window.of_file(path) as window:
         size = window.size
         tail = window.look(size - FOOTER_BYTES, FOOTER_BYTES) if size > FOOTER_BYTES else None
@@ -243,34 +221,35 @@ def read_summary(path: Path) -> SalvagedSummary:
                 if covered <= _MAX_SEARCHED:  # otherwise, checking would take long
                     (told,) = struct.unpack("<I", tail[-len(MAGIC) - 4 : -len(MAGIC)])
                     summary.is_verified = told in (0, zlib.crc32(window.peek(covered)))
-                _read_from(window, start, summary)
-    summary.finish()
+                is_whole = _read_from(window, start, summary)
+    if not is_whole or not summary.is_verified:
+        summary.chunks = ChunkTable()
+        summary.statistics = None
+    summary.chunks.finish()
     return summary
 
 
-def _read_from(window: Window, start: int, summary: SalvagedSummary) -> None:
+def _read_from(window: Window, start: int, summary: McapSummary) -> bool:
+    """Add the records from a byte on to a summary; whether there was nothing else."""
     framing = McapFraming({})
     is_there = framing.frame(window.peek(framing.lookahead)) is not None
     if not is_there and window.left > _MAX_SEARCHED:
-        return  # the rest may be anything
+        return True  # the rest may be anything
     summary.offset = start
-
-    def lose(*_: object) -> None:
-        summary.is_whole = False
-
-    scan = Scan(window, framing, lose)
+    problems: list[str] = []
+    scan = Scan(window, framing, lambda _offset, _size, problem: problems.append(problem))
     while frame := scan.next():
         if frame.kind == Opcode.FOOTER:
-            return
+            return not problems
         if frame.kind not in OF_SUMMARY:
             break
         body = scan.body(frame)
         if body is not None:
             try:
                 summary.add(frame.kind, body)
-            except DamageError:
-                summary.is_whole = False
-    summary.is_whole = False
+            except DamageError as error:
+                problems.append(str(error))
+    return False
 
 
 # ---------------------------------------------------------------- a pass
@@ -554,9 +533,14 @@ class McapSalvage(FileSalvage):
     def _channel(self, channel_id: int) -> Channel | None:
         """The channel with an id; from a doubtful summary only as a last resort."""
         channels = self._declared.channels
-        if channel_id not in channels and channel_id in self._summary.doubtful:
-            record = self._summary.doubtful[channel_id]
-            schema = self._summary.schemas.get(record.schema_id)
+        summary = self._summary
+        if (
+            channel_id not in channels
+            and not summary.is_verified
+            and channel_id in summary.channels
+        ):
+            record = summary.channels[channel_id]
+            schema = summary.schemas.get(record.schema_id)
             if schema is not None and schema.id not in self._defined:
                 self._defined.add(schema.id)
                 self._declared.add_schema(schema)
