@@ -486,15 +486,14 @@ def test_a_database_alone_tells_that_its_payloads_are_compressed(tmp_path: Path)
     assert list(map(fields, messages(read(tmp_path / "a" / "a_0.db3")[1]))) == expected
 
 
-@pytest.mark.parametrize(
-    ("storage", "place"),
-    [("sqlite3", "message 1, topic /on"), ("mcap", r"message of log time \d+, topic /on")],
-)
-def test_payloads_that_are_not_compressed_as_told(tmp_path: Path, storage: str, place: str) -> None:
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_payloads_that_are_not_compressed_as_told(tmp_path: Path, storage: str) -> None:
     write(tmp_path / "a", storage, scene()[1:])
     told = {"compression_mode": "message", "compression_format": "zstd"}
     edit(tmp_path / "a", lambda info: info.update(told))
-    with pytest.raises(SourceError, match=rf"{place}: zstd data is damaged"):
+    with pytest.raises(
+        SourceError, match=r"message of log time \d+, topic /on: zstd data is damaged"
+    ):
         read(tmp_path / "a")
 
 

@@ -6,7 +6,6 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
-from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,6 @@ from mp4ds.bags.files import (
     most_held,
     most_unpacked,
     open_source,
-    unreadable,
 )
 from mp4ds.bags.mcap_index import ChunkEntry, McapSummary, read_summary
 from mp4ds.bags.mcap_records import (
@@ -63,8 +61,6 @@ class McapReader(BagReader):
     Args:
         path: The file.
         shown: Its name in errors, where it is a decompressed copy.
-        message_decompress: Decompresses the payload of a message; raises `DamageError` if it
-            cannot.
 
     Raises:
         SourceError: The file is missing, not an MCAP file, or cut short.
@@ -72,17 +68,10 @@ class McapReader(BagReader):
 
     format = "mcap"
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        shown: Path | None = None,
-        message_decompress: Callable[[memoryview], bytes] | None = None,
-    ) -> None:
+    def __init__(self, path: Path, *, shown: Path | None = None) -> None:
         self.path = path
         self._shown = shown or path
         self.files = [self._shown]
-        self._decompress = message_decompress
         self._declared = declared = Declared()
         self._channels = declared.channels
         self._schemas = declared.schemas.values()
@@ -230,7 +219,7 @@ class McapReader(BagReader):
                 raise stream.damaged(error) from None
             # Of messages at the very start of the next chunk, some may be before this one.
             until = None if following is None else following - 1
-            yield from map(self._unpacked, held.release(until))
+            yield from held.release(until)
         for place in others:
             yield self._other_at(stream, place)
         if excerpt == EVERYTHING and not summary.covers(count):
@@ -263,7 +252,7 @@ class McapReader(BagReader):
                     read += 1
                     message = declared.message(part, f"message {read}")
                     if held is None:
-                        yield self._unpacked(message)
+                        yield message
                     else:
                         held.add(message)
                 record = declared.other(opcode, body)
@@ -271,12 +260,12 @@ class McapReader(BagReader):
                 raise stream.damaged(error) from None
             if held is not None and self._summary:
                 until = self._summary.chunks.later.after(stream.start)
-                yield from map(self._unpacked, held.release(until))
+                yield from held.release(until)
             if record:
                 yield record
         stream.read_magic()
         if held is not None:
-            yield from map(self._unpacked, held.release(None))
+            yield from held.release(None)
 
     def _messages(self, opcode: int, body: bytes) -> Iterator[bytes | memoryview]:
         """The messages of a top-level record; schemas and channels are declared on the way."""
@@ -288,17 +277,6 @@ class McapReader(BagReader):
                     yield part
                 else:
                     self._declared.take(kind, part)
-
-    def _unpacked(self, message: Message) -> Message:
-        """A message with its individually compressed payload decompressed."""
-        if self._decompress is None:
-            return message
-        try:
-            data = self._decompress(memoryview(message.data))
-        except DamageError as error:
-            place = f": message of log time {message.log_time}, topic {message.channel.topic}"
-            raise unreadable(self._shown, place, error, SALVAGE_REMEDY) from None
-        return replace(message, data=data)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts from the statistics record, spans from the chunks that hold the channel."""

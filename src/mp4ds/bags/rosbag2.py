@@ -7,16 +7,19 @@ import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from mp4ds.bags.files import (
     SALVAGE,
+    SALVAGE_REMEDY,
     ZSTD_MAGIC,
+    DamageError,
     copy_file,
     decompress_file,
     open_source,
+    unreadable,
     unzstd,
 )
 from mp4ds.bags.formats import CombinedReader
@@ -126,10 +129,7 @@ class Rosbag2Reader(CombinedReader):
     def _file_reader(self, file: Path, shown: Path) -> BagReader:
         """The reader of a file, or of its decompressed copy."""
         is_mcap = self._is_mcap(shown, _start(file))
-        opened = partial(self._mcap_reader if is_mcap else self._sqlite_reader, file, shown=shown)
-        reader = opened()
-        is_packed = self._info.compression == "message" if self._info else self._holds_zstd(reader)
-        return opened(message_decompress=unzstd) if is_packed else reader
+        return (self._mcap_reader if is_mcap else self._sqlite_reader)(file, shown=shown)
 
     def _holds_zstd(self, reader: BagReader) -> bool:
         """Whether the messages of a file without metadata.yaml are individually compressed."""
@@ -225,7 +225,22 @@ class Rosbag2Reader(CombinedReader):
     def _part_records(self, number: int, part: BagReader, excerpt: Excerpt) -> Iterator[Record]:
         if number > 0 and self._is_packed[number] and part.tables:
             yield MetadataRecord(TABLES_RECORD, part.tables)
-        yield from part.records(excerpt)
+        is_packed = self._info.compression == "message" if self._info else self._holds_zstd(part)
+        records: Iterator[Record | None] = part.records(excerpt)
+        if is_packed:
+            records = (
+                self._unzstd(number, one) if isinstance(one, Message) else one for one in records
+            )
+        yield from filter(None, records)
+
+    def _unzstd(self, number: int, message: Message) -> Message | None:
+        """A message of a file with its payload decompressed; None to leave it out."""
+        try:
+            return replace(message, data=unzstd(message.data))
+        except DamageError as error:
+            place = f": message of log time {message.log_time}, topic {message.channel.topic}"
+            path = self._storage_files[number]
+            raise unreadable(path, place, error, SALVAGE_REMEDY) from None
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Those of all files; empty if one of them must be decompressed first."""

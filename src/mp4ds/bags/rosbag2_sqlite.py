@@ -8,7 +8,7 @@ import re
 import sqlite3
 import sys
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import astuple
 from functools import cached_property, partial
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from mp4ds.bags.files import (
     SALVAGE,
     SALVAGE_REMEDY,
-    DamageError,
     OversizeError,
     most_held,
     open_source,
@@ -193,8 +192,6 @@ class SqliteReader(BagReader):
     Args:
         path: The database.
         shown: Its name in errors and tables, where it is a decompressed copy.
-        message_decompress: Makes the payload of a message from what the file holds; raises
-            `DamageError` for what it cannot read.
         damaged: Read a file that was cut short, too.
 
     Attributes:
@@ -216,14 +213,12 @@ class SqliteReader(BagReader):
         path: Path,
         *,
         shown: Path | None = None,
-        message_decompress: Callable[[bytes], bytes] | None = None,
         damaged: bool = False,
     ) -> None:
         self.path = path
         self._damaged = damaged
         self._shown = shown or path
         self.files = [self._shown]
-        self._decompress = message_decompress
         self._definitions: list[tuple[Schema, str]] = []
         with closing(open_source(path, self._shown)) as stream:
             if stream.read(len(_MAGIC)) != _MAGIC:
@@ -406,11 +401,6 @@ class SqliteReader(BagReader):
         if kind != b"blob":
             problem = f"{place}: the payload is {kind.decode()}, not a blob"
             raise SourceError(self._shown, problem, SALVAGE_REMEDY)
-        if self._decompress:
-            try:
-                data = self._decompress(data)
-            except DamageError as error:
-                raise unreadable(self._shown, f": {place}", error, SALVAGE_REMEDY) from None
         return Message(channel, timestamp, timestamp, 0, data)
 
     def _check_size(self, tables: Tables, row_id: int, place: str) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,6 @@ from mp4ds.bags.mcap_records import (
     parse,
     unpack_chunk,
 )
-from mp4ds.bags.salvage.losses import Draft, lost_by
 from mp4ds.bags.salvage.scan import FileSalvage, Framing, RecordFrame, Scan, Window
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord
 
@@ -335,8 +334,6 @@ class McapSalvage(FileSalvage):
         path: The file.
         shown: Its name in losses, if it is a decompressed copy, to which their offsets refer.
         is_alone: Whether it is an error, not just a loss, if nothing can be read.
-        message_decompress: Decompresses the payload of a message; raises `DamageError` if it
-            cannot.
 
     Raises:
         SourceError: The file is missing, empty, or unreadable.
@@ -352,11 +349,9 @@ class McapSalvage(FileSalvage):
         *,
         shown: Path | None = None,
         is_alone: bool = True,
-        message_decompress: Callable[[memoryview], bytes] | None = None,
     ) -> None:
         super().__init__(path, shown=shown, is_alone=is_alone)
         open_source(path, shown).close()
-        self._decompress = message_decompress
         self._declared = declared = Declared()
         self._channels = declared.channels
         self._schemas = declared.schemas.values()
@@ -515,43 +510,24 @@ class McapSalvage(FileSalvage):
             DamageError: It is shorter than its fields.
         """
         if self._channel(channel_id) is None and len(body) >= MESSAGE_HEAD.size:
+            self._tally.stray(channel_id)
             problem = f"messages of channel {channel_id}, whose record is missing"
-            self._lose_message(channel_id, offset, problem)
+            self._log.lost_of_kind(problem, offset, problem).add(1, ())
             return None
-        message = self._declared.message(body)
-        if self._decompress:
-            topic = message.channel.topic
-            try:
-                message = replace(message, data=self._decompress(memoryview(message.data)))
-            except DamageError as error:
-                problem = f"messages of {topic} {lost_by(error)}"
-                loss = self._lose_message(channel_id, offset, problem)
-                loss.topics[topic] = None
-                return None
-        return message
+        return self._declared.message(body)
 
     def _channel(self, channel_id: int) -> Channel | None:
         """The channel with an id; from a doubtful summary only as a last resort."""
         channels = self._declared.channels
         summary = self._summary
-        if (
-            channel_id not in channels
-            and not summary.is_verified
-            and channel_id in summary.channels
-        ):
-            record = summary.channels[channel_id]
+        record = None if summary.is_verified else summary.channels.get(channel_id)
+        if channel_id not in channels and record is not None:
             schema = summary.schemas.get(record.schema_id)
             if schema is not None and schema.id not in self._defined:
                 self._defined.add(schema.id)
                 self._declared.add_schema(schema)
             self._declared.add_channel(record)
         return channels.get(channel_id)
-
-    def _lose_message(self, channel_id: int, offset: int, problem: str) -> Draft:
-        self._tally.stray(channel_id)
-        loss = self._log.lost_of_kind(problem, offset, problem)
-        loss.add(1, ())
-        return loss
 
     def _chunk(self, frame: RecordFrame) -> Iterator[_Found]:
         """The messages of a chunk, as far as it can be decompressed."""

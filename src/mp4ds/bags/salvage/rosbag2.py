@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sqlite3
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from mp4ds.bags.files import (
     OversizeError,
     decompress_file,
     most_held,
+    unzstd,
 )
 from mp4ds.bags.protocols import BagReader
 from mp4ds.bags.rosbag2 import STORAGE_NAME, Rosbag2Reader, unlisted_storage
@@ -46,8 +48,6 @@ class SqliteSalvage(SqliteReader):
     Args:
         path: The database.
         shown: Its name in errors and tables, where it is a decompressed copy.
-        message_decompress: Decompresses the payload of a message; raises `DamageError` if it
-            cannot.
 
     Attributes:
         expected: Expected number of messages, if known from elsewhere.
@@ -61,16 +61,10 @@ class SqliteSalvage(SqliteReader):
     _times = BagReader._times
     _stats = BagReader._stats
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        shown: Path | None = None,
-        message_decompress: Callable[[bytes], bytes] | None = None,
-    ) -> None:
+    def __init__(self, path: Path, *, shown: Path | None = None) -> None:
         self.expected: int | None = None
         try:
-            super().__init__(path, shown=shown, message_decompress=message_decompress, damaged=True)
+            super().__init__(path, shown=shown, damaged=True)
         except SourceError as error:
             remedy = _UNFINISHED if Path(f"{path}-journal").exists() else _RECOVER
             raise SourceError(shown or path, error.problem, remedy) from None
@@ -131,7 +125,7 @@ class SqliteSalvage(SqliteReader):
             (data,) = _first(tables, "data", key)
             if not isinstance(data, bytes):
                 raise Refused(f"messages of {channel.topic} without a payload")
-            return Message(channel, time, time, 0, self._decompressed(data, channel.topic))
+            return Message(channel, time, time, 0, data)
         except Refused as lost:
             problem = str(lost)
         except (sqlite3.Error, SourceError):
@@ -140,12 +134,6 @@ class SqliteSalvage(SqliteReader):
             problem = f"messages{of} with damaged or missing pages"
         log.lost_of_kind(problem, None, problem).add(1, topics)
         return None
-
-    def _decompressed(self, data: bytes, topic: str) -> bytes:
-        try:
-            return self._decompress(data) if self._decompress else data
-        except DamageError as error:
-            raise Refused(f"messages of {topic} {lost_by(error)}") from None
 
 
 def _first(tables: Tables, columns: str, key: int) -> tuple[object, ...]:
@@ -228,6 +216,7 @@ class Rosbag2Salvage(Rosbag2Reader):
         self._is_alone = is_alone
         self._of_files: list[Loss] = []
         self._of_copies: dict[str, Loss] = {}
+        self._logs: dict[int, LossLog] = {}  # of payloads in each file
         super().__init__(path)
 
     def _find_storage(self) -> tuple[BagInfo | None, list[Path]]:
@@ -330,8 +319,13 @@ class Rosbag2Salvage(Rosbag2Reader):
 
     def _records_of(self, number: int, excerpt: Excerpt) -> Iterator[Record]:
         file = self._storage_files[number]
+        log = self._logs[number] = LossLog(file.name)
         try:
-            yield from super()._records_of(number, excerpt)
+            for record in super()._records_of(number, excerpt):
+                if isinstance(record, Message):
+                    log.gave(record.log_time)
+                yield record
+            self._losses[number] = [*self._losses[number], *log.finish()]
         except SourceError as error:
             self._losses[number] = [
                 Loss(file.name, None, None, error.problem, self._expected(file))
@@ -339,6 +333,15 @@ class Rosbag2Salvage(Rosbag2Reader):
             self._done += file.stat().st_size
             if number == 0:
                 self._drop_first()
+
+    def _unzstd(self, number: int, message: Message) -> Message | None:
+        try:
+            return replace(message, data=unzstd(message.data))
+        except DamageError as error:
+            topic = message.channel.topic
+            problem = f"messages of {topic} {lost_by(error)}"
+            self._logs[number].lost_of_kind(problem, None, problem).add(1, [topic])
+            return None
 
 
 def _number(name: str) -> tuple[str, int, str]:
