@@ -845,8 +845,8 @@ def test_stamps_beyond_32_bits_have_no_place_in_ros(tmp_path: Path) -> None:
         if r.topic == "/camera/image"
     ]
     packed_ = Packed(tmp_path, Scene(late), "mcap-protobuf")
-    for kind, problem in (("raw", "bits for"), ("compressed-video", "outside the range")):
-        with pytest.raises(ConversionError, match=rf"/camera/image: message 0: .* {problem}"):
+    for kind in ("raw", "compressed-video"):
+        with pytest.raises(ConversionError, match=r"/camera/image: message 0: .* bits for"):
             packed_.unpack("mcap", kind)
     assert not (tmp_path / "again.mcap").exists()
 

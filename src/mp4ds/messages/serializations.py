@@ -72,6 +72,7 @@ _BINNING = (("binning_x", "I"), ("binning_y", "I"))
 _ROI = (("roi", "4I"), ("roi_do_rectify", "B"))  # x_offset, y_offset, height, width
 
 _Layout = tuple[tuple[str, str], ...]
+_PACKET = "ffmpeg_image_transport_msgs/FFMPEGPacket"
 
 ROS_TYPES: Mapping[str, tuple[type[Fields], _Layout]] = {
     "sensor_msgs/Image": (
@@ -83,7 +84,7 @@ ROS_TYPES: Mapping[str, tuple[type[Fields], _Layout]] = {
         CalibrationFields,
         (*_HEADER, *_SIZE[::-1], *_MATRICES, *_BINNING, *_ROI),
     ),
-    "ffmpeg_image_transport_msgs/FFMPEGPacket": (
+    _PACKET: (
         CodedFields,
         (
             *_HEADER,
@@ -101,6 +102,12 @@ ROS_TYPES: Mapping[str, tuple[type[Fields], _Layout]] = {
 }
 """The fields of each type, in the order of its definition (spec/registry.md, "Message types")."""
 
+# ROS 1 has another type of this name, which is written only: such messages are kept verbatim
+_ROS1_PACKET = (
+    *(*_HEADER, _BODY, ("width", "i"), ("height", "i"), ("format", "s")),
+    *(("pts", "Q"), ("flags", "B")),
+)
+
 
 class RosForm(Form):
     """A message type in a ROS serialization.
@@ -108,12 +115,14 @@ class RosForm(Form):
     Args:
         wire: ``ros1``, ``cdr-le`` or ``cdr-be``.
         type_name: One of `ROS_TYPES`.
+        layout: Its fields, if they differ from those there.
     """
 
-    def __init__(self, wire: str, type_name: str) -> None:
+    def __init__(self, wire: str, type_name: str, layout: _Layout | None = None) -> None:
         self.wire = wire
         self._prefix, self._order, self._ros2 = _ROS_WIRES[wire]
-        self._kind, self._layout = ROS_TYPES[type_name]
+        self._kind, known = ROS_TYPES[type_name]
+        self._layout = layout or known
         self._sec_code = "i" if self._ros2 else "I"
         names = [name for name, _ in self._layout]
         has_tail = "body" in names and names[-1] != "body"
@@ -171,8 +180,16 @@ class RosForm(Form):
 
     def plain(self, frame_id: str, fields: Fields) -> bytes | None:
         """The blank as ROS writes it; None for types whose other fields are not modelled."""
-        if not self._is_plain:
-            return None
+        return self.blank(frame_id, fields) if self._is_plain else None
+
+    def blank(self, frame_id: str, fields: Fields, *, flags: int = 0) -> bytes:
+        """A message as ROS writes it, with zeros for its slots.
+
+        Args:
+            frame_id: Coordinate frame.
+            fields: Its fields.
+            flags: Of a packet.
+        """
         writer = PrimitiveWriter(self._prefix, self._order, aligned=self._ros2)
         for name, code in self._layout:
             if name in ("header", "time"):
@@ -183,6 +200,8 @@ class RosForm(Form):
                     writer.string(frame_id, terminated=self._ros2)
             elif name == "body":
                 writer.put("I", 0)
+            elif name in ("pts", "flags") or (name, self._kind) == ("is_bigendian", CodedFields):
+                writer.put(code, flags if name == "flags" else 0)
             elif name == "frame_id":
                 writer.string(frame_id, terminated=self._ros2)
             else:
@@ -291,7 +310,14 @@ def form_of(wire: str, type_name: str, schema: bytes) -> Form:
 
 
 def plain_message(
-    wire: str, type_name: str, frame_id: str, fields: Fields, slots: Slots, body: bytes | memoryview
+    wire: str,
+    type_name: str,
+    frame_id: str,
+    fields: Fields,
+    slots: Slots,
+    body: bytes | memoryview,
+    *,
+    flags: int = 0,
 ) -> bytes:
     """A camera message as written by a plain ROS serializer.
 
@@ -302,16 +328,17 @@ def plain_message(
         fields: Its fields.
         slots: Its times.
         body: Pixels or coded picture; empty for a calibration.
+        flags: Of a packet: 1 if decoding can begin with it.
 
     Raises:
-        WireError: The type has no plain form, or cannot represent a value.
+        WireError: The type cannot represent a value.
     """
-    form = form_of(wire, type_name, b"")
-    blank = form.plain(frame_id, fields)
-    if blank is None:
-        raise WireError(f"{type_name} has no plain form")
-    head, tail = form.template(blank).around(slots, len(body))
-    return b"".join((head, body, tail))
+    name = _ros_type(type_name)
+    form = RosForm(wire, name, _ROS1_PACKET if (wire, name) == ("ros1", _PACKET) else None)
+    template = form.template(form.blank(frame_id, fields, flags=flags))
+    head, tail = template.around(slots, len(body))
+    gap = bytes(template.padding(len(body)))  # what follows a body is aligned in CDR
+    return b"".join((head, body, gap, tail))
 
 
 class MessageSplitter:

@@ -5,27 +5,22 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.columns import marked
-from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.columns import DecodedColumns, marked
 from mp4ds.dataset.images import Images, VerbatimImages
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import View
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import csv_cell
-from mp4ds.unpacking.pictures import (
-    FrameTimes,
-    Reduction,
-    files_of,
-    resized_view,
-)
+from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.pictures import files_of, resized_view
 from mp4ds.video.images import ImageFile
 
 _STAMPS_NAME = "stamps.csv"
@@ -78,22 +73,45 @@ class _Files:
                 )
 
 
-@dataclass(frozen=True)
 class TopicImages:
-    """The images of a topic, about to be written.
+    """The images of a topic, in videos and verbatim, about to be written.
+
+    Args:
+        frames: The topic, whose frames are reduced together.
+        options: How.
 
     Attributes:
         topic: The topic.
-        frames: Its frames.
         thinned: How many of them are left out because fewer were requested.
         refused: How many cannot be written, by reason.
+
+    Raises:
+        OptionError: The size is too large.
+        FormatError: The dataset is damaged.
     """
 
-    topic: str
-    frames: Topic
-    thinned: int
-    refused: Counter[str]
-    _files: Sequence[_Files]
+    def __init__(self, frames: Topic, options: UnpackOptions) -> None:
+        self.topic = frames.topic
+        self.thinned, self.refused = 0, Counter[str]()
+        self._digits = len(str(len(frames) - 1))
+        self._files: list[_Files] = []
+        reduction = options.reduction
+        is_kept = reduction.kept(DecodedColumns.of_frames(frames.stamps, frames.log_times))
+        for place, part in enumerate(frames.parts):
+            numbers = frames.numbers_of(place)
+            kept = is_kept[numbers]
+            self.thinned += part.count(~kept)
+            size = reduction.size_of(part)
+            keeps_files = size is None and part.are_jpeg_files and options.image_format != "png"
+            kind = "jpeg" if keeps_files else options.image_format or "png"
+            view = resized_view(part, size)
+            try:
+                file = None
+                if not keeps_files:
+                    file = ImageFile(view.encoding.name, kind, quality=options.jpeg_quality)
+                self._files.append(_Files(part, numbers, kept, kind, view, file))
+            except OptionError as error:
+                self.refused[str(error).rstrip(".")] += part.count(kept)
 
     @property
     def count(self) -> int:
@@ -114,7 +132,6 @@ class TopicImages:
             FormatError: The dataset is damaged.
         """
         folder.mkdir()
-        digits = len(str(len(self.frames) - 1))
         rows: dict[int, list[str | int]] = {}
         for files in self._files:
             part = files.part
@@ -123,7 +140,7 @@ class TopicImages:
                     self.refused[_NOT_DECODED] += 1
                     continue
                 number = int(files.numbers[index])
-                name = f"{number:0{digits}d}.{_SUFFIXES[files.kind]}"
+                name = f"{number:0{self._digits}d}.{_SUFFIXES[files.kind]}"
                 (folder / name).write_bytes(data)
                 stamp, log_time = int(part.stamps[index]), int(part.log_times[index])
                 rows[number] = [name, stamp, log_time, csv_cell(part.frame_id(index))]
@@ -131,54 +148,6 @@ class TopicImages:
         with (folder / _STAMPS_NAME).open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([_HEAD, *(rows[number] for number in sorted(rows))])
         return len(rows)
-
-
-def topic_images(
-    dataset: Dataset,
-    topic: str,
-    *,
-    image_format: str | None,
-    jpeg_quality: int,
-    reduction: Reduction,
-) -> TopicImages | None:
-    """The images of a topic, in videos and verbatim, as they are to be written.
-
-    Args:
-        dataset: The dataset.
-        topic: One of its topics.
-        image_format: ``png`` or ``jpeg``; None for JPEG files as they were recorded, else PNG.
-        jpeg_quality: Of new JPEG files, 1 to 100.
-        reduction: How to reduce them; the frames of a topic are counted together.
-
-    Returns:
-        None if the topic has no frames.
-
-    Raises:
-        OptionError: The size is too large.
-        FormatError: The dataset is damaged.
-    """
-    if topic not in dataset:
-        return None
-    frames = dataset[topic]
-    is_kept = reduction.kept(FrameTimes(frames.stamps, frames.log_times))
-    refused, thinned = Counter[str](), 0
-    made = []
-    for place, part in enumerate(frames.parts):
-        numbers = frames.numbers_of(place)
-        kept = is_kept[numbers]
-        thinned += part.count(~kept)
-        size = reduction.size_of(part)
-        keeps_files = size is None and part.are_jpeg_files and image_format != "png"
-        kind = "jpeg" if keeps_files else image_format or "png"
-        view = resized_view(part, size)
-        try:
-            file = None
-            if not keeps_files:
-                file = ImageFile(view.encoding.name, kind, quality=jpeg_quality)
-            made.append(_Files(part, numbers, kept, kind, view, file))
-        except OptionError as error:
-            refused[str(error).rstrip(".")] += part.count(kept)
-    return TopicImages(topic, frames, thinned, refused, made)
 
 
 def image_names(folder: Path) -> set[str] | None:

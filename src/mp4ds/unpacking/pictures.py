@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,18 +31,11 @@ from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
 from mp4ds.options import WHAT, Parsed, TopicOptions, option, parse_resize
 from mp4ds.times import intervals, usual_interval
-from mp4ds.unpacking.types import KINDS, VideoFields
+from mp4ds.unpacking.types import KINDS, packet_format
 from mp4ds.video.images import ImageFile
 from mp4ds.video.packets import PacketReader
 
 _NS = 1_000_000_000
-
-
-class FrameTimes(NamedTuple):
-    """Times of frames, nanoseconds, int64, shape (frames,). See `DecodedColumns`."""
-
-    stamp: NDArray[np.int64]
-    log_time: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +85,7 @@ class Reduction:
         """Whether there may be fewer images."""
         return self.every > 1 or self.max_rate is not None
 
-    def kept(self, columns: DecodedColumns | FrameTimes) -> NDArray[np.bool_]:
+    def kept(self, columns: DecodedColumns) -> NDArray[np.bool_]:
         """Which frames are kept, shape (frames,)."""
         is_kept = np.zeros(len(columns.stamp), np.bool_)
         is_kept[:: self.every] = True
@@ -140,7 +133,7 @@ def _check_size(resize: Any) -> None:
         )
 
 
-def times_of(columns: DecodedColumns | FrameTimes) -> NDArray[np.int64]:
+def times_of(columns: DecodedColumns) -> NDArray[np.int64]:
     """When the frames were taken, nanoseconds: by their stamps, or by their log times.
 
     The latter if most stamps do not increase, as with cameras that leave them zero.
@@ -193,7 +186,7 @@ class Given:
         is_key: For a packet, whether decoding can begin with it.
     """
 
-    fields: Fields | VideoFields
+    fields: Fields
     body: bytes | memoryview
     is_key: bool = False
 
@@ -347,7 +340,7 @@ def frames_of(stream: Stream, form: ImageForm) -> Frames:
         Refused: They cannot be converted; says why.
     """
     if KINDS[form.kind].family == "video":
-        return _video(stream, form.kind)
+        return _video(stream, form)
     if form.size is None and holds_files(stream, form.kind):
         return partial(_own_files, stream, _own_formats(stream.sidecar, form))
     makers = [_maker(stream, header, form) for header in stream.sidecar.headers]
@@ -385,11 +378,11 @@ def files_of(
         yield index, body[start:]
 
 
-def _video(stream: Stream, kind: str) -> Frames:
+def _video(stream: Stream, form: ImageForm) -> Frames:
     sidecar = stream.sidecar
     codec = sidecar.video.codec
     if codec not in _VIDEO_CODECS:
-        known, name = ", ".join(_VIDEO_CODECS), KINDS[kind].type_name.rpartition("/")[2]
+        known, name = ", ".join(_VIDEO_CODECS), KINDS[form.kind].type_name.rpartition("/")[2]
         raise Refused(f"{name} supports the codecs {known}, but this video is {codec}")
     if sidecar.body != "packet" and not sidecar.layout.is_shown:
         raise Refused(
@@ -397,16 +390,18 @@ def _video(stream: Stream, kind: str) -> Frames:
         )
     if stream.hidden_frames:
         raise Refused("the first packets of the slice depend on packets outside it")
-    return partial(_packets_of, stream)
+    return partial(_packets_of, stream, form)
 
 
-def _packets_of(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int, Given]]:
+def _packets_of(
+    stream: Stream, form: ImageForm, choice: Choice, verify: bool
+) -> Iterator[tuple[int, Given]]:
     """The packets of the video, self-contained from each key frame on."""
     if verify:
         _verify(stream)
-    codec, image = stream.sidecar.video.codec, stream.sidecar.image
-    with PacketReader(stream.video_path, codec=codec, frames=len(stream)) as packets:
-        fields = VideoFields(codec, image.encoding, image.width, image.height, packets.pixel_format)
+    with _packets(stream) as packets:
+        told = packet_format(form.kind, stream.sidecar, packets.pixel_format, ros1=form.ros1)
+        fields = CodedFields(told, *stream.image_size)
         wanted = choice(stream.columns)
         for index in stream.sound_of(unbroken(wanted, packets.key_numbers, from_key=True)):
             is_key = bool(packets.keyframes[index])

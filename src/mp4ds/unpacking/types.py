@@ -7,128 +7,17 @@ from dataclasses import dataclass, field, replace
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.types import RosVersion, make_store, ros1_version, ros2_version, types_of
+from mp4ds.format.models import StreamSidecar
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.serializations import plain_message
-from mp4ds.messages.wire import NS, Fields, PrimitiveWriter, Slots, WireError
+from mp4ds.messages.wire import NS, Fields, Slots
 from mp4ds.records import HASH_KEY, Channel, Schema
 from mp4ds.video.codecs import CODECS
-
-_ENCODERS = {"h264": "libx264", "h265": "hevc_nvenc"}
-_KEY_FRAME = 1  # AV_PKT_FLAG_KEY
-
-
-@dataclass(frozen=True, slots=True)
-class VideoFields:
-    """A message's fields for a video packet.
-
-    Attributes:
-        codec: Name in the registry.
-        encoding: ROS image encoding of the images that the video was made from.
-        width: Columns of the images.
-        height: Rows of the images.
-        pixel_format: Of the video as ffmpeg calls it.
-    """
-
-    codec: str
-    encoding: str
-    width: int
-    height: int
-    pixel_format: str
-
-    def ffmpeg_encoding(self, *, ros1: bool) -> str:
-        """The field ``encoding`` of an FFMPEGPacket."""
-        codec = CODECS[self.codec].ffmpeg
-        if ros1:
-            return _ENCODERS.get(self.codec, codec)
-        known = ENCODINGS[self.encoding]
-        if known.channels == 1 and not known.mosaic and known.rows == 1:
-            before = shown = "mono8"
-        else:
-            before = "bgr8"
-            shown = "rgb8" if self.encoding.startswith("rgb") else "bgr8"
-        pixel_format = self.pixel_format.replace("yuvj", "yuv")  # the video itself has its range
-        return ";".join((codec, pixel_format, before, shown))
-
-
-def video_message(
-    encoding: str, slots: Slots, frame_id: str, codec: str, body: bytes | memoryview
-) -> bytes:
-    """A CompressedVideo; what follows the data is aligned in CDR.
-
-    Args:
-        encoding: ``ros1`` or ``cdr``.
-        slots: Stamp.
-        frame_id: Coordinate frame.
-        codec: Its field ``format``.
-        body: The packet.
-
-    Raises:
-        WireError: The serialization cannot represent the stamp.
-    """
-    is_cdr = encoding == "cdr"
-    head = _begun(encoding, slots)
-    head.string(frame_id, terminated=is_cdr)
-    head.put("I", len(body))
-    tail = PrimitiveWriter(b"", "<", aligned=False)
-    tail.string(codec, terminated=is_cdr)
-    gap = bytes(-len(body) % 4 if is_cdr else 0)
-    return b"".join((head.getvalue(), body, gap, tail.getvalue()))
-
-
-def ffmpeg_message(
-    encoding: str,
-    slots: Slots,
-    frame_id: str,
-    fields: VideoFields,
-    body: bytes | memoryview,
-    is_key: bool,
-) -> bytes:
-    """An FFMPEGPacket, whose fields have another order and other names in ROS 1.
-
-    Args:
-        encoding: ``ros1`` or ``cdr``.
-        slots: Stamp, sequence number, presentation time.
-        frame_id: Coordinate frame.
-        fields: Of the video.
-        body: The packet.
-        is_key: Whether decoding can begin with it.
-
-    Raises:
-        WireError: The serialization cannot represent the stamp or a number.
-    """
-    is_cdr = encoding == "cdr"
-    head = _begun(encoding, slots, has_seq=not is_cdr)
-    head.string(frame_id, terminated=is_cdr)
-    told = PrimitiveWriter(b"", "<", aligned=False) if not is_cdr else head
-    told.put("i", fields.width, fields.height)
-    told.string(fields.ffmpeg_encoding(ros1=not is_cdr), terminated=is_cdr)
-    told.put("Q", slots.pts or 0)
-    told.put("B", _KEY_FRAME if is_key else 0)
-    if is_cdr:
-        head.put("B", 0)  # not from a big-endian machine
-        head.put("I", len(body))
-        return b"".join((head.getvalue(), body))
-    head.put("I", len(body))
-    return b"".join((head.getvalue(), body, told.getvalue()))
-
-
-def _begun(encoding: str, slots: Slots, *, has_seq: bool = False) -> PrimitiveWriter:
-    """A message up to and including its stamp."""
-    is_cdr = encoding == "cdr"
-    seconds, nanoseconds = divmod(slots.stamp, NS)
-    if not (-(2**31) if is_cdr else 0) <= seconds < (2**31 if is_cdr else 2**32):
-        raise WireError("its stamp is outside the range of ROS")
-    writer = PrimitiveWriter(b"\0\1\0\0" if is_cdr else b"", "<", aligned=is_cdr)
-    if has_seq:
-        writer.put("I", slots.seq or 0)
-    writer.put("i" if is_cdr else "I", seconds)
-    writer.put("I", nanoseconds)
-    return writer
-
 
 # ---------------------------------------------------------------- kinds
 
 _DISTRIBUTION = "humble"
+_ENCODERS = {"h264": "libx264", "h265": "hevc_nvenc"}  # decoders in ROS 1 go by these
 _VIDEO = "string frame_id\nuint8[] data\nstring format\n"
 
 
@@ -188,6 +77,32 @@ KINDS: Mapping[str, Kind] = {
 FAMILIES = {kind.type_name.rpartition("/")[2]: kind.family for kind in KINDS.values()}
 """Last part of the name of a camera's type -> its family."""
 FAMILIES["RawImage"] = FAMILIES["Image"]  # Foxglove's
+
+
+def packet_format(kind: str, sidecar: StreamSidecar, pixel_format: str, *, ros1: bool) -> str:
+    """What messages say about the coding of their packets.
+
+    Args:
+        kind: ``compressed-video`` or ``ffmpeg``.
+        sidecar: Of the video.
+        pixel_format: Of the video as ffmpeg calls it.
+        ros1: Whether they are messages of ROS 1.
+    """
+    if kind == "compressed-video":
+        return sidecar.video.codec
+    codec = CODECS[sidecar.video.codec].ffmpeg
+    if ros1:
+        return _ENCODERS.get(sidecar.video.codec, codec)
+    encoding = sidecar.image.encoding
+    known = ENCODINGS[encoding]
+    if known.channels == 1 and not known.mosaic and known.rows == 1:
+        before = shown = "mono8"
+    else:
+        before = "bgr8"
+        shown = "rgb8" if encoding.startswith("rgb") else "bgr8"
+    pixel_format = pixel_format.replace("yuvj", "yuv")  # the video itself has its range
+    return ";".join((codec, pixel_format, before, shown))
+
 
 # ---------------------------------------------------------------- types
 
@@ -271,7 +186,7 @@ class Types:
         self,
         slots: Slots,
         frame_id: str,
-        fields: Fields | VideoFields,
+        fields: Fields,
         body: bytes | memoryview,
         *,
         is_key: bool = False,
@@ -291,12 +206,8 @@ class Types:
         """
         stamp = _wrapped(slots.stamp, signed=self.encoding == "cdr")
         slots = Slots(stamp, slots.seq, slots.pts)
-        if isinstance(fields, VideoFields):
-            if self._kind == "ffmpeg":
-                return ffmpeg_message(self.encoding, slots, frame_id, fields, body, is_key)
-            return video_message(self.encoding, slots, frame_id, fields.codec, body)
         wire, name = _WIRES[self.encoding], KINDS[self._kind].type_name
-        return plain_message(wire, name, frame_id, fields, slots, body)
+        return plain_message(wire, name, frame_id, fields, slots, body, flags=int(is_key))
 
 
 def _is_kept(key: str) -> bool:

@@ -41,7 +41,7 @@ from mp4ds.records import (
     MetadataRecord,
     bounded,
 )
-from mp4ds.unpacking.image_folders import TopicImages, image_names, topic_images
+from mp4ds.unpacking.image_folders import TopicImages, image_names
 from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
 from mp4ds.unpacking.pictures import Reduction
 from mp4ds.unpacking.republish import Republisher, check_kind
@@ -548,15 +548,9 @@ def _unpack_images(
     found: list[TopicImages] = []
     refused: dict[str, str] = {}
     for topic in filter(options.selected, dataset.camera_topics):
-        images = topic_images(
-            dataset,
-            topic,
-            image_format=options.image_format,
-            jpeg_quality=options.jpeg_quality,
-            reduction=options.reduction,
-        )
         without = dataset.verbatim(topic)[1]
-        if images is not None:
+        if topic in dataset:
+            images = TopicImages(dataset[topic], options)
             found.append(images)
             if images.refused:
                 refused[topic] = "; ".join(images.refused)
