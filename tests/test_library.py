@@ -222,7 +222,7 @@ def test_what_cannot_be_opened(tmp_path: Path, colour: tuple[Path, Scene]) -> No
         ):
             mp4ds.pack(video, tmp_path / "packed")
     shutil.copy(colour[0] / "cam_image_raw.mp4", tmp_path / "alone.mp4")
-    with pytest.raises(mp4ds.SourceError, match=r"without its sidecar, alone\.yaml"):
+    with pytest.raises(mp4ds.FormatError, match=r"without its sidecar, alone\.yaml"):
         mp4ds.Dataset(tmp_path / "alone.mp4")
     (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(range(256)))
     with pytest.raises(mp4ds.Mp4dsError):

@@ -20,7 +20,8 @@ NAMES = [
     "ClusterError", "ConversionError", "Dataset", "EncoderRefusedError", "EvaluateOptions",
     "Evaluation", "ExportOptions", "ExportSummary", "FormatError", "Frame",
     "FrameNotFoundError", "ImageFolder", "Mp4dsError", "OptionError", "PackOptions",
-    "PackSummary", "PartsFailedError", "PlayOptions", "PlaySummary", "Problem", "PublishError",
+    "PackSummary", "PartsFailedError", "PathError", "PlayOptions", "PlaySummary", "Problem",
+    "PublishError",
     "RecordOptions", "RecordSummary", "RecordedMessage", "RemoteError", "ReportOptions",
     "ReportSummary", "SampleError", "ScoringError", "SourceError", "SourceNotFoundError",
     "Stream", "Sync", "TargetError", "TargetExistsError", "Topic", "UnpackOptions",
@@ -67,7 +68,7 @@ BUILTIN: dict[type[Exception], str] = {
     LookupError: "FrameNotFoundError",
     ConnectionError: "ClusterError",
     RuntimeError: "SampleError",
-    Exception: "RemoteError PartsFailedError ScoringError EncoderRefusedError",
+    Exception: "PathError RemoteError PartsFailedError ScoringError EncoderRefusedError",
 }
 WRONG_INPUT = [
     "SourceError", "SourceNotFoundError", "TargetError", "TargetExistsError", "OptionError",

@@ -249,8 +249,8 @@ def test_a_video_alone_that_was_cut_short(dataset: Path, tmp_path: Path) -> None
 def test_a_video_without_its_sidecar(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "alone.mp4").write_bytes((dataset / VIDEO).read_bytes())
     refused = call("info", tmp_path / "alone.mp4")
-    assert refused.code == 2
-    assert "alone.mp4: is a video without its sidecar, alone.yaml." in refused.err
+    assert refused.code == 1
+    assert "alone.mp4: is a video without its sidecar, alone.yaml [file-missing]." in refused.err
 
 
 def test_a_folder_of_datasets_is_not_one(dataset: Path) -> None:

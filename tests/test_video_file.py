@@ -164,7 +164,7 @@ def test_videos_of_a_dataset_need_their_sidecars(tmp_path: Path) -> None:
     with mp4ds.open(tmp_path / "alone.mp4") as dataset:
         assert len(dataset["alone"]) == 8
     (tmp_path / "drive" / "cam_image_raw.yaml").rename(tmp_path / "alone.yaml")
-    with pytest.raises(mp4ds.SourceError, match=r"without its sidecar, cam_image_raw\.yaml"):
+    with pytest.raises(mp4ds.FormatError, match=r"sidecar, cam_image_raw\.yaml"):
         mp4ds.open(tmp_path / "drive" / "cam_image_raw.mp4")
     with mp4ds.open(tmp_path / "alone.mp4") as dataset:
         assert len(dataset.streams) == 1
@@ -175,7 +175,7 @@ def test_videos_of_a_dataset_need_their_sidecars(tmp_path: Path) -> None:
 def test_only_frames_are_read_without_a_sidecar(tmp_path: Path) -> None:
     write_video(tmp_path / "clip.mp4", "h264")
     for call in (mp4ds.Dataset, lambda path: mp4ds.unpack(path, "bag", tmp_path / "again.bag")):
-        with pytest.raises(mp4ds.SourceError, match=r"without its sidecar, clip\.yaml"):
+        with pytest.raises(mp4ds.FormatError, match=r"sidecar, clip\.yaml \[file-missing\]"):
             call(tmp_path / "clip.mp4")
     assert [item.code for item in mp4ds.validate(tmp_path / "clip.mp4")] == ["file-missing"]
 

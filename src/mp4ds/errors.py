@@ -3,23 +3,24 @@
 ::
 
     Mp4dsError                         exit code 1
-    ├── SourceError (ValueError)       2  a recording that cannot be read
-    │   └── SourceNotFoundError (FileNotFoundError)
-    ├── TargetError (OSError)          2  an output that cannot be written there
-    │   └── TargetExistsError (FileExistsError)
+    ├── PathError                      1  a file or folder with which something is wrong
+    │   ├── SourceError (ValueError)   2  a recording that cannot be read
+    │   │   └── SourceNotFoundError (FileNotFoundError)
+    │   ├── TargetError (OSError)      2  an output that cannot be written there
+    │   │   └── TargetExistsError (FileExistsError)
+    │   ├── WriteError (OSError)       1  an output could not be written
+    │   └── RemoteError                1  a store or web server that fails
     ├── OptionError (ValueError)       2  options that are unknown or contradict each other
     ├── FrameNotFoundError (LookupError) 2  no frame has the requested time
     ├── FormatError (ValueError)       1  a dataset that breaks a rule of the format
     │   ├── VersionError               1  written by a newer major version
     │   └── VideoError                 1  a video that cannot be decoded as its sidecar says
     ├── ConversionError (ValueError)   1  a message that the target cannot hold
-    ├── WriteError (OSError)           1  an output could not be written
     ├── PartsFailedError               1  parts of a pack failed, the others are kept
     ├── EncoderRefusedError            1  pictures that an encoder does not support
     ├── ScoringError                   1  an ffmpeg with libvmaf that is missing or failed
     ├── SampleError (RuntimeError)     1  a sample of a data loader that cannot be read
     ├── ClusterError (ConnectionError) 1  a cluster that does not respond, or was lost
-    ├── RemoteError                    1  a store or web server that fails
     └── PublishError (OSError)         1  ROS or another receiver that is missing or was lost
 
 The classes build their sentence from their fields: what, where, and what to do.
@@ -108,7 +109,7 @@ def interrupted(error: KeyboardInterrupt | SystemExit, text: str) -> BaseExcepti
     return told
 
 
-class _PathError(Mp4dsError):
+class PathError(Mp4dsError):
     """Something is wrong with a file or folder.
 
     Args:
@@ -123,7 +124,7 @@ class _PathError(Mp4dsError):
         super().__init__(f"{path_text(path)}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
-class SourceError(_PathError, ValueError):
+class SourceError(PathError, ValueError):
     """A recording cannot be read."""
 
     exit_code = 2
@@ -136,7 +137,7 @@ class SourceNotFoundError(SourceError, FileNotFoundError):
         super().__init__(path, "no such file or folder", "Check the path.")
 
 
-class TargetError(_PathError, OSError):
+class TargetError(PathError, OSError):
     """An output cannot be written to the requested place."""
 
     exit_code = 2
@@ -249,7 +250,7 @@ class ConversionError(Mp4dsError, ValueError):
         super().__init__(f"topic {topic}: {problem}." + (f" {remedy}" if remedy else ""))
 
 
-class WriteError(_PathError, OSError):
+class WriteError(PathError, OSError):
     """An output could not be written, since the disk is full, for example.
 
     Args:
@@ -304,7 +305,7 @@ class ClusterError(Mp4dsError, ConnectionError):
         super().__init__(f"{address}: {problem}. {remedy}")
 
 
-class RemoteError(_PathError):
+class RemoteError(PathError):
     """A store or web server did not answer, or the network failed, while reading or uploading.
 
     It is neither a `ValueError` nor an `OSError` on purpose: handlers of a damaged recording or a

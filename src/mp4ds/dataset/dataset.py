@@ -28,6 +28,7 @@ from mp4ds.dataset.messages import MessagesFile, RecordedMessage, as_recorded
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.errors import (
+    FormatError,
     OptionError,
     SourceError,
     SourceNotFoundError,
@@ -111,11 +112,8 @@ class Dataset:
         else:
             sidecar = self.path.with_suffix(".yaml") if self.path.suffix == ".mp4" else self.path
             if sidecar != self.path and self.path.exists() and not sidecar.exists():
-                raise SourceError(
-                    self.path,
-                    f"is a video without its sidecar, {sidecar.name}",
-                    "Put them side by side; without one, `mp4ds.open` in Python reads the video.",
-                )
+                problem = f"is a video without its sidecar, {sidecar.name}"
+                raise FormatError("file-missing", self.path, problem)
             sidecars = [sidecar]
         self.streams = [Stream(sidecar, jpeg_quality=jpeg_quality) for sidecar in sidecars]
         self._file = MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
