@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mp4ds.format.fields import FORMAT_VERSION
-from mp4ds.format.sidecars import generate_schema
+from mp4ds.format.sidecars import MODELS
 
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = ("stream", "dataset")
@@ -41,6 +41,17 @@ def outputs() -> dict[Path, str]:
         (ROOT / "pyproject.toml").read_text()
     )
     return texts
+
+
+def generate_schema(kind: str) -> str:
+    """The JSON Schema that the models describe now."""
+    schema = MODELS[kind].model_json_schema(by_alias=True, mode="validation")
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"urn:mp4ds:{FORMAT_VERSION}:{kind}",
+        **schema,
+    }
+    return json.dumps(schema, indent=2) + "\n"
 
 
 def floors_picture(text: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Callable
 from fractions import Fraction
@@ -171,10 +170,12 @@ _COMMENTS = {
     "stream": "One camera stream, packed by mp4ds: frame n of the video is entry n of each column.",
     "dataset": "A robot recording, packed by mp4ds: `mp4ds unpack` gives it back.",
 }
-_MODELS: dict[str, type[StreamSidecar] | type[Manifest]] = {
+MODELS: dict[str, type[StreamSidecar] | type[Manifest]] = {
     "stream": StreamSidecar,
     "dataset": Manifest,
 }
+"""Kind of a document -> its model."""
+
 _NEWS_LISTED = 5
 _ModelT = TypeVar("_ModelT", bound=BaseModel)
 
@@ -225,7 +226,7 @@ def load_document(path: Path) -> dict[str, Any]:
         raise FormatError(
             "version-unsupported", path, f"has version {version!r}, which does not exist"
         )
-    if document.get("kind") not in list(_MODELS):
+    if document.get("kind") not in list(MODELS):
         raise FormatError("kind-unknown", path, "is not a stream or a dataset")
     return document if found == supported else _without_news(document, path)
 
@@ -236,7 +237,7 @@ def cut_short(document: dict[str, Any]) -> str:
     Keys are written in the order of the model, so the last one is missing from a file that ends
     early.
     """
-    fields = model_for(document).model_fields
+    fields = MODELS[document["kind"]].model_fields
     required = [name for name, field in fields.items() if field.is_required()]
     if required[-1] in document:
         return ""
@@ -249,7 +250,7 @@ def _without_news(document: dict[str, Any], path: Path) -> dict[str, Any]:
     dropped: list[str] = []
     while True:
         try:
-            model_for(document).model_validate(document)
+            MODELS[document["kind"]].model_validate(document)
         except ValidationError as error:
             unknown = [item["loc"] for item in error.errors() if item["type"] == "extra_forbidden"]
         else:
@@ -379,11 +380,6 @@ def model_problems(error: ValidationError) -> list[tuple[str, str]]:
     ]
 
 
-def model_for(document: dict[str, Any]) -> type[StreamSidecar] | type[Manifest]:
-    """The model of a document that `load_document` returned."""
-    return _MODELS[document["kind"]]
-
-
 @cache
 def schema_text(kind: str) -> str:
     """The released JSON Schema of ``stream`` or ``dataset``, as shipped with the package."""
@@ -393,14 +389,3 @@ def schema_text(kind: str) -> str:
         return shipped.read_text(encoding="utf-8")
     # a checkout: the wheel's copy is made from this folder
     return (Path(__file__).parents[3] / "schemas" / name).read_text(encoding="utf-8")
-
-
-def generate_schema(kind: str) -> str:
-    """The JSON Schema that the models describe now."""
-    schema = _MODELS[kind].model_json_schema(by_alias=True, mode="validation")
-    schema = {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"urn:mp4ds:{FORMAT_VERSION}:{kind}",
-        **schema,
-    }
-    return json.dumps(schema, indent=2) + "\n"
