@@ -13,7 +13,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,8 +20,8 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 import mp4ds
+from commands import call
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
-from mp4ds.cli import commands
 from mp4ds.dataset.views import effective
 from mp4ds.messages.transforms import Transform
 from mp4ds.messages.wire import CalibrationFields
@@ -316,12 +315,12 @@ def test_effective_matrices_are_told_where_they_differ(
 
 def command(path: Path, *options: str) -> tuple[str, dict[str, Any]]:
     """What the command prints, and the names that this sets when it is run as Python."""
-    result = CliRunner().invoke(commands, ["info", str(path), "--intrinsics", *options])
-    assert result.exit_code == 0, result.output
+    result = call("info", path, "--intrinsics", *options)
+    assert result.code == 0, result.err
     names: dict[str, Any] = {}
     if "--json" not in options:
-        exec(compile(result.stdout, "printed", "exec"), names)
-    return result.stdout, names
+        exec(compile(result.out, "printed", "exec"), names)
+    return result.out, names
 
 
 @pytest.mark.parametrize("packed", [False, True])
