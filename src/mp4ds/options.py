@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import Field, dataclass, field
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -40,6 +40,7 @@ class Declared:
         metavar: Placeholder for its value.
         least: The minimum; None for any value.
         most: The maximum; None for any value.
+        choices: Its values; empty for any.
         parse: Makes the value of text; passes on what is a value.
         changes: `CONTENT`, `ENCODING`, or empty.
         only: The formats, layouts or ROS versions that it works with; empty for all.
@@ -51,6 +52,7 @@ class Declared:
     metavar: str | None = None
     least: float | None = None
     most: float | None = None
+    choices: Collection[str] = ()
     parse: Callable[[Any], Any] | None = None
     changes: str = ""
     only: tuple[str, ...] = ()
@@ -101,7 +103,7 @@ class Options:
                 if declared.parse:
                     value = declared.parse(value)
                     object.__setattr__(self, name, value)  # dataclasses of options are frozen
-                _check_bounds(value, declared)
+                _check(value, declared)
             except OptionError as error:
                 raise OptionError(f"`{name}` {error}") from None
 
@@ -133,7 +135,9 @@ def declared_in(kind: type) -> list[tuple[str, Declared]]:
     return [(name, item.metadata["declared"]) for name, item in known.items()]
 
 
-def _check_bounds(value: Any, declared: Declared) -> None:
+def _check(value: Any, declared: Declared) -> None:
+    if declared.choices and value not in ("", *declared.choices):
+        raise OptionError(f"{value!r} is not known. Use {', '.join(declared.choices)}.")
     if isinstance(value, (int, float)):
         if declared.least is not None and not value >= declared.least:  # no number, too
             raise OptionError(f"{value} is below {declared.least:g}.")

@@ -18,7 +18,7 @@ from mp4ds.cli.output import be_quiet, complain
 from mp4ds.cli.process import DEBUG, caught_signals
 from mp4ds.cli.progress import Row, display
 from mp4ds.errors import OptionError
-from mp4ds.options import HOW, WHERE, Options
+from mp4ds.options import WHERE, Options
 from mp4ds.options import option as field_option
 from mp4ds.plugins.ros.names import LOG_LEVELS, PLAIN, NodeNames, node_arguments
 
@@ -33,7 +33,9 @@ class RosOptions(Options):
 
     ros1: bool = field_option("Use ROS 1.", False, panel=WHERE)
     ros2: bool = field_option("Use ROS 2, with rclpy, or else Cyclone DDS.", False, panel=WHERE)
-    log_level: str = field_option("Log level: debug, info, warn, error or fatal.", "", panel=HOW)
+    log_level: str = field_option(
+        "Log level: debug, info, warn, error or fatal.", "", choices=LOG_LEVELS
+    )
     disable_keyboard_controls: bool = field_option("Disable the keyboard controls.", False)
     progress: bool = field_option("Show the progress.", True, "--progress/--no-progress")
 
@@ -41,8 +43,6 @@ class RosOptions(Options):
         super().__post_init__()
         if self.ros1 and self.ros2:
             raise OptionError("--ros1 contradicts --ros2.")
-        if self.log_level not in ("", *LOG_LEVELS):
-            raise OptionError(f"`log_level` {self.log_level!r} is not {', '.join(LOG_LEVELS)}.")
 
     @property
     def to(self) -> str | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mp4ds.errors import OptionError
+from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import (
     ENCODING,
     LONG,
@@ -42,6 +43,7 @@ class ImageFolder(Options):
     )
     unit: str | None = option(
         "Unit of integer times: s, ms, us or ns; default: ns, if they have enough digits.",
+        choices=("s", "ms", "us", "ns"),
         only=_PLAIN,
     )
     calibration: str | None = option(
@@ -55,6 +57,7 @@ class ImageFolder(Options):
     frame_id: str | None = option("Frame id of plain images; default: camera.", only=_PLAIN)
     encoding: str | None = option(
         "Encoding of plain images, such as bayer_rggb8 or 16UC1; default: as in the files.",
+        choices=ENCODINGS,
         only=_PLAIN,
     )
 

@@ -9,6 +9,7 @@ from mp4ds.options import WHAT, SliceOptions, force, jpeg_quality, latched, opti
 from mp4ds.records import Loss
 from mp4ds.unpacking.pictures import ReductionOptions
 from mp4ds.unpacking.republish import Republished
+from mp4ds.unpacking.types import KINDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,15 +19,18 @@ class UnpackOptions(SliceOptions, ReductionOptions):
     latched: bool = latched()
     salvage: bool = option("Restore what can be read of a damaged dataset.", False, panel=WHAT)
     storage: str | None = option(
-        "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap."
+        "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap.",
+        choices=("sqlite3", "mcap"),
     )
     image_format: str | None = option(
-        "png (exact) or jpeg, for `to` images; default: JPEG files as recorded, others as png."
+        "png (exact) or jpeg, for `to` images; default: JPEG files as recorded, others as png.",
+        choices=("png", "jpeg"),
     )
     images: str | None = option(
         "Convert all cameras to raw, jpeg, png, compressed-video or ffmpeg messages; "
         "default: as recorded.",
         metavar="KIND",
+        choices=KINDS,
     )
     jpeg_quality: int = jpeg_quality()
     skip_unconvertible: bool = option(

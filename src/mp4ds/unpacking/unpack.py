@@ -45,7 +45,6 @@ from mp4ds.unpacking.image_folders import TopicImages, image_names
 from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
 from mp4ds.unpacking.pictures import Reduction
 from mp4ds.unpacking.republish import Republisher, check_kind
-from mp4ds.unpacking.types import KINDS
 
 TARGETS = ("bag", "rosbag2", "mcap", "images")
 _SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
@@ -261,14 +260,8 @@ def _check(to: str, options: UnpackOptions) -> None:
     """
     if to not in TARGETS:
         raise OptionError(f"`to` {to!r} is not known. Use {', '.join(TARGETS)}.")
-    if options.storage not in (None, "sqlite3", "mcap"):
-        raise OptionError(f"`storage` {options.storage!r} is not known. Use sqlite3 or mcap.")
     if options.storage and to != "rosbag2":
         raise OptionError(f"`storage` works with `to` rosbag2, not with `to` {to}.")
-    if options.image_format not in (None, "png", "jpeg"):
-        raise OptionError(f"`image_format` {options.image_format!r} is not known. Use png or jpeg.")
-    if options.images not in (None, *KINDS):
-        raise OptionError(f"`images` {options.images!r} is not known. Use {', '.join(KINDS)}.")
     if options.images and to == "images":
         raise OptionError("`images` is for recordings; with `to` images, use `image_format`.")
     check_kind(options.images, options.reduction)

@@ -28,7 +28,6 @@ from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
 
 _FOLDERS, _LEROBOT = ("euroc", "tum", "colmap"), ("lerobot",)
-_CODECS = ("av1", "h264", "h265")
 _NS_PER_MS = 1_000_000
 
 
@@ -79,7 +78,12 @@ class ExportOptions(SliceOptions, ReductionOptions):
     task: str = option(
         "Task description, for lerobot.", "", panel=WHAT, metavar="TEXT", only=_LEROBOT
     )
-    codec: str = option("Video codec for lerobot: av1, h264 or h265.", "av1", only=_LEROBOT)
+    codec: str = option(
+        "Video codec for lerobot: av1, h264 or h265.",
+        "av1",
+        choices=("av1", "h264", "h265"),
+        only=_LEROBOT,
+    )
     crf: int = option(
         "Quality of lerobot's videos; lower is better.", 30, least=0, most=63, only=_LEROBOT
     )
@@ -87,8 +91,6 @@ class ExportOptions(SliceOptions, ReductionOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.codec not in _CODECS:
-            raise OptionError(f"`codec` {self.codec!r} is not known. Use {', '.join(_CODECS)}.")
         most = MAX_CRF[self.codec]
         if not 0 <= self.crf <= most:
             raise OptionError(f"`crf` {self.crf} is not from 0 to {most}, as {self.codec} has it.")

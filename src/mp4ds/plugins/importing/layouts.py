@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from mp4ds.errors import OptionError, Refused, SourceError, SourceNotFoundError
 from mp4ds.files.sources import members
 from mp4ds.files.urls import remote
-from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.packing.options import ImageFolder
 from mp4ds.plugins.importing.parsing import (
-    UNITS,
     Rows,
     at_rate,
     euroc_calibration,
@@ -54,7 +52,8 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
         raise SourceNotFoundError(folder)
     if not folder.is_dir():
         raise SourceError(folder, "is not a folder of images")
-    _check(options)
+    if options.topic is not None and not options.topic.strip("/"):
+        raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
     try:
         reader = ImagesReader(folder)
         if _is_euroc(folder):
@@ -73,15 +72,6 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
         reader.add_file(Path(options.calibration), is_kept=True)
     reader.finish()
     return reader
-
-
-def _check(options: ImageFolder) -> None:
-    for name, known in (("unit", UNITS), ("encoding", ENCODINGS)):
-        value = getattr(options, name)
-        if value is not None and value not in known:
-            raise OptionError(f"`{name}` {value!r} is not one of {', '.join(known)}.")
-    if options.topic is not None and not options.topic.strip("/"):
-        raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
 
 
 def _calibration(

@@ -157,7 +157,9 @@ class PlayOptions(ReductionOptions):
         only=("ros2",),
     )
     publish_as: str | None = option(
-        "Publish cameras as raw, compressed (JPEG) or ffmpeg (video packets); default: as recorded."
+        "Publish cameras as raw, compressed (JPEG) or ffmpeg (video packets); "
+        "default: as recorded.",
+        choices=KINDS,
     )
     jpeg_quality: int = jpeg_quality()
     read_ahead: int = option(
@@ -169,7 +171,9 @@ class PlayOptions(ReductionOptions):
         most=10_000,
     )
     drop: bool = option("Drop late frames instead of playing slower.", False)
-    restamp: str | None = option("Set header stamps to the time of publishing.", metavar="now")
+    restamp: str | None = option(
+        "Set header stamps to the time of publishing.", metavar="now", choices=("now",)
+    )
     lock_step: str = option(
         "Publish the next frame only after a message on this topic.", "", metavar="TOPIC"
     )
@@ -183,11 +187,6 @@ class PlayOptions(ReductionOptions):
             raise OptionError(f"`clock` {self.clock:g} is not a rate above 0 and up to 10000 Hz.")
         if self.until_sec is not None and not math.isfinite(self.until_sec):
             raise OptionError(f"`until_sec` {self.until_sec:g} is not a number of seconds.")
-        if self.publish_as not in (None, *KINDS):
-            known = ", ".join(KINDS)
-            raise OptionError(f"`publish_as` {self.publish_as!r} is not known. Use {known}.")
-        if self.restamp not in (None, "now"):
-            raise OptionError(f"`restamp` {self.restamp!r} is not known. Use now.")
         clocks = {
             "clock": self.clock is not None,
             "clock_topics": bool(self.clock_topics),

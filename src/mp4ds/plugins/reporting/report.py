@@ -52,7 +52,6 @@ from mp4ds.plugins.reporting.proxies import (
 )
 from mp4ds.plugins.reporting.stills import StillOptions, frames
 
-PROXIES = ("auto", "all", "none")
 _PROXIES, _PICTURES = "proxies", "pictures"
 _PICTURE_WIDTH = 240
 
@@ -72,16 +71,12 @@ class ReportOptions(Options):
         "Make small videos for cameras browsers cannot play (auto), for all, or for none.",
         "auto",
         metavar="WHICH",
+        choices=("auto", "all", "none"),
     )
     proxy_width: int = option(
         "Maximum width of a proxy.", 640, metavar="PIXELS", least=64, most=3840
     )
     force: bool = force("Replace an index.html that is not a report.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.proxies not in PROXIES:
-            raise OptionError(f"`proxies` {self.proxies!r} is not known. Use {', '.join(PROXIES)}.")
 
 
 @dataclass(frozen=True)
