@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 import mp4ds
 from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE
-from mp4ds.messages.layouts import bind, fit
+from mp4ds.messages.layouts import fit
 from mp4ds.packing.options import PackOptions
 from mp4ds.plan import Purpose
 from mp4ds.video.codecs import lossless_codecs, recipe_for
-from mp4ds.video.encoder import Choice, VideoEncoder, choose, encode_on_trial
+from mp4ds.video.encoder import Coding, VideoEncoder, choose, encode_on_trial
 from pictures import picture
 from pixel_kinds import as_message, rounded
 from round_trips import unpacked
@@ -28,7 +28,7 @@ from sources import SOURCES
 Pixels = NDArray[Any]
 
 
-def chosen(samples: Sequence[Pixels], encoding: str, **options: Any) -> Choice:
+def chosen(samples: Sequence[Pixels], encoding: str, **options: Any) -> Coding:
     given = {"codec": None, "preset": None, "gop": 60, "threads": 1, **options}
     return choose(samples, ENCODINGS[encoding], **given)
 
@@ -46,8 +46,8 @@ def texture(rng: np.random.Generator, top: int, width: int = 96, height: int = 6
     return rng.integers(0, top, (height, width), np.uint16, endpoint=True)
 
 
-def video_size(path: Path, samples: Sequence[Pixels], encoding: str, choice: Choice) -> int:
-    layout = bind(choice.layout, ENCODINGS[encoding], choice.parameters)
+def video_size(path: Path, samples: Sequence[Pixels], encoding: str, choice: Coding) -> int:
+    layout = choice.layout
     pictures = [layout.to_picture(pixels) for pixels in samples]
     height, width = pictures[0][0].shape[:2]
     encoder = VideoEncoder(
@@ -68,7 +68,7 @@ def video_size(path: Path, samples: Sequence[Pixels], encoding: str, choice: Cho
 def test_the_estimate_is_near_the_truth(encoding: str, tmp_path: Path) -> None:
     samples = scene(encoding, 24)
     choice = chosen(samples[:6], encoding)
-    layout = bind(choice.layout, ENCODINGS[encoding], choice.parameters)
+    layout = choice.layout
     if any(map(layout.refuses, samples)):
         samples = [*samples[:6], *samples[5::-1]] * 2
     size = video_size(tmp_path / "v.mp4", samples, encoding, choice)
@@ -109,9 +109,8 @@ def test_some_layout_is_chosen_for_every_encoding(encoding: str) -> None:
     first, again = chosen(samples, encoding), chosen(samples, encoding)
     assert first == again
     assert first.recipe.lossless
-    assert first.layout in ENCODINGS[encoding].exact
-    layout = bind(first.layout, ENCODINGS[encoding], first.parameters)
-    assert not any(map(layout.refuses, samples))
+    assert first.layout.name in ENCODINGS[encoding].exact
+    assert not any(map(first.layout.refuses, samples))
     assert 0 < first.bytes_per_frame < samples[0].nbytes * 1.1
     views = [
         as_message(pixels, ENCODINGS[encoding], pad=8, is_bigendian=True) for pixels in samples
@@ -135,8 +134,8 @@ def test_noise_below_the_signal_is_folded_away() -> None:
     samples = [still + rng.integers(0, 4, still.shape, np.uint16) for _ in range(6)]
     samples = [np.minimum(pixels, 4095) for pixels in samples]
     choice = chosen(samples, "mono16")
-    assert (choice.layout, choice.recipe.codec) == ("fold", "h264")
-    assert (choice.parameters.bits, choice.parameters.low) == (12, 3)
+    assert (choice.layout.name, choice.recipe.codec) == ("fold", "h264")
+    assert (choice.layout.parameters.bits, choice.layout.parameters.low) == (12, 3)
 
 
 def test_values_that_change_are_listed_in_each_picture() -> None:
@@ -147,7 +146,7 @@ def test_values_that_change_are_listed_in_each_picture() -> None:
         disparity = np.rint(400 + 180 * np.sin((x + n) / 90) + 100 * np.cos(y / 40) + 3 * n)
         samples.append((np.float32(70.123) / disparity).astype(np.float32))
     choice = chosen(samples, "32FC1")
-    assert choice.layout == "palette"
+    assert choice.layout.name == "palette"
     assert choice.bytes_per_frame < samples[0].nbytes / 8
 
 
@@ -162,12 +161,12 @@ def test_metres_are_stored_as_millimetres(scale: str) -> None:
         metres[(x + n) % 13 == 0] = np.nan
         samples.append(metres)
     choice = chosen(samples, "32FC1")
-    assert choice.layout in ("metres16", "metres_fold")
-    assert choice.parameters.scale == scale
+    assert choice.layout.name in ("metres16", "metres_fold")
+    assert choice.layout.parameters.scale == scale
     samples[3][5, 5] = 1.00025  # one is no whole number of millimetres
-    assert chosen(samples, "32FC1").layout == "palette"
+    assert chosen(samples, "32FC1").layout.name == "palette"
     noise = [s + rng.normal(0, 0.01, s.shape).astype(np.float32) for s in samples]
-    assert chosen(noise, "32FC1").layout == "bytes"
+    assert chosen(noise, "32FC1").layout.name == "bytes"
 
 
 @pytest.mark.one_in(5)
@@ -202,7 +201,7 @@ def test_pictures_beyond_the_bounds_are_not_tried() -> None:
     """Twice the height of this image is more than a video may have."""
     rng = np.random.default_rng(0)
     ramp = np.cumsum(rng.integers(0, 3, (MAX_SIDE // 2 + 2, 4)), axis=0).astype(np.uint16)
-    assert chosen([ramp], "mono16").layout != "fold"
+    assert chosen([ramp], "mono16").layout.name != "fold"
     assert chosen([ramp], "mono16", codec="ffv1").recipe.pixel_format == "gray16le"
 
 
@@ -212,7 +211,7 @@ def test_large_images_are_tried_in_part(encoding: str) -> None:
     """The estimate is for the whole."""
     samples = scene(encoding, 3, width=1602, height=1202)
     choice = chosen(samples, encoding)
-    layout = bind(choice.layout, ENCODINGS[encoding], choice.parameters)
+    layout = choice.layout
     whole = encode_on_trial(
         [layout.to_picture(pixels) for pixels in samples],
         choice.recipe,

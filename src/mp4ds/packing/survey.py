@@ -14,10 +14,10 @@ from mp4ds.bags.mcap import compressed_size
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import EncoderRefusedError, OptionError, Refused
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.messages.layouts import bind, layout_for
+from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.tracks import FALLS, Coding, TrackPlan, WindowCoder, out_of_reach
+from mp4ds.packing.tracks import FALLS, TrackPlan, WindowCoder, out_of_reach
 from mp4ds.plan import visual_setting
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import TIMESCALE
@@ -31,7 +31,7 @@ from mp4ds.video.codecs import (
     lossless_codecs,
     recipe_for,
 )
-from mp4ds.video.encoder import choose
+from mp4ds.video.encoder import Coding, choose
 from mp4ds.video.scores import SMALLEST, largest_crf
 
 SAMPLES = 6
@@ -250,9 +250,8 @@ def _lossless_plans(
     _refuse_noise(samples, best.bytes_per_frame)
     if codec is None:
         _refuse_few(samples, best.bytes_per_frame)
-    layout = bind(best.layout, encoding, best.parameters)
-    plan = TrackPlan(Coding(layout, best.recipe, best.gop), note=note)
-    if layout.name == encoding.general:
+    plan = TrackPlan(best, note=note)
+    if best.layout.name == encoding.general:
         return [plan]
     return [plan, _general_plan(samples[0].key, options)]
 

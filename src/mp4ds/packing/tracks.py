@@ -23,60 +23,14 @@ from mp4ds.errors import EncoderRefusedError, Refused
 from mp4ds.format.models import SCORE_STEPS, Color, LayoutParameters
 from mp4ds.format.models import Quality as Measured
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.messages.layouts import Layout, layout_for
+from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage
 from mp4ds.plan import LOSSLESS, QualityTarget
 from mp4ds.video.codecs import LEAST_CRF, MAX_CRF, Recipe, lossless_codecs, recipe_for
-from mp4ds.video.encoder import Choice, VideoEncoder, coded_size
+from mp4ds.video.encoder import Coding, VideoEncoder, coded_size
 from mp4ds.video.packets import PacketWriter, join_segments
 from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
 from mp4ds.video.scores import Ffmpeg, find_ffmpeg, scores_of
-
-
-@dataclass(frozen=True, slots=True)
-class Coding:
-    """How pixels are encoded.
-
-    Attributes:
-        layout: How they become pictures.
-        recipe: Codec and options.
-        gop: Most frames between key frames.
-    """
-
-    layout: Layout
-    recipe: Recipe
-    gop: int
-
-    def with_crf(self, crf: int) -> Coding:
-        """The same at another crf."""
-        options = {**self.recipe.options, "crf": str(crf)}
-        return replace(self, recipe=replace(self.recipe, options=options))
-
-    @property
-    def crf(self) -> int:
-        """The constant rate factor of a lossy one."""
-        return int(self.recipe.options["crf"])
-
-    def facts(self, size: tuple[int, int], options: Mapping[str, str]) -> dict[str, Any]:
-        """The fields of `mp4ds.format.models.Video`, except for the file.
-
-        Args:
-            size: Columns and rows of the coded pictures.
-            options: Of the encoder.
-        """
-        layout, recipe = self.layout, self.recipe
-        values = layout.parameters.to_values()
-        return {
-            "layout": layout.name,
-            "parameters": LayoutParameters.model_validate(values) if values else None,
-            "codec": recipe.codec,
-            "pixel_format": recipe.pixel_format,
-            "width": size[0],
-            "height": size[1],
-            "color": _color(recipe) if layout.is_shown else None,
-            "encoder": recipe.encoder,
-            "options": dict(options),
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,10 +57,7 @@ class TrackPlan:
     @property
     def text(self) -> str:
         """All that decides about the video, in words."""
-        if self.coding is None:
-            return "copied"
-        layout, recipe, gop = self.coding.layout, self.coding.recipe, self.coding.gop
-        return Choice(layout.name, layout.parameters, recipe, 0.0, gop).text
+        return self.coding.text if self.coding else "copied"
 
 
 class Track(ABC):
@@ -275,7 +226,7 @@ class _EncodedTrack(Track):
 
     def describe(self) -> dict[str, Any]:
         encoder = self._encoder
-        return self._coding.facts((encoder.width, encoder.height), encoder.options)
+        return _facts(self._coding, (encoder.width, encoder.height), encoder.options)
 
 
 def _refuses(coding: Coding, seen: CameraMessage) -> str | None:
@@ -291,13 +242,33 @@ def _recipes(coding: Coding) -> Iterator[Recipe]:
             yield recipe_for(pixel_format, lossless=True, codec=codec)
 
 
-def _color(recipe: Recipe) -> Color:
-    return Color(
+def _facts(coding: Coding, size: tuple[int, int], options: Mapping[str, str]) -> dict[str, Any]:
+    """The fields of `mp4ds.format.models.Video`, except for the file.
+
+    Args:
+        coding: How its pictures are encoded.
+        size: Columns and rows of the coded pictures.
+        options: Of the encoder.
+    """
+    layout, recipe = coding.layout, coding.recipe
+    values = layout.parameters.to_values()
+    color = Color(
         primaries="bt709",
         transfer="bt709",
         matrix=recipe.matrix,
         range="full" if recipe.full_range else "limited",
     )
+    return {
+        "layout": layout.name,
+        "parameters": LayoutParameters.model_validate(values) if values else None,
+        "codec": recipe.codec,
+        "pixel_format": recipe.pixel_format,
+        "width": size[0],
+        "height": size[1],
+        "color": color if layout.is_shown else None,
+        "encoder": recipe.encoder,
+        "options": dict(options),
+    }
 
 
 # ---------------------------------------------------------------- aimed at a score
@@ -619,7 +590,7 @@ class _ScoredTrack(Track):
         coder = self._coder
         options = {**coder.coding.recipe.options, "g": str(coder.coding.gop)}
         return {
-            **coder.coding.facts(coder.coded_size, options),
+            **_facts(coder.coding, coder.coded_size, options),
             "quality": Measured.from_scores(
                 coder.target,
                 np.concatenate(self._scores),

@@ -17,7 +17,7 @@ import numpy as np
 from av.error import FFmpegError
 
 from mp4ds.errors import EncoderRefusedError, OptionError
-from mp4ds.messages.encodings import MAX_SIDE, Encoding, Parameters, Picture, Pixels
+from mp4ds.messages.encodings import MAX_SIDE, Encoding, Picture, Pixels
 from mp4ds.messages.layouts import Layout, fit
 from mp4ds.plan import Purpose
 from mp4ds.times import TIMESCALE
@@ -279,28 +279,37 @@ _LARGEST = 800 * 600  # pixels of an image that are tried; of a larger one its m
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
-    """The choice for a stream.
+class Coding:
+    """How the pixels of a stream are encoded.
 
     Attributes:
-        layout: Name of the layout.
-        parameters: Of the layout, which may refuse later images because of them.
+        layout: How they become pictures; it may refuse later images because of its parameters.
         recipe: Codec and options.
-        bytes_per_frame: Estimated size of a coded image.
-        gop: Frames from one key frame to the next.
+        gop: Most frames from one key frame to the next.
+        bytes_per_frame: Estimated size of a coded image; 0 if it was not tried.
     """
 
-    layout: str
-    parameters: Parameters
+    layout: Layout
     recipe: Recipe
-    bytes_per_frame: float
     gop: int
+    bytes_per_frame: float = 0.0
+
+    def with_crf(self, crf: int) -> Coding:
+        """The same at another crf."""
+        options = {**self.recipe.options, "crf": str(crf)}
+        return replace(self, recipe=replace(self.recipe, options=options))
+
+    @property
+    def crf(self) -> int:
+        """The constant rate factor of a lossy one."""
+        return int(self.recipe.options["crf"])
 
     @property
     def text(self) -> str:
-        """The choice in words: the same for the same choice, in every process."""
-        recipe, parameters = self.recipe, self.parameters.to_values()
-        return f"{self.layout} {parameters} {recipe.encoder} {dict(recipe.options)} gop {self.gop}"
+        """All of it in words: the same for the same coding, in every process."""
+        layout, recipe = self.layout, self.recipe
+        values, options = layout.parameters.to_values(), dict(recipe.options)
+        return f"{layout.name} {values} {recipe.encoder} {options} gop {self.gop}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -419,7 +428,7 @@ def choose(
     threads: int,
     purpose: Purpose | None = None,
     known: Collection[str] = (),
-) -> Choice:
+) -> Coding:
     """The best lossless layout, recipe and distance of key frames, found by trying each.
 
     Args:
@@ -444,7 +453,7 @@ def choose(
     """
     crops, share = _crops(samples, encoding)
     is_fast = purpose is not None and purpose.is_training
-    tried: list[tuple[Choice, Coded]] = []
+    tried: list[tuple[Coding, Coded]] = []
     refusals: list[Exception] = []
     for layout in _candidates(samples, encoding):
         pictures = [layout.to_picture(pixels) for pixels in crops]
@@ -466,7 +475,7 @@ def choose(
                 refusals.append(error)
             else:
                 size = coded.bytes_per_frame(gop) / share
-                tried.append((Choice(layout.name, layout.parameters, recipe, size, gop), coded))
+                tried.append((Coding(layout, recipe, gop, size), coded))
     if not tried:
         # that an encoder refuses the size says more than that another has no such format
         raise next((e for e in refusals if isinstance(e, EncoderRefusedError)), refusals[0])
@@ -478,8 +487,8 @@ def choose(
 
 
 def _fastest(
-    tried: Sequence[tuple[Choice, Coded]], share: float, most: float, known: Collection[str]
-) -> Choice:
+    tried: Sequence[tuple[Coding, Coded]], share: float, most: float, known: Collection[str]
+) -> Coding:
     """The choice, with its best distance of key frames, whose random frames decode fastest.
 
     Args:
