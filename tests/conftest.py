@@ -125,7 +125,6 @@ def packed_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A lossless dataset of a small ROS 1 bag; not to be changed."""
     folder = tmp_path_factory.mktemp("packed")
     source = folder / "source"
-    source.mkdir()
     paths = SOURCES["bag-none"](source, scene("bayer_rggb8"))
     mp4ds.pack(paths, folder / "dataset", PackOptions(codec="h264"))
     return folder / "dataset"

@@ -107,7 +107,6 @@ def stamps_of(made: Scene, topic: str) -> list[int]:
 
 def pack_drive(folder: Path, made: Scene, **options: Any) -> Path:
     """A dataset of a scene."""
-    (folder / "source").mkdir()
     paths = SOURCES["mcap-ros2-none"](folder / "source", made)
     mp4ds.pack(paths, folder / "drive", mp4ds.PackOptions(**options))
     return folder / "drive"

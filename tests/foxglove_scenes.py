@@ -137,11 +137,12 @@ def write_foxglove(path: Path, scene: Scene, serialization: str) -> None:
 
 
 def _source(folder: Path, scene: Scene, *, serialization: str) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
     write_foxglove(folder / "drive.mcap", scene, serialization)
     return [folder / "drive.mcap"]
 
 
-# Each writes into a folder and returns the paths that make up the recording.
+# Each writes into a folder, which it makes, and returns the paths that make up the recording.
 FOXGLOVE_SOURCES: dict[str, Callable[[Path, Scene], list[Path]]] = {
     f"mcap-{name}": partial(_source, serialization=name) for name in SERIALIZATIONS
 }

@@ -68,7 +68,6 @@ def _later(images: list[Record], number: int) -> Record:
 
 def pack_cameras(folder: Path, made: Scene, **options: Any) -> Path:
     """A dataset of a scene, in a folder that is there."""
-    (folder / "source").mkdir()
     paths = SOURCES["bag-none"](folder / "source", made)
     mp4ds.pack(paths, folder / "drive", PackOptions(**{"quality": "visual", **options}))
     return folder / "drive"

@@ -90,7 +90,6 @@ def journey(folder: Path, write: Source, scene: Scene, target: str, **options: A
         target: One of `TARGETS`.
         options: Of the pack.
     """
-    (folder / "source").mkdir()
     sources = write(folder / "source", scene)
     summary = mp4ds.pack(sources, folder / "dataset", PackOptions(**options))
     assert mp4ds.validate(folder / "dataset", deep=True) == []

@@ -228,25 +228,29 @@ Source = Callable[[Path, Scene], list[Path]]
 
 
 def _bag(folder: Path, scene: Scene, *, compression: str) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
     write_bag(folder / "drive.bag", scene, compression)
     return [folder / "drive.bag"]
 
 
 def _split(folder: Path, scene: Scene) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
     return write_split_bags(folder, scene, 3)
 
 
 def _rosbag2(folder: Path, scene: Scene, **options: Any) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
     write_rosbag2(folder / "drive", scene, **options)
     return [folder / "drive"]
 
 
 def _mcap(folder: Path, scene: Scene, **options: Any) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
     write_mcap(folder / "drive.mcap", scene, **options)
     return [folder / "drive.mcap"]
 
 
-# Each writes into a folder and returns the paths that make up the recording.
+# Each writes into a folder, which it makes, and returns the paths that make up the recording.
 SOURCES: dict[str, Source] = {
     **{f"bag-{c}": partial(_bag, compression=c) for c in ("none", "bz2", "lz4")},
     "bag-split": _split,

@@ -70,7 +70,6 @@ def camera_scene(encoding: str, *, width: int = 96, frames: int = 10) -> Scene:
 
 
 def recording(folder: Path, encoding: str = "rgb8", source: str = "bag-none", **size: Any) -> Path:
-    (folder / "source").mkdir()
     return SOURCES[source](folder / "source", camera_scene(encoding, **size))[0]
 
 

@@ -2,38 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 import mp4ds
-from commands import typed
+from commands import program, typed
 from mp4ds.cli import COMMANDS, commands
 from mp4ds.plugins.demo import demo
 from sources import SOURCES, scene
-from waiting import WATCHDOG_S
 
 ROOT = Path(__file__).parents[1]
 
 
-def run(*command: str, cwd: Path) -> str:
-    bin_folder = str(Path(sys.executable).parent)
-    done = subprocess.run(
-        command,
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        env={**os.environ, "PATH": f"{bin_folder}:{os.environ['PATH']}"},
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+def run(*command: object, cwd: Path) -> str:
+    return program(*command, cwd=cwd).out
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +38,6 @@ def test_frames(demo_dataset: Path) -> None:
 
 
 def test_other_topics(tmp_path: Path) -> None:
-    (tmp_path / "source").mkdir()
     mp4ds.pack(SOURCES["mcap-ros2-zstd"](tmp_path / "source", scene("mono8")), tmp_path / "drive")
     out = run(
         sys.executable, str(ROOT / "examples/other_topics.py"), str(tmp_path / "drive"), cwd=ROOT
@@ -120,7 +105,6 @@ def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> No
         if line.startswith("mp4ds ")
     ]
     assert len(lines) >= 3
-    (tmp_path / "source").mkdir()
     source = SOURCES["rosbag2-mcap-v9"](tmp_path / "source", scene("mono8"))[0]
     shutil.copytree(source, tmp_path / "rosbag2_drive")
     for name in ("drive_0.mcap", "drive.mcap"):

@@ -63,7 +63,6 @@ class Pack:
     """
 
     def __init__(self, folder: Path, kind: str, patch: pytest.MonkeyPatch) -> None:
-        (folder / "source").mkdir()
         (self.source,) = SOURCES[kind](folder / "source", scene("bayer_rggb8", frames=6))
         self.target = folder / "dataset"
         self._folder, self._patch = folder, patch

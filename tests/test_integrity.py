@@ -47,7 +47,6 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> MakePacked:
     def make(source: str) -> tuple[list[Path], Path]:
         if source not in made:
             folder = tmp_path_factory.mktemp(source)
-            (folder / "source").mkdir()
             made_of = CODED[source](frames=6) if source in CODED else scene("bayer_rggb8")
             write = SOURCES["mcap-ros2-none" if source in CODED else source]
             paths = write(folder / "source", made_of)
@@ -492,7 +491,6 @@ def test_images_are_not_written_of_a_damaged_video(packed_bag: Path, tmp_path: P
 
 
 def test_jpeg_of_sixteen_bits_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    (tmp_path / "source").mkdir()
     sources = SOURCES["mcap-ros2-none"](tmp_path / "source", scene("mono16"))
     mp4ds.pack(sources, tmp_path / "dataset")
     options = mp4ds.UnpackOptions(image_format="jpeg")

@@ -62,7 +62,6 @@ def expected_pixels(values: Any) -> np.ndarray[Any, Any]:
 
 def packed(folder: Path, source: Scene, variant: str = "bag-none", **options: Any) -> Path:
     """A dataset of the scene."""
-    (folder / "source").mkdir(parents=True)
     paths = SOURCES[variant](folder / "source", source)
     mp4ds.pack(paths, folder / "dataset", PackOptions(**options))
     return folder / "dataset"

@@ -29,7 +29,6 @@ WORK = ".out.mp4ds-part"
 
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
-    (tmp_path / "source").mkdir()
     (path,) = SOURCES["bag-none"](tmp_path / "source", scene("bayer_rggb8", frames=9))
     return path
 

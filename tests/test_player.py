@@ -471,7 +471,6 @@ def test_publishing_as_jpeg(drive: tuple[Path, list[Recorded]]) -> None:
 
 def test_pictures_that_cannot_be_decoded_are_published_as_recorded(tmp_path: Path) -> None:
     """Though all of their channel was expected to become raw images."""
-    (tmp_path / "source").mkdir()
     made = CODED["video-h265-lost"]()
     mp4ds.pack(SOURCES["mcap-ros2-zstd"](tmp_path / "source", made), tmp_path / "video")
     publisher, summary = run(

@@ -147,7 +147,6 @@ class Datasets(dict[str, Path]):
 
     def __missing__(self, name: str) -> Path:
         case, place = CASES[name], self._folder / name.replace(" ", "_")
-        (place / "source").mkdir(parents=True)
         paths = SOURCES["bag-none"](place / "source", case.scene())
         options = PackOptions(topics=["/cam/*"], **case.options)
         self[name] = mp4ds.pack(paths, place / "dataset", options).dataset

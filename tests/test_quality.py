@@ -74,7 +74,6 @@ def recording(folder: Path, noises: list[float], source: str = "mcap-ros2-none")
             "data": data.ravel(),
         }  # fmt: skip
         groups.append([Record(TOPIC, IMAGE, log, image)])
-    (folder / "source").mkdir(exist_ok=True)
     return SOURCES[source](folder / "source", together(groups))
 
 
@@ -278,7 +277,6 @@ def test_what_cannot_have_it_later_on_is_lossless(
 
 
 def test_small_images_are_lossless(tmp_path: Path) -> None:
-    (tmp_path / "source").mkdir()
     paths = SOURCES["bag-none"](tmp_path / "source", scene("rgb8", width=12, height=12))
     summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="psnr=30", **QUICK))
     (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
@@ -288,7 +286,6 @@ def test_small_images_are_lossless(tmp_path: Path) -> None:
 def test_jpeg_files_that_cannot_have_it_stay(
     tmp_path: Path, compare: Callable[..., list[str]]
 ) -> None:
-    (tmp_path / "source").mkdir()
     paths = SOURCES["mcap-ros2-none"](tmp_path / "source", CODED["jpeg-rgb"]())
     options = {"transcode": True, **QUICK}
     mp4ds.pack(paths, tmp_path / "small", PackOptions(quality="ssim=0.9", **options))

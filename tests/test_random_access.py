@@ -38,7 +38,6 @@ ORDER = (5, 0, -1, 5, 3, 4, -9, 8)
 
 def packed(folder: Path, source: Scene, variant: str = "mcap-ros2-none", **options: Any) -> Path:
     """A dataset of the scene."""
-    (folder / "source").mkdir(parents=True)
     paths = SOURCES[variant](folder / "source", source)
     mp4ds.pack(paths, folder / "dataset", PackOptions(**options))
     return folder / "dataset"

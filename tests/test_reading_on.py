@@ -54,7 +54,6 @@ def rows(records: Iterator[Record]) -> list[Row]:
 
 
 def packed(folder: Path, made: Scene, source: str = "bag-none", **options: Any) -> Path:
-    (folder / "source").mkdir()
     paths = SOURCES[source](folder / "source", made)
     mp4ds.pack(paths, folder / "dataset", PackOptions(**options))
     return folder / "dataset"

@@ -52,7 +52,6 @@ def pieces(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def write(folder: Path, source: str = "bag-none", of: Scene | None = None) -> list[Path]:
-    (folder / "source").mkdir()
     made = of or scene("bayer_rggb8", frames=40)
     return SOURCES[source](folder / "source", replace(made, silent={}))  # nobody hears of those
 

@@ -72,7 +72,6 @@ def check_value(own: Any, value: Any) -> None:
 @pytest.mark.parametrize("variant", SOURCES)
 def test_messages_of_every_source(variant: str, tmp_path: Path) -> None:
     source = scene("mono8", frames=6)
-    (tmp_path / "source").mkdir()
     dataset = packed(tmp_path, SOURCES[variant](tmp_path / "source", source))
     sent = [record for record in source.messages if record.topic != TOPIC]
     with mp4ds.open(dataset) as opened:
@@ -307,7 +306,6 @@ def test_a_message_of_another_type_is_told(tmp_path: Path) -> None:
     images = scene("mono8", with_info=False).messages
     for variant in ("bag-none", "mcap-ros2-zstd"):
         folder = tmp_path / variant
-        (folder / "source").mkdir(parents=True)
         source = Scene([*made.messages, *images])
         dataset = packed(folder, SOURCES[variant](folder / "source", source))
         with mp4ds.open(dataset) as opened:

@@ -212,7 +212,6 @@ def some(first: int) -> list[Any]:
 def test_every_source_in_a_store(
     source: str, tmp_path: Path, put: Put, compare: Compare, executor: InlineExecutor
 ) -> None:
-    (tmp_path / "source").mkdir()
     paths = SOURCES[source](tmp_path / "source", scene("bayer_rggb8", frames=7))
     round_trip(paths, [put(path) for path in paths], tmp_path, source, compare)
 
@@ -573,7 +572,6 @@ def test_without_a_stores_package(
 
 def test_a_frame_costs_its_group_of_pictures(tmp_path: Path) -> None:
     """One of 12 groups of some 250 kB, and the index."""
-    (tmp_path / "source").mkdir()
     source = scene("mono8", frames=48, width=320, height=240)
     (path,) = SOURCES["mcap-ros2-none"](tmp_path / "source", source)
     mp4ds.pack(path, tmp_path / "drive", PackOptions(codec="h264", gop=4))

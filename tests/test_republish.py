@@ -85,7 +85,6 @@ class Packed:
     def __init__(
         self, folder: Path, made: Scene, source: str, options: PackOptions | None = None
     ) -> None:
-        (folder / "source").mkdir(parents=True)
         write = SOURCES.get(source) or FOXGLOVE_SOURCES[source]
         self.folder = folder
         self.scene = made

@@ -41,7 +41,6 @@ PARTS = [f"0000{number}" for number in range(4)]
 
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
-    (tmp_path / "source").mkdir()
     (path,) = SOURCES["bag-none"](tmp_path / "source", scene("bayer_rggb8", frames=12))
     return path
 

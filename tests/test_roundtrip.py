@@ -42,7 +42,6 @@ def has_streams(folder: Path) -> bool:
 def test_every_source_returns_to_its_own_format(
     source: str, encoding: str, tmp_path: Path, compare: Compare
 ) -> None:
-    (tmp_path / "source").mkdir()
     sources = SOURCES[source](tmp_path / "source", scene(encoding))
     output = round_trip(sources, tmp_path, own_target(source))
     assert has_streams(tmp_path / "dataset")
@@ -138,7 +137,6 @@ FOXGLOVE_TOPICS = {"/camera/image", "/camera/calibration", "/tf", "/pose", "/log
 @pytest.mark.parametrize("target", [*TARGETS][:3])
 def test_what_ros_can_hold_of_the_rest(target: str, tmp_path: Path, compare: Compare) -> None:
     """The remedy that the refusal names."""
-    (tmp_path / "source").mkdir()
     recorded = scene("rgb8")
     sources = SOURCES["mcap-none-profile"](tmp_path / "source", recorded)
     mp4ds.pack(sources, tmp_path / "dataset")
@@ -155,7 +153,6 @@ def test_what_ros_can_hold_of_the_rest(target: str, tmp_path: Path, compare: Com
 @pytest.mark.parametrize("trait", TRAITS)
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-none"])
 def test_odd_messages_return(trait: str, source: str, tmp_path: Path, compare: Compare) -> None:
-    (tmp_path / "source").mkdir()
     sources = SOURCES[source](tmp_path / "source", odd_scene(trait))
     output = round_trip(sources, tmp_path, own_target(source))
     assert compare(sources, output) == []

@@ -33,7 +33,6 @@ def executor(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def recording(folder: Path, trait: str, source: str = "mcap-ros2-none", **options: Any) -> Any:
-    (folder / "source").mkdir()
     return SOURCES[source](folder / "source", odd_scene(trait, **options))
 
 

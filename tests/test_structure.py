@@ -6,7 +6,6 @@ import ast
 import hashlib
 import json
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -16,6 +15,7 @@ from typing import Any
 import pydantic
 import pytest
 
+from commands import program
 from generate import generate_schema
 from mp4ds.format.fields import FORMAT_VERSION, document_of
 from mp4ds.format.manifest import Manifest
@@ -33,19 +33,13 @@ LONGER: dict[str, str] = {}
 """Modules that may be longer -> why."""
 
 
-def run(*command: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-
-
 # ---------------------------------------------------------------- modules
 
 
 def test_imports_keep_to_the_floors() -> None:
     pytest.importorskip("importlinter")
     code = "from importlinter.cli import lint_imports_command; lint_imports_command()"
-    done = run(sys.executable, "-c", code, "--no-cache")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert re.search(r"\b[1-9]\d* kept, 0 broken", done.stdout)
+    assert re.search(r"\b[1-9]\d* kept, 0 broken", program("-c", code, "--no-cache", cwd=ROOT).out)
 
 
 def test_modules_are_short() -> None:
@@ -125,8 +119,7 @@ writes_schemas = pytest.mark.skipif(
 
 @writes_schemas
 def test_what_is_generated_is_up_to_date() -> None:
-    done = run(sys.executable, "tools/generate.py", "--check")
-    assert done.returncode == 0, done.stdout + done.stderr
+    program(sys.executable, ROOT / "tools/generate.py", "--check")
 
 
 @pytest.mark.parametrize("kind", KINDS)

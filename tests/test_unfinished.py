@@ -30,7 +30,6 @@ PIECE, PART = "000002.mcap", "000001"
 def left(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a recorder leaves that could not finish, beside what was recorded; not to be changed."""
     folder = tmp_path_factory.mktemp("left")
-    (folder / "source").mkdir()
     made = replace(scene("bayer_rggb8", frames=FRAMES), silent={})
     paths = SOURCES["bag-none"](folder / "source", made)
     (folder / "robot" / "drives").mkdir(parents=True)
@@ -83,7 +82,6 @@ def test_a_recorder_leaves_what_it_finds(unfinished: Path) -> None:
 
 def test_a_recorder_leaves_files_of_the_user(tmp_path: Path) -> None:
     """What somebody put into its folder while it was recording stays when it is done."""
-    (tmp_path / "source").mkdir()
     made = replace(scene("mono8", frames=4), silent={})
     paths = SOURCES["bag-none"](tmp_path / "source", made)
 

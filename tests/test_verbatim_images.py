@@ -29,7 +29,6 @@ FRAMES = 12
 
 
 def packed(folder: Path, made: Scene, **options: Any) -> Path:
-    (folder / "source").mkdir()
     paths = SOURCES["mcap-ros2-zstd"](folder / "source", made)
     mp4ds.pack(paths, folder / "dataset", mp4ds.PackOptions(**options))
     return folder / "dataset"

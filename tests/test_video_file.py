@@ -158,7 +158,6 @@ def test_real_videos(name: str) -> None:
 
 
 def test_videos_of_a_dataset_need_their_sidecars(tmp_path: Path) -> None:
-    (tmp_path / "source").mkdir()
     mp4ds.pack(SOURCES["bag-none"](tmp_path / "source", scene("rgb8")), tmp_path / "drive")
     shutil.copy(tmp_path / "drive" / "cam_image_raw.mp4", tmp_path / "alone.mp4")
     with mp4ds.open(tmp_path / "alone.mp4") as dataset:

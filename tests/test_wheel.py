@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import email
-import os
 import re
 import shutil
-import subprocess
 import sys
 import tarfile
 import zipfile
@@ -22,7 +20,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import mp4ds
-from waiting import WATCHDOG_S
+from commands import program
 
 ROOT = Path(__file__).parents[1]
 for _module in ("hatchling", "hatch_fancy_pypi_readme"):
@@ -35,17 +33,8 @@ OWN_NAMES = {"xxhash": "python-xxhash"}
 def built(kind: str, source: Path, target: Path, **environment: str) -> Path:
     """What hatchling makes of a source tree offline: an ``sdist``, a ``wheel`` or ``editable``."""
     code = f"import hatchling.build as b, sys; print(b.build_{kind}(sys.argv[1]))"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(target)],
-        cwd=source,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **environment},
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return target / done.stdout.split()[-1]
+    env = {"PYTHONDONTWRITEBYTECODE": "1", **environment}
+    return target / program("-c", code, target, cwd=source, env=env).out.split()[-1]
 
 
 def contents(folder: Path) -> set[str]:
@@ -114,17 +103,9 @@ def test_a_compiled_wheel_is_for_its_platform(unpacked: Path, tmp_path: Path) ->
         assert re.fullmatch(r"py3-none-(linux|macosx)_\w+", metadata_of(wheel, "WHEEL")["Tag"])
         wheel.extractall(tmp_path / "installed")
     code = "import mp4ds.video.colour as c; assert c.compiled() is not None; print(c.__file__)"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(tmp_path / "installed")},
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(str(tmp_path / "installed"))
+    installed = str(tmp_path / "installed")
+    done = program("-c", code, cwd=tmp_path, env={"PYTHONPATH": installed})
+    assert done.out.startswith(installed)
 
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
@@ -163,28 +144,6 @@ def test_the_page_on_the_index_needs_no_file_of_the_repository(pure: zipfile.Zip
     assert metadata["License-Expression"] == "Apache-2.0"
     urls = dict(url.split(", ") for url in metadata.get_all("Project-URL", []))
     assert {"Documentation", "Repository", "Changelog", "Issues"} == set(urls)
-
-
-def test_the_shell_completes(tmp_path: Path) -> None:
-    bash = shutil.which("bash")
-    if not bash:
-        pytest.skip("there is no bash")
-    code = """
-    eval "$(_MP4DS_COMPLETE=bash_source mp4ds)"
-    COMP_WORDS=(mp4ds vali) COMP_CWORD=1
-    $(complete -p mp4ds | sed 's/.*-F \\([^ ]*\\).*/\\1/') mp4ds
-    echo "${COMPREPLY[@]}"
-    """
-    done = subprocess.run(
-        [bash, "-c", code],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=WATCHDOG_S,
-        check=False,
-        env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
-    )
-    assert done.stdout.split() == ["validate"], done.stderr
 
 
 # ---------------------------------------------------------------- what else says the same

@@ -42,7 +42,6 @@ def compare_packs(
     executor: InlineExecutor,
     **options: Any,
 ) -> None:
-    (folder / "source").mkdir()
     paths = SOURCES[source](folder / "source", recorded)
     whole = mp4ds.pack(paths, folder / "whole", PackOptions(**options))
     assert executor.ran == []
@@ -74,7 +73,6 @@ def test_every_source(
     source: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
 ) -> None:
     recorded = scene("bayer_gbrg8", frames=10)
-    (tmp_path / "source").mkdir()
     paths = SOURCES[source](tmp_path / "source", recorded)
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
@@ -88,7 +86,6 @@ def test_every_source(
 def test_coded_images(
     name: str, source: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
 ) -> None:
-    (tmp_path / "source").mkdir()
     paths = SOURCES[source](tmp_path / "source", CODED[name]())
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
@@ -100,7 +97,6 @@ def test_coded_images(
 def test_odd_messages(
     trait: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
 ) -> None:
-    (tmp_path / "source").mkdir()
     paths = SOURCES["mcap-ros2-zstd"](tmp_path / "source", odd_scene(trait))
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
@@ -113,7 +109,6 @@ def test_odd_messages(
 def test_foxglove_messages(
     name: str, source: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
 ) -> None:
-    (tmp_path / "source").mkdir()
     paths = FOXGLOVE_SOURCES[source](tmp_path / "source", FOXGLOVE[name]())
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
@@ -128,7 +123,6 @@ def test_a_lossy_profile(
     """The parts are decoded alike; each begins with a key frame, and nothing else differs."""
     options = {"quality": "crf=12", "codec": codec}
     recorded = scene("rgb8", frames=10, width=96, height=64, noisy=False)
-    (tmp_path / "source").mkdir()
     paths = SOURCES["bag-none"](tmp_path / "source", recorded)
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3, **options))
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
@@ -149,7 +143,6 @@ def test_channels_that_cannot_be_told_apart(
     tmp_path: Path, compare: Compare, executor: InlineExecutor
 ) -> None:
     """Two of the same topic, type and metadata are one: its messages are counted together."""
-    (tmp_path / "source").mkdir()
     (source,) = SOURCES["mcap-ros2-zstd"](tmp_path / "source", scene("mono8", frames=11))
     path = tmp_path / "source" / "twice.mcap"
     with source.open("rb") as read, path.open("wb") as write:
