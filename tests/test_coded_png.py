@@ -367,9 +367,6 @@ def test_every_cut_is_refused() -> None:
     data = by_opencv(picture(9, 9, 3, np.uint8))
     for length in range(len(data)):
         assert refusal(png.decode, data[:length])
-        assert refusal(png.check_whole, data[:length])
-    png.check_whole(data)
-    assert "no image data" in refusal(png.check_whole, made(chunks=[]))
 
 
 def test_damage_is_refused_or_comes_back() -> None:

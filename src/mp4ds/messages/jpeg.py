@@ -10,7 +10,7 @@ from mp4ds.messages.encodings import check_size
 
 _SOI, _EOI, _SOS, _DHT, _JPG, _DAC = 0xD8, 0xD9, 0xDA, 0xC4, 0xC8, 0xCC
 _RESTARTS = range(0xD0, 0xD8)
-_FRAMES = {0xC0: "baseline", 0xC1: "extended", 0xC2: "progressive"}
+_FRAMES = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive
 _OTHER_FRAMES = {
     0xC3: "lossless",
     **dict.fromkeys((0xC5, 0xC6, 0xC7), "hierarchical"),
@@ -36,43 +36,29 @@ _OTHER_IMAGES = [
     )
 ]
 
-# sampling factors of Y, Cb and Cr, horizontal then vertical, that decoders support -> name
+# sampling factors of Y, Cb and Cr, horizontal then vertical, that decoders support
 _SAMPLINGS = {
-    (0x11, 0x11, 0x11): "444",
-    (0x12, 0x12, 0x12): "444",
-    (0x21, 0x21, 0x21): "444",
-    (0x22, 0x22, 0x22): "444",
-    (0x12, 0x11, 0x11): "440",
-    (0x22, 0x21, 0x21): "440",
-    (0x21, 0x11, 0x11): "422",
-    (0x22, 0x12, 0x12): "422",
-    (0x22, 0x11, 0x11): "420",
-    (0x41, 0x11, 0x11): "411",
-    (0x42, 0x12, 0x12): "411",
+    *((factor, factor, factor) for factor in (0x11, 0x12, 0x21, 0x22)),  # 4:4:4
+    *((0x12, 0x11, 0x11), (0x22, 0x21, 0x21)),  # 4:4:0
+    *((0x21, 0x11, 0x11), (0x22, 0x12, 0x12)),  # 4:2:2
+    (0x22, 0x11, 0x11),  # 4:2:0
+    *((0x41, 0x11, 0x11), (0x42, 0x12, 0x12)),  # 4:1:1
 }
 
 
 @dataclass(frozen=True, slots=True)
 class JpegInfo:
-    """A JPEG's properties.
+    """What is needed of a JPEG's header.
 
     Attributes:
         width: Columns.
         height: Rows.
         components: 1 or 3.
-        precision: Bits of a sample: 8.
-        process: ``baseline``, ``extended`` or ``progressive``.
-        sampling: ``gray``, or of the chroma: ``444``, ``440``, ``422``, ``420``, ``411``.
-        trailing: Bytes after the end-of-image marker.
     """
 
     width: int
     height: int
     components: int
-    precision: int
-    process: str
-    sampling: str
-    trailing: int
 
 
 def parse(data: bytes | memoryview) -> JpegInfo:
@@ -107,7 +93,7 @@ def parse(data: bytes | memoryview) -> JpegInfo:
         if marker in _FRAMES:
             if info is not None:
                 raise Refused("its JPEG holds two pictures")
-            info = _frame(segment, _FRAMES[marker])
+            info = _frame(segment)
         elif marker in _OTHER_FRAMES:
             raise Refused(f"its JPEG is {_OTHER_FRAMES[marker]}, which few decoders take")
         elif marker == _SOS:
@@ -119,15 +105,7 @@ def parse(data: bytes | memoryview) -> JpegInfo:
         raise Refused(f"its JPEG has more than {_MAX_SEGMENTS} segments")
     if info is None or not scans:
         raise Refused("its JPEG holds no picture")
-    return JpegInfo(
-        info.width,
-        info.height,
-        info.components,
-        info.precision,
-        info.process,
-        info.sampling,
-        trailing=len(data) - offset,
-    )
+    return info
 
 
 def _next_marker(data: memoryview, offset: int) -> tuple[int, int]:
@@ -158,7 +136,7 @@ def _skip_coded_data(data: memoryview, offset: int) -> int:
     return found.start()
 
 
-def _frame(segment: memoryview, process: str) -> JpegInfo:
+def _frame(segment: memoryview) -> JpegInfo:
     if len(segment) < 6 or len(segment) != 6 + 3 * segment[5]:
         raise Refused("its JPEG has a frame header of a wrong length")
     precision, components = segment[0], segment[5]
@@ -168,14 +146,11 @@ def _frame(segment: memoryview, process: str) -> JpegInfo:
     if components not in (1, 3):
         raise Refused(f"its JPEG has {components} colour components, not 1 or 3")
     check_size(width, height)
-    sampling = "gray"
-    if components == 3:
-        factors = (segment[7], segment[10], segment[13])
-        if factors not in _SAMPLINGS:
-            raise Refused(
-                "its JPEG has the chroma sampling "
-                + " ".join(f"{factor >> 4}x{factor & 15}" for factor in factors)
-                + ", which few decoders take"
-            )
-        sampling = _SAMPLINGS[factors]
-    return JpegInfo(width, height, components, precision, process, sampling, 0)
+    factors = tuple(segment[at] for at in (7, 10, 13)) if components == 3 else ()
+    if factors and factors not in _SAMPLINGS:
+        raise Refused(
+            "its JPEG has the chroma sampling "
+            + " ".join(f"{factor >> 4}x{factor & 15}" for factor in factors)
+            + ", which few decoders take"
+        )
+    return JpegInfo(width, height, components)

@@ -397,18 +397,6 @@ def parse(data: bytes | memoryview) -> PngInfo:
     return PngInfo(width, height, bit_depth, color_type, bool(interlace))
 
 
-def check_whole(data: bytes | memoryview) -> None:
-    """Refuse a PNG whose chunks do not reach its end.
-
-    Raises:
-        Refused: It is cut short.
-    """
-    view = memoryview(data)
-    kinds = [kind for kind, _, _ in _chunks(view, len(SIGNATURE))]
-    if b"IDAT" not in kinds:
-        raise Refused("its PNG holds no image data")
-
-
 def pixels_of(data: bytes | memoryview) -> Pixels:
     """The pixels of a PNG, whether or not it could be rebuilt. See `decode`.
 

@@ -129,8 +129,16 @@ class _Coding:
     fast: Mapping[str, str] | None = None  # further options by which it decodes in less time
     tried: bool = True  # without being asked for
     codec: str = ""  # name in the registry, where that is another one
+    presets: tuple[str, ...] = ()  # of a lossy encoder
+    most: int = 51  # its largest crf
+    least: int = 1  # the smallest crf chosen automatically
 
 
+_X26X_PRESETS = (
+    *("ultrafast", "superfast", "veryfast", "faster", "fast"),
+    *("medium", "slow", "slower", "veryslow"),
+)
+_AV1_PRESETS = tuple(str(number) for number in range(14))
 _SAME_HEADERS = "stitchable=1"  # parameter sets that do not depend on the crf
 # the converter sites chroma in the middle; untagged, decoders take it for left
 _CENTRED = "chromaloc=1"
@@ -197,50 +205,27 @@ _LOSSLESS: dict[str, dict[str, _Coding]] = {
     },
     **{planar: {"h264": _x264_lossless(planar), "ffv1": _ffv1_8bit(planar)} for planar in _YUV},
 }
-_X26X_PRESETS = (
-    *("ultrafast", "superfast", "veryfast", "faster", "fast"),
-    *("medium", "slow", "slower", "veryslow"),
-)
-_AV1_PRESETS = tuple(str(number) for number in range(14))
-
-
-@dataclass(frozen=True, slots=True)
-class _Lossy:
-    """A lossy encoder, as ``--codec`` names it.
-
-    Attributes:
-        coding: What it is given.
-        presets: That it has.
-        most: The largest crf.
-        least: The smallest crf chosen automatically.
-    """
-
-    coding: _Coding
-    presets: tuple[str, ...]
-    most: int
-    least: int = 1
-
-
 # with a crf of 1, SVT-AV1's presets from 11 on were seen to make frames that do not look like the
 # pictures, and videos that cannot be decoded
 _AV1_FAST = 11
 _SMALL = "hierarchical-levels=3:enable-qm=1:qm-min=8:ac-bias=1.0"
-_LOSSY: Mapping[str, _Lossy] = {
-    "av1": _Lossy(_Coding("libsvtav1", "yuv420p", {}, "6"), _AV1_PRESETS, 63, 2),
+_LOSSY: Mapping[str, _Coding] = {
+    "av1": _Coding("libsvtav1", "yuv420p", {}, "6", presets=_AV1_PRESETS, most=63, least=2),
     # a sixth fewer bits for 1.3 times the time (spec/notes.md)
-    "av1-10bit": _Lossy(
-        _Coding("libsvtav1", TEN_BITS, {"svtav1-params": _SMALL}, "6", codec="av1"),
-        _AV1_PRESETS, 63, 2,
+    "av1-10bit": _Coding(
+        "libsvtav1", TEN_BITS, {"svtav1-params": _SMALL}, "6", codec="av1",
+        presets=_AV1_PRESETS, most=63, least=2,
     ),
-    "h264": _Lossy(
-        _Coding("libx264", "yuv420p", {**_X264, "x264-params": _CENTRED}, "medium"),
-        _X26X_PRESETS, 51,
+    "h264": _Coding(
+        "libx264", "yuv420p", {**_X264, "x264-params": _CENTRED}, "medium", presets=_X26X_PRESETS
     ),
-    "h265": _Lossy(
-        _Coding("libx265", "yuv420p", {"x265-params": f"{_X265}:{_CENTRED}:{_QUIET}"}, "medium"),
-        _X26X_PRESETS, 51,
+    "h265": _Coding(
+        "libx265", "yuv420p", {"x265-params": f"{_X265}:{_CENTRED}:{_QUIET}"}, "medium",
+        presets=_X26X_PRESETS,
     ),
 }  # fmt: skip
+"""By what ``--codec`` names."""
+
 DEFAULT_LOSSY = "av1"
 """The lossy codec if none is asked for."""
 
@@ -255,7 +240,7 @@ AV1 = ("av1", "av1-10bit")
 MAX_CRF = {name: found.most for name, found in _LOSSY.items()}
 """The largest crf of each lossy codec."""
 
-LEAST_CRF = {found.coding.codec or name: found.least for name, found in _LOSSY.items()}
+LEAST_CRF = {found.codec or name: found.least for name, found in _LOSSY.items()}
 """The smallest crf chosen automatically for each codec."""
 
 
@@ -405,7 +390,7 @@ def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:
     if name not in _LOSSY:
         known = ", ".join(_LOSSY)
         raise OptionError(f"codec {name} is lossless only; use one of {known}")
-    coding = _LOSSY[name].coding
+    coding = _LOSSY[name]
     return coding, {**coding.options, "crf": str(crf)}
 
 

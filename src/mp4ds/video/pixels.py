@@ -323,70 +323,10 @@ def _gray_to_yuv(picture: NDArray[Any], pixel_format: str) -> av.VideoFrame:
     return frame
 
 
-def frame_to_picture(
-    frame: av.VideoFrame,
-    picture_format: str,
-    width: int,
-    height: int,
-    converter: PictureConverter,
-    place: str,
-) -> Picture:
-    """The picture in a decoded frame; views of it where possible.
-
-    Args:
-        frame: As decoded.
-        picture_format: Of the picture wanted.
-        width: Columns of the picture; the video's padding is cut off.
-        height: Rows of the picture.
-        converter: The stream's own.
-        place: The video, for errors.
-
-    Raises:
-        VideoError: The frame is smaller than the picture, or of another kind.
-    """
-    if frame.width < width or frame.height < height:
-        raise VideoError(
-            "geometry-mismatch",
-            place,
-            f"has frames of {frame.width}x{frame.height}, not {width}x{height}",
-        )
-    if picture_format.startswith("bayer_"):
-        colours = _packed(frame, "rgb24", converter)
-        return (_sample_mosaic(colours, picture_format, width, height),)
-    if picture_format in _CHANNELS:
-        return (_packed(frame, picture_format, converter)[:height, :width],)
-    if frame.format.name == TEN_BITS and picture_format in ("gray", *CHROMA_SHIFTS):
-        frame = narrowed(frame)
-    return _planes(frame, picture_format, width, height, place)
-
-
 def _rows(frame: av.VideoFrame, index: int) -> NDArray[np.uint8]:
     """A plane as a view of shape (rows, bytes of a row), padding included."""
     plane: Any = frame.planes[index]  # a buffer, which its type does not tell
     return np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-
-
-def _planes(
-    frame: av.VideoFrame, picture_format: str, width: int, height: int, place: str
-) -> Picture:
-    expected = _DECODED_AS.get(picture_format, (picture_format,))
-    if frame.format.name not in expected:
-        raise VideoError(
-            "codec-mismatch",
-            place,
-            f"decodes to {frame.format.name}, not {' or '.join(expected)}",
-        )
-    if picture_format.startswith("gray"):
-        sizes = [(height, width)]
-    else:
-        across, down = CHROMA_SHIFTS.get(picture_format, (0, 0))
-        chroma = (-(-height >> down), -(-width >> across))
-        sizes = [(height, width)] + [chroma] * (len(frame.planes) - 1)
-    sample = "<u2" if picture_format.endswith("le") else "u1"
-    return tuple(
-        _rows(frame, index).view(sample)[:rows, :columns]
-        for index, (rows, columns) in enumerate(sizes)
-    )
 
 
 def _packed(
@@ -395,18 +335,6 @@ def _packed(
     channels = _CHANNELS[pixel_format]
     rows = _rows(converter.convert(frame, pixel_format), 0)
     return rows[: frame.height, : channels * frame.width].reshape(frame.height, -1, channels)
-
-
-def _sample_mosaic(
-    picture: NDArray[np.uint8], picture_format: str, width: int, height: int
-) -> NDArray[np.uint8]:
-    """The mosaic that a sensor with this pattern would have seen."""
-    mosaic = picture_format.removeprefix("bayer_")[:4]
-    pixels = np.empty((height, width), np.uint8)
-    for index, color in enumerate(mosaic):
-        row, column = divmod(index, 2)
-        pixels[row::2, column::2] = picture[row:height:2, column:width:2, "rgb".index(color)]
-    return pixels
 
 
 # ---------------------------------------------------------------- pictures
@@ -419,7 +347,7 @@ class PictureMaker:
         path: The video, for errors.
         coded_size: Width and height of its frames.
         picture_format: Pixel format of the pictures wanted.
-        picture_size: Width and height of the pictures wanted.
+        picture_size: Width and height of the pictures wanted, at most those of the frames.
         matrix: Matrix coefficients of the video's colours; None to use the video's own tags.
         full_range: Whether its samples use their full range, unless the video is tagged.
     """
@@ -472,6 +400,37 @@ class PictureMaker:
             )
         if scale is not None:
             return (self._converter.scale(frame, scale, out),)
-        return frame_to_picture(
-            frame, self._picture_format, *self._picture_size, self._converter, str(self._path)
+        if self._picture_format.startswith("bayer_"):
+            return (self._mosaic(_packed(frame, "rgb24", self._converter)),)
+        if self._picture_format in _CHANNELS:
+            width, height = self._picture_size
+            return (_packed(frame, self._picture_format, self._converter)[:height, :width],)
+        return self._planes(frame)
+
+    def _planes(self, frame: av.VideoFrame) -> Picture:
+        wanted, (width, height) = self._picture_format, self._picture_size
+        if frame.format.name == TEN_BITS and wanted in ("gray", *CHROMA_SHIFTS):
+            frame = narrowed(frame)
+        expected = _DECODED_AS.get(wanted, (wanted,))
+        if frame.format.name not in expected:
+            problem = f"decodes to {frame.format.name}, not {' or '.join(expected)}"
+            raise VideoError("codec-mismatch", self._path, problem)
+        sizes = [(height, width)]
+        if not wanted.startswith("gray"):
+            across, down = CHROMA_SHIFTS.get(wanted, (0, 0))
+            chroma = (-(-height >> down), -(-width >> across))
+            sizes += [chroma] * (len(frame.planes) - 1)
+        sample = "<u2" if wanted.endswith("le") else "u1"
+        return tuple(
+            _rows(frame, index).view(sample)[:rows, :columns]
+            for index, (rows, columns) in enumerate(sizes)
         )
+
+    def _mosaic(self, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The mosaic that a sensor with this pattern would have seen."""
+        width, height = self._picture_size
+        pixels = np.empty((height, width), np.uint8)
+        for index, color in enumerate(self._picture_format.removeprefix("bayer_")[:4]):
+            row, column = divmod(index, 2)
+            pixels[row::2, column::2] = colours[row:height:2, column:width:2, "rgb".index(color)]
+        return pixels
