@@ -353,7 +353,6 @@ OF_READING = {
     *("the parameters of the track are cut short", "its PNG recipe holds unknown values"),
     *("a message of this type needs a template", "contradicts the fields beside it"),
     "a blank message has times or data",
-    "* has no plain form",
     "it is a packet of a video, which cannot be decoded on its own",
     *("it is no image of a known format", "its picture is damaged, or cut short"),
     "its PNG has 16 bits, of which Pillow would read only 8",
