@@ -21,10 +21,10 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from mp4ds.dataset.channels import ChannelGroup
 from mp4ds.dataset.checks import Problem, validate
 from mp4ds.dataset.columns import DecodedColumns
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.messages import ChannelGroup
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Mp4dsError, SourceError
 from mp4ds.files.urls import location

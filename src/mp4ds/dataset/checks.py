@@ -18,10 +18,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from mp4ds.bags.formats import limits_of
-from mp4ds.dataset.channels import Part
 from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.messages import MessagesFile, recorded_storage
+from mp4ds.dataset.messages import MessagesFile, Part, recorded_storage
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError, VideoError
 from mp4ds.files.urls import location
@@ -115,8 +114,8 @@ def _problems(path: Path, deep: bool, report: _Report) -> list[Problem]:
     if model is None:
         return problems
     stream = Stream(sidecar, sidecar=model)
-    problems = _check_stream(stream)
-    return [*problems, *_check_deep(stream, report)] if deep else problems
+    problems = _found(_check_stream(stream))
+    return [*problems, *_found(_check_deep(stream, report))] if deep else problems
 
 
 def _scaled(report: _Report, before: int, total: int, size: int = 1) -> _Report:
@@ -173,47 +172,52 @@ def _schema_validator(kind: str) -> Any:
     return Draft202012Validator(json.loads(schema_text(kind)))
 
 
+def _found(errors: Iterable[FormatError]) -> list[Problem]:
+    """The problems that errors tell of; one that is raised is the last."""
+    found = []
+    try:
+        for error in errors:
+            found.append(Problem.of(error))
+    except FormatError as error:
+        found.append(Problem.of(error))
+    return found
+
+
 def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem]:
     """Check everything cheap, then, if deep, the rest."""
     manifest, problems = _read(folder / MANIFEST_NAME, "dataset", Manifest)
     if manifest is None:
         return problems
-    problems = list(_check_files(folder, manifest, report))
-    told = {(problem.code, problem.place) for problem in problems}
+    of_files = _found(_check_files(folder, manifest, report))
     streams: list[Stream] = []
     for entry in manifest.streams:
         sidecar, found = _read(folder / entry.sidecar, "stream", StreamSidecar)
         problems += found
         if sidecar is not None:
-            problems += _check_entry(folder, entry, sidecar)
             streams.append(Stream(folder / entry.sidecar, sidecar=sidecar))
-            problems += _check_stream(streams[-1])
-    problems += _check_listed(folder, manifest)
-    dataset = (
-        None
-        if problems
-        else Dataset.of(folder, manifest, streams, MessagesFile(folder / MESSAGES_NAME))
-    )
-    if dataset is not None:
-        problems += _check_messages(dataset, manifest)
+            problems += _found(_check_entry(folder, entry, sidecar))
+            problems += _found(_check_stream(streams[-1]))
+    problems += _found(_check_listed(folder, manifest))
+    dataset: Dataset | None = None
+    if not of_files and not problems:
+        dataset = Dataset.of(folder, manifest, streams, MessagesFile(folder / MESSAGES_NAME))
+        problems += _found(_check_messages(dataset, manifest))
     if deep:
-        problems += _check_files(folder, manifest, report, deep=True)
+        problems += _found(_check_files(folder, manifest, report, deep=True))
         frames = [len(stream) for stream in streams]
         for number, stream in enumerate(streams):
             part = _scaled(report, sum(frames[:number]), sum(frames), frames[number])
-            problems += _check_deep(stream, part)
+            problems += _found(_check_deep(stream, part))
         if dataset is not None and not problems:
-            problems += _check_recorded(dataset, manifest, report)
-    return [
-        problem
-        for number, problem in enumerate(problems)
-        if number < len(told) or (problem.code, problem.place) not in told
-    ]
+            report(f"reading {MESSAGES_NAME}", 1.0)
+            problems += _found(_check_limits(dataset, manifest, _counted(dataset, manifest)))
+    told = {(problem.code, problem.place) for problem in of_files}
+    return [*of_files, *(one for one in problems if (one.code, one.place) not in told)]
 
 
 def _check_files(
     folder: Path, manifest: Manifest, report: _Report, *, deep: bool = False
-) -> Iterator[Problem]:
+) -> Iterator[FormatError]:
     """Check that each listed file exists with its size; small ones also with their hash.
 
     Args:
@@ -232,33 +236,30 @@ def _check_files(
         try:
             verify_file(path, entry, hashed=deep or is_small)
         except FormatError as error:
-            yield Problem(error.code, error.place, error.problem)
+            yield error
 
 
-def _check_listed(folder: Path, manifest: Manifest) -> Iterator[Problem]:
+def _inconsistent(folder: Path, problem: str) -> FormatError:
+    return FormatError("manifest-inconsistent", folder / MANIFEST_NAME, problem)
+
+
+def _check_listed(folder: Path, manifest: Manifest) -> Iterator[FormatError]:
     """Check that each file of the folder, and each stream's files, are in the manifest."""
     listed = {entry.name for entry in manifest.files}
-    for entry in manifest.streams:
-        for name in (entry.sidecar, entry.video):
-            if name not in listed:
-                yield Problem(
-                    "manifest-inconsistent", str(folder / MANIFEST_NAME), f"does not list {name}"
-                )
-    if MESSAGES_NAME not in listed:
-        yield Problem(
-            "manifest-inconsistent", str(folder / MANIFEST_NAME), f"does not list {MESSAGES_NAME}"
-        )
-    own = {name for entry in manifest.streams for name in (entry.sidecar, entry.video)}
-    for name in sorted(listed - own - {MESSAGES_NAME}):
-        problem = f"lists {name}, which belongs to no stream"
-        yield Problem("manifest-inconsistent", str(folder / MANIFEST_NAME), problem)
-    listed.add(MANIFEST_NAME)
+    own = [name for entry in manifest.streams for name in (entry.sidecar, entry.video)]
+    own.append(MESSAGES_NAME)
+    for name in own:
+        if name not in listed:
+            yield _inconsistent(folder, f"does not list {name}")
+    for name in sorted(listed.difference(own)):
+        yield _inconsistent(folder, f"lists {name}, which belongs to no stream")
     for path in sorted(folder.iterdir()):
-        if path.name not in listed and path.suffix in (".mp4", ".yaml", ".mcap"):
-            yield Problem("file-unlisted", str(path), "is not listed in the manifest")
+        is_known = path.name in listed or path.name == MANIFEST_NAME
+        if not is_known and path.suffix in (".mp4", ".yaml", ".mcap"):
+            yield FormatError("file-unlisted", path, "is not listed in the manifest")
 
 
-def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> Iterator[Problem]:
+def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> Iterator[FormatError]:
     """Check that a sidecar agrees with the manifest."""
     for what, own, listed in (
         ("topic", sidecar.channel.topic, entry.topic),
@@ -266,58 +267,15 @@ def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> It
         ("frames", sidecar.frames, entry.frames),
     ):
         if own != listed:
-            yield Problem(
-                "manifest-inconsistent",
-                str(folder / MANIFEST_NAME),
-                f"gives {what} {listed} for {entry.sidecar}, which gives {own}",
-            )
+            problem = f"gives {what} {listed} for {entry.sidecar}, which gives {own}"
+            yield _inconsistent(folder, problem)
 
 
-def _check_stream(stream: Stream) -> list[Problem]:
-    """Check a valid sidecar's columns and its video."""
-    problems: list[Problem] = []
-    try:
-        problems += _check_video_file(stream, deep=False)
-        _ = stream.rebuilder  # decodes and checks the columns
-        _ = stream.infos and stream.infos.templates
-        _check_quality(stream)
-        with stream.open_video(sequential=True) as decoder:
-            problems += _check_count(stream, decoder.coded_frames)
-    except FormatError as error:
-        problems.append(Problem.of(error))
-    return problems
-
-
-def _check_count(stream: Stream, coded: int) -> Iterator[Problem]:
-    if coded != len(stream):
-        yield Problem(
-            "frame-count",
-            str(stream.video_path),
-            f"has {coded} frames, but its sidecar says {len(stream)}",
-        )
-
-
-def _check_deep(stream: Stream, report: _Report) -> list[Problem]:
-    """Check a video's hash, and that every frame decodes to the recorded message."""
-    problems: list[Problem] = []
-    try:
-        report(f"hashing {stream.video_path.name}", None)
-        problems += _check_video_file(stream, deep=True)
-        with stream.open_video(sequential=True) as decoder:
-            if any(_check_count(stream, decoder.coded_frames)):
-                return problems
-        problems += _check_frames(stream, report)
-    except FormatError as error:
-        problems.append(Problem.of(error))
-    return problems
-
-
-def _check_quality(stream: Stream) -> None:
-    """Check that there is a score for each frame, and that the statistics match.
-
-    Raises:
-        FormatError: They do not.
-    """
+def _check_stream(stream: Stream) -> Iterator[FormatError]:
+    """Check a valid sidecar's columns, its scores and its video."""
+    yield from _wrong_facts(stream.video_path, stream.sidecar.video, deep=False)
+    _ = stream.rebuilder  # decodes and checks the columns
+    _ = stream.infos and stream.infos.templates
     quality = stream.sidecar.video.quality
     if quality is not None:
         try:
@@ -325,52 +283,51 @@ def _check_quality(stream: Stream) -> None:
         except ValueError as error:
             place = f"{stream.path} at video.quality.scores"
             raise FormatError("scores-invalid", place, str(error)) from None
+    with stream.open_video(sequential=True) as decoder:
+        if decoder.coded_frames != len(stream):
+            problem = f"has {decoder.coded_frames} frames, but its sidecar says {len(stream)}"
+            yield FormatError("frame-count", stream.video_path, problem)
 
 
-def _check_video_file(stream: Stream, *, deep: bool) -> Iterator[Problem]:
-    if not stream.video_path.is_file():
-        return  # reported when it is opened
-    for error in wrong_facts(stream.video_path, stream.sidecar.video, deep=deep):
-        yield Problem.of(error)
-
-
-def _check_frames(stream: Stream, report: _Report) -> Iterator[Problem]:
-    """Check that every frame decodes and that its message matches its digest, if any."""
+def _check_deep(stream: Stream, report: _Report) -> Iterator[FormatError]:
+    """Check a video's hash, and that each frame decodes to a message of its digest, if any."""
+    name = stream.video_path.name
+    report(f"hashing {name}", None)
+    yield from _wrong_facts(stream.video_path, stream.sidecar.video, deep=True)
+    with stream.open_video(sequential=True) as decoder:
+        if decoder.coded_frames != len(stream):
+            return
 
     def tell(number: int) -> None:
         if number % _TELL_EVERY == 0:
-            report(f"decoding {stream.video_path.name}", number / len(stream))
+            report(f"decoding {name}", number / len(stream))
 
     for error, *_ in stream.damages(tell):
-        yield Problem.of(error)
+        yield error
 
 
-def _check_messages(dataset: Dataset, manifest: Manifest) -> list[Problem]:
+def _check_messages(dataset: Dataset, manifest: Manifest) -> Iterator[FormatError]:
     """Check that the number of messages is as packed, and that they can be unpacked."""
-    place = str(dataset.path / MESSAGES_NAME)
-    try:
-        gaps = [Problem("messages-missing", topic, what) for topic, what in dataset.gaps()]
-        if gaps:
-            return gaps
-        total = sum(map(_modelled, dataset.streams)) + sum(dataset.recorded_counts.values())
-        if total != manifest.messages:
-            problem = f"and the videos hold {total} messages, but the manifest says "
-            return [Problem("message-count", place, f"{problem}{manifest.messages}")]
-        return [*_check_verbatim(dataset, manifest), *_check_limits(dataset, manifest, (), place)]
-    except FormatError as error:
-        return [Problem.of(error)]
+    gaps = [FormatError("messages-missing", topic, what) for topic, what in dataset.gaps()]
+    if gaps:
+        yield from gaps
+        return
+    total = sum(dataset.counts().values())
+    if total != manifest.messages:
+        problem = f"and the videos hold {total} messages, but the manifest says {manifest.messages}"
+        yield FormatError("message-count", dataset.path / MESSAGES_NAME, problem)
+        return
+    yield from _check_verbatim(dataset, manifest)
+    yield from _check_limits(dataset, manifest, ())
 
 
-def _check_verbatim(dataset: Dataset, manifest: Manifest) -> Iterator[Problem]:
+def _check_verbatim(dataset: Dataset, manifest: Manifest) -> Iterator[FormatError]:
     """Check that there are as many messages of each topic as are listed as stored verbatim."""
+    totals, counts = Counter[str](), dataset.counts()
+    for channel in dataset.channels:
+        totals[channel.topic] += counts.get(channel.id, 0)
     topics = {item.topic for item in manifest.verbatim}
-    totals = Counter({topic: len(dataset.recorded_times(topic)) for topic in topics})
-    recorded = dict(totals)
-    for stream in dataset.streams:
-        totals[stream.topic] += len(stream)
-        info = stream.sidecar.camera_info
-        if info:
-            totals[info.channel.topic] += info.messages
+    recorded = {topic: len(dataset.recorded_times(topic)) for topic in topics}
     for number, item in enumerate(manifest.verbatim):
         recorded[item.topic] -= item.messages
         problem = ""
@@ -383,27 +340,17 @@ def _check_verbatim(dataset: Dataset, manifest: Manifest) -> Iterator[Problem]:
             problem = f"begins at message {item.first} of {item.topic}, which has {count}"
         if problem:
             place = f"{dataset.path / MANIFEST_NAME} at verbatim.{number}"
-            yield Problem("manifest-inconsistent", place, problem)
+            yield FormatError("manifest-inconsistent", place, problem)
 
 
-def _check_recorded(dataset: Dataset, manifest: Manifest, report: _Report) -> list[Problem]:
-    """Check that all of messages.mcap can be read and unpacked."""
-    report(f"reading {MESSAGES_NAME}", 1.0)
-    place = str(dataset.path / MESSAGES_NAME)
-    try:
-        return list(_check_limits(dataset, manifest, _counted(dataset, manifest, place), place))
-    except FormatError as error:
-        return [Problem.of(error)]
-
-
-def _counted(dataset: Dataset, manifest: Manifest, place: str) -> Iterator[Record]:
+def _counted(dataset: Dataset, manifest: Manifest) -> Iterator[Record]:
     """All of messages.mcap, which must agree with its index and the manifest.
 
     Raises:
         FormatError: ``messages-unreadable``: a channel's number of messages differs;
             ``manifest-inconsistent``: the times of the first and last message of all do.
     """
-    counts = Counter[int]()
+    counts, place = Counter[int](), dataset.path / MESSAGES_NAME
     times = [message.log_time for stream in dataset.streams for message in _extremes(stream)]
     for record in dataset.recorded_records():
         if isinstance(record, Message):
@@ -423,37 +370,38 @@ def _counted(dataset: Dataset, manifest: Manifest, place: str) -> Iterator[Recor
 
 
 def _check_limits(
-    dataset: Dataset, manifest: Manifest, records: Iterable[Record], place: str
-) -> Iterator[Problem]:
+    dataset: Dataset, manifest: Manifest, records: Iterable[Record]
+) -> Iterator[FormatError]:
     """Check that the recording's format can hold each channel and message, as unpacking requires.
 
     Args:
         dataset: The dataset.
         manifest: Its manifest.
         records: The records of messages.mcap.
-        place: Its name.
     """
     storage = ""
     if manifest.format == "rosbag2":
         storage = recorded_storage(dataset.recorded_records())
     check_channel, check_message = limits_of(manifest.format, storage)
 
-    def refusal(check: Callable[[_Checked], None], item: _Checked, place: str) -> list[Problem]:
+    def refusal(
+        check: Callable[[_Checked], None], item: _Checked, place: Path | str
+    ) -> list[FormatError]:
         try:
             check(item)
         except ConversionError as error:
-            return [Problem("message-invalid", place, str(error))]
+            return [FormatError("message-invalid", place, str(error))]
         return []
 
     for channel in dataset.channels:
         yield from refusal(check_channel, channel, channel.topic)
     for stream in dataset.streams:
         for message in _extremes(stream):
-            yield from refusal(check_message, message, str(stream.path))
-    refused: list[Problem] = []
+            yield from refusal(check_message, message, stream.path)
+    refused: list[FormatError] = []
     for record in records:  # to the end: they are counted
         if isinstance(record, Message) and not refused:
-            refused = refusal(check_message, record, place)
+            refused = refusal(check_message, record, dataset.path / MESSAGES_NAME)
     yield from refused
 
 
@@ -468,24 +416,22 @@ def _extremes(stream: Stream) -> Iterator[Message]:
             yield Message(part.channel, log_time, publish_time, sequence, b"")
 
 
-def _modelled(stream: Stream) -> int:
-    return len(stream) + len(stream.infos or ())
-
-
 # ---------------------------------------------------------------- facts of the video
 
 
-def wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[FormatError]:
+def _wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[FormatError]:
     """What a sidecar gets wrong about its video file.
 
     Args:
-        path: The video, which exists.
+        path: The video; one that is missing is reported when it is opened.
         video: Its sidecar's description.
         deep: Also read the whole file.
 
     Raises:
         OSError: It cannot be read.
     """
+    if not path.is_file():
+        return
     size = path.stat().st_size
     if video.size is not None and size != video.size:
         yield VideoError(

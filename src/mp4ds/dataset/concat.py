@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import WHOLE, RecordingSlice, in_span, write_record
-from mp4ds.dataset.channels import by_time
 from mp4ds.dataset.columns import DecodedColumns, columns_model, digests_model, within
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.messages import by_time
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Refused, VideoError
 from mp4ds.files.outputs import digest_file

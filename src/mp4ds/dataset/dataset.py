@@ -7,24 +7,25 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain, count, islice
+from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.channels import (
+from mp4ds.dataset.columns import Choice, everything, within
+from mp4ds.dataset.images import Images, VerbatimImages, VideoImages, verbatim_images
+from mp4ds.dataset.messages import (
     ChannelGroup,
+    MessagesFile,
     MessageSource,
     Part,
-    Read,
+    RecordedMessage,
+    as_recorded,
     by_time,
     channel_groups,
 )
-from mp4ds.dataset.columns import Choice, everything, within
-from mp4ds.dataset.images import Images, VerbatimImages, VideoImages, verbatim_images
-from mp4ds.dataset.messages import MessagesFile, RecordedMessage, as_recorded
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.errors import (
@@ -50,10 +51,6 @@ _MOST_TOPICS = 4  # named in a repr
 
 Ahead = Callable[[Iterator[Any]], Iterator[Any]]
 """Fetches the items of an iterator in advance, for example in a thread."""
-
-
-def _read_all(part: Part, channel: Channel) -> Iterator[tuple[int, Message]]:
-    return part.messages(channel)
 
 
 class Dataset:
@@ -369,7 +366,7 @@ class Dataset:
             if wanted is not None and group.channel.topic not in wanted:
                 continue
             if not group.streams:
-                calibrations.append(self._group_messages(group, _read_all))
+                calibrations.append(self._group_messages(group, group.sources()))
             elif wanted is not None:
                 ids |= group.recorded_ids
         found = self._file.in_time(Excerpt(topics=wanted))
@@ -443,15 +440,15 @@ class Dataset:
         span = Excerpt(start, end, None if topics is None else frozenset(topics))
         choice = within(span, choose) if is_span else choose
 
-        def read(part: Part, channel: Channel) -> Iterator[tuple[int, Message]]:
-            return ahead((sources or {}).get(part, part.messages)(channel, choice))
+        def own(group: ChannelGroup) -> list[Iterator[tuple[int, Message]]]:
+            return [*map(ahead, group.sources(choice, sources or {}))]
 
         groups = [item for item in self._groups if topics is None or item.channel.topic in topics]
         if is_span:
             recorded = ahead(self.recorded_messages(span))
-            parts = [part for group in groups for part in group.parts_of(read)]
+            parts = [(message for _, message in part) for group in groups for part in own(group)]
             return by_time(recorded, *parts)
-        channels = (self._group_messages(group, read, ahead) for group in groups)
+        channels = (self._group_messages(group, own(group), ahead) for group in groups)
         return by_time(ahead(self._verbatim_records(topics)), *channels)
 
     def times(self, topics: Collection[str] | None = None) -> dict[int, NDArray[np.int64]]:
@@ -540,13 +537,16 @@ class Dataset:
             yield replace(message, channel=owner) if owner else message
 
     def _group_messages(
-        self, group: ChannelGroup, read: Read, ahead: Ahead = iter
+        self,
+        group: ChannelGroup,
+        own: Sequence[Iterator[tuple[int, Message]]],
+        ahead: Ahead = iter,
     ) -> Iterator[Message]:
         """One channel's messages from all its files, in the channel's order."""
         recorded = ahead(group.found_in(self.recorded_records()))
-        if self.manifest is None:  # a pair on its own has only its own messages
-            return chain(group.messages(read), recorded)
-        return group.merged(read, recorded, None if self.is_salvaged else str(self.path))
+        # a pair on its own has only its own messages
+        is_whole = self.manifest is not None and not self.is_salvaged
+        return group.merged(own, recorded, str(self.path) if is_whole else None)
 
     def close(self) -> None:
         """Close all videos."""

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import WHOLE, BagReader, RecordingSlice, stats_of
-from mp4ds.dataset.channels import MessageSource, Part
 from mp4ds.dataset.concat import concat
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.messages import MessageSource, Part
 from mp4ds.errors import OptionError, Refused, advising
 from mp4ds.files.outputs import digest_file
 from mp4ds.format.manifest import About, EarlierDataset, Manifest

@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.channels import ChannelGroup, MessageSource, Part
 from mp4ds.dataset.columns import Choice, everything, marked
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.messages import ChannelGroup, MessageSource, Part
 from mp4ds.dataset.rebuild import CalibrationMessages, message_at
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import Placement
