@@ -24,6 +24,7 @@ from sources import image_cdr, image_ros1, scene, typestore
 
 HEADER = "std_msgs/msg/Header"
 NO_SEQ = "messages with a header sequence number, which ROS 2 does not have"
+PLAIN: dict[str, Any] = {"width": 3, "height": 2, "encoding": "mono8", "data": b"abcdef"}
 TAILS = "messages with trailing bytes, which were dropped"
 REAL_BAGS = (
     "bag_reader_java/Int64MultiArray",
@@ -193,13 +194,11 @@ def test_latching_is_transient_local(qos: str, latching: str | None) -> None:
     made = converter.channel(Channel(0, "/a", "cdr", schema, {"offered_qos_profiles": qos}))
     assert made.metadata.get("latching") == latching
     assert bool(converter.omitted) == bool(qos and not latching)
-
-
-@pytest.mark.parametrize("latching", ["1", "true", "True"])
-def test_transient_local_is_latching(latching: str) -> None:
-    channel = ros1_channel(0, "/a", "std_msgs/String", "/node")
-    made = Converter("ros2").channel(replace(channel, metadata={"latching": latching}))
-    assert made.metadata["offered_qos_profiles"] == LATCHED_QOS
+    for word in ("1", "true", "True") if latching else ():
+        ros1 = replace(
+            ros1_channel(0, "/a", "std_msgs/String", "/node"), metadata={"latching": word}
+        )
+        assert Converter("ros2").channel(ros1).metadata["offered_qos_profiles"] == LATCHED_QOS
 
 
 def test_tf_message_is_renamed() -> None:
@@ -275,33 +274,28 @@ def test_bounds_do_not_change_payloads() -> None:
     assert Converter("ros2").payload(made, there) == data
 
 
-def test_big_endian_cdr() -> None:
-    plain: dict[str, Any] = {"width": 3, "height": 2, "encoding": "mono8", "data": b"abcdef"}
-    channel = Channel(0, "/a", "cdr", Schema("sensor_msgs/msg/Image", "", b""), {})
-    made = Converter("ros1").payload(channel, image_cdr(**plain, little_endian=False))
-    assert made == image_ros1(**plain)
-
-
-@pytest.mark.parametrize("options", [{"padding": b"\x61"}, {"options": b"\0\3"}, {"tail": b"\0\0"}])
-def test_what_cdr_may_hold_besides(options: dict[str, Any]) -> None:
-    plain: dict[str, Any] = {"width": 3, "height": 2, "encoding": "mono8", "data": b"abcdef"}
+@pytest.mark.parametrize(
+    "options",
+    [{"little_endian": False}, {"padding": b"\x61"}, {"options": b"\0\3"}, {"tail": b"\0\0"}],
+    ids=lambda options: next(iter(options)),
+)
+def test_forms_of_cdr(options: dict[str, Any]) -> None:
     channel = Channel(0, "/a", "cdr", Schema("sensor_msgs/msg/Image", "", b""), {})
     converter = Converter("ros1")
-    assert converter.payload(channel, image_cdr(**plain, **options)) == image_ros1(**plain)
+    assert converter.payload(channel, image_cdr(**PLAIN, **options)) == image_ros1(**PLAIN)
     assert not converter.omitted  # padding up to a multiple of four is no content
 
 
 def test_bytes_after_a_message_are_counted() -> None:
-    plain: dict[str, Any] = {"width": 3, "height": 2, "encoding": "mono8", "data": b"abcdef"}
     ros1 = ros1_channel(0, "/a", "sensor_msgs/Image", "/node")
     to_ros2, to_ros1 = Converter("ros2"), Converter("ros1")
-    assert to_ros2.payload(ros1, image_ros1(**plain, tail=b"four")) == image_cdr(**plain)
+    assert to_ros2.payload(ros1, image_ros1(**PLAIN, tail=b"four")) == image_cdr(**PLAIN)
     assert to_ros2.omitted == {TAILS: 1, NO_SEQ: 1}
     made = to_ros2.channel(ros1)
-    assert to_ros1.payload(made, image_cdr(**plain, tail=b"four")) == image_ros1(**plain)
+    assert to_ros1.payload(made, image_cdr(**PLAIN, tail=b"four")) == image_ros1(**PLAIN)
     assert to_ros1.omitted == {TAILS: 1}
     with pytest.raises(ConversionError):
-        to_ros2.payload(ros1, image_ros1(**plain, tail=b"more than eight"))
+        to_ros2.payload(ros1, image_ros1(**PLAIN, tail=b"more than eight"))
 
 
 def test_an_empty_definition_of_a_type_that_is_not_empty() -> None:
@@ -359,11 +353,10 @@ def test_what_cannot_be_converted(
 @pytest.mark.parametrize("target", ["ros1", "ros2"])
 def test_payloads_that_do_not_parse(target: str) -> None:
     ros1 = ros1_channel(0, "/a", "sensor_msgs/Image", "/node")
-    plain: dict[str, Any] = {"width": 3, "height": 2, "encoding": "mono8", "data": b"abcdef"}
     if target == "ros2":
-        channel, data = ros1, image_ros1(**plain)
+        channel, data = ros1, image_ros1(**PLAIN)
     else:
-        channel, data = Converter("ros2").channel(ros1), image_cdr(**plain)
+        channel, data = Converter("ros2").channel(ros1), image_cdr(**PLAIN)
     converter = Converter(target)
     huge = data.replace(b"\6\0\0\0abcdef", b"\xff\xff\xff\xffabcdef")
     for damaged in [huge, b"\xff" * 80, *(data[:length] for length in range(len(data)))]:

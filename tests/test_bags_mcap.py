@@ -20,7 +20,7 @@ from conftest import real
 from mp4ds.bags.files import DamageError, unzstd
 from mp4ds.bags.mcap import McapReader, McapWriter
 from mp4ds.bags.rosbag2 import Rosbag2Reader
-from mp4ds.errors import ConversionError, Mp4dsError, OptionError, SourceError
+from mp4ds.errors import Mp4dsError, SourceError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Record, Schema
 
 REAL_FILES = (
@@ -418,33 +418,6 @@ def test_a_huge_record_is_refused(tmp_path: Path) -> None:
 
 
 # Writing ----------------------------------------------------------------------------------
-
-
-def test_unknown_compression(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="zstd, lz4, none"):
-        McapWriter(tmp_path / "a.mcap", profile="", compression="gzip")
-    assert not (tmp_path / "a.mcap").exists()
-
-
-def test_a_time_that_does_not_fit(tmp_path: Path) -> None:
-    def write_it() -> None:
-        write_all(tmp_path / "a.mcap", [Message(Channel(1, "/a", "cdr", None), -1, 0, 0, b"")])
-
-    with pytest.raises(ConversionError, match="topic /a"):
-        write_it()
-
-
-def test_an_abandoned_file_is_not_finished(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-
-    def write_it() -> None:
-        with McapWriter(path, profile="") as writer:
-            writer.add_channel(Channel(1, "/a", "cdr", None))
-            raise RuntimeError("stop")
-
-    with pytest.raises(RuntimeError, match="stop"):
-        write_it()
-    refuse(path, "mcap recover|is not an MCAP file|is empty")
 
 
 def test_a_release_of_mcap_without_what_is_set_in_it(

@@ -21,10 +21,7 @@ from mp4ds.bags.formats import open_sources
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.bags.ros1_writer import Ros1Writer
 from mp4ds.errors import (
-    ConversionError,
-    OptionError,
     SourceError,
-    TargetExistsError,
 )
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Schema
 from sources import START, scene, write_bag
@@ -480,29 +477,6 @@ def test_what_a_bag_cannot_hold_is_counted(tmp_path: Path) -> None:
     with Ros1Reader(tmp_path / "a.bag") as reader:
         assert len(reader.channels) == 1
         assert rows(reader) == [(0, START, b"a"), (0, START, b"b"), (0, START, b"c")]
-
-
-@pytest.mark.parametrize("time", [-1, 2**32 * 10**9])
-def test_a_time_out_of_range_is_refused(tmp_path: Path, time: int) -> None:
-    def write_it() -> None:
-        with Ros1Writer(tmp_path / "a.bag") as writer:
-            writer.add_channel(STRING)
-            writer.write(Message(STRING, time, time, 0, b""))
-
-    with pytest.raises(ConversionError, match="topic /a: has a log time of"):
-        write_it()
-    refuse(tmp_path / "a.bag", "is not indexed")  # abandoned
-
-
-def test_what_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.bag"
-    with pytest.raises(OptionError, match="none, bz2 or lz4"):
-        Ros1Writer(path, "zip")  # type: ignore[arg-type]
-    assert not path.exists()
-    with Ros1Writer(path) as writer, pytest.raises(ConversionError, match="messages are cdr"):
-        writer.add_channel(Channel(0, "/a", "cdr", STRING.schema, {}))
-    with pytest.raises(TargetExistsError):
-        Ros1Writer(path)
 
 
 def test_lz4_as_ros_reads_it(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from mp4ds.bags.formats import open_sources
 from mp4ds.bags.rosbag2 import Rosbag2Reader, Rosbag2Writer
 from mp4ds.bags.rosbag2_metadata import RECORD, TABLES_RECORD, native_qos, parse_bag_info
 from mp4ds.bags.rosbag2_sqlite import SqliteReader, SqliteWriter
-from mp4ds.errors import ConversionError, OptionError, SourceError
+from mp4ds.errors import SourceError
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
 from scenes import scene as camera
 from sources import write_rosbag2
@@ -337,39 +337,6 @@ def test_what_sqlite3_cannot_hold_is_counted(tmp_path: Path) -> None:
         "sequence numbers (sqlite3 storage keeps none)": 1,
     }
     assert [c.topic for c in Rosbag2Reader(tmp_path / "a").channels] == ["/image", "/ros1"]
-
-
-def test_a_database_that_cannot_be_made(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="unable to open"):
-        SqliteWriter(tmp_path / "missing" / "a.db3")
-
-
-def test_what_sqlite3_cannot_hold_at_all(tmp_path: Path) -> None:
-    with Rosbag2Writer(tmp_path / "a", storage="sqlite3") as writer:
-        with pytest.raises(ConversionError, match="topic /none: has no schema"):
-            writer.add_channel(Channel(1, "/none", "json", None))
-        writer.add_channel(channels()[0])
-        with pytest.raises(ConversionError, match="log time"):
-            writer.write(Message(channels()[0], 2**63, 0, 0, b""))
-    assert messages(read(tmp_path / "a")[1]) == []
-
-
-def test_unknown_storage(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="sqlite3, mcap"):
-        Rosbag2Writer(tmp_path / "a", storage="bolt")
-    with pytest.raises(OptionError, match="compression"):
-        Rosbag2Writer(tmp_path / "a", storage="mcap", compression="gzip")
-
-
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_an_abandoned_recording_is_not_finished(tmp_path: Path, storage: str) -> None:
-    def stop() -> Iterable[Record]:
-        yield from scene()
-        raise RuntimeError("stop")
-
-    with pytest.raises(RuntimeError, match="stop"):
-        write(tmp_path / "a", storage, stop())
-    assert not (tmp_path / "a" / "metadata.yaml").exists()
 
 
 # Split and compressed recordings ----------------------------------------------------------

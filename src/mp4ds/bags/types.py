@@ -281,13 +281,11 @@ class RosVersion:
     """ROS 1 or ROS 2.
 
     Attributes:
-        name: ``ROS 1`` or ``ROS 2``.
         encoding: Message encoding of its channels.
         schema_encoding: Encoding of the definitions generated for it.
         standard: Its standard types.
     """
 
-    name: str
     encoding: str
     schema_encoding: str
     standard: Typesdict
@@ -298,7 +296,7 @@ def ros1_version() -> RosVersion:
     tf2 = "tf2_msgs/msg/TFMessage"
     standard = {tf2: get_typestore(Stores.ROS2_HUMBLE).fielddefs[tf2]}
     standard.update(get_typestore(Stores.ROS1_NOETIC).fielddefs)
-    return RosVersion("ROS 1", "ros1", "ros1msg", standard)
+    return RosVersion("ros1", "ros1msg", standard)
 
 
 def ros2_version(distribution: str) -> RosVersion:
@@ -311,7 +309,7 @@ def ros2_version(distribution: str) -> RosVersion:
     # including later types: a recording without definitions may have them
     latest = get_typestore(Stores.LATEST).fielddefs
     standard = {**latest, **get_typestore(store).fielddefs}
-    return RosVersion("ROS 2", "cdr", "ros2msg", standard)
+    return RosVersion("cdr", "ros2msg", standard)
 
 
 def ros2_store(distribution: str) -> Stores:
