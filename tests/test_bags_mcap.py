@@ -19,6 +19,7 @@ from mcap.writer import IndexType, Writer
 from conftest import real
 from mp4ds.bags.files import DamageError, unzstd
 from mp4ds.bags.mcap import McapReader, McapWriter
+from mp4ds.bags.protocols import write_record
 from mp4ds.bags.rosbag2 import Rosbag2Reader
 from mp4ds.errors import Mp4dsError, SourceError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Record, Schema
@@ -151,13 +152,7 @@ def write_all(path: Path, records: Iterable[Record], **options: Any) -> list[Rec
     with McapWriter(path, profile="ros2", **options) as writer:
         writer.add_schema(UNUSED)
         for record in records:
-            if isinstance(record, Message):
-                writer.add_channel(record.channel)
-                writer.write(record)
-            elif isinstance(record, Attachment):
-                writer.add_attachment(record)
-            else:
-                writer.add_metadata(record)
+            write_record(writer, record)
         assert writer.omitted == {}
     return records
 
