@@ -16,6 +16,7 @@ import socket
 import warnings
 from collections.abc import Callable, Iterator
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -404,47 +405,39 @@ def test_columns_that_do_not_decode(name: str, pair: Path, jail: Jail) -> None:
 
 
 COLUMN_CHANGES: dict[str, tuple[Change, set[str]]] = {
-    "stamp-negative": (put("columns", "stamp", "start", value=-1), {"column-invalid"}),
-    "stamp-beyond": (put("columns", "stamp", "start", value=2**62), {"column-invalid"}),
-    "seq-negative": (put("columns", "seq", "start", value=-1), {"column-invalid"}),
-    "seq-beyond": (put("columns", "seq", "start", value=2**32), {"column-invalid"}),
-    "variant-beyond": (put("columns", "variant", value=column(1, 0, WHOLE)), {"column-invalid"}),
-    "variant-negative": (
-        put("columns", "variant", value=column(-1, 0, WHOLE)),
-        {"column-invalid"},
-    ),
-    "ordinal-repeated": (put("columns", "ordinal", value=column(0, 0, WHOLE)), {"column-invalid"}),
-    "ordinal-falling": (put("columns", "ordinal", value=column(9, -1, WHOLE)), {"column-invalid"}),
-    "ordinal-negative": (put("columns", "ordinal", value=column(-1, 1, WHOLE)), {"column-invalid"}),
-    "ordinal-wrapped": (
-        put("columns", "ordinal", value=column(0, 2**62, WHOLE)),
-        {"column-invalid"},
-    ),
+    **{
+        name: (put(*place, value=value), {"column-invalid"})
+        for name, (*place, value) in {
+            "stamp-negative": ("columns", "stamp", "start", -1),
+            "stamp-beyond": ("columns", "stamp", "start", 2**62),
+            "seq-negative": ("columns", "seq", "start", -1),
+            "seq-beyond": ("columns", "seq", "start", 2**32),
+            "variant-beyond": ("columns", "variant", column(1, 0, WHOLE)),
+            "variant-negative": ("columns", "variant", column(-1, 0, WHOLE)),
+            "ordinal-repeated": ("columns", "ordinal", column(0, 0, WHOLE)),
+            "ordinal-falling": ("columns", "ordinal", column(9, -1, WHOLE)),
+            "ordinal-negative": ("columns", "ordinal", column(-1, 1, WHOLE)),
+            "ordinal-wrapped": ("columns", "ordinal", column(0, 2**62, WHOLE)),
+            "info-stamp-negative": ("camera_info", "columns", "stamp", "start", -1),
+            "info-seq-beyond": ("camera_info", "columns", "seq", "start", 2**32),
+        }.items()
+    },
+    **{
+        f"template-{name}": (put(*place, "template", value=value), {"header-mismatch"})
+        for name, (*place, value) in {
+            "no-base64": ("headers", 0, "A"),
+            "short": ("headers", 0, "AAAA"),
+            "empty": ("headers", 0, ""),
+            "long": ("headers", 0, "AAAA" * 2**15),
+            "of-info-no-base64": ("camera_info", "calibrations", 0, "A"),
+            "of-info-short": ("camera_info", "calibrations", 0, "AAAA"),
+        }.items()
+    },
     "digests-wrong": (put("digests", "values", value="00" * 8 * FRAMES), {"digest-mismatch"}),
-    "template-no-base64": (put("headers", 0, "template", value="A"), {"header-mismatch"}),
-    "template-short": (put("headers", 0, "template", value="AAAA"), {"header-mismatch"}),
-    "template-empty": (put("headers", 0, "template", value=""), {"header-mismatch"}),
-    "template-long": (put("headers", 0, "template", value="AAAA" * 2**15), {"header-mismatch"}),
-    "info-template-no-base64": (
-        put("camera_info", "calibrations", 0, "template", value="A"),
-        {"header-mismatch"},
-    ),
-    "info-template-short": (
-        put("camera_info", "calibrations", 0, "template", value="AAAA"),
-        {"header-mismatch"},
-    ),
     "info-no-columns": (drop("camera_info", "columns"), {"column-invalid", *BAD_DOCUMENT}),
     "info-no-calibrations": (
         put("camera_info", "calibrations", value=[]),
         {"column-invalid", *BAD_DOCUMENT},
-    ),
-    "info-stamp-negative": (
-        put("camera_info", "columns", "stamp", "start", value=-1),
-        {"column-invalid"},
-    ),
-    "info-seq-beyond": (
-        put("camera_info", "columns", "seq", "start", value=2**32),
-        {"column-invalid"},
     ),
     "wire-other": (put("wire", value="cdr-le"), {"digest-mismatch", "model-invalid"}),
     "schema-no-base64": (
@@ -513,10 +506,6 @@ def h264(size: tuple[int, int], frames: int) -> bytes:
     return b"".join(bytes(packet) for packet in [*packets, *context.encode(None)])
 
 
-def put_bytes(path: Path, data: bytes) -> None:
-    path.write_bytes(data)
-
-
 def video_that_changes(path: Path, *parts: bytes) -> None:
     """A video of bare streams, one after the other."""
     with (
@@ -531,22 +520,27 @@ def video_that_changes(path: Path, *parts: bytes) -> None:
             output.mux(packet)
 
 
-OTHER_VIDEOS: dict[str, tuple[Callable[[Path], None], set[str]]] = {
-    "mpeg4": (lambda path: video(path, "mpeg4", "yuv420p"), {"codec-mismatch"}),
-    "ffv1": (lambda path: video(path, "ffv1"), {"codec-mismatch"}),
-    "yuv444p": (lambda path: video(path, pixel_format="yuv444p"), {"codec-mismatch"}),
-    "rgb24": (lambda path: video(path, "libx264rgb", "rgb24"), {"codec-mismatch"}),
-    "fewer-frames": (lambda path: video(path, frames=FRAMES - 1), {"frame-count"}),
-    "more-frames": (lambda path: video(path, frames=FRAMES + 1), {"frame-count"}),
-    "larger": (lambda path: video(path, size=(128, 96)), {"geometry-mismatch"}),
-    "very-large": (lambda path: video(path, size=(8192, 8192), frames=1), {"geometry-mismatch"}),
-    "very-wide": (lambda path: video(path, size=(16384, 16)), {"geometry-mismatch"}),
-    "matroska": (lambda path: video(path, container="matroska"), {"video-unreadable"}),
-    "avi": (lambda path: video(path, container="avi"), {"video-unreadable"}),
-    "nut": (lambda path: video(path, "ffv1", container="nut"), {"video-unreadable"}),
-    "h264": (lambda path: put_bytes(path, h264((WIDTH, HEIGHT), FRAMES)), {"video-unreadable"}),
-    "empty": (lambda path: put_bytes(path, b""), {"frame-count", "video-unreadable"}),
-    "text": (lambda path: put_bytes(path, b"hello\n" * 99), {"video-unreadable"}),
+OTHER_VIDEOS: dict[str, tuple[Callable[[Path], object], set[str]]] = {
+    **{
+        name: (partial(video, **options), {code})
+        for name, code, options in [
+            ("mpeg4", "codec-mismatch", {"codec": "mpeg4", "pixel_format": "yuv420p"}),
+            ("ffv1", "codec-mismatch", {"codec": "ffv1"}),
+            ("yuv444p", "codec-mismatch", {"pixel_format": "yuv444p"}),
+            ("rgb24", "codec-mismatch", {"codec": "libx264rgb", "pixel_format": "rgb24"}),
+            ("fewer-frames", "frame-count", {"frames": FRAMES - 1}),
+            ("more-frames", "frame-count", {"frames": FRAMES + 1}),
+            ("larger", "geometry-mismatch", {"size": (128, 96)}),
+            ("very-large", "geometry-mismatch", {"size": (8192, 8192), "frames": 1}),
+            ("very-wide", "geometry-mismatch", {"size": (16384, 16)}),
+            ("matroska", "video-unreadable", {"container": "matroska"}),
+            ("avi", "video-unreadable", {"container": "avi"}),
+            ("nut", "video-unreadable", {"codec": "ffv1", "container": "nut"}),
+        ]
+    },
+    "h264": (lambda path: path.write_bytes(h264((WIDTH, HEIGHT), FRAMES)), {"video-unreadable"}),
+    "empty": (lambda path: path.write_bytes(b""), {"frame-count", "video-unreadable"}),
+    "text": (lambda path: path.write_bytes(b"hello\n" * 99), {"video-unreadable"}),
     "half": (lambda path: os.truncate(path, path.stat().st_size // 2), {"video-unreadable"}),
     "missing": (lambda path: path.unlink(), {"file-missing"}),
 }
