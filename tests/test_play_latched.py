@@ -10,7 +10,7 @@ import pytest
 import mp4ds
 from mp4ds.bags.latched import LATCHED_QOS, LatchedMessages, latched_depth
 from mp4ds.plugins.ros.qos import offered_qos
-from mp4ds.records import Channel
+from mp4ds.records import Channel, Message
 from player_scenes import (
     STATIC,
     RecordingPublisher,
@@ -29,10 +29,10 @@ STRING = "std_msgs/msg/String"
 
 def late(channel: Channel, *payloads: bytes) -> list[bytes]:
     """What is kept of messages for those that come after them."""
-    kept = LatchedMessages[bytes](channel)
+    kept = LatchedMessages(channel)
     for payload in payloads:
-        kept.add(payload, payload)
-    return list(kept)
+        kept.add(Message(channel, 0, 0, 0, payload))
+    return [bytes(message.data) for message in kept]
 
 
 @pytest.fixture(scope="module")

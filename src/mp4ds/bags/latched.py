@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Generic, TypeVar
+from itertools import chain
+from typing import Any
 
-from mp4ds.bags.protocols import BagReader, RecordingSlice, in_span, stats_of
+from mp4ds.bags.protocols import BagReader, RecordingSlice, in_span, stats_of, with_own_payload
 from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import Refused, SourceError
 from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.transforms import transform_parser
 from mp4ds.messages.wire import WireError
 from mp4ds.options import Slice
-from mp4ds.records import QOS_KEY, Channel, Excerpt, Message, Record
+from mp4ds.records import QOS_KEY, Channel, Excerpt, Message
 
 _QOS = """\
 - history: 1
@@ -49,7 +50,6 @@ MOST_BYTES = 2**28
 """Of the latched messages from before a slice."""
 
 _TF_STATIC = "tf_static"
-_Item = TypeVar("_Item")
 
 
 def is_latched(channel: Channel) -> bool:
@@ -96,7 +96,7 @@ def is_ros1(channel: Channel) -> bool:
     return channel.metadata.get("latching", "").lower() in ("1", "true")
 
 
-class LatchedMessages(Generic[_Item]):
+class LatchedMessages:
     """The messages of a latched channel that are kept for late subscribers, oldest first.
 
     For /tf_static, these are the newest transforms of each child frame, as each of many publishers
@@ -112,38 +112,32 @@ class LatchedMessages(Generic[_Item]):
     def __init__(self, channel: Channel) -> None:
         self._depth = latched_depth(channel)
         self._children = None if is_ros1(channel) else _parser(channel)
-        self._kept: list[tuple[bytes | memoryview, frozenset[str] | None, _Item]] = []
+        self._kept: list[tuple[Message, frozenset[str] | None]] = []
         self.size = 0
 
-    def __iter__(self) -> Iterator[_Item]:
-        return (item for _, _, item in self._kept)
+    def __iter__(self) -> Iterator[Message]:
+        return (message for message, _ in self._kept)
 
-    def add(self, payload: bytes | memoryview, item: _Item) -> None:
-        """Keep one more.
-
-        Args:
-            payload: The serialized message.
-            item: What to return for it when iterating.
-        """
-        kept = [one for one in self._kept if one[0] != payload]
-        kept.append((payload, self._children(payload) if self._children else None, item))
+    def add(self, message: Message) -> None:
+        """Keep one more."""
+        kept = [one for one in self._kept if one[0].data != message.data]
+        kept.append((message, self._children(message.data) if self._children else None))
         if self._children:
             kept = _uncovered(kept)
         self._kept = kept[-(MOST if self._children else self._depth) :]
-        self.size = sum(len(row[0]) for row in self._kept)
+        self.size = sum(len(one.data) for one in self)
 
 
-_Row = tuple["bytes | memoryview", "frozenset[str] | None", _Item]
+_Row = tuple[Message, frozenset[str] | None]
 
 
-def _uncovered(rows: list[_Row[_Item]]) -> list[_Row[_Item]]:
+def _uncovered(rows: list[_Row]) -> list[_Row]:
     """The messages with a child frame that is in no later message."""
     later: set[str] = set()
     found = []
-    for row in reversed(rows):
-        frames = row[1]
+    for message, frames in reversed(rows):
         if frames is None or not frames <= later:
-            found.append(row)
+            found.append((message, frames))
         later |= frames or set()
     return found[::-1]
 
@@ -170,47 +164,6 @@ def _is_tf_static(channel: Channel) -> bool:
     return channel.topic.rpartition("/")[2] == _TF_STATIC
 
 
-Read = Callable[[frozenset[str]], Iterable[Record]]
-"""Yields the earlier messages of some topics."""
-
-
-def latched_before(
-    channels: Sequence[Channel], read: Read
-) -> tuple[Sequence[Message], Sequence[str]]:
-    """The latched messages from before a slice, in recorded order.
-
-    Images are never among them.
-
-    Args:
-        channels: Those of the recording.
-        read: Reads what was recorded before the slice.
-
-    Returns:
-        The messages, and the topics left out since the messages are too large.
-    """
-    own = {item.id: item for item in channels if has_late(item) and not is_camera(item)}
-    if not own:
-        return (), ()
-    kept = {key: LatchedMessages[tuple[int, Message]](channel) for key, channel in own.items()}
-    topics = frozenset(channel.topic for channel in own.values())
-    left_out: dict[str, None] = {}
-    size = 0
-    for number, message in enumerate(read(topics)):
-        if not isinstance(message, Message) or message.channel.id not in kept:
-            continue
-        data = bytes(message.data)  # a view would keep a whole chunk
-        one = kept[message.channel.id]
-        size -= one.size
-        one.add(data, (number, replace(message, data=data)))
-        size += one.size
-        while size > MOST_BYTES:
-            largest = max(kept, key=lambda key: kept[key].size)
-            size -= kept.pop(largest).size
-            left_out[own[largest].topic] = None
-    found = sorted((pair for one in kept.values() for pair in one), key=lambda pair: pair[0])
-    return [message for _, message in found], [*left_out]
-
-
 def take_slice(reader: BagReader, asked: Slice) -> None:
     """Let a reader give a slice of its recording, with latched messages if requested.
 
@@ -226,18 +179,41 @@ def take_slice(reader: BagReader, asked: Slice) -> None:
     first, last = min(item.start for item in known), max(item.end for item in known)
     first = max(first, reader.begin or first)
     span = Excerpt(*asked.times(first, last, reader.path))
-    latched: tuple[Sequence[Message], Sequence[str]] = (), ()
-    if asked.latched and span.start is not None:
-        before = Excerpt(end=span.start, others=False)
-        times = reader.times()
-        sent = [
-            channel
-            for channel in reader.channels
-            if channel.id in times and len(in_span(times[channel.id], before))
-        ]
-
-        def read(topics: frozenset[str]) -> Iterable[Record]:
-            return reader.records(replace(before, topics=topics))
-
-        latched = latched_before(sent, read)
+    wants_latched = asked.latched and span.start is not None
+    latched = _latched_before(reader, Excerpt(end=span.start)) if wants_latched else ((), ())
     reader.slice = RecordingSlice(span, *latched)
+
+
+def _latched_before(reader: BagReader, before: Excerpt) -> tuple[Sequence[Message], Sequence[str]]:
+    """The latched messages from before a slice, by log time; images are never among them.
+
+    Returns:
+        The messages, and the topics left out since the messages are too large.
+    """
+    times = reader.times()
+    own = {
+        channel.id: channel
+        for channel in reader.channels
+        if has_late(channel)
+        and not is_camera(channel)
+        and channel.id in times
+        and len(in_span(times[channel.id], before))
+    }
+    if not own:
+        return (), ()
+    kept = {key: LatchedMessages(channel) for key, channel in own.items()}
+    topics = frozenset(channel.topic for channel in own.values())
+    left_out: dict[str, None] = {}
+    size = 0
+    for message in reader.records(replace(before, topics=topics, others=False)):
+        if not isinstance(message, Message) or message.channel.id not in kept:
+            continue
+        one = kept[message.channel.id]
+        size -= one.size
+        one.add(with_own_payload(message))
+        size += one.size
+        while size > MOST_BYTES:
+            largest = max(kept, key=lambda key: kept[key].size)
+            size -= kept.pop(largest).size
+            left_out[own[largest].topic] = None
+    return sorted(chain.from_iterable(kept.values()), key=lambda one: one.log_time), [*left_out]

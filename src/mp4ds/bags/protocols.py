@@ -152,7 +152,20 @@ class BagReader(ABC):
         """
         records = self._records(excerpt.within(self.slice.span))
         latched = [message for message in self.slice.latched if excerpt.has(message)]
-        return begun_by(latched, records) if latched else records
+        return self._begun_by(latched, records) if latched else records
+
+    @staticmethod
+    def _begun_by(latched: Sequence[Message], records: Iterator[Record]) -> Iterator[Record]:
+        # What is not a message comes first: it may tell about those that follow.
+        for record in records:
+            if isinstance(record, Message):
+                yield from latched
+                yield record
+                break
+            yield record
+        else:
+            yield from latched
+        yield from records
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times of every message, nanoseconds, sorted, by channel id."""
@@ -312,19 +325,6 @@ def write_record(writer: BagWriter, record: Record) -> None:
         writer.add_attachment(record)
     else:
         writer.add_metadata(record)
-
-
-def begun_by(latched: Sequence[Message], records: Iterable[Record]) -> Iterator[Record]:
-    """Records with latched messages before the first message.
-
-    What is not a message comes first: it may tell about those that follow.
-    """
-    for record in records:
-        if latched and isinstance(record, Message):
-            yield from latched
-            latched = ()
-        yield record
-    yield from latched
 
 
 # ---------------------------------------------------------------- ordering

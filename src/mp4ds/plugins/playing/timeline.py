@@ -339,13 +339,13 @@ class _Part:
     def latched(self, time_ns: int) -> Iterator[Message]:
         """The latched messages of each channel at a time."""
         channels = [item for item in self._dataset.channels if item.topic in self._topics]
-        kept = {item.id: LatchedMessages[Message](item) for item in filter(has_late, channels)}
+        kept = {item.id: LatchedMessages(item) for item in filter(has_late, channels)}
         topics = {item.topic for item in channels if item.id in kept}
         most = max((latched_depth(item) for item in channels if item.id in kept), default=1)
         earlier = self._dataset.records(end=time_ns, choose=last_of(time_ns, most), topics=topics)
         for message in earlier if topics else ():
             if isinstance(message, Message) and message.channel.id in kept:
-                kept[message.channel.id].add(message.data, message)
+                kept[message.channel.id].add(message)
         messages = sorted(chain.from_iterable(kept.values()), key=lambda item: item.log_time)
         return map(self._as_published, messages)
 
