@@ -161,25 +161,19 @@ def test_a_video_without_sidecar(drives: list[Path], tmp_path: Path) -> None:
 # ---------------------------------------------------------------- many at a time
 
 
-def test_many_samples_share_no_memory(drives: list[Path]) -> None:
-    wanted = [20, 3, 3, -1, 0]
-    samples = FrameDataset(drives[0], topics=[LEFT]).__getitems__(wanted)
-    frames = frames_of(drives[0], LEFT)
-    for number, sample in zip(wanted, samples, strict=True):
-        assert torch.equal(sample[LEFT], first(frames[number]))
-    samples[1][LEFT].zero_()
-    assert torch.equal(samples[2][LEFT], first(frames[3]))
-
-
-def test_several_datasets_follow_each_other(drives: list[Path]) -> None:
+def test_many_samples_of_several_datasets(drives: list[Path]) -> None:
+    """In any order, repeated, and without shared memory."""
     dataset = FrameDataset(drives, topics=[LEFT])
     assert dataset.lengths == [FRAMES] * 3
     assert dataset.paths == list(map(str, drives))
-    wanted = [2 * FRAMES, FRAMES - 1, FRAMES, 0, 3 * FRAMES - 1]
-    for number, sample in zip(wanted, dataset.__getitems__(wanted), strict=True):
-        recording, row = divmod(number, FRAMES)
-        assert (sample["index"], sample["dataset"]) == (number, recording)
+    wanted = [2 * FRAMES, FRAMES - 1, 3, 3, FRAMES, 0, -1]
+    samples = dataset.__getitems__(wanted)
+    for number, sample in zip(wanted, samples, strict=True):
+        recording, row = divmod(number % len(dataset), FRAMES)
+        assert (sample["index"], sample["dataset"]) == (number % len(dataset), recording)
         assert torch.equal(sample[LEFT], first(frames_of(drives[recording], LEFT)[row]))
+    samples[2][LEFT].zero_()
+    assert torch.equal(samples[3][LEFT], first(frames_of(drives[0], LEFT)[3]))
 
 
 def test_one_camera_is_opened_lazily(drives: list[Path], tmp_path: Path) -> None:

@@ -278,15 +278,6 @@ def test_depth_just_allowed() -> None:
 
 
 @pytest.mark.parametrize(
-    "header", ["values: |", "values: |-", "values: |+", "values: >", "values:"]
-)
-def test_any_spelling_of_a_column_is_read(header: str) -> None:
-    """Other writers choose other styles; the slicer must not make a difference."""
-    text = f"c:\n  {header}\n    1 2\n    3\nd: 4\n"
-    assert same(load(text), yaml.safe_load(text))
-
-
-@pytest.mark.parametrize(
     "text",
     [
         "c:\n    values: |\n      1 2\n\n      3\nd: 4\n",  # a blank line inside
@@ -300,6 +291,10 @@ def test_any_spelling_of_a_column_is_read(header: str) -> None:
         "c:\n  values: |\n    1\n      2\nd: 4\n",
         "c:\n- values: |\n    1 2\n- values: |\n    3\n",
         "c:\n  values: |\r\n    1 2\r\nd: 4\r\n",
+        *(
+            f"c:\n  values:{style}\n    1 2\n    3\nd: 4\n"
+            for style in ("", " |", " |-", " |+", " >")
+        ),
     ],
 )
 def test_columns_written_otherwise(text: str) -> None:

@@ -247,19 +247,17 @@ def cut_short(document: dict[str, Any]) -> str:
 
 def _without_news(document: dict[str, Any], path: Path) -> dict[str, Any]:
     """A document of a newer minor version without the keys that this one does not know."""
-    dropped: list[str] = []
-    while True:
-        try:
-            MODELS[document["kind"]].model_validate(document)
-        except ValidationError as error:
-            unknown = [item["loc"] for item in error.errors() if item["type"] == "extra_forbidden"]
-        else:
-            unknown = []
-        if not unknown:
-            break
-        for place in unknown:
-            _remove(document, place)
-            dropped.append(".".join(map(str, place)))
+    unknown: list[tuple[int | str, ...]] = []
+    try:
+        MODELS[document["kind"]].model_validate(document)
+    except ValidationError as error:
+        unknown = [item["loc"] for item in error.errors() if item["type"] == "extra_forbidden"]
+    for *above, last in unknown:
+        node: Any = document
+        for key in above:
+            node = node[key]
+        node.pop(last, None)
+    dropped = [".".join(map(str, place)) for place in unknown]
     warnings.warn(
         f"{path} has format version {document['mp4ds']}, newer than {FORMAT_VERSION}; ignored: "
         f"{', '.join(dropped[:_NEWS_LISTED]) or 'nothing'}"
@@ -267,12 +265,6 @@ def _without_news(document: dict[str, Any], path: Path) -> dict[str, Any]:
         stacklevel=2,
     )
     return document
-
-
-def _remove(document: Any, place: tuple[int | str, ...]) -> None:
-    for key in place[:-1]:
-        document = document[key]
-    document.pop(place[-1], None)
 
 
 def load_stream(path: Path, *, video: str | None = None) -> StreamSidecar:

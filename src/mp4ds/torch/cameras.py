@@ -24,7 +24,7 @@ from mp4ds.dataset.collections import datasets_in
 from mp4ds.dataset.dataset import open_dataset
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.views import FORMATS, size_after
+from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
 from mp4ds.files.urls import location, remote, spelled
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
@@ -33,8 +33,6 @@ from mp4ds.times import nearest, synchronize
 from mp4ds.video.codecs import TEN_BITS
 from mp4ds.video.mp4 import read_sample_table
 
-Resize = float | tuple[int, int]
-Crop = tuple[int, int, int, int]
 Dtype = Literal["native", "uint8", "float32"]
 Backend = Literal["mp4ds", "torchcodec"]
 
@@ -71,8 +69,8 @@ def pictures_from(
     topics: Sequence[str],
     *,
     format_: str | Mapping[str, str],
-    resize: Resize | Mapping[str, Resize] | None,
-    crop: Crop | Mapping[str, Crop] | None,
+    resize: Resize | Mapping[str, Resize],
+    crop: Crop | Mapping[str, Crop],
     dtype: str,
     channels_first: bool,
     backend: str,
@@ -318,7 +316,7 @@ class TorchcodecReader:
         VideoError: It cannot open the video.
     """
 
-    def __init__(self, topic: Topic, crop: Crop | None, device: str) -> None:
+    def __init__(self, topic: Topic, crop: Crop, device: str) -> None:
         self._path = topic.parts[0].video_path
         for stream in topic.streams:
             _check_layout(stream)

@@ -15,16 +15,15 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
+from mp4ds.dataset.views import Crop, Resize
 from mp4ds.errors import Mp4dsError, OptionError, SampleError, absent, counted
 from mp4ds.torch.cameras import (
     Backend,
-    Crop,
     Dtype,
     OpenCamera,
     OpenCameras,
     Paths,
     Recording,
-    Resize,
     pictures_from,
     recordings_of,
 )
@@ -347,8 +346,8 @@ class FrameDataset(Dataset):
         tolerance_ns: int | None = None,
         sync_tolerance_ns: int = SYNC_TOLERANCE_NS,
         format: str | Mapping[str, str] = "rgb",  # noqa: A002 - as of Stream.read
-        resize: Resize | Mapping[str, Resize] | None = None,
-        crop: Crop | Mapping[str, Crop] | None = None,
+        resize: Resize | Mapping[str, Resize] = None,
+        crop: Crop | Mapping[str, Crop] = None,
         dtype: Dtype = "native",
         channels_first: bool = True,
         transform: Transform | None = None,

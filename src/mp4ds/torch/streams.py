@@ -10,14 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
+from mp4ds.dataset.views import Crop, Resize
 from mp4ds.errors import OptionError
 from mp4ds.torch.cameras import (
     Backend,
-    Crop,
     Dtype,
     Paths,
     Recording,
-    Resize,
 )
 from mp4ds.torch.datasets import (
     SYNC_TOLERANCE_NS,
@@ -143,8 +142,8 @@ class FrameStream(IterableDataset):
         topics: Sequence[str] | None = None,
         sync_tolerance_ns: int = SYNC_TOLERANCE_NS,
         format: str | Mapping[str, str] = "rgb",  # noqa: A002 - as of Stream.read
-        resize: Resize | Mapping[str, Resize] | None = None,
-        crop: Crop | Mapping[str, Crop] | None = None,
+        resize: Resize | Mapping[str, Resize] = None,
+        crop: Crop | Mapping[str, Crop] = None,
         dtype: Dtype = "native",
         channels_first: bool = True,
         transform: Transform | None = None,
