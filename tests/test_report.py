@@ -51,6 +51,7 @@ from report_scenes import (
     WIDTH,
     blocks,
     pack_cameras,
+    serving,
     two_cameras,
 )
 from sources import COMMON, ENCODINGS, Scene, scene
@@ -551,18 +552,15 @@ def server(tmp_path: Path) -> Iterator[ReportServer]:
     (tmp_path / "secret").write_text("secret")
     files = {"/d/a b.mp4": tmp_path / "a b.mp4", "/index.html": tmp_path / "index.html"}
     files["/gone"] = tmp_path / "gone"
-    with ReportServer(files, "/index.html") as made:
-        thread = threading.Thread(target=made.serve)
-        thread.start()
+    made = ReportServer(files, "/index.html")
+    with serving(made):
         yield made
-        made.stop()
-        thread.join()
 
 
 def ask(
     server: ReportServer, path: str, method: str = "GET", **headers: str
 ) -> tuple[int, dict[str, str], bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=WATCHDOG_S)
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=WATCHDOG_S)
     try:
         connection.request(method, urlsplit(server.root).path + path, headers=headers)
         answer = connection.getresponse()
@@ -605,9 +603,10 @@ def test_nothing_else_is_served(server: ReportServer, path: str) -> None:
 
 
 def test_other_sites_and_users_get_nothing(server: ReportServer) -> None:
-    for host in (f"evil.example:{server.port}", "127.0.0.1", f"127.0.0.1:{server.port}:1"):
+    port = server.server_port
+    for host in (f"evil.example:{port}", "127.0.0.1", f"127.0.0.1:{port}:1"):
         assert ask(server, "/index.html", Host=host)[0] == 403
-    assert ask(server, "/index.html", Host=f"localhost:{server.port}")[0] == 200
+    assert ask(server, "/index.html", Host=f"localhost:{port}")[0] == 200
     for site, dest, status in (
         ("same-origin", "script", 200),
         ("none", "document", 200),
@@ -623,7 +622,7 @@ def test_other_sites_and_users_get_nothing(server: ReportServer) -> None:
         assert headers["X-Content-Type-Options"] == "nosniff"
     with ReportServer({}, "/index.html") as other:
         path = urlsplit(other.url).path
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=WATCHDOG_S)
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=WATCHDOG_S)
     for guess in ("/index.html", path, path.replace("/index.html", "")):
         connection.request("GET", guess)
         answer = connection.getresponse()
@@ -636,11 +635,11 @@ def test_odd_requests_print_nothing(
 ) -> None:
     """What scanners and browsers that were closed send; the next one is answered all the same."""
     path = urlsplit(server.root).path.encode()
-    host = b" HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n" % server.port
+    host = b" HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n" % server.server_port
     asked = (b"GET http://[" + host, b"GET //[" + host, b"GET " + path + b"/d/a%20b.mp4" + host)
     for request in (*(line + b"\r\n" for line in asked), asked[2], b"GET /", b"\x16\x03\x01\r\n"):
         for is_reset in (False, True):
-            with socket.create_connection(("127.0.0.1", server.port), 20) as connection:
+            with socket.create_connection(("127.0.0.1", server.server_port), 20) as connection:
                 connection.sendall(request)
                 if is_reset:
                     linger = struct.pack("ii", 1, 0)

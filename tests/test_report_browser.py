@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,6 +30,7 @@ from report_scenes import (
     blocks,
     many_cameras,
     pack_cameras,
+    serving,
     two_cameras,
 )
 from waiting import WATCHDOG_S, until
@@ -379,29 +379,24 @@ def test_lossless_rgb_plays_itself_to_the_bit(browser: Tab, tmp_path: Path) -> N
     drive = pack_cameras(tmp_path, two_cameras(), quality="lossless", codec="h264")
     summary = report(drive)
     assert [camera.plays for camera in summary.cameras] == ["proxy", "video"]
-    with ReportServer(summary.files, summary.start) as server:
-        thread = threading.Thread(target=server.serve)
-        thread.start()
-        try:
-            page = show(browser, server.url)
-            with mp4ds.open(drive) as dataset:
-                for number in (0, FRAMES - 1, 11):
-                    page.evaluate(
-                        f"mp4dsReport.player.go(mp4dsReport.player.cameras[1].position[{number}])"
-                    )
-                    assert page.evaluate(SETTLED)
-                    seen = page.evaluate(
-                        "(v => { const c = new OffscreenCanvas(v.videoWidth, v.videoHeight)"
-                        ".getContext('2d'); c.drawImage(v, 0, 0); return Array.from("
-                        "c.getImageData(0, 0, v.videoWidth, v.videoHeight).data); })"
-                        "(mp4dsReport.player.cameras[1].video)"
-                    )
-                    picture = np.array(seen, np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3]
-                    np.testing.assert_array_equal(picture, dataset[COLOUR][number].data)
-            page.open("about:blank", ready="true")
-        finally:
-            server.stop()
-            thread.join()
+    server = ReportServer(summary.files, summary.start)
+    with serving(server):
+        page = show(browser, server.url)
+        with mp4ds.open(drive) as dataset:
+            for number in (0, FRAMES - 1, 11):
+                page.evaluate(
+                    f"mp4dsReport.player.go(mp4dsReport.player.cameras[1].position[{number}])"
+                )
+                assert page.evaluate(SETTLED)
+                seen = page.evaluate(
+                    "(v => { const c = new OffscreenCanvas(v.videoWidth, v.videoHeight)"
+                    ".getContext('2d'); c.drawImage(v, 0, 0); return Array.from("
+                    "c.getImageData(0, 0, v.videoWidth, v.videoHeight).data); })"
+                    "(mp4dsReport.player.cameras[1].video)"
+                )
+                picture = np.array(seen, np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3]
+                np.testing.assert_array_equal(picture, dataset[COLOUR][number].data)
+        page.open("about:blank", ready="true")
 
 
 def test_hostile_names_run_nothing(browser: Tab, tmp_path: Path) -> None:
@@ -424,19 +419,14 @@ def test_a_server_shows_the_same(
     browser: Tab, drive: Path, recorded: Recorded, tmp_path: Path
 ) -> None:
     summary = report(drive, ReportOptions(output=tmp_path / "else where"))
-    with ReportServer(summary.files, summary.start) as server:
-        thread = threading.Thread(target=server.serve)
-        thread.start()
-        try:
-            page = show(browser, server.url)
-            page.evaluate("mp4dsReport.player.go(7e8)")
-            for camera in (0, 1):
-                assert_shows(page, recorded, camera, recorded.frame_at(camera, 7e8))
-            assert page.problems == []
-            page.open("about:blank", ready="true")
-        finally:
-            server.stop()
-            thread.join()
+    server = ReportServer(summary.files, summary.start)
+    with serving(server):
+        page = show(browser, server.url)
+        page.evaluate("mp4dsReport.player.go(7e8)")
+        for camera in (0, 1):
+            assert_shows(page, recorded, camera, recorded.frame_at(camera, 7e8))
+        assert page.problems == []
+        page.open("about:blank", ready="true")
 
 
 INTRUDER = """<!doctype html><title>intruder</title><script>
@@ -461,21 +451,14 @@ def test_another_origin_can_include_nothing(browser: Tab, drive: Path, tmp_path:
     """Even one that has learned the token."""
     summary = report(drive)
     page = tmp_path / "intruder.html"
-    with ReportServer(summary.files, summary.start) as server:
-        page.write_text(INTRUDER.replace("ROOT", server.root))
-        with ReportServer({"/intruder.html": page}, "/intruder.html") as other:
-            threads = [threading.Thread(target=each.serve) for each in (server, other)]
-            for thread in threads:
-                thread.start()
-            try:
-                for url in (page.as_uri(), other.url, other.url.replace("127.0.0.1", "localhost")):
-                    browser.open(url, ready="typeof all === 'object'")
-                    assert browser.evaluate("all") == []
-                browser.open("about:blank", ready="true")
-            finally:
-                for each, thread in zip((server, other), threads, strict=True):
-                    each.stop()
-                    thread.join()
+    server = ReportServer(summary.files, summary.start)
+    page.write_text(INTRUDER.replace("ROOT", server.root))
+    other = ReportServer({"/intruder.html": page}, "/intruder.html")
+    with serving(server, other):
+        for url in (page.as_uri(), other.url, other.url.replace("127.0.0.1", "localhost")):
+            browser.open(url, ready="typeof all === 'object'")
+            assert browser.evaluate("all") == []
+        browser.open("about:blank", ready="true")
 
 
 def test_troubles_are_told(browser: Tab, drive: Path, tmp_path: Path) -> None:

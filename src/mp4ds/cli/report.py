@@ -78,7 +78,7 @@ def report_command(
             with printed():
                 stream = sys.stderr if is_json() else sys.stdout
                 print(f"{server.url} (Ctrl-C ends)", file=stream, flush=True)
-            server.serve()
+            server.serve_forever()
     if summary.problems:
         raise click.exceptions.Exit(1)
 

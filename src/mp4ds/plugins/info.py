@@ -22,7 +22,6 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.errors import Refused, SourceError, counted
 from mp4ds.files.urls import location
-from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, names_dataset
 from mp4ds.messages.serializations import MessageSplitter, kind_of
 from mp4ds.messages.wire import CodedFields, ImageFields
@@ -366,11 +365,7 @@ def brief(path: Path) -> Brief:
     """
     if not (path / MANIFEST_NAME).is_file():
         raise SourceError(path, "is not a dataset", "Give folders made by `mp4ds pack`.")
-    return brief_of(path, load_manifest(path / MANIFEST_NAME))
-
-
-def brief_of(path: Path, manifest: Manifest) -> Brief:
-    """The summary of a dataset whose manifest is known."""
+    manifest = load_manifest(path / MANIFEST_NAME)
     by_topic: Counter[str] = Counter()
     for stream in manifest.streams:
         by_topic[stream.topic] += stream.frames

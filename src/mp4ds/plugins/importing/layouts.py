@@ -354,12 +354,8 @@ def _columns(path: Path, number: int, values: list[str]) -> tuple[int, int | Non
     time = next((place for place, value in enumerate(values) if is_number(value)), None)
     if time is None:
         raise SourceError(path, f"line {number} has no time")
-    names = (place for place, value in enumerate(values) if _is_image(value))
+    names = (place for place, value in enumerate(values) if value.lower().endswith(STILL_SUFFIXES))
     return time, next(names, None)
-
-
-def _is_image(name: str) -> bool:
-    return name.lower().endswith(STILL_SUFFIXES)
 
 
 def _by_name(reader: ImagesReader, images: list[Path], unit: str | None) -> NDArray[np.int64]:

@@ -62,18 +62,15 @@ def of_unit(unit: str, found: Counter[str]) -> Callable[[str], int]:
     def read(text: str) -> int:
         if not _NUMBER.fullmatch(text):
             raise Refused(f"{text!r} is not a time in {unit}")
-        return _checked(Fraction(text) * scale, text, found)
+        time = Fraction(text) * scale
+        nanoseconds = round(time)
+        if not 0 <= nanoseconds <= MAX_STAMP:
+            raise Refused(f"{text!r} is not between 1970 and 2038, the range of ROS 2 times")
+        if nanoseconds != time:
+            found[ROUNDED] += 1
+        return nanoseconds
 
     return read
-
-
-def _checked(time: Fraction, text: str, found: Counter[str]) -> int:
-    nanoseconds = round(time)
-    if not 0 <= nanoseconds <= MAX_STAMP:
-        raise Refused(f"{text!r} is not between 1970 and 2038, the range of ROS 2 times")
-    if nanoseconds != time:
-        found[ROUNDED] += 1
-    return nanoseconds
 
 
 def at_rate(count: int, rate: str) -> NDArray[np.int64]:
@@ -376,14 +373,13 @@ def listed_images(
         SourceError: A line is not a time and name, or its file does not exist.
     """
     if rows is None:
-        rows = [(number, _time_and_name(line)) for number, line in lines_of(path)]
+        rows = [
+            # in two: a name may have spaces in it
+            (number, [part.strip() for part in re.split(r",|\s", line, maxsplit=1)])
+            for number, line in lines_of(path)
+        ]
     times = read_times(path, rows, read)
     return [_listed(path, folder, number, values) for number, values in rows], times
-
-
-def _time_and_name(line: str) -> list[str]:
-    """Two values: a name may have spaces in it."""
-    return [part.strip() for part in re.split(r",|\s", line, maxsplit=1)]
 
 
 def _listed(path: Path, folder: Path, number: int, values: list[str]) -> Path:

@@ -16,7 +16,7 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.errors import FormatError, SourceError
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.plugins.info import brief_of, notes_of, topics_of
+from mp4ds.plugins.info import notes_of, topics_of
 from mp4ds.plugins.reporting.cameras import ReportedCamera, axis_of, untimed
 from mp4ds.records import Message
 
@@ -122,13 +122,12 @@ def _summary(dataset: Dataset, topics: list[dict[str, Any]]) -> dict[str, Any]:
     }
     if manifest is None:
         return summary | {"profile": dataset.streams[0].sidecar.profile}
-    brief = brief_of(dataset.path, manifest)
-    if brief.start is not None:
-        summary |= {"start": str(brief.start), "end": str(brief.end)}
+    if span := manifest.time_range:
+        summary |= {"start": str(span.start), "end": str(span.end)}
     return summary | {
-        "profile": brief.profile,
-        "format": brief.format,
-        "bytes": brief.bytes,
+        "profile": manifest.profile,
+        "format": manifest.format,
+        "bytes": sum(entry.size for entry in manifest.files),
         "source_bytes": sum(source.size for source in manifest.sources),
         "sources": [source.name for source in manifest.sources][:_MOST_NOTES],
     }

@@ -42,8 +42,8 @@ _TYPES = {
 }
 
 
-class ReportServer:
-    """Serves some files, and nothing else. A context manager.
+class ReportServer(ThreadingHTTPServer):
+    """Serves some files, and nothing else.
 
     Args:
         files: The files, by URL path, such as ``/index.html``, unquoted. An unguessable token
@@ -59,35 +59,18 @@ class ReportServer:
         OptionError: The port is taken.
     """
 
+    daemon_threads = True
+
     def __init__(self, files: Mapping[str, Path], start: str, *, port: int = 0) -> None:
         token = secrets.token_urlsafe(_TOKEN_BYTES)
         served = {f"/{token}{path}": file for path, file in files.items()}
         try:
-            self._server = _Server((_HOST, port), partial(_Handler, served))
+            super().__init__((_HOST, port), partial(_Handler, served))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise OptionError(f"`port` {port} cannot be used: {reason}.") from None
-        self.port: int = self._server.server_address[1]
-        self.root = f"http://{_HOST}:{self.port}/{token}"
+        self.root = f"http://{_HOST}:{self.server_port}/{token}"
         self.url = f"{self.root}{start}"
-
-    def serve(self) -> None:
-        """Serve until interrupted."""
-        self._server.serve_forever(0.2)
-
-    def stop(self) -> None:
-        """End `serve`, which runs in another thread."""
-        self._server.shutdown()
-
-    def __enter__(self) -> ReportServer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.server_close()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore connections closed by the browser."""
