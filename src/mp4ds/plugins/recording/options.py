@@ -28,9 +28,12 @@ def _parse_duration(value: str | float) -> float:
     text = str(value)
     factor = {"m": 60, "h": 3600}.get(text[-1:], 1)
     try:
-        return float(text[:-1] if factor > 1 else text) * factor
+        seconds = float(text[:-1] if factor > 1 else text) * factor
     except ValueError:
         raise OptionError(f"{value!r} is not a number of seconds, such as 2.5.") from None
+    if not 0 <= seconds < 1e9:
+        raise OptionError(f"{seconds:.15g} is not from 0 to 999999999 seconds.")
+    return seconds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,13 +72,14 @@ class RecordOptions(Options):
         metavar="SECONDS",
         parse=_parse_duration,
     )
-    max_duration: float | None = option(
-        "Start a new dataset after this many seconds; 0: never.",
+    max_duration: Parsed[float | None] = option(
+        "Start a new dataset after this many seconds, 5m or 2h; 0: never.",
         None,
         "--max-bag-duration",
         "-d",
-        metavar="SECONDS",
         panel=WHAT,
+        metavar="SECONDS",
+        parse=_parse_duration,
     )
     max_size: Parsed[int | None] = option(
         "Start a new dataset at this size, such as 4G.",

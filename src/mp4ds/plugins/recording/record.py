@@ -175,9 +175,6 @@ def _check(options: RecordOptions) -> None:
             f"`quality` {options.quality} takes several tries per video. Record lossless or "
             "visual, then pack the dataset with this quality."
         )
-    for name, seconds in (("duration", options.duration), ("max_duration", options.max_duration)):
-        if seconds is not None and not 0 <= seconds < 1e9:
-            raise OptionError(f"`{name}` {seconds:.15g} is not from 0 to 999999999 seconds.")
     if options.about is not None:
         load_about(options.about)
     checked_codec(quality, options.codec, options.preset, Purpose(SPEED))

@@ -13,7 +13,7 @@ from cyclonedds.core import DDSException
 from cyclonedds.dynamic import get_types_for_typeid
 from cyclonedds.idl import make_idl_struct, types
 
-from mp4ds.bags.types import by_library, field_shape
+from mp4ds.bags.types import FieldShape, by_library, field_shape
 from mp4ds.errors import ConversionError, Refused
 from mp4ds.plugins.ros.ros2 import (
     described_definition,
@@ -170,45 +170,35 @@ def make_struct(known: dict[str, Any], name: str, *, has_fields: bool = False) -
     Raises:
         Refused: DDS cannot have this type.
     """
-    return _StructMaker(known, has_fields).struct(name)[0]
+    sized: dict[str, tuple[Any, int]] = {}
+    begun: list[str] = []
 
-
-class _StructMaker:
-    def __init__(self, known: dict[str, Any], has_fields: bool) -> None:
-        self._known = known
-        self._has_fields = has_fields
-        self._made: dict[str, tuple[Any, int]] = {}
-        self._open: list[str] = []
-
-    def struct(self, name: str) -> tuple[Any, int]:
+    def struct(name: str) -> tuple[Any, int]:
         """The class of a type, and the size of its fixed-size parts in bytes."""
-        if name in self._made:
-            return self._made[name]
-        if name in self._open or len(self._open) >= _MAX_NESTING or not _NAME.fullmatch(name):
+        if name in sized:
+            return sized[name]
+        if name in begun or len(begun) >= _MAX_NESTING or not _NAME.fullmatch(name):
             raise Refused(_NO_DDS_TYPE)
-        self._open.append(name)
+        begun.append(name)
         fields: dict[str, Any] = {}
         total = 0
-        for field, desc in self._known[name][1]:
+        for field, desc in known[name][1]:
             if field in fields or field.startswith("__"):
                 raise Refused(_NO_DDS_TYPE)
-            fields[field], size = self._field(desc)
+            fields[field], size = kind_of(desc)
             total += size
         if total > _MAX_SIZE:
             raise Refused(_NO_DDS_TYPE)
-        self._open.pop()
+        begun.pop()
         short = f"{name.rpartition('/')[2]}_"
-        make = partial(make_idl_struct, dataclassify=self._has_fields)
-        made = by_library(_NO_DDS_TYPE, make, short, dds_name(name), fields)
-        self._made[name] = made, total
-        return made, total
+        make = partial(make_idl_struct, dataclassify=has_fields)
+        sized[name] = by_library(_NO_DDS_TYPE, make, short, dds_name(name), fields), total
+        return sized[name]
 
-    def _field(self, desc: Any) -> tuple[Any, int]:
+    def kind_of(desc: Any) -> tuple[Any, int]:
+        """The type of a field, and its size."""
         shape = field_shape(desc)
-        if shape.message:
-            kind, size = self.struct(shape.message)
-        else:
-            kind, size = _base(shape.base, shape.text_bound), 8
+        kind, size = struct(shape.message) if shape.message else (_base(shape), 8)
         if shape.length is not None:
             made = by_library(_NO_DDS_TYPE, getitem, types.array, (kind, shape.length))
             return made, size * shape.length
@@ -217,13 +207,15 @@ class _StructMaker:
             return by_library(_NO_DDS_TYPE, getitem, types.sequence, bounded), 24
         return kind, size
 
+    return struct(name)[0]
 
-def _base(name: str, bound: int) -> Any:
-    if name not in _BASES:
+
+def _base(shape: FieldShape) -> Any:
+    if shape.base not in _BASES:
         raise Refused(_NO_DDS_TYPE)
-    if name == "string":
-        return types.bounded_str[bound] if bound else str
-    return bool if name == "bool" else getattr(types, _BASES[name])
+    if shape.base == "string":
+        return types.bounded_str[shape.text_bound] if shape.text_bound else str
+    return bool if shape.base == "bool" else getattr(types, _BASES[shape.base])
 
 
 # ---------------------------------------------------------------- services
