@@ -18,10 +18,8 @@ import pytest
 
 import mp4ds
 from commands import Result, call, program
-from mp4ds.plugins.playing.options import PlayOptions
-from mp4ds.plugins.playing.play import open_player
-from player_scenes import make_drive, recorded
-from player_scenes import run as run_player
+from mp4ds.plugins.ros.node import chosen_world
+from player_scenes import make_drive
 from ros2_sides import alone_in_ros2
 from waiting import WATCHDOG_S
 
@@ -170,16 +168,6 @@ def test_errors_are_sentences(drive: Path, arguments: list[str], words: str) -> 
     assert "Traceback" not in done.err
 
 
-def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("ROS_VERSION", raising=False)
-    monkeypatch.setattr("mp4ds.plugins.ros.node.find_spec", lambda _: None)
-    with (
-        pytest.raises(mp4ds.PublishError, match="no ROS is sourced"),
-        open_player(drive, PlayOptions()),
-    ):
-        pass
-
-
 @pytest.mark.parametrize(
     ("version", "modules", "kind"),
     [
@@ -188,24 +176,19 @@ def test_nothing_sourced(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("", ["rospy"], "ros1"),
         ("", ["rclpy", "rospy"], "ros2"),
         ("", ["cyclonedds"], "ros2"),
+        ("", [], None),
     ],
 )
 def test_what_is_sourced(
-    version: str, modules: list[str], kind: str, monkeypatch: pytest.MonkeyPatch
+    version: str, modules: list[str], kind: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mp4ds.plugins.ros.node import chosen_world
-
     monkeypatch.setenv("ROS_VERSION", version)
     monkeypatch.setattr(
         "mp4ds.plugins.ros.node.find_spec",
         lambda name: object() if name in modules else None,
     )
-    assert chosen_world("play", None) == kind
-
-
-def test_the_library_plays_as_the_command_does(drive: Path) -> None:
-    publisher, summary = run_player(drive, rate=4.0)
-    assert [sent.payload for sent in publisher.sent] == [
-        payload for _, payload, _ in recorded(drive.with_suffix(".bag"))
-    ]
-    assert isinstance(summary, mp4ds.PlaySummary)
+    if kind:
+        assert chosen_world("play", None) == kind
+        return
+    with pytest.raises(mp4ds.PublishError, match="no ROS is sourced"):
+        chosen_world("play", None)
