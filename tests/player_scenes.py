@@ -105,7 +105,7 @@ def run(
 ) -> tuple[RecordingPublisher, PlaySummary]:
     """Play to the end."""
     publisher = publisher or RecordingPublisher()
-    with open_player(dataset, PlayOptions(**options), node=publisher) as player:  # type: ignore[arg-type]
+    with open_player(dataset, PlayOptions(**options), node=publisher) as player:
         return publisher, player.run()
 
 
@@ -116,7 +116,7 @@ def running(
     """A player that runs in a thread, stopped at the end."""
     publisher = publisher or RecordingPublisher()
     failures: list[BaseException] = []
-    with open_player(dataset, PlayOptions(**options), node=publisher) as player:  # type: ignore[arg-type]
+    with open_player(dataset, PlayOptions(**options), node=publisher) as player:
 
         def work() -> None:
             try:

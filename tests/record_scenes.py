@@ -116,7 +116,7 @@ def recorded(node: PlayedNode, target: Path, **options: Any) -> RecordSummary:
 @contextmanager
 def played(node: PlayedNode, *arguments: Any, **options: Any) -> Iterator[Recorder]:
     """A recorder that ends with the recording."""
-    with open_recorder(*arguments, node=node, **options) as recorder:  # type: ignore[arg-type]
+    with open_recorder(*arguments, node=node, **options) as recorder:
         node.stop = recorder.stop
         yield recorder
 
@@ -135,7 +135,7 @@ def fail_to_pack(piece: int, problem: str, monkeypatch: pytest.MonkeyPatch) -> N
 
 def _main(recording: str, dataset: str, rate: str) -> None:
     node = PlayedNode([Path(recording)], rate=float(rate))
-    with open_recorder((), dataset, RecordOptions(all=True), node=node) as recorder:  # type: ignore[arg-type]
+    with open_recorder((), dataset, RecordOptions(all=True), node=node) as recorder:
         recorder.run()
 
 

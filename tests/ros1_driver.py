@@ -112,6 +112,9 @@ class Driver:
     def _set(self, is_paused: bool) -> None:
         self.is_paused = is_paused
 
+    def dropped(self) -> int:
+        return sum(sender.dropped for sender in self.publisher._senders())
+
     def close(self) -> None:
         self.publisher.close()
         self.publisher.close()

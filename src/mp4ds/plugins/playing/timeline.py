@@ -270,8 +270,7 @@ class _Part:
             )
         self._topics = {item.topic for item in dataset.channels if wanted(item.topic)}
         self._published: dict[int, Channel] = {}  # by id of the dataset's channel
-        self.frames: set[int] = set()
-        """`id()` of published channels with images."""
+        self.frames: set[int] = set()  # id() of published channels with images
         with_frames = {item.channel.id for item in dataset.image_channels()}
         for channel in dataset.channels:
             is_emptied = self.republisher is not None and self.republisher.empties(channel)

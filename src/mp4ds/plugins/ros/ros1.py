@@ -50,6 +50,9 @@ class Sender:
         transport: rospy's connection to it.
         messages: Queue size, 0 for as many as `MAX_BYTES` allows; when the queue is full, the
             oldest message is dropped.
+
+    Attributes:
+        dropped: Messages dropped so far.
     """
 
     def __init__(self, transport: Any, messages: int) -> None:
@@ -155,7 +158,6 @@ class AdvertisedTopic:
         self._lock = threading.Lock()
         self._senders: dict[Any, Sender] = {}
         self._latched: dict[str, bytes] = {}  # by who published it
-        self._dropped = 0
         # a subscriber may connect before rospy returns
         with self._lock, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # rospy's advice to use its queues
@@ -166,12 +168,6 @@ class AdvertisedTopic:
     def subscribers(self) -> int:
         """Number of current subscribers."""
         return int(self._publisher.get_num_connections())
-
-    @property
-    def dropped(self) -> int:
-        """Messages dropped because a subscriber was too slow."""
-        with self._lock:
-            return self._dropped + sum(sender.dropped for sender in self._senders.values())
 
     def mark_latched(self) -> None:
         """Announce to later subscribers that the topic is latched."""
@@ -198,18 +194,11 @@ class AdvertisedTopic:
                 self._latched.pop(caller, None)  # the latest comes last
                 self._latched[caller] = data
 
-    def flush(self, deadline: float) -> None:
-        """Wait until everything is sent, or until a ``time.monotonic()`` deadline."""
+    @property
+    def senders(self) -> list[Sender]:
+        """Those to its current subscribers."""
         with self._lock:
-            senders = list(self._senders.values())
-        for sender in senders:
-            sender.flush(deadline)
-
-    def end(self) -> None:
-        """Discard the queue, and send nothing more."""
-        with self._lock:
-            for sender in self._senders.values():
-                sender.end()
+            return list(self._senders.values())
 
     def peer_subscribe(self, *_: object) -> None:
         """Called by rospy when a subscriber has connected."""
@@ -225,9 +214,7 @@ class AdvertisedTopic:
         if len(connections) == len(self._senders) and all(c in self._senders for c in connections):
             return
         for gone in self._senders.keys() - set(connections):
-            sender = self._senders.pop(gone)
-            sender.end()
-            self._dropped += sender.dropped
+            self._senders.pop(gone).end()
         for connection in connections:
             if connection not in self._senders:
                 sender = self._senders[connection] = Sender(connection, self._messages)
@@ -449,11 +436,6 @@ class Ros1Node(Node):
         """How many subscribers the channel's topic has now."""
         return self._channels[id(channel)][1].subscribers
 
-    @property
-    def dropped(self) -> int:
-        """Messages dropped so far because subscribers were too slow."""
-        return sum(topic.dropped for topic in self._topics.values())
-
     def _check_alive(self) -> None:
         if not self.is_alive:
             raise PublishError(self._master, "the node was shut down from outside; play again")
@@ -586,14 +568,17 @@ class Ros1Node(Node):
         for subscriber in self._subscribers:
             subscriber.unregister()
         deadline = time.monotonic() + _FLUSH_S
-        for topic in self._topics.values():
-            topic.flush(deadline)
+        for sender in self._senders():
+            sender.flush(deadline)
         if self.is_alive and any(topic.subscribers for topic in self._topics.values()):
             time.sleep(_FAREWELL_S)
         # The master may be gone.
         _answer(lambda: rospy.signal_shutdown("the node is closed"), _ANSWER_S)
-        for topic in self._topics.values():
-            topic.end()
+        for sender in self._senders():
+            sender.end()
+
+    def _senders(self) -> list[Sender]:
+        return [sender for topic in self._topics.values() for sender in topic.senders]
 
 
 _HEADER = re.compile(r"(?:\s|#[^\n]*\n)*(?:std_msgs/)?Header\s")
