@@ -142,12 +142,10 @@ def _warnings(state: RecordProgress) -> Iterator[str]:
 
 def _rows(state: RecordProgress) -> list[Row]:
     """All of it, and the busiest topics; a bar shows which part of the data rate is theirs."""
-    count = sum(item.messages for item in state.topics.values())
     rate = sum(item.bytes_per_s for item in state.topics.values())
     texts = [
         f"{state.seconds:.0f} s",
-        counted(count, "message"),
-        f"{rate / 1e6:.1f} MB/s received",
+        f"{rate / 1e6:.1f} MB/s",
         f"{state.bytes_written / 1e6:.1f} MB written",
     ]
     if state.spool_bytes >= 1e6:
@@ -157,7 +155,7 @@ def _rows(state: RecordProgress) -> list[Row]:
     rows = [Row(state.state, "  ".join(texts))]
     busiest = sorted(state.topics.items(), key=lambda item: -item[1].bytes_per_s)
     for topic, item in busiest[:_SHOWN]:
-        text = f"{item.messages:8}  {item.hz:7.1f} Hz  {item.bytes_per_s / 1e6:8.2f} MB/s"
+        text = f"{item.messages:7}  {item.hz:6.1f} Hz  {item.bytes_per_s / 1e6:7.2f} MB/s"
         if gone := item.dropped + item.lost + item.untimed:
             text += f"  {gone} lost"
         rows.append(Row(topic, text, item.bytes_per_s / rate if rate else 0.0))
