@@ -35,12 +35,6 @@ def write(folder: str, name: str) -> None:
     new.rename(place)
 
 
-def write_slowly(folder: str, name: str) -> None:
-    """As `write`, and there is time to do something to it."""
-    write(folder, name)
-    time.sleep(4 * SECONDS)
-
-
 def die(folder: str, name: str) -> None:
     """As `write`, but the worker does not survive the one that is deadly."""
     if name == "deadly":

@@ -41,9 +41,8 @@ COLUMNS = ("log_time", "stamp", "seq")
 
 
 @pytest.fixture(scope="module")
-def jail() -> Iterator[Jail]:
-    with Jail() as opened:
-        yield opened
+def jail() -> Jail:
+    return Jail()
 
 
 @pytest.fixture

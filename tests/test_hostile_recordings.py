@@ -8,7 +8,7 @@ import os
 import re
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -53,9 +53,8 @@ PAGE = 512
 
 
 @pytest.fixture(scope="module")
-def jail() -> Iterator[Jail]:
-    with Jail() as opened:
-        yield opened
+def jail() -> Jail:
+    return Jail()
 
 
 def bounded(outcome: Outcome) -> Outcome:

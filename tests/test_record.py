@@ -64,11 +64,6 @@ def again(dataset: Path, folder: Path, to: str | None = None) -> Path:
     return output
 
 
-def reasons(summary: mp4ds.PackSummary, topic: str) -> dict[str, int]:
-    (found,) = (item for item in summary.topics if item.topic == topic)
-    return {reason: count for reason, (count, _) in found.verbatim.items()}
-
-
 # ---------------------------------------------------------------- what comes
 
 

@@ -135,7 +135,6 @@ def test_every_exact_layout_is_what_the_spec_says(size: tuple[int, int]) -> None
 
 # ---------------------------------------------------------------- what is packed today
 
-Case = tuple[Callable[..., Scene], str]
 ROS = {"ros1": "mcap-ros1-zstd", "ros2": "mcap-ros2-none"}
 
 

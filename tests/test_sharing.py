@@ -14,8 +14,6 @@ import pytest
 import mp4ds
 from commands import program
 
-LEFT = "/left/image_raw"
-
 BEGIN = """
 import os, sys, threading
 import numpy as np
