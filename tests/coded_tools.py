@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import io
-import os
 import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
 from typing import Any
 
 import av
 import cv2
 import numpy as np
-from av.video.frame import PictureType
 from numpy.typing import NDArray
 from PIL import Image
 
+from encoders import encoded
 from mp4ds.errors import Refused
 
 WIDTH, HEIGHT = 64, 48
@@ -105,23 +103,13 @@ def encode(
     all_p: bool = False,
 ) -> list[Packet]:
     """Encode the scene; with `all_p`, without B-frames although they are allowed."""
-    os.environ.setdefault("SVT_LOG", "0")
-    context: Any = av.CodecContext.create(encoding.encoder, "w")
-    context.width, context.height = width, height
-    context.pix_fmt = encoding.pixel_format
-    context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
-    context.thread_count = 1
-    context.gop_size = gop
-    context.options = {"g": str(gop), **encoding.options}
-    packets: list[Any] = []
-    for number, pixels in enumerate(scene(frames, width, height)):
-        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-        frame = frame.reformat(format=encoding.pixel_format, threads=1)
-        frame.pts = number
-        if all_p and number:
-            frame.pict_type = PictureType.P
-        packets += context.encode(frame)
-    packets += context.encode(None)
+    packets = encoded(
+        encoding.encoder,
+        encoding.pixel_format,
+        {"g": str(gop), **encoding.options},
+        scene(frames, width, height),
+        all_p=all_p,
+    )
     return [Packet(bytes(packet), packet.is_keyframe, packet.pts) for packet in packets]
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import av
 import cv2
 import numpy as np
+from av.video.frame import PictureType
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -179,21 +180,40 @@ def packets(name: str, *, frames: int, width: int, height: int, seed: int = 0) -
         seed: Of the noise.
     """
     encoder, pixel_format, options = RECIPES[name]
+    rng = np.random.default_rng(seed)
+    pictures = (
+        np.ascontiguousarray(picture("rgb8", frame=n, width=width, height=height, rng=rng))
+        for n in range(frames)
+    )
+    coded = encoded(encoder, pixel_format, {"g": str(GOP), **dict(options)}, pictures)
+    return [Packet(bytes(packet), packet.pts, packet.is_keyframe) for packet in coded]
+
+
+def encoded(
+    encoder: str,
+    pixel_format: str,
+    options: dict[str, str],
+    pictures: Iterable[Pixels],
+    *,
+    all_p: bool = False,
+) -> list[Any]:
+    """PyAV's packets of RGB pictures; with `all_p`, without B-frames though they are allowed."""
     os.environ.setdefault("SVT_LOG", "0")
     context: Any = av.CodecContext.create(encoder, "w")
-    context.width, context.height, context.pix_fmt = width, height, pixel_format
-    context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
-    context.gop_size, context.thread_count, context.options = GOP, 1, dict(options)
-    rng = np.random.default_rng(seed)
-    coded: list[Any] = []
-    for n in range(frames):
-        rgb = picture("rgb8", frame=n, width=width, height=height, rng=rng)
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
-        frame = frame.reformat(format=pixel_format)
-        frame.pts, frame.time_base = n, context.time_base
-        coded += context.encode(frame)
-    coded += context.encode(None)
-    return [Packet(bytes(packet), packet.pts, packet.is_keyframe) for packet in coded]
+    packets: list[Any] = []
+    for number, pixels in enumerate(pictures):
+        if not number:
+            context.height, context.width = pixels.shape[:2]
+            context.pix_fmt, context.thread_count = pixel_format, 1
+            context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
+            context.options = options
+        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+        frame = frame.reformat(format=pixel_format, threads=1)
+        frame.pts = number
+        if all_p and number:
+            frame.pict_type = PictureType.P
+        packets += context.encode(frame)
+    return packets + context.encode(None)
 
 
 def nal_units(data: bytes) -> list[tuple[int, bytes]]:

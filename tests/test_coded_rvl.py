@@ -13,6 +13,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 
 from coded_tools import mutations, refusal
+from encoders import rvl
 from mp4ds.errors import Refused
 from mp4ds.messages.depth import decode_rvl, encode_rvl
 
@@ -29,25 +30,8 @@ def nibbles_of(value: int) -> list[int]:
 
 
 def reference(depth: Depth) -> bytes:
-    """The coder of the paper, pixel by pixel."""
-    pixels = depth.reshape(-1).tolist()
-    nibbles: list[int] = []
-    at = previous = 0
-    while at < len(pixels):
-        start = at
-        while at < len(pixels) and not pixels[at]:
-            at += 1
-        nibbles += nibbles_of(at - start)
-        start = at
-        while at < len(pixels) and pixels[at]:
-            at += 1
-        nibbles += nibbles_of(at - start)
-        for value in pixels[start:at]:
-            delta = value - previous
-            nibbles += nibbles_of((delta << 1) ^ (delta >> 31))
-            previous = value
-    rows, columns = depth.shape
-    return struct.pack("<II", columns, rows) + packed(nibbles)
+    """Header and words by a coder that goes pixel by pixel."""
+    return struct.pack("<II", *depth.shape[::-1]) + rvl(depth)
 
 
 def packed(nibbles: list[int]) -> bytes:

@@ -246,14 +246,6 @@ def test_ffprobe_knows_all(name: str, datasets: Datasets) -> None:
     assert tags == [case.range, case.matrix, *others]
 
 
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("name", CASES)
-def test_ffprobe_reads_the_times(name: str, datasets: Datasets) -> None:
-    path = video_of(datasets[name])
-    frames = ffprobe(path, "-show_entries", "frame=best_effort_timestamp,pict_type")["frames"]
-    assert [frame["best_effort_timestamp"] for frame in frames] == expected_ticks(datasets[name])
-
-
 def ffmpeg(path: Path, pixel_format: str, *filters: str) -> bytes:
     """All frames, as ffmpeg converts them."""
     if not shutil.which("ffmpeg"):

@@ -239,22 +239,6 @@ def test_lossless_of_a_scene_with_threads(
 TAGS = ("color_range", "color_space", "color_transfer", "color_primaries")
 
 
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("codec", LOSSY)
-@pytest.mark.parametrize("picture_format", ["rgb24", "bgr24", "gray", "bayer_rggb8"])
-def test_lossy_files_are_tagged_as_bt709_full_range(
-    codec: str, picture_format: str, tmp_path: Path
-) -> None:
-    encoding = {"rgb24": "rgb8", "bgr24": "bgr8", "gray": "mono8"}
-    pictures = scene_pictures(encoding.get(picture_format, "bayer_rggb8"), 64, 48, 3)
-    recipe = recipe_for("rgb24", lossless=False, codec=codec, crf=20)
-    encode(tmp_path / "v.mp4", recipe, pictures, picture_format)
-    found = ffprobe(tmp_path / "v.mp4", "-show_streams")["streams"]
-    assert len(found) == 1
-    assert [found[0].get(tag) for tag in TAGS] == ["pc", "bt709", "bt709", "bt709"]
-    assert found[0]["pix_fmt"] in (recipe.pixel_format, "yuvj420p")
-
-
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize(("codec", "picture_format"), LOSSLESS)
 def test_lossless_files_are_tagged_too(codec: str, picture_format: str, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -288,16 +288,11 @@ class TransformCollector:
         Returns:
             A part of `transforms`, in the same order.
         """
-        return between(self._latest, frame_ids)
-
-
-def between(by_child: Mapping[str, Transform], frame_ids: Iterable[str]) -> list[Transform]:
-    """See `TransformCollector.between`; `by_child` has names without a leading slash."""
-    kept: set[str] = set()
-    for frame_id in frame_ids:
-        child = _name(frame_id)
-        # stops where another camera's path continued, and in a cycle
-        while child in by_child and child not in kept:
-            kept.add(child)
-            child = _name(by_child[child].parent)
-    return [transform for child, transform in by_child.items() if child in kept]
+        kept: set[str] = set()
+        for frame_id in frame_ids:
+            child = _name(frame_id)
+            # stops where another camera's path continued, and in a cycle
+            while child in self._latest and child not in kept:
+                kept.add(child)
+                child = _name(self._latest[child].parent)
+        return [transform for child, transform in self._latest.items() if child in kept]

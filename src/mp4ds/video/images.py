@@ -344,34 +344,9 @@ def _layout(encoding: Encoding, *, demosaic: bool) -> Layout:
 
 # ---------------------------------------------------------------- rendering
 
-# channels and samples of packed formats
-_PACKED = {
-    "gray": (1, "u1"),
-    "rgb24": (3, "u1"),
-    "bgr24": (3, "u1"),
-    "rgba": (4, "u1"),
-    "bgra": (4, "u1"),
-    "gray16le": (1, "<u2"),
-    "rgb48le": (3, "<u2"),
-    "bgr48le": (3, "<u2"),
-    "rgba64le": (4, "<u2"),
-    "bgra64le": (4, "<u2"),
-}
 # numbers of channels that are colours by the registry: blue, green, red and alpha
 _NAMED = {"mono8": "gray", "mono16": "gray16le", "8UC1": "gray", "8UC3": "bgr24", "8UC4": "bgra",
           "16UC3": "bgr48le", "16UC4": "bgra64le"}  # fmt: skip
-_BY_BITS = {
-    8: {"rgb": "rgb24", "bgr": "bgr24", "gray": "gray"},
-    16: {"rgb": "rgb48le", "bgr": "bgr48le", "gray": "gray16le"},
-}
-_ENCODING_OF = {
-    "rgb24": "rgb8",
-    "bgr24": "bgr8",
-    "gray": "mono8",
-    "rgb48le": "rgb16",
-    "bgr48le": "bgr16",
-    "gray16le": "mono16",
-}
 
 
 def shown_format(encoding: Encoding) -> str | None:
@@ -403,7 +378,7 @@ def encoding_as(encoding: Encoding, colours: str) -> str | None:
     """
     if shown_format(encoding) is None:
         return None
-    return _ENCODING_OF[_BY_BITS[8 * encoding.bytes_per_sample][colours]]
+    return f"{'mono' if colours == 'gray' else colours}{8 * encoding.bytes_per_sample}"
 
 
 class Renderer:
@@ -492,7 +467,7 @@ def _even_mosaic(pixels: Pixels) -> Pixels:
 
 
 def _frame(array: NDArray[Any], pixel_format: str) -> av.VideoFrame:
-    if pixel_format in ("gray", "gray16le") or _PACKED[pixel_format][1] == "u1":
+    if array.dtype == np.uint8 or array.ndim == 2:
         return plain_frame((array,), pixel_format)
     frame = av.VideoFrame(array.shape[1], array.shape[0], pixel_format)
     _array(frame)[...] = array
@@ -501,10 +476,11 @@ def _frame(array: NDArray[Any], pixel_format: str) -> av.VideoFrame:
 
 def _array(frame: av.VideoFrame) -> NDArray[Any]:
     """The pixels of a packed frame as a view of shape (H, W) or (H, W, C)."""
-    channels, samples = _PACKED[frame.format.name]
+    channels = len(frame.format.components)
+    samples = np.dtype("u1" if frame.format.components[0].bits == 8 else "<u2")
     plane: Any = frame.planes[0]  # a buffer, which its type does not tell
     rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-    row_bytes = frame.width * channels * np.dtype(samples).itemsize
+    row_bytes = frame.width * channels * samples.itemsize
     pixels = rows[: frame.height, :row_bytes].view(samples)
     return pixels if channels == 1 else pixels.reshape(frame.height, frame.width, channels)
 

@@ -345,15 +345,6 @@ class SampleTable:
     order: Integers
 
 
-@dataclass(frozen=True, slots=True)
-class _Edit:
-    """The part of a track that is shown, in ticks of the track."""
-
-    delay: int
-    start: int
-    duration: int
-
-
 class _Movie:
     """The movie box, held in memory."""
 
@@ -476,8 +467,12 @@ def _parse_track(movie: _Movie, track: Box, file_size: int) -> SampleTable:
     edit = _edit(movie, track, timescale)
     order: Integers = np.arange(len(sizes), dtype=np.int64)
     if edit:
-        order = _shown(presentation, edit, order)
-        shift = edit.delay - int(presentation[order].min())
+        delay, start, end = edit
+        shown = (presentation >= start) & (presentation < end)
+        if not shown.any():
+            raise Refused("its edit list shows no frames")
+        order = order[shown]
+        shift = delay - int(presentation[order].min())
         decoding += shift
         presentation += shift
     times = presentation[order]
@@ -593,8 +588,11 @@ def _sync(movie: _Movie, tables: dict[bytes, Box], count: int) -> NDArray[np.boo
     return sync
 
 
-def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
+def _edit(movie: _Movie, track: Box, timescale: int) -> tuple[int, int, int] | None:
     """The edit list, if it only delays the track and trims its ends; None without one.
+
+    Returns:
+        Delay, start and end of what is shown, in ticks of the track.
 
     Raises:
         Refused: It does more than that.
@@ -619,14 +617,7 @@ def _edit(movie: _Movie, track: Box, timescale: int) -> _Edit | None:
         raise Refused("it has several edits")
     if rows["speed"][-1] != _NORMAL_SPEED or not durations[-1]:
         raise Refused("it has an edit that freezes a frame or has no end")
-    edit = _Edit(sum(durations[:-1]), starts[-1], durations[-1])
-    if max(edit.delay, edit.start + edit.duration) > _LATEST:
+    delay, end = sum(durations[:-1]), starts[-1] + durations[-1]
+    if max(delay, end) > _LATEST:
         raise DamagedBoxError("an edit is too late")
-    return edit
-
-
-def _shown(presentation: Integers, edit: _Edit, order: Integers) -> Integers:
-    shown = (presentation >= edit.start) & (presentation < edit.start + edit.duration)
-    if not shown.any():
-        raise Refused("its edit list shows no frames")
-    return order if shown.all() else order[shown]
+    return delay, starts[-1], end
