@@ -37,3 +37,10 @@ def agreed(folder: Path) -> None:
         manifest["files"] = [digest(folder / entry["name"]) for entry in manifest["files"]]
 
     changed(folder / "dataset.yaml", change)
+
+
+def flip(path: Path, place: float = 0.5) -> None:
+    """Change a bit, at a share of the file's length."""
+    data = bytearray(path.read_bytes())
+    data[int(place * len(data))] ^= 0x10
+    path.write_bytes(data)

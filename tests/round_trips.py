@@ -11,7 +11,7 @@ import mp4ds
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.options import UnpackOptions
 from scenes import Scene
-from sources import Source
+from sources import SOURCES, Source
 
 Compare = Callable[..., list[str]]
 
@@ -23,6 +23,13 @@ TARGETS = {
     "rosbag2": ("rosbag2", None),
 }
 OWN_TARGET = {"bag": "bag", "rosbag2": "rosbag2-mcap", "mcap": "mcap"}
+
+
+def packed(folder: Path, recorded: Scene, source: str = "bag-none", **options: Any) -> Path:
+    """A dataset of a scene in a source."""
+    paths = SOURCES[source](folder / "source", recorded)
+    mp4ds.pack(paths, folder / "dataset", PackOptions(**options))
+    return folder / "dataset"
 
 
 def own_target(source: str) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edits import flip
 from mp4ds.bags.protocols import RecordingSlice
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.concat import concat
@@ -101,8 +102,6 @@ def test_videos_are_joined_where_nothing_is_hidden(whole: Path, tmp_path: Path) 
 def test_a_damaged_part_is_not_copied(whole: Path, tmp_path: Path) -> None:
     parts = cut(whole, tmp_path / "parts", 2)
     video = next(parts[1].glob("*.mp4"))
-    data = bytearray(video.read_bytes())
-    data[len(data) // 2] ^= 1
-    video.write_bytes(data)
+    flip(video)
     with pytest.raises(FormatError, match=video.name):
         join(parts, tmp_path / "joined")

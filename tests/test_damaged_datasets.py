@@ -17,6 +17,7 @@ import mp4ds
 from coded_scenes import CODED
 from commands import call
 from damage import Key, all_messages, pieces_of
+from edits import flip
 from mp4ds import FormatError, OptionError, SourceError, UnpackOptions
 from mp4ds.errors import VideoError
 from mp4ds.plugins.playing.play import open_player
@@ -74,13 +75,6 @@ def file_of(dataset: Path, name: str) -> Path:
     stem, _, suffix = name.partition(".")
     (path,) = dataset.glob(f"{stem}*.{suffix}")
     return path
-
-
-def flip(path: Path, place: float) -> None:
-    """Change a bit, at a share of the file's length."""
-    data = bytearray(path.read_bytes())
-    data[int(place * len(data))] ^= 0x10
-    path.write_bytes(data)
 
 
 def zero(path: Path, start: float, size: int = 512) -> None:

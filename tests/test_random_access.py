@@ -22,25 +22,18 @@ import mp4ds
 from mp4ds.dataset.views import Placement
 from mp4ds.format.models import Calibration, Roi
 from mp4ds.messages.encodings import ENCODINGS as KNOWN
-from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.demo import demo
 from mp4ds.times import StampIndex
 from mp4ds.unpacking.options import UnpackOptions
 from mp4ds.video.images import Renderer
 from pictures import YUV, picture, pixels
 from republished import psnr
-from sources import ENCODINGS, SOURCES, Scene, odd_scene, scene
+from round_trips import packed
+from sources import ENCODINGS, Scene, odd_scene, scene
 
 TOPIC = "/cam/image_raw"
 FRAMES = 9
 ORDER = (5, 0, -1, 5, 3, 4, -9, 8)
-
-
-def packed(folder: Path, source: Scene, variant: str = "mcap-ros2-none", **options: Any) -> Path:
-    """A dataset of the scene."""
-    paths = SOURCES[variant](folder / "source", source)
-    mp4ds.pack(paths, folder / "dataset", PackOptions(**options))
-    return folder / "dataset"
 
 
 def recorded(source: Scene) -> list[Any]:

@@ -13,17 +13,15 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-import mp4ds
 from coded_scenes import CODED
-from mp4ds.dataset.columns import DecodedColumns, everything, marked, unbroken, within
+from mp4ds.dataset.columns import DecodedColumns, everything
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, VideoError
-from mp4ds.packing.options import PackOptions
-from mp4ds.records import Excerpt, Message, Record
+from mp4ds.records import Message, Record
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.mp4 import read_sample_table
+from round_trips import packed
 from scenes import TRAITS, Scene, odd_scene, scene
-from sources import SOURCES
 
 T = TypeVar("T")
 Row = tuple[str, int, int, int, bytes]
@@ -51,12 +49,6 @@ def row(message: Message) -> Row:
 
 def rows(records: Iterator[Record]) -> list[Row]:
     return [row(record) for record in records if isinstance(record, Message)]
-
-
-def packed(folder: Path, made: Scene, source: str = "bag-none", **options: Any) -> Path:
-    paths = SOURCES[source](folder / "source", made)
-    mp4ds.pack(paths, folder / "dataset", PackOptions(**options))
-    return folder / "dataset"
 
 
 @pytest.fixture(scope="module")
@@ -188,36 +180,6 @@ def test_a_choice_is_asked_when_the_message_before_was_made(long: Path) -> None:
                 events.append(("made", times[record.log_time]))
     numbers = [*range(10), *range(10, 200, 40)]
     assert events == [(what, number) for number in numbers for what in ("asked", "made")]
-
-
-def test_choices() -> None:
-    times = np.array([5, 3, 9, 7, 9], np.int64)
-    zeros = np.zeros(5, np.int64)
-    columns = DecodedColumns(times, times, zeros, times, None, None, zeros, np.arange(5))
-    assert list(everything(columns)) == [0, 1, 2, 3, 4]
-    assert list(within(Excerpt(start=6))(columns)) == [2, 3, 4]
-    assert list(within(Excerpt(start=6), every(2))(columns)) == [2, 4]
-    assert list(within(Excerpt(end=6))(columns)) == [0, 1]
-    assert list(within(Excerpt())(columns)) == [0, 1, 2, 3, 4]
-    assert list(marked(times != 9, every(3))(columns)) == [0, 3]
-
-
-@pytest.mark.parametrize(
-    ("indices", "from_key", "wanted"),
-    [
-        ([], True, []),
-        ([6], False, [6]),
-        ([6], True, [4, 5, 6]),
-        ([0, 1, 3], False, [0, 1, 2, 3]),
-        ([2, 9], True, [0, 1, 2, 8, 9]),
-        ([2, 9, 10], False, [2, 8, 9, 10]),
-        ([4, 8], True, [4, 8]),
-    ],
-)
-def test_packets_come_with_those_that_they_need(
-    indices: list[int], from_key: bool, wanted: list[int]
-) -> None:
-    assert list(unbroken(indices, [0, 4, 8], from_key=from_key)) == wanted
 
 
 @pytest.mark.parametrize("name", ["video-h264", "jpeg-rgb"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,52 +69,34 @@ def test_every_encoding(
     compare_packs(tmp_path, source, recorded, compare, executor)
 
 
-@pytest.mark.one_in(8)
-@pytest.mark.parametrize("source", SOURCES)
-def test_every_source(
-    source: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
+OTHERS: dict[str, tuple[Callable[[], Scene], str]] = {
+    **{name: (partial(scene, "bayer_gbrg8", frames=10), name) for name in SOURCES},
+    **{
+        f"{name}-{source}": (CODED[name], source)
+        for name in CODED
+        for source in ("bag-none", "mcap-ros2-zstd")
+    },
+    **{f"odd-{trait}": (partial(odd_scene, trait), "mcap-ros2-zstd") for trait in TRAITS},
+    **{
+        f"foxglove-{name}-{source}": (FOXGLOVE[name], source)
+        for name in ("raw-rgb8", "raw-padded", "jpeg-cut-one", "video-h264-mid-gop")
+        for source in list(FOXGLOVE_SOURCES)[::2]
+    },
+}
+
+
+@pytest.mark.one_in(12)
+@pytest.mark.parametrize("name", OTHERS)
+def test_every_source_and_message(
+    name: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
 ) -> None:
-    recorded = scene("bayer_gbrg8", frames=10)
-    paths = SOURCES[source](tmp_path / "source", recorded)
+    recorded, source = OTHERS[name]
+    paths = (SOURCES | FOXGLOVE_SOURCES)[source](tmp_path / "source", recorded())
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
-    assert compare(paths, unpacked(tmp_path, own_target(source))) == []
+    to = "mcap" if source in FOXGLOVE_SOURCES else own_target(source)
+    assert compare(paths, unpacked(tmp_path, to)) == []
     assert leftovers(tmp_path) == []
-
-
-@pytest.mark.one_in(20)
-@pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
-@pytest.mark.parametrize("name", CODED)
-def test_coded_images(
-    name: str, source: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
-) -> None:
-    paths = SOURCES[source](tmp_path / "source", CODED[name]())
-    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
-    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
-    assert compare(paths, unpacked(tmp_path, own_target(source))) == []
-
-
-@pytest.mark.one_in(6)
-@pytest.mark.parametrize("trait", TRAITS)
-def test_odd_messages(
-    trait: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
-) -> None:
-    paths = SOURCES["mcap-ros2-zstd"](tmp_path / "source", odd_scene(trait))
-    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
-    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
-    assert compare(paths, unpacked(tmp_path, "mcap")) == []
-
-
-@pytest.mark.one_in(8)
-@pytest.mark.parametrize("source", list(FOXGLOVE_SOURCES)[::2])
-@pytest.mark.parametrize("name", ["raw-rgb8", "raw-padded", "jpeg-cut-one", "video-h264-mid-gop"])
-def test_foxglove_messages(
-    name: str, source: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
-) -> None:
-    paths = FOXGLOVE_SOURCES[source](tmp_path / "source", FOXGLOVE[name]())
-    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
-    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
-    assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
 @pytest.mark.one_in(2)
