@@ -118,8 +118,8 @@ class RemoteFile(io.RawIOBase):
         batch: set[int] = set()
         before: set[int] = set()  # those on their way
         most = _FIRST_BATCH
-        for start, end in ranges:
-            for number in range(start // BLOCK, -(-end // BLOCK)):
+        for start, end in ranges:  # as an index says, which may be damaged
+            for number in range(start // BLOCK, min(-(-end // BLOCK), self._count)):
                 if number not in self._blocks and number not in before:
                     batch.add(number)
                 if len(batch) == most:
@@ -130,21 +130,22 @@ class RemoteFile(io.RawIOBase):
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read that many bytes, or all that are left."""
-        wanted = self._size if size is None or size < 0 else self._place + size
-        end = max(self._place, min(wanted, self._size))
+        place = self._place
+        wanted = self._size if size is None or size < 0 else place + size
+        end = max(place, min(wanted, self._size))
         pieces: list[bytes | memoryview] = []
-        while self._place < end:
-            number, skipped = divmod(self._place, BLOCK)
+        while place < end:
+            number, skipped = divmod(place, BLOCK)
             if number in self._batch:
                 self._await_batch()
             block = self._blocks.get(number)
             if block is None:
                 self._fill(number, -(-end // BLOCK))
                 continue
-            piece = memoryview(block)[skipped : end - number * BLOCK]
-            pieces.append(piece)
-            self._place += len(piece)
+            pieces.append(memoryview(block)[skipped : end - number * BLOCK])
+            place += len(pieces[-1])
             self._after = number + 1
+        self._place = place
         return b"".join(pieces)
 
     def _await_batch(self) -> None:

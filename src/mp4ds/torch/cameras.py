@@ -476,14 +476,11 @@ class OpenCamera:
         keys = np.flatnonzero(table.sync[table.order])
         return np.union1d(0, keys).astype(np.int64)  # a slice may begin between two
 
-    def empty(self, *shape: int) -> Tensor:
-        """A tensor for frames.
-
-        Args:
-            *shape: Leading dimensions.
+    def empty(self, frames: int) -> Tensor:
+        """A tensor of no samples, each of that many frames.
 
         Returns:
-            Shape (*shape, H, W, C).
+            Shape (0, frames, H, W, C).
 
         Raises:
             OptionError: The frames cannot be returned as requested.
@@ -496,14 +493,14 @@ class OpenCamera:
                 "dtype='native' to get them as stored, or dtype='float32'."
             )
         dtype = torch.float32 if self._pictures.dtype == "float32" else like.dtype
-        return like.new_empty((*shape, *like.shape[1:3], *(like.shape[3:] or (1,))), dtype=dtype)
+        return like.new_empty((0, frames, *like.shape[1:3], *(like.shape[3:] or (1,))), dtype=dtype)
 
     def read(self, frames: Sequence[int], outs: Sequence[Tensor]) -> None:
         """Decode frames in one pass.
 
         Args:
             frames: Numbers, in any order.
-            outs: For each frame a row of a tensor from `empty`, shape (H, W, C).
+            outs: Where each goes: of the type that `empty` has, shape (H, W, C).
 
         Raises:
             SampleError: One of them cannot be decoded.

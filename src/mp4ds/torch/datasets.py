@@ -130,6 +130,16 @@ def _kind(row: torch.Tensor) -> tuple[object, ...]:
     return row.untyped_storage().data_ptr(), row.dtype, row.device, row.shape, row.stride()
 
 
+def _longer(like: torch.Tensor, rows: int, *, shared: bool = False) -> torch.Tensor:
+    """A new tensor of some rows, like one without any; shared with other processes if asked for."""
+    shape = (rows, *like.shape[1:])
+    if not shared or like.device.type != "cpu":
+        return like.new_empty(shape)
+    # as torch's own collate does in a worker
+    storage = torch.UntypedStorage._new_shared(prod(shape) * like.itemsize)
+    return like.new_empty(0).set_(storage, 0, shape)
+
+
 class Samples:
     """The samples of several datasets, one after another.
 
@@ -216,7 +226,12 @@ class Samples:
             for number, topic in enumerate(self.topics):
                 with self._camera(recording, number) as camera:
                     frames, padded = self._offsets.frames(recording, number, camera, rows)
-                    outs = self._rows(camera, topic, tensors, places, (len(numbers), shared))
+                    like = camera.empty(len(self._offsets.steps))
+                    if topic not in tensors:
+                        tensors[topic] = _longer(like, len(numbers), shared=shared)
+                    outs = [tensors[topic][place] for place in places]
+                    if (outs[0].shape, outs[0].dtype) != (like.shape[1:], like.dtype):
+                        outs = list(_longer(like, len(places)))  # of a recording of other images
                     camera.read(frames.ravel().tolist(), [frame for row in outs for frame in row])
                     if number == 0:
                         stamps = camera.stamps[recording.frames(rows, 0)].tolist()
@@ -229,39 +244,6 @@ class Samples:
                 index = int(wanted[place])
                 samples[place] |= {"stamp_ns": stamps[n], "index": index, "dataset": owner}
         return samples if self._transform is None else [self._transform(s) for s in samples]
-
-    def _rows(
-        self,
-        camera: OpenCamera,
-        topic: str,
-        tensors: dict[str, torch.Tensor],
-        places: Sequence[int],
-        batch: tuple[int, bool],
-    ) -> Sequence[torch.Tensor]:
-        """A row of a tensor of shape (samples, offsets, H, W, C) for each of some samples.
-
-        Args:
-            camera: Whose frames it is for.
-            topic: Its topic.
-            tensors: The tensors of the batch, by topic.
-            places: Numbers of the samples in the batch.
-            batch: Number of its samples, and whether other processes need access.
-        """
-        count, shared = batch
-        steps = len(self._offsets.steps)
-        like = camera.empty(0, 0)
-        if topic not in tensors:
-            shape = (count, steps, *like.shape[2:])
-            if shared and like.device.type == "cpu":
-                # as torch's own collate does in a worker
-                storage = torch.UntypedStorage._new_shared(prod(shape) * like.itemsize)
-                tensors[topic] = like.new_empty(0).set_(storage, 0, shape)
-            else:
-                tensors[topic] = like.new_empty(shape)
-        whole = tensors[topic]
-        if (whole.shape[2:], whole.dtype) != (like.shape[2:], like.dtype):
-            return list(camera.empty(len(places), steps))  # of a recording with other images
-        return [whole[place] for place in places]
 
     @contextmanager
     def _camera(self, recording: Recording, number: int) -> Iterator[OpenCamera]:
