@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,22 +49,29 @@ def drive() -> Scene:
                 messages.append(replace(message, topic=f"{topic.rpartition('/')[0]}/{name}"))
             elif seed == 0:
                 messages.append(message)
-    messages.append(Record("/tf_static", TF, START - 1, {"transforms": [*map(_link, LINKS)]}))
+    messages.append(transforms(LINKS, time=START - 1))
     messages += [_joints(n) for n in range(3 * FRAMES)]
     messages += [_odometry(n) for n in range(FRAMES + 1)]
     return Scene(sorted(messages, key=lambda message: message.log_time))
 
 
-def _link(link: tuple[str, str, tuple[float, ...], tuple[float, ...]]) -> dict[str, Any]:
-    parent, child, translation, rotation = link
-    return {
-        "header": {"seq": 0, "stamp": START, "frame_id": parent},
-        "child_frame_id": child,
-        "transform": {
-            "translation": dict(zip("xyz", translation, strict=True)),
-            "rotation": dict(zip("xyzw", rotation, strict=True)),
-        },
-    }
+Link = tuple[str, str, tuple[float, ...], tuple[float, ...]]
+
+
+def transforms(links: Sequence[Link], topic: str = "/tf_static", time: int = START) -> Record:
+    """A message of transforms: parent, child, translation and rotation of each."""
+    made = [
+        {
+            "header": {"seq": 0, "stamp": START, "frame_id": parent},
+            "child_frame_id": child,
+            "transform": {
+                "translation": dict(zip("xyz", translation, strict=True)),
+                "rotation": dict(zip("xyzw", rotation, strict=True)),
+            },
+        }
+        for parent, child, translation, rotation in links
+    ]
+    return Record(topic, TF, time, {"transforms": made})
 
 
 def joints_at(n: int) -> tuple[int, list[float]]:

@@ -507,18 +507,27 @@ def lerobot_folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
+def lerobot_frames(fps: int = 30) -> list[tuple[int, list[float]]]:
+    """For each frame of an episode the camera's frame and the joints that are nearest to it."""
+    stamps, joints = stamps_of(MADE, COLOUR), [joints_at(n) for n in range(3 * FRAMES)]
+    found = []
+    for number in range(round((stamps[-1] - stamps[0]) * fps / 1e9) + 1):
+        time = stamps[0] + round(number * 10**9 / fps)
+        frame = min(range(FRAMES), key=lambda n: abs(stamps[n] - time))
+        found.append((frame, min(joints, key=lambda item: abs(item[0] - time))[1]))
+    return found
+
+
 def test_lerobot_tables(lerobot_folder: Path) -> None:
     import pyarrow.parquet as pq
 
     info = json.loads((lerobot_folder / "meta/info.json").read_text())
     assert (info["codebase_version"], info["fps"], info["total_episodes"]) == ("v3.0", 30, 2)
-    stamps = stamps_of(MADE, COLOUR)
-    length = round((stamps[-1] - stamps[0]) * 30 / 1e9) + 1
+    length = len(lerobot_frames())
     assert info["total_frames"] == 2 * length
     feature = info["features"]["observation.images.front_image_raw"]
     assert feature["shape"] == [HEIGHT, WIDTH, 3]
     assert info["features"]["observation.state"]["names"] == ["shoulder", "elbow"]
-    sent = [joints_at(n) for n in range(3 * FRAMES)]
     for episode in range(2):
         path = info["data_path"].format(chunk_index=0, file_index=episode)
         table = pq.read_table(lerobot_folder / path).to_pydict()
@@ -526,10 +535,8 @@ def test_lerobot_tables(lerobot_folder: Path) -> None:
         assert table["index"] == list(range(episode * length, (episode + 1) * length))
         assert table["episode_index"] == [episode] * length
         assert table["timestamp"] == pytest.approx([n / 30 for n in range(length)])
-        for n, state in enumerate(table["observation.state"]):
-            time = stamps[0] + round(n * 10**9 / 30)
-            expected = min(sent, key=lambda item: abs(item[0] - time))[1]
-            assert state == pytest.approx(expected)
+        for state, (_, joints) in zip(table["observation.state"], lerobot_frames(), strict=True):
+            assert state == pytest.approx(joints)
     tasks = pq.read_table(lerobot_folder / "meta/tasks.parquet").to_pydict()
     assert tasks == {"task_index": [0], "task": ["push the cube"]}
     statistics = json.loads((lerobot_folder / "meta/stats.json").read_text())
@@ -546,18 +553,11 @@ def test_lerobot_videos(lerobot_folder: Path) -> None:
     path = "videos/observation.images.front_image_raw/chunk-000/file-001.mp4"
     capture = cv2.VideoCapture(str(lerobot_folder / path))
     assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(30, abs=0.01)
-    stamps = stamps_of(MADE, COLOUR)
-    number = 0
-    while True:
-        there, image = capture.read()
-        if not there:
-            break
-        time = stamps[0] + round(number * 10**9 / 30)
-        nearest_frame = min(range(FRAMES), key=lambda n: abs(stamps[n] - time))
-        expected = pixels_of(COLOUR, nearest_frame).astype(float)
+    for frame, _ in lerobot_frames():
+        _, image = capture.read()
+        expected = pixels_of(COLOUR, frame).astype(float)
         assert np.abs(image[..., ::-1] - expected).mean() < 8  # other frames: more than 20
-        number += 1
-    assert number == round((stamps[-1] - stamps[0]) * 30 / 1e9) + 1
+    assert not capture.read()[0]
 
 
 @pytest.mark.parametrize("decoder", ["mp4ds", pytest.param("torchcodec", marks=pytest.mark.slow)])
@@ -620,37 +620,32 @@ def test_lerobot_loads_it(lerobot_folder: Path, tmp_path: Path) -> None:
         pytest.skip(f"{LEROBOT} does not name the Python of an environment with LeRobot")
     env = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hub")}
     program(python, "-c", LOAD, lerobot_folder, tmp_path / "loaded.npz", env=env)
-    loaded = np.load(tmp_path / "loaded.npz")
-    stamps = stamps_of(MADE, COLOUR)
-    length = round((stamps[-1] - stamps[0]) * 30 / 1e9) + 1
+    loaded, frames = np.load(tmp_path / "loaded.npz"), lerobot_frames()
+    length = len(frames)
     assert loaded["episodes"] == 2
     assert loaded["tasks"].tolist() == ["push the cube"] * 2 * length
     assert loaded["episode_index"].tolist() == [0] * length + [1] * length
     assert loaded["timestamp"] == pytest.approx([*(n / 30 for n in range(length))] * 2)
-    sent = [joints_at(n) for n in range(3 * FRAMES)]
-    for number, image in enumerate(loaded["images"]):
-        time = stamps[0] + round(number % length * 10**9 / 30)
-        frame = min(range(FRAMES), key=lambda n: abs(stamps[n] - time))
+    for image, states, actions, (frame, joints) in zip(
+        loaded["images"], loaded["observation.state"], loaded["action"], 2 * frames, strict=True
+    ):
         expected = pixels_of(COLOUR, frame).astype(float)
         assert np.abs(image.transpose(1, 2, 0) * 255 - expected).mean() < 8  # of others: over 20
-        joints = min(sent, key=lambda item: abs(item[0] - time))[1]
-        for name in ("observation.state", "action"):
-            assert loaded[name][number] == pytest.approx(joints)
+        assert states == pytest.approx(joints)
+        assert actions == pytest.approx(joints)
     assert (loaded["pair"] == loaded["images"][-2:]).all()
 
 
 def test_frames_that_are_dropped_and_doubled(dataset: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
-    stamps = stamps_of(MADE, COLOUR)
     slow: dict[str, Any] = {"topics": [COLOUR], "fps": 10}
     summary = export(dataset, "lerobot", tmp_path / "slow", **slow)
-    given = round((stamps[-1] - stamps[0]) * 10 / 1e9) + 1
+    given = len(lerobot_frames(10))
     assert summary.messages == {COLOUR: given}
     assert sum(summary.left_out[COLOUR].values()) == FRAMES - given
     fast = {**slow, "fps": 60, "codec": "h265", "resize": 2.0}
     summary = export(dataset, "lerobot", tmp_path / "fast", **fast)
-    length = round((stamps[-1] - stamps[0]) * 60 / 1e9) + 1
-    used = summary.messages[COLOUR]
+    length, used = len(lerobot_frames(60)), summary.messages[COLOUR]
     assert any(f"{length - used} of {length} frames repeat" in note for note in summary.notes)
 
 

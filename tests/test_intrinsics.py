@@ -21,6 +21,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 import mp4ds
 from commands import call
+from export_scenes import transforms
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.dataset.views import effective
 from mp4ds.messages.transforms import Transform
@@ -56,19 +57,11 @@ def infos(made: Scene) -> list[Record]:
     return [record for record in made.messages if "k" in record.values]
 
 
-def static(*, topic: str = "/tf_static") -> Record:
-    def numbers(names: str, values: Sequence[float]) -> dict[str, float]:
-        return dict(zip(names, values, strict=True))
-
-    links = [
-        {
-            "header": {"seq": 0, "stamp": START, "frame_id": parent},
-            "child_frame_id": child,
-            "transform": {"translation": numbers("xyz", t), "rotation": numbers("xyzw", r)},
-        }
-        for parent, child, t, r in LINKS
-    ]
-    return Record(topic, TF, START, {"transforms": links})
+def recorded(folder: Path, made: Scene, *, packed: bool) -> Path:
+    """A bag of a scene, or the dataset of it."""
+    path = folder / "drive.bag"
+    write_bag(path, made)
+    return mp4ds.pack(path, folder / "dataset").dataset if packed else path
 
 
 def camera_of(result: Intrinsics) -> CameraCalibrations:
@@ -155,11 +148,7 @@ def test_what_belongs_to_no_other_is_listed_too(packed: bool, tmp_path: Path) ->
     )
     lens = {**calibration(64, 48), "width": 64, "height": 48, "header": {"frame_id": "lens"}}
     alone = [Record("/lens", INFO, START + n * PERIOD, lens) for n in range(4)]
-    path = tmp_path / "drive.bag"
-    write_bag(path, Scene([*left.messages, *alone]))
-    if packed:
-        mp4ds.pack(path, tmp_path / "dataset")
-        path = tmp_path / "dataset"
+    path = recorded(tmp_path, Scene([*left.messages, *alone]), packed=packed)
     first, second = intrinsics(path).cameras
     assert (first.topic, first.info_topic, first.calibrations) == ("/left/image_raw", "", [])
     assert (second.topic, second.info_topic, second.sizes) == ("", "/lens", [])
@@ -171,10 +160,7 @@ def test_calibrations_without_end_are_counted(
     packed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mp4ds.plugins.intrinsics.MAX_LISTED", 3)
-    path = SOURCES["bag-none"](tmp_path, focused(scene("mono8"), range(100, 108)))[0]
-    if packed:
-        mp4ds.pack(path, tmp_path / "dataset")
-        path = tmp_path / "dataset"
+    path = recorded(tmp_path, focused(scene("mono8"), range(100, 108)), packed=packed)
     camera = camera_of(intrinsics(path))
     assert [item.message for item in camera.calibrations] == [0, 1, 2]
     assert camera.more == 5
@@ -202,11 +188,11 @@ PATH = [Transform(*link) for link in LINKS[:2]]
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-zstd"])
 def test_static_transforms_of_a_recording(source: str, tmp_path: Path) -> None:
     made = scene("mono8")
-    path = SOURCES[source](tmp_path, Scene([static(), *made.messages]))[0]
+    path = SOURCES[source](tmp_path, Scene([transforms(LINKS), *made.messages]))[0]
     assert intrinsics(path).transforms == PATH
     moving = tmp_path / "moving"
     moving.mkdir()
-    path = SOURCES[source](moving, Scene([static(topic="/tf"), *made.messages]))[0]
+    path = SOURCES[source](moving, Scene([transforms(LINKS, "/tf"), *made.messages]))[0]
     assert intrinsics(path).transforms == []
 
 
@@ -326,10 +312,7 @@ def command(path: Path, *options: str) -> tuple[str, dict[str, Any]]:
 @pytest.mark.parametrize("packed", [False, True])
 def test_what_is_printed_is_python_for_opencv(packed: bool, tmp_path: Path) -> None:
     made = focused(scene("mono8"))
-    path = SOURCES["bag-none"](tmp_path, Scene([static(), *made.messages]))[0]
-    if packed:
-        mp4ds.pack(path, tmp_path / "dataset")
-        path = tmp_path / "dataset"
+    path = recorded(tmp_path, Scene([transforms(LINKS), *made.messages]), packed=packed)
     text, names = command(path)
     (*_, last) = camera_of(intrinsics(path)).calibrations
     for name, value in (("K", last.k), ("D", last.d), ("R", last.r), ("P", last.p)):
