@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
 
+import mp4ds
 from mp4ds.errors import Mp4dsError
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, load_stream
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.parts import PartPacker
 from mp4ds.packing.processes import CallError
+from sources import SOURCES, scene
 
 WORK = ".dataset.mp4ds-part"
+IN_PARTS = PackOptions(window=3, codec="h264")
 
 _ExecutorT = TypeVar("_ExecutorT", bound=Executor)
 
@@ -87,3 +92,52 @@ def facts(dataset: Path) -> dict[str, Any]:
 def leftovers(folder: Path) -> list[str]:
     """Names of what no finished pack leaves beside its dataset."""
     return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
+
+
+class Pack:
+    """A pack in parts of three frames that meets hard times, and is then to end well.
+
+    Args:
+        folder: Where all of it is.
+        kind: Of the recording.
+        patch: Undoes what is changed for it.
+        frames: Of its camera.
+    """
+
+    def __init__(self, folder: Path, kind: str, patch: pytest.MonkeyPatch, frames: int = 6) -> None:
+        (self.source,) = SOURCES[kind](folder / "source", scene("bayer_rggb8", frames=frames))
+        self.target = folder / "dataset"
+        self._folder, self._patch = folder, patch
+
+    @cached_property
+    def expected(self) -> dict[str, Any]:
+        """What an undisturbed pack in one pass makes."""
+        mp4ds.pack(self.source, self._folder / "undisturbed", PackOptions(codec="h264"))
+        return facts(self._folder / "undisturbed")
+
+    def run(
+        self,
+        executor: Executor | None = None,
+        progress: Callable[[mp4ds.PackProgress], None] | None = None,
+        **options: Any,
+    ) -> list[str]:
+        """The command; returns the tasks that it ran."""
+        inline = InlineExecutor()
+        use(self._patch, executor or inline)
+        mp4ds.pack(self.source, self.target, replace(IN_PARTS, **options), progress=progress)
+        return inline.ran
+
+    def refused(self, words: str | None, *given: Any, **options: Any) -> Mp4dsError:
+        """The error of the command, which leaves nothing under the dataset's name."""
+        with pytest.raises(Mp4dsError, match=words) as caught:
+            self.run(*given, **options)
+        assert not self.target.exists()
+        return caught.value
+
+    def goes_on(self) -> list[str]:
+        """The same command ends well; returns the tasks that it ran."""
+        ran = self.run()
+        assert facts(self.target) == self.expected
+        assert mp4ds.validate(self.target, deep=True) == []
+        assert leftovers(self.target.parent) == []
+        return ran

@@ -17,10 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +25,7 @@ import pytest
 
 import mp4ds
 from commands import NEEDS_ROOT, run, start, tree
-from in_parts import WORK, InlineExecutor, facts, leftovers, use
+from in_parts import WORK, InlineExecutor, Pack, facts, leftovers
 from mp4ds.errors import Mp4dsError, PartsFailedError, SourceError, TargetError, WriteError
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.parts import PartPacker
@@ -36,10 +33,8 @@ from mp4ds.packing.planning import Piece
 from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.plugins.demo import demo
 from round_trips import Compare, unpacked
-from sources import SOURCES, scene
 from waiting import WATCHDOG_S, until
 
-IN_PARTS = PackOptions(window=3, codec="h264")
 PARTS = ["00000", "00001"]
 PAGE = 4096
 KINDS = ["bag-none", "mcap-ros2-zstd", "rosbag2-sqlite3-v9", "rosbag2-mcap-v9"]
@@ -51,54 +46,6 @@ def instead_of_open(patch: pytest.MonkeyPatch, opened: Callable[..., Any]) -> No
     patch.setattr("io.open", opened)
     if sys.version_info < (3, 11):  # which keeps io.open as a method of its own
         patch.setattr("pathlib._NormalAccessor.open", staticmethod(opened))
-
-
-class Pack:
-    """A pack in two parts that meets hard times, and is then to end well.
-
-    Args:
-        folder: Where all of it is.
-        kind: Of the recording.
-        patch: Undoes what is changed for it.
-    """
-
-    def __init__(self, folder: Path, kind: str, patch: pytest.MonkeyPatch) -> None:
-        (self.source,) = SOURCES[kind](folder / "source", scene("bayer_rggb8", frames=6))
-        self.target = folder / "dataset"
-        self._folder, self._patch = folder, patch
-
-    @cached_property
-    def expected(self) -> dict[str, Any]:
-        """What an undisturbed pack in one pass makes."""
-        mp4ds.pack(self.source, self._folder / "undisturbed", PackOptions(codec="h264"))
-        return facts(self._folder / "undisturbed")
-
-    def run(
-        self,
-        executor: Executor | None = None,
-        progress: Callable[[mp4ds.PackProgress], None] | None = None,
-        **options: Any,
-    ) -> list[str]:
-        """The command; returns the tasks that it ran."""
-        inline = InlineExecutor()
-        use(self._patch, executor or inline)
-        mp4ds.pack(self.source, self.target, replace(IN_PARTS, **options), progress=progress)
-        return inline.ran
-
-    def refused(self, words: str | None, *given: Any, **options: Any) -> Mp4dsError:
-        """The error of the command, which leaves nothing under the dataset's name."""
-        with pytest.raises(Mp4dsError, match=words) as caught:
-            self.run(*given, **options)
-        assert not self.target.exists()
-        return caught.value
-
-    def goes_on(self) -> list[str]:
-        """The same command ends well; returns the tasks that it ran."""
-        ran = self.run()
-        assert facts(self.target) == self.expected
-        assert mp4ds.validate(self.target, deep=True) == []
-        assert leftovers(self.target.parent) == []
-        return ran
 
 
 @pytest.fixture
