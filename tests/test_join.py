@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import shutil
 import signal
 import struct
-import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -28,7 +26,6 @@ from mp4ds.video.mp4 import read_sample_entry
 from mp4ds.video.packets import PacketReader, PacketWriter, join_segments
 from test_packets import write as write_packets
 from test_players import blocks as means_of_blocks
-from test_players import ffprobe
 from test_video import LOSSLESS, LOSSY, decode, encode, noise, same, scene_pictures, video_decoder
 
 GOP = 4
@@ -239,33 +236,6 @@ def test_parts_that_end_at_key_frames_give_the_uncut_file(
     encode(tmp_path / "uncut.mp4", recipe, pictures, picture_format, ticks=ticks, gop=GOP)
     join_segments(segments, ticks, tmp_path / "joined.mp4")
     assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
-
-
-def ffmpeg_says(path: Path) -> tuple[int, str]:
-    """What comes of decoding all, and what is written while it is done."""
-    if not shutil.which("ffmpeg"):
-        pytest.skip("there is no ffmpeg")
-    command = ["ffmpeg", "-v", "warning", "-i", str(path), "-fps_mode", "passthrough"]
-    done = subprocess.run([*command, "-f", "null", "-"], capture_output=True, check=False)
-    return done.returncode, done.stderr.decode()
-
-
-@pytest.mark.one_in(6)
-@every_kind
-def test_ffmpeg_reads_it_without_a_word(kind: Kind, joined: Joined) -> None:
-    target, segments, told = joined(kind)
-    if ffmpeg_says(segments[0])[0]:
-        pytest.skip("this ffmpeg does not decode such videos")
-    assert ffmpeg_says(target) == (0, "")
-    found = ffprobe(target, "-count_frames", "-show_streams", "-show_frames")
-    (stream,) = found["streams"]
-    assert int(stream["nb_frames"]) == int(stream["nb_read_frames"]) == TOTAL
-    assert (stream["width"], stream["height"]) == told["coded_size"]
-    assert stream["has_b_frames"] == 0
-    assert stream["time_base"] == "1/1000000"
-    assert stream["duration_ts"] == TOTAL * STEP
-    times = [frame["best_effort_timestamp"] for frame in found["frames"]]
-    assert times == [number * STEP for number in range(TOTAL)]
 
 
 @pytest.mark.one_in(6)

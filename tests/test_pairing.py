@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import pytest
 from hypothesis import given, settings
@@ -235,82 +235,66 @@ def info(
     )  # fmt: skip
 
 
-class Recording:
-    """Channels by topic and what they say, in the order of the stamps."""
+Track = tuple[str, Iterable[int], Fields, str]
+"""A topic, the stamps of its messages, what they hold, and their frame_id."""
 
-    def __init__(self) -> None:
-        self.channels: list[Channel] = []
-        self.messages: list[tuple[int, Parts]] = []
 
-    def add(
-        self, topic: str, stamps: Iterable[int], fields: Fields, frame_id: str = ""
-    ) -> Recording:
+def paired(
+    *tracks: Track,
+    held: Mapping[str, str] | None = None,
+    final: bool = True,
+    in_order: bool = False,
+) -> dict[str, str]:
+    """What is paired, calibration topic -> image topic.
+
+    Args:
+        tracks: Recorded in the order of their stamps.
+        held: Existing pairs.
+        final: Whether the recording has ended.
+        in_order: One track after the other, instead.
+    """
+    found, messages = [], []
+    for number, (topic, stamps, fields, frame_id) in enumerate(tracks):
         kind = INFO if isinstance(fields, CalibrationFields) else RAW
         kind = CODED if isinstance(fields, CodedFields) else kind
-        number = len(self.channels)
-        self.channels.append(channel(number, topic, kind[0]))
-        self.messages += [(number, message(stamp, fields, frame_id)) for stamp in stamps]
-        return self
+        found.append(channel(number, topic, kind[0]))
+        messages += [(number, message(stamp, fields, frame_id)) for stamp in stamps]
+    if not in_order:
+        messages.sort(key=lambda item: item[1].stamp)
+    pairing = StampPairing()
+    for number, parts in messages:
+        pairing.add(found[number], parts)
+    number_of = {own.topic: own.id for own in found}
+    known = {number_of[info]: number_of[image] for info, image in (held or {}).items()}
+    pairs = pairing.decide(known, final=final)
+    assert pairing.decide(known, final=final) == pairs
+    return {found[i].topic: found[j].topic for i, j in pairs.items()}
 
-    def pair(
-        self, *paired: tuple[str, str], final: bool = True, in_order: bool = False
-    ) -> dict[str, str]:
-        """What is paired, calibration topic -> image topic."""
-        pairing = StampPairing()
-        key = (lambda item: 0) if in_order else (lambda item: item[1].stamp)
-        for number, parts in sorted(self.messages, key=key):
-            pairing.add(self.channels[number], parts)
-        number_of = {own.topic: own.id for own in self.channels}
-        held = {number_of[info]: number_of[image] for info, image in paired}
-        pairs = pairing.decide(held, final=final)
-        assert pairing.decide(held, final=final) == pairs
-        return {self.channels[i].topic: self.channels[j].topic for i, j in pairs.items()}
+
+def eye(stamps: Iterable[int] = STAMPS, name: str = "/eye", frame_id: str = "") -> Track:
+    return name, stamps, raw(), frame_id
+
+
+def eye_info(stamps: Iterable[int] = STAMPS, name: str = "/eye_info", frame_id: str = "") -> Track:
+    return name, stamps, info(), frame_id
 
 
 def test_equal_stamps_pair() -> None:
-    found = Recording().add("/eye", STAMPS, raw()).add("/eye_info", STAMPS, info())
-    assert found.pair() == {"/eye_info": "/eye"}
-    assert found.pair(final=False) == {"/eye_info": "/eye"}
-    assert found.pair(in_order=True) == {"/eye_info": "/eye"}
-
-
-def test_several_cameras_by_their_own_stamps() -> None:
-    found = Recording()
-    for number in range(5):
-        stamps = [stamp + number for stamp in STAMPS]
-        found.add(f"/eye{number}", stamps, raw()).add(f"/info{4 - number}", stamps, info())
-    assert found.pair() == {f"/info{4 - n}": f"/eye{n}" for n in range(5)}
-
-
-@pytest.mark.parametrize(
-    ("lost", "pairs"),
-    [(range(0, 40, 5), True), (range(0, 40, 4), False), (range(0, 40, 2), False)],
-)
-def test_four_of_five_stamps_must_agree(lost: range, pairs: bool) -> None:
-    images = [stamp + (n in lost) for n, stamp in enumerate(STAMPS)]
-    found = Recording().add("/eye", images, raw()).add("/eye_info", STAMPS[1:-1], info())
-    assert bool(found.pair()) == pairs
-
-
-def test_frequent_images_and_rare_calibrations() -> None:
-    found = Recording().add("/eye", STAMPS, raw()).add("/eye_info", STAMPS[::10], info())
-    assert found.pair() == {"/eye_info": "/eye"}
-    often = Recording().add("/eye", STAMPS[::10], raw()).add("/eye_info", STAMPS, info())
-    assert often.pair() == {}  # one stamp of ten is an image's
-
-
-def test_only_the_time_of_both_counts() -> None:
-    images = Recording().add("/eye", STAMPS[20:], raw()).add("/eye_info", STAMPS, info())
-    assert images.pair() == {"/eye_info": "/eye"}
-    infos = Recording().add("/eye", STAMPS, raw()).add("/eye_info", STAMPS[30:], info())
-    assert infos.pair() == {"/eye_info": "/eye"}
-    apart = Recording().add("/eye", STAMPS[:20], raw()).add("/eye_info", STAMPS[20:], info())
-    assert apart.pair() == {}
+    for order in ({}, {"final": False}, {"in_order": True}):
+        assert paired(eye(), eye_info(), **order) == {"/eye_info": "/eye"}
 
 
 @pytest.mark.parametrize(
     ("image_stamps", "info_stamps", "pairs"),
     [
+        ([stamp + (n % 5 == 0) for n, stamp in enumerate(STAMPS)], STAMPS[1:-1], True),
+        ([stamp + (n % 4 == 0) for n, stamp in enumerate(STAMPS)], STAMPS[1:-1], False),
+        ([stamp + (n % 2 == 0) for n, stamp in enumerate(STAMPS)], STAMPS[1:-1], False),
+        (STAMPS, STAMPS[::10], True),  # frequent images and rare calibrations
+        (STAMPS[::10], STAMPS, False),  # one stamp of ten is an image's
+        (STAMPS[20:], STAMPS, True),  # only the time of both counts
+        (STAMPS, STAMPS[30:], True),
+        (STAMPS[:20], STAMPS[20:], False),
         (STAMPS[:1], STAMPS[:1], True),
         (STAMPS[:2], STAMPS[:2], True),
         (STAMPS[:3], STAMPS[:3], True),
@@ -333,9 +317,10 @@ def test_only_the_time_of_both_counts() -> None:
         ([-5, -4, -3], [-5, -4, -3], True),
     ],
 )
-def test_few_stamps(image_stamps: list[int], info_stamps: list[int], pairs: bool) -> None:
-    found = Recording().add("/eye", image_stamps, raw()).add("/eye_info", info_stamps, info())
-    assert bool(found.pair()) == pairs
+def test_stamps_that_agree_or_not(
+    image_stamps: list[int], info_stamps: list[int], pairs: bool
+) -> None:
+    assert bool(paired(eye(image_stamps), eye_info(info_stamps))) == pairs
 
 
 SIZES: list[tuple[Fields, tuple[int, int], bool]] = [
@@ -359,101 +344,116 @@ SIZES: list[tuple[Fields, tuple[int, int], bool]] = [
 
 @pytest.mark.parametrize(("calibration", "size", "pairs"), SIZES)
 def test_sizes_must_not_contradict(calibration: Fields, size: tuple[int, int], pairs: bool) -> None:
-    found = Recording().add("/eye", STAMPS, raw(*size)).add("/eye_info", STAMPS, calibration)
-    assert bool(found.pair()) == pairs
+    image = ("/eye", STAMPS, raw(*size), "")
+    assert bool(paired(image, ("/eye_info", STAMPS, calibration, ""))) == pairs
 
 
 def test_the_size_of_a_coded_image_may_be_told() -> None:
     for size, pairs in (((0, 0), {1: 0}), ((640, 480), {1: 0}), ((320, 240), {})):
-        eye, calibration = channels("/eye/compressed", "/eye_info")
+        image, calibration = channels("/eye/compressed", "/eye_info")
         pairing = StampPairing()
         for stamp in STAMPS:
-            pairing.add(eye, message(stamp, CodedFields("jpeg")), size=size)
+            pairing.add(image, message(stamp, CodedFields("jpeg")), size=size)
             pairing.add(calibration, message(stamp, info()))
         assert pairing.decide({}) == pairs
 
 
-def test_a_size_decides_between_cameras_that_are_triggered_together() -> None:
-    found = Recording()
-    for name, size in (("a", (640, 480)), ("b", (320, 240))):
-        found.add(f"/{name}", STAMPS, raw(*size)).add(f"/{name}_info", STAMPS, info(*size))
-    assert found.pair() == {"/a_info": "/a", "/b_info": "/b"}
+RIGS: dict[str, tuple[list[Track], dict[str, str]]] = {
+    "own stamps": (
+        [
+            track
+            for n in range(5)
+            for stamps in [[stamp + n for stamp in STAMPS]]
+            for track in (eye(stamps, f"/eye{n}"), eye_info(stamps, f"/info{4 - n}"))
+        ],
+        {f"/info{4 - n}": f"/eye{n}" for n in range(5)},
+    ),
+    "triggered together, by size": (
+        [
+            track
+            for name, size in (("a", (640, 480)), ("b", (320, 240)))
+            for track in (
+                (f"/{name}", STAMPS, raw(*size), ""),
+                (f"/{name}_info", STAMPS, info(*size), ""),
+            )
+        ],
+        {"/a_info": "/a", "/b_info": "/b"},
+    ),
+    "triggered together, by frame_id": (
+        [
+            *(eye(name=f"/{name}", frame_id=f"/{name}_frame") for name in "ab"),
+            *(eye_info(name=f"/{name}_info", frame_id=f"{name}_frame") for name in "ab"),
+        ],
+        {"/a_info": "/a", "/b_info": "/b"},
+    ),
+    **{
+        f"cannot be told apart {frame_id}": (
+            [
+                *(eye(name=f"/{name}", frame_id=frame_id) for name in "ab"),
+                *(eye_info(name=f"/{name}_info", frame_id=frame_id) for name in "ab"),
+            ],
+            {},
+        )
+        for frame_id in ("", "rig")
+    },
+    "a dropped frame tells nothing": (
+        [eye(name="/a"), eye(STAMPS[:5] + STAMPS[6:], "/b"), eye_info()],
+        {},
+    ),
+    "another frame": ([eye(frame_id="left"), eye_info(frame_id="right")], {}),
+    "views of one camera": (
+        [
+            ("/cam/image_raw/compressed", STAMPS, CodedFields("jpeg"), ""),
+            *(eye(name=f"/cam/{name}") for name in ("image_rect", "image_raw")),
+            eye_info(name="/calibs/cam_info"),
+        ],
+        {"/calibs/cam_info": "/cam/image_raw"},
+    ),
+    "the view of its size": (
+        [
+            ("/cam/image_raw", STAMPS, raw(320, 240), ""),
+            *(eye(name="/cam/image_color"), eye_info()),
+        ],
+        {"/eye_info": "/cam/image_color"},
+    ),
+    "two calibrations": ([eye(), eye_info(name="/a_info"), eye_info(name="/b_info")], {}),
+}
 
 
-def test_a_frame_id_decides_between_cameras_that_are_triggered_together() -> None:
-    found = Recording()
-    for name in "ab":
-        found.add(f"/{name}", STAMPS, raw(), f"/{name}_frame")
-        found.add(f"/{name}_info", STAMPS, info(), f"{name}_frame")
-    assert found.pair() == {"/a_info": "/a", "/b_info": "/b"}
-
-
-def test_cameras_that_cannot_be_told_apart_are_not_paired() -> None:
-    for frame_id in ("", "rig"):
-        found = Recording()
-        for name in "ab":
-            found.add(f"/{name}", STAMPS, raw(), frame_id)
-            found.add(f"/{name}_info", STAMPS, info(), frame_id)
-        assert found.pair() == {}
-
-
-def test_a_dropped_frame_does_not_tell_cameras_apart() -> None:
-    found = Recording().add("/a", STAMPS, raw()).add("/b", STAMPS[:5] + STAMPS[6:], raw())
-    assert found.add("/info", STAMPS, info()).pair() == {}
-
-
-def test_another_frame_is_another_camera() -> None:
-    found = Recording().add("/eye", STAMPS, raw(), "left").add("/eye_info", STAMPS, info(), "right")
-    assert found.pair() == {}
-
-
-def test_of_the_views_of_one_camera_the_raw_image_is_taken() -> None:
-    found = Recording()
-    found.add("/cam/image_raw/compressed", STAMPS, CodedFields("jpeg"))
-    found.add("/cam/image_rect", STAMPS, raw()).add("/cam/image_raw", STAMPS, raw())
-    assert found.add("/calibs/cam_info", STAMPS, info()).pair() == {
-        "/calibs/cam_info": "/cam/image_raw"
-    }
-    small = Recording().add("/cam/image_raw", STAMPS, raw(320, 240))
-    small.add("/cam/image_color", STAMPS, raw())
-    assert small.add("/info", STAMPS, info()).pair() == {"/info": "/cam/image_color"}
-
-
-def test_two_calibrations_of_one_camera_are_not_paired() -> None:
-    found = Recording().add("/eye", STAMPS, raw())
-    assert found.add("/a_info", STAMPS, info()).add("/b_info", STAMPS, info()).pair() == {}
+@pytest.mark.parametrize("name", RIGS)
+def test_rigs_of_cameras(name: str) -> None:
+    tracks, pairs = RIGS[name]
+    assert paired(*tracks) == pairs
 
 
 def test_what_is_paired_stays_and_is_a_rival() -> None:
-    found = Recording().add("/a", STAMPS, raw()).add("/b", STAMPS, raw())
-    found.add("/a_info", STAMPS, info()).add("/b_info", STAMPS, info())
-    assert found.pair(("/a_info", "/a")) == {}  # /b_info may be of a third camera
-    one = Recording().add("/a", STAMPS, raw()).add("/a_info", STAMPS, info())
-    assert one.add("/other_info", STAMPS, info()).pair(("/a_info", "/a")) == {}
-    assert one.pair(("/a_info", "/a"), ("/other_info", "/a")) == {}
+    two = [eye(name="/a"), eye(name="/b"), eye_info(name="/a_info"), eye_info(name="/b_info")]
+    assert paired(*two, held={"/a_info": "/a"}) == {}  # /b_info may be of a third camera
+    one = [eye(name="/a"), eye_info(name="/a_info"), eye_info(name="/other_info")]
+    assert paired(*one, held={"/a_info": "/a"}) == {}
+    assert paired(*one, held={"/a_info": "/a", "/other_info": "/a"}) == {}
 
 
 def test_memory_is_bounded_and_a_late_start_is_found() -> None:
-    eye, calibration = channels("/eye", "/eye_info")
+    image, calibration = channels("/eye", "/eye_info")
     pairing = StampPairing()
     for n in range(5 * IMAGE_WINDOW):
         pairing.add(calibration, message(n + 1, info()))
     for n in range(5 * IMAGE_WINDOW, 5 * IMAGE_WINDOW + INFO_WINDOW):
-        pairing.add(eye, message(n + 1, raw()))
+        pairing.add(image, message(n + 1, raw()))
         pairing.add(calibration, message(n + 1, info()))
     assert pairing.decide({}) == {1: 0}
     for n in range(IMAGE_WINDOW):  # images go on, their calibration does not
-        pairing.add(eye, message(10**9 + n, raw()))
+        pairing.add(image, message(10**9 + n, raw()))
     assert pairing.decide({}) == {}
 
 
 def test_too_many_channels_are_not_compared() -> None:
-    for extra, paired in ((0, MAX_CHANNELS), (1, 0)):
-        found = Recording()
-        for number in range(MAX_CHANNELS + extra):
-            stamps = [stamp + number for stamp in STAMPS[:3]]
-            found.add(f"/eye{number}", stamps, raw()).add(f"/info{number}", stamps, info())
-        assert len(found.pair()) == paired
+    for extra, count in ((0, MAX_CHANNELS), (1, 0)):
+        stamps = [[stamp + n for stamp in STAMPS[:3]] for n in range(MAX_CHANNELS + extra)]
+        images = [eye(own, f"/eye{n}") for n, own in enumerate(stamps)]
+        infos = [eye_info(own, f"/info{n}") for n, own in enumerate(stamps)]
+        assert len(paired(*images, *infos)) == count
 
 
 # ---------------------------------------------------------------- real recordings

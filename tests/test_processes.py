@@ -40,6 +40,7 @@ def threads() -> int:
 @pytest.mark.parametrize("count", COUNTS)
 def test_jobs_of_a_stream_run_in_order_and_all_run(count: int) -> None:
     done: dict[int, list[int]] = defaultdict(list)
+    used: dict[int, set[int]] = defaultdict(set)
     before = threads()
     with StreamThreads(count) as workers:
         for number in range(200):
@@ -48,23 +49,16 @@ def test_jobs_of_a_stream_run_in_order_and_all_run(count: int) -> None:
             def job(key: int = key, number: int = number) -> None:
                 time.sleep(0.0005 * (number % 3))
                 done[key].append(number)
+                used[key].add(threading.get_ident())
 
             workers.submit(key, job)
     assert {key: numbers == sorted(numbers) for key, numbers in done.items()} == dict.fromkeys(
         range(7), True
     )
     assert sum(map(len, done.values())) == 200
+    assert [len(found) for found in used.values()] == [1] * 7  # each on one thread
+    assert (threading.get_ident() in set().union(*used.values())) == (count == 0)
     assert threads() == before
-
-
-def test_a_stream_stays_on_its_thread() -> None:
-    used: dict[int, set[int]] = defaultdict(set)
-    with StreamThreads(3) as workers:
-        for number in range(60):
-            key = number % 5
-            workers.submit(key, lambda key=key: used[key].add(threading.get_ident()))  # type: ignore[misc]
-    assert [len(found) for found in used.values()] == [1] * 5
-    assert threading.get_ident() not in set().union(*used.values())
 
 
 def test_without_threads_a_job_runs_at_once() -> None:
@@ -115,17 +109,13 @@ def test_the_first_error_reaches_the_caller(count: int) -> None:
     assert threads() == before
 
 
-def test_an_error_of_the_last_job_is_raised_at_the_end() -> None:
-    with pytest.raises(BrokenError), StreamThreads(2) as workers:
-        workers.submit(1, fail())
-
-
-def test_even_those_that_are_no_exceptions() -> None:
+@pytest.mark.parametrize("error", [BrokenError, KeyboardInterrupt])
+def test_an_error_of_the_last_job_is_raised_at_the_end(error: type[BaseException]) -> None:
     def stop() -> None:
-        raise KeyboardInterrupt
+        raise error
 
-    with pytest.raises(KeyboardInterrupt), StreamThreads(1) as workers:
-        workers.submit(0, stop)
+    with pytest.raises(error), StreamThreads(2) as workers:
+        workers.submit(1, stop)
 
 
 def test_an_error_of_the_caller_drops_what_has_not_begun(monkeypatch: pytest.MonkeyPatch) -> None:
