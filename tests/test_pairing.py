@@ -123,15 +123,6 @@ def test_only_the_types_count() -> None:
     assert pair_camera_infos([image, Channel(1, "/cam/camera_info", "ros1", None)]) == {}
 
 
-def test_of_coded_images_the_largest_is_taken() -> None:
-    found = channels("/cam/a/compressed", "/cam/b/compressed", "/cam/camera_info")
-    assert pair_camera_infos(found) == {2: 0}
-    assert pair_camera_infos(found, sizes={0: (320, 240), 1: (640, 480)}) == {2: 1}
-    assert pair_camera_infos(found, sizes={0: (640, 480), 1: (320, 240)}) == {2: 0}
-    raw = channels("/cam/a", "/cam/b/compressed", "/cam/camera_info")
-    assert pair_camera_infos(raw, sizes={0: (320, 240), 1: (640, 480)}) == {2: 0}
-
-
 def test_what_was_chosen_stays() -> None:
     found = channels("/l/image_raw", "/l/camera_info", "/r/image_raw", "/r/camera_info")
     assert pair_camera_infos(found, chosen={1: 2}) == {1: 2}
@@ -415,6 +406,14 @@ RIGS: dict[str, tuple[list[Track], dict[str, str]]] = {
             *(eye(name="/cam/image_color"), eye_info()),
         ],
         {"/eye_info": "/cam/image_color"},
+    ),
+    "the largest of coded views": (
+        [
+            ("/cam/image_color/compressed", STAMPS, CodedFields("jpeg", 320, 240), ""),
+            ("/cam/image_mono/compressed", STAMPS, CodedFields("jpeg", 640, 480), ""),
+            ("/info", STAMPS, info(0, 0), ""),
+        ],
+        {"/info": "/cam/image_mono/compressed"},
     ),
     "two calibrations": ([eye(), eye_info(name="/a_info"), eye_info(name="/b_info")], {}),
 }

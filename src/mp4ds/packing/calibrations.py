@@ -138,24 +138,20 @@ def _check_kind(
 
 
 def pair_camera_infos(
-    channels: Sequence[Channel],
-    *,
-    chosen: Mapping[int, int] | None = None,
-    sizes: Mapping[int, tuple[int, int]] | None = None,
+    channels: Sequence[Channel], *, chosen: Pairs | None = None
 ) -> dict[int, int]:
     """Pair calibrations with images by the names of their topics.
 
     A topic named ``camera_info``, or ``calibration`` as in Foxglove's examples, belongs to the
     image topic in the same namespace. For coded images the namespace is that of the image they
     transport: ``/cam/image_raw/compressed`` has its calibration on ``/cam/camera_info``. Among
-        several, raw images come first, with ``image_raw`` preferred, then the first by name; among
-        coded ones the largest. librealsense's ``NAME/info/camera_info`` belongs to
-        ``NAME/image/data``. With several publishers on a calibration topic none is paired.
+    several, raw images come first, with ``image_raw`` preferred, then the first by name.
+    librealsense's ``NAME/info/camera_info`` belongs to ``NAME/image/data``. With several publishers
+    on a calibration topic none is paired.
 
     Args:
         channels: The recording's, as far as they are packed.
         chosen: Existing pairs, such as those of `choose_pairs`.
-        sizes: Width and height of the channels' images, where known.
 
     Returns:
         Id of the calibration channel -> id of the image channel; the chosen ones too.
@@ -167,7 +163,7 @@ def pair_camera_infos(
             beside.setdefault(namespace, []).append((rank, image))
     infos = by_topic(filter(is_calibration, channels))
     found = [
-        ((INFO_NAMES.index(_leaf(topic)), rank, *_preference(image, sizes or {})), own[0], image)
+        ((INFO_NAMES.index(_leaf(topic)), rank, *_preference(image)), own[0], image)
         for topic, own in infos.items()
         if len(own) == 1 and _leaf(topic) in INFO_NAMES
         for rank, image in beside.get(_namespace_of_images(topic), [])
@@ -180,15 +176,12 @@ def pair_camera_infos(
     return pairs
 
 
-def _preference(
-    image: Channel, sizes: Mapping[int, tuple[int, int]]
-) -> tuple[bool, int, bool, str, int]:
+def _preference(image: Channel, size: tuple[int, int] = (0, 0)) -> tuple[bool, int, bool, str, int]:
     """Orders the images of a camera: the raw image is what the calibration was made for."""
     coded = _is_coded(image)
-    width, height = sizes.get(image.id, (0, 0))
     return (
         coded,
-        -width * height if coded else 0,
+        -size[0] * size[1] if coded else 0,
         _leaf(_base(image)) != "image_raw",
         image.topic,
         image.id,
@@ -342,8 +335,7 @@ def _only_camera(info: _Track, fitting: list[_Track], taken: set[int]) -> Channe
         return None
     if any(image.channel.id in taken for image in fitting):
         return None
-    sizes = {image.channel.id: image.size for image in fitting}
-    return min((i.channel for i in fitting), key=lambda channel: _preference(channel, sizes))
+    return min(fitting, key=lambda image: _preference(image.channel, image.size)).channel
 
 
 def _fits(info: _Track, image: _Track, found: set[int], final: bool) -> bool:
