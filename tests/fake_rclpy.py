@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -95,6 +96,21 @@ class Bus:
         self.halves: set[str] = set()  # types of which only the Python half is installed
         self.share: Path | None = None  # where the definitions of types are installed
 
+    def get_message(self, identifier: str) -> Any:
+        package, *rooms = identifier.split("/")
+        if len(rooms) != 2 or "srv" in rooms:
+            raise ValueError(f"Expected the full name of a message, got {identifier}")
+        return self._found(package, identifier)
+
+    def get_service(self, identifier: str) -> Any:
+        event = self._found(identifier.split("/")[0], f"{identifier}_Event")
+        return SimpleNamespace(Event=event)
+
+    def _found(self, package: str, name: str) -> Any:
+        if name not in self.kinds:
+            raise ModuleNotFoundError(f"No module named {package!r}")
+        return self.kinds[name]
+
     def share_of(self, package: str) -> str:
         if self.share is None or not (self.share / package).is_dir():
             raise KeyError(f"package '{package}' not found")  # PackageNotFoundError is a KeyError
@@ -152,8 +168,10 @@ class Subscription:
 
 
 class Node:
-    def __init__(self, name: str, context: Context, bus: Bus, namespace: str = "") -> None:
-        self.name, self.context, self.bus = name, context, bus
+    def __init__(
+        self, bus: Bus, node_name: str, *, context: Context, namespace: str | None = None
+    ) -> None:
+        self.name, self.context, self.bus = node_name, context, bus
         self.namespace = f"/{namespace.strip('/')}" if namespace else ""
         self.inbox: queue.Queue[Callable[[], None]] = queue.Queue()
 
@@ -255,37 +273,12 @@ class SingleThreadedExecutor:
         return True
 
 
-def _get_message(kinds: dict[str, Any]) -> Callable[[str], Any]:
-    def get_message(identifier: str) -> Any:
-        parts = identifier.split("/")
-        if len(parts) != 3 or "srv" in parts:
-            raise ValueError(f"Expected the full name of a message, got {identifier}")
-        if identifier not in kinds:
-            raise ModuleNotFoundError(f"No module named {parts[0]!r}")
-        return kinds[identifier]
-
-    return get_message
-
-
-def _get_service(kinds: dict[str, Any]) -> Callable[[str], Any]:
-    def get_service(identifier: str) -> Any:
-        event = f"{identifier}_Event"
-        if event not in kinds:
-            raise ModuleNotFoundError(f"No module named {identifier.split('/')[0]!r}")
-        return SimpleNamespace(Event=kinds[event])
-
-    return get_service
-
-
 def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
     """Let `import rclpy` find this until the test ends."""
     bus = Bus()
 
     def init(*, args: Any = None, context: Context) -> None:
         context.init()
-
-    def create_node(node_name: str, *, context: Context, namespace: str | None = None) -> Node:
-        return Node(node_name, context, bus, namespace or "")
 
     bus.kinds = {
         name: SimpleNamespace(type_name=name, type_hash=_type_hash(name)) for name in INSTALLED
@@ -295,7 +288,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
     services = ("Pause", "Resume", "TogglePaused", "IsPaused", "GetRate", "SetRate")
     services += ("Play", "PlayNext", "Burst", "Seek", "Stop", "SplitBagfile")
     modules: dict[str, dict[str, Any]] = {
-        "rclpy": {"init": init, "create_node": create_node},
+        "rclpy": {"init": init, "create_node": partial(Node, bus)},
         "rclpy.context": {"Context": Context},
         "rclpy.executors": {
             "SingleThreadedExecutor": SingleThreadedExecutor,
@@ -304,16 +297,16 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
         "rclpy.exceptions": {"InvalidTopicNameException": InvalidTopicNameException},
         "rclpy.duration": {"Duration": Duration},
         "rclpy.qos": {
-            "QoSProfile": QoSProfile,
-            "HistoryPolicy": HistoryPolicy,
-            "ReliabilityPolicy": ReliabilityPolicy,
-            "DurabilityPolicy": DurabilityPolicy,
-            "LivelinessPolicy": LivelinessPolicy,
+            kind.__name__: kind
+            for kind in (
+                *(QoSProfile, HistoryPolicy, ReliabilityPolicy, DurabilityPolicy),
+                LivelinessPolicy,
+            )
         },
         "rosidl_runtime_py": {},
         "rosidl_runtime_py.utilities": {
-            "get_message": _get_message(bus.kinds),
-            "get_service": _get_service(bus.kinds),
+            "get_message": bus.get_message,
+            "get_service": bus.get_service,
         },
         "ament_index_python": {},
         "ament_index_python.packages": {"get_package_share_directory": bus.share_of},
@@ -344,7 +337,7 @@ class FakePeer:
     def __init__(self, bus: Bus) -> None:
         context = Context()
         context.init()
-        self._node = Node("peer", context, bus)
+        self._node = Node(bus, "peer", context=context)
         self._bus = bus
         self._seen: dict[str, list[bytes]] = {}
         self._lock = threading.Lock()
