@@ -757,7 +757,7 @@ NO_DATASETS: dict[str, Callable[[Path], Path]] = {
 
 @pytest.mark.parametrize("command", ["unpack", "validate"])
 @pytest.mark.parametrize("name", NO_DATASETS)
-def test_what_is_no_dataset(name: str, command: str, tmp_path: Path) -> None:
+def test_not_a_dataset(name: str, command: str, tmp_path: Path) -> None:
     path = NO_DATASETS[name](tmp_path)
     options = ("--to", "mcap", "-o", tmp_path / "out.mcap") if command == "unpack" else ()
     with unchanged(tmp_path):

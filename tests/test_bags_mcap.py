@@ -306,7 +306,7 @@ def refuse(path: Path, problem: str) -> None:
     assert str(path) in str(caught.value)
 
 
-def test_what_is_no_recording(tmp_path: Path) -> None:
+def test_not_a_recording(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"#ROSBAG V2.0\n" + bytes(5000))
     refuse(path, "is not an MCAP file")

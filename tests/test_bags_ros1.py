@@ -331,7 +331,7 @@ def test_the_index_may_point_to_a_connection_record(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- what cannot be read
 
 
-def test_what_is_no_bag(tmp_path: Path) -> None:
+def test_not_a_bag(tmp_path: Path) -> None:
     refuse(tmp_path, "cannot be read: Is a directory")
     path = tmp_path / "a.bag"
     index = 4096 + 13

@@ -89,7 +89,7 @@ def test_any_bytes_come_back_or_are_refused(data: bytes) -> None:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_is_no_access_unit(data: bytes, reason: str) -> None:
+def test_not_an_access_unit(data: bytes, reason: str) -> None:
     assert reason in refusal(split, data)
 
 
@@ -105,7 +105,7 @@ NO_FRAMINGS = (
 
 
 @pytest.mark.parametrize("framing", NO_FRAMINGS)
-def test_what_is_no_framing(framing: str) -> None:
+def test_not_a_framing(framing: str) -> None:
     assert refusal(join, [b"\x65"], framing)
 
 

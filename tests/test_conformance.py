@@ -54,7 +54,7 @@ def test_mp4ds_reads_what_is_expected(case: Case) -> None:
     assert found == (expected(case) if "expected" in case else {"problems": case["problems"]})
 
 
-def test_null_is_as_good_as_absent(tmp_path: Path) -> None:
+def test_null_means_absent(tmp_path: Path) -> None:
     for file in ("least.yaml", "gray.mp4"):
         shutil.copy(CASES / "sidecars" / "valid" / file, tmp_path)
     path = tmp_path / "least.yaml"
@@ -202,7 +202,7 @@ def test_the_json_can_be_read_in_any_language() -> None:
         assert all(abs(number) < 2**53 for number in integers(values)), path
 
 
-def test_the_list_is_whole() -> None:
+def test_every_case_is_listed() -> None:
     assert LISTED["format"] == FORMAT_VERSION
     paths = [case["path"] for case in LISTED["cases"]]
     files = [
@@ -224,7 +224,7 @@ def test_the_suite_is_small() -> None:
     assert size < 2_000_000
 
 
-def test_a_stream_that_does_not_decode_is_told_without_planes(
+def test_a_stream_that_does_not_decode_has_no_planes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As packets are that were recorded after others had been lost."""

@@ -222,7 +222,7 @@ def packet_bytes(path: Path) -> int:
         return sum(packet.size for packet in container.demux(video=0))
 
 
-def test_a_frame_of_a_long_video_is_reckoned_without_the_key_frames_of_a_clip() -> None:
+def test_a_frame_of_a_long_video_is_estimated_without_the_key_frames_of_a_clip() -> None:
     clip = [1000, 100, 100, 1200, 100], [1, 0, 0, 1, 0]
     assert mean_size(*clip, gop=60) == pytest.approx((1100 + 59 * 100) / 60)
     assert mean_size(*clip, gop=1) == 1100

@@ -126,7 +126,7 @@ def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_list_of_commands_says_what_each_says_of_itself(name: str) -> None:
+def test_the_list_of_commands_agrees_with_their_help(name: str) -> None:
     command = commands.get_command(None, name)
     assert command is not None
     assert (command.help or "").splitlines()[0] == COMMANDS[name][1]

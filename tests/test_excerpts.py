@@ -613,7 +613,7 @@ REBUILT = (
 
 
 @pytest.mark.parametrize("value", ["NULL", "'text'", "x'ff'", "-5", "1e300", "-1e300"])
-def test_what_is_no_time_is_refused_by_some_span(value: str, tmp_path: Path) -> None:
+def test_invalid_times_of_a_span_are_refused(value: str, tmp_path: Path) -> None:
     path = changed_database(
         tmp_path, *REBUILT, f"UPDATE messages SET timestamp = {value} WHERE id = 50"
     )

@@ -397,7 +397,7 @@ def test_a_task_that_ends_its_process(
 
 @pytest.mark.skipif(shutil.which("prlimit") is None, reason="prlimit is not installed")
 @pytest.mark.parametrize("megabytes", [20, 150])
-def test_processes_that_cannot_begin_for_want_of_memory(
+def test_processes_that_cannot_start_for_lack_of_memory(
     megabytes: int, pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     python = tmp_path / "python"

@@ -27,7 +27,7 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return fuzz.make_kinds(tmp_path_factory.mktemp("good"))
 
 
-def test_what_is_changed_keeps_to_the_rules(kinds: dict[str, Any], tmp_path: Path) -> None:
+def test_mutated_files_keep_the_rules(kinds: dict[str, Any], tmp_path: Path) -> None:
     around = tmp_path / "around"
     around.mkdir()
     counts, findings = fuzz.run(kinds, count=COUNT, seed=7, seconds=600.0, around=around)
@@ -48,7 +48,7 @@ def test_what_is_changed_keeps_to_the_rules(kinds: dict[str, Any], tmp_path: Pat
         (("mp4ds.unpack", lambda *_: None), "what was packed is not unpacked"),
     ],
 )
-def test_a_rule_that_is_broken_is_found(
+def test_a_broken_rule_is_found(
     broken: tuple[str, Any], rule: str, kinds: dict[str, Any], tmp_path: Path, monkeypatch: Any
 ) -> None:
     monkeypatch.setattr(*broken)

@@ -216,7 +216,7 @@ def test_links_in_a_circle(suffix: str, pair: Path, jail: Jail) -> None:
 
 @pytest.mark.parametrize("kind", ["zero", "fifo", "folder"])
 @pytest.mark.parametrize("name", [f"{STEM}.yaml", f"{STEM}.mp4", "messages.mcap", "dataset.yaml"])
-def test_what_is_no_regular_file(name: str, kind: str, dataset: Path, jail: Jail) -> None:
+def test_not_a_regular_file(name: str, kind: str, dataset: Path, jail: Jail) -> None:
     path = dataset / name
     path.unlink()
     if kind == "zero":
@@ -295,7 +295,7 @@ def test_a_newer_major_version_is_refused(version: str, pair: Path, jail: Jail) 
     [b"1", b"1.0", b'"1"', b'"1.0.0"', b'"01.0"', b'"0.9"', b'"1.0 "', b'"-1.0"', b'"1.\xd9\xa1"',
      b"null", b"[1]", b"{}", b"true", b'"' + b"9" * 5000 + b'.0"'],
 )  # fmt: skip
-def test_what_is_no_version(version: bytes, pair: Path, jail: Jail) -> None:
+def test_not_a_version(version: bytes, pair: Path, jail: Jail) -> None:
     edited(pair, b'mp4ds: "1.1"', b"mp4ds: " + version)
     refused(jail, pair, "version-unsupported")
 

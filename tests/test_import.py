@@ -217,7 +217,7 @@ def test_finer_times_are_rounded_and_counted() -> None:
 @pytest.mark.parametrize(
     "text", ["", "x", "-1", "nan", "inf", "1e99", "0x10", "1_000", "2147483648"]
 )
-def test_what_is_no_time_is_refused(text: str) -> None:
+def test_invalid_times_are_refused(text: str) -> None:
     with pytest.raises(Refused):
         parsing.of_unit("s", Counter())(text)
 

@@ -346,7 +346,7 @@ def test_the_next_run_removes_what_a_killed_one_left(
     assert only(tmp_path, name)
 
 
-def test_what_is_at_work_or_not_ours_is_no_leftover(tmp_path: Path) -> None:
+def test_only_abandoned_files_of_this_user_are_leftovers(tmp_path: Path) -> None:
     target = tmp_path / "out"
     command = [sys.executable, "-c", KILLED, str(target), "wait"]
     precious = tmp_path / "precious" / "out"

@@ -108,7 +108,7 @@ def test_strangers_in_it_are_kept(stranger: str, bag: Path, work: Path, tmp_path
 
 
 @pytest.mark.parametrize("kind", ["fifo", "hole"])
-def test_what_is_no_file_is_refused(kind: str, bag: Path, work: Path, tmp_path: Path) -> None:
+def test_other_kinds_of_files_are_refused(kind: str, bag: Path, work: Path, tmp_path: Path) -> None:
     (work / "plan.json").unlink()
     if kind == "fifo":
         os.mkfifo(work / "plan.json")

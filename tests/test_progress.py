@@ -169,7 +169,7 @@ def jobs(draw: st.DrawFn) -> list[tuple[float, PackProgress]]:
 
 @settings(max_examples=8, deadline=None)
 @given(jobs(), st.integers(20, 200), st.integers(1, 60))
-def test_whatever_is_told_nothing_silly_is_shown(
+def test_contradictory_progress_is_shown_sensibly(
     reports: list[tuple[float, PackProgress]], width: int, height: int
 ) -> None:
     clock, lines, events = Clock(0.0), io.StringIO(), io.StringIO()

@@ -128,7 +128,7 @@ def test_numbers_out_of_range(index: int, colour: mp4ds.Topic) -> None:
 @pytest.mark.parametrize(
     "indices", [["1"], [1.0], [None], np.array([0.5]), 3, np.array(3), np.array([True, False])]
 )
-def test_what_is_no_number(indices: Any, colour: mp4ds.Topic) -> None:
+def test_not_a_number(indices: Any, colour: mp4ds.Topic) -> None:
     for ask in (colour.get, colour.read):
         with pytest.raises(TypeError):
             ask(indices)

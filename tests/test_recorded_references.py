@@ -117,7 +117,7 @@ def test_unknown_structures_are_not_recorded(name: str, tmp_path: Path) -> None:
     assert digest_video(path, REFUSED[name].codec)[2] is None
 
 
-def test_what_is_no_video_is_hashed(tmp_path: Path) -> None:
+def test_other_files_are_hashed(tmp_path: Path) -> None:
     path = tmp_path / "v.mp4"
     path.write_bytes(b"\0\0\0\x08moov" * 3)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -458,7 +458,7 @@ def test_times_are_stamps_or_log_times(stamps: str) -> None:
     ],
     ids=repr,
 )
-def test_what_is_no_reduction(options: dict[str, Any]) -> None:
+def test_not_a_reduction(options: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match=r"`(resize|every|max_rate)` .* use "):
         Reduction(**options)
 

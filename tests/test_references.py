@@ -384,7 +384,7 @@ def test_a_picture_of_several_slices() -> None:
         ("ffv1", b"\0", "short"),
     ],
 )
-def test_what_is_no_picture(name: str, data: bytes, reason: str) -> None:
+def test_not_a_picture(name: str, data: bytes, reason: str) -> None:
     assert reason in after_key(encoded(RECIPES[name]), data)
 
 

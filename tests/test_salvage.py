@@ -429,7 +429,7 @@ def test_the_damaged_files_of_others() -> None:
 
 
 @pytest.mark.parametrize("suffix", ["bag", "mcap"])
-def test_what_is_no_recording_is_refused(suffix: str, tmp_path: Path) -> None:
+def test_other_files_are_refused(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"drive.{suffix}"
     path.write_bytes(random.Random(suffix).randbytes(10**6))
     with pytest.raises(SourceError, match="holds no records of"):

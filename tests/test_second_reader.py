@@ -63,7 +63,7 @@ def test_it_shares_no_code_with_mp4ds(path: Path) -> None:
 
 
 @pytest.mark.parametrize(("inside", "is_taken"), [(31, True), (32, False)])
-def test_both_readers_count_nesting_alike(inside: int, is_taken: bool) -> None:
+def test_both_readers_limit_nesting_alike(inside: int, is_taken: bool) -> None:
     """32 maps and lists within one another, the top being the first."""
     text = "a: " + "[" * inside + "1" + "]" * inside + "\n"
     if is_taken:

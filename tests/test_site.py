@@ -66,7 +66,7 @@ def test_every_public_name_is_in_the_reference(site: Path) -> None:
         assert all(any(f"<code>{name}</code>" in page for page in pages) for name in fields), kind
 
 
-def test_the_reference_is_of_what_programs_use(site: Path) -> None:
+def test_the_reference_has_nothing_private(site: Path) -> None:
     """And of nothing that only the package itself uses."""
     page = (site / "api" / "reading" / "index.html").read_text()
     members = re.findall(r'<h3 id="mp4ds\.Dataset\.(\w+)"', page)

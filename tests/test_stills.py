@@ -79,7 +79,7 @@ def test_times_as_they_are_written(text: str, time: int) -> None:
         "٣",
     ],
 )
-def test_what_is_no_time(text: str) -> None:
+def test_not_a_time(text: str) -> None:
     with pytest.raises(OptionError, match="`at`"):
         StillOptions(at=text)
 
@@ -210,7 +210,7 @@ def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1"])
-def test_what_is_no_sheet(text: str) -> None:
+def test_not_a_sheet(text: str) -> None:
     with pytest.raises(OptionError, match="`sheet`"):
         StillOptions(sheet=text)
 

@@ -36,7 +36,7 @@ LONGER: dict[str, str] = {}
 # ---------------------------------------------------------------- modules
 
 
-def test_imports_keep_to_the_floors() -> None:
+def test_packages_import_downward_only() -> None:
     pytest.importorskip("importlinter")
     code = "from importlinter.cli import lint_imports_command; lint_imports_command()"
     assert re.search(r"\b[1-9]\d* kept, 0 broken", program("-c", code, "--no-cache", cwd=ROOT).out)
@@ -91,7 +91,7 @@ HOMES = {
 
 
 @pytest.mark.parametrize("package", HOMES)
-def test_each_library_has_its_room(package: str) -> None:
+def test_each_library_is_imported_in_its_home_only(package: str) -> None:
     found = [path for path in MODULES if package in imports_of(path)]
     homes = [SOURCE / home for home in HOMES[package]]
     others = [path for path in found if not any(map(path.is_relative_to, homes))]
@@ -99,7 +99,7 @@ def test_each_library_has_its_room(package: str) -> None:
     assert found, f"nobody imports {package}: strike it, and from pyproject.toml"
 
 
-def test_the_picture_of_the_code_names_every_room() -> None:
+def test_architecture_names_every_package() -> None:
     text = (ROOT / "ARCHITECTURE.md").read_text()
     for path in [*SOURCE.iterdir(), *(SOURCE / "plugins").iterdir()]:
         if path.is_dir() and (path / "__init__.py").is_file():
@@ -118,7 +118,7 @@ writes_schemas = pytest.mark.skipif(
 
 
 @writes_schemas
-def test_what_is_generated_is_up_to_date() -> None:
+def test_generated_files_are_up_to_date() -> None:
     program(sys.executable, ROOT / "tools/generate.py", "--check")
 
 
@@ -249,7 +249,7 @@ def anchors(path: Path) -> set[str]:
     ],
     ids=lambda path: str(path.relative_to(ROOT)),
 )
-def test_links_lead_somewhere(path: Path) -> None:
+def test_links_resolve(path: Path) -> None:
     for file, anchor in links(path):
         target = (path.parent / file).resolve() if file else path
         assert target.exists(), f"{path.name} -> {file}"

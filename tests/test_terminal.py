@@ -196,7 +196,7 @@ main()
 
 @LIMITED
 @pytest.mark.parametrize(("name", "mebibytes"), [("validate", 2), ("pack", 24), ("unpack", 24)])
-def test_a_want_of_memory_is_no_damage(
+def test_running_out_of_memory_is_not_damage(
     name: str, mebibytes: int, recording: Path, dataset: Path, tmp_path: Path
 ) -> None:
     """Whatever ffmpeg says of it."""

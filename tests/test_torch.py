@@ -332,7 +332,7 @@ def test_names_of_other_libraries(drives: list[Path]) -> None:
             _ = dataset[index]  # type: ignore[index]
 
 
-def test_what_is_no_path(drives: list[Path]) -> None:
+def test_not_a_path(drives: list[Path]) -> None:
     with mp4ds.open(drives[0]) as dataset:
         for wrong in (None, 7, [drives[0]]):
             with pytest.raises(TypeError, match="is no path: give a str"):

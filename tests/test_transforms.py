@@ -217,7 +217,7 @@ def len_of(file: Any) -> int:
         channel("protobuf", ONE, ONE_SCHEMA[:-40]),
     ],
 )
-def test_what_is_no_transform(own: Channel) -> None:
+def test_not_a_transform(own: Channel) -> None:
     with pytest.raises(WireError):
         transform_parser(own)
 

@@ -260,7 +260,7 @@ def test_a_picture_of_the_cover_is_no_track(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"no video at all", b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + bytes(64)]
 )
-def test_what_is_no_video(content: bytes, tmp_path: Path) -> None:
+def test_not_a_video(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(content)
     with pytest.raises(mp4ds.VideoError, match=r"clip\.mp4.*\[video-unreadable\]"):
         mp4ds.open(tmp_path / "clip.mp4")

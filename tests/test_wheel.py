@@ -120,7 +120,7 @@ def test_an_editable_install_is_compiled_where_it_runs(unpacked: Path, tmp_path:
         assert not [name for name in wheel.namelist() if name.endswith(".so")]
 
 
-def test_the_sdist_has_its_tests_and_no_rubbish(unpacked: Path) -> None:
+def test_the_sdist_has_its_tests_and_no_build_files(unpacked: Path) -> None:
     for name in ("tests/test_wheel.py", "tools/test.sh", "src/mp4ds/video/colour.c", "LICENSE"):
         assert (unpacked / name).is_file(), name
     names = [path.relative_to(unpacked).parts for path in unpacked.rglob("*")]
@@ -128,7 +128,7 @@ def test_the_sdist_has_its_tests_and_no_rubbish(unpacked: Path) -> None:
     assert not [parts for parts in names if rubbish & {*parts} or parts[-1].endswith(".so")]
 
 
-def test_the_page_on_the_index_needs_no_file_of_the_repository(pure: zipfile.ZipFile) -> None:
+def test_links_on_pypi_are_absolute(pure: zipfile.ZipFile) -> None:
     metadata = metadata_of(pure)
     text = str(metadata.get_payload())
     targets = re.findall(r"\]\(([^)]+)\)", text)
@@ -215,7 +215,7 @@ def pinned() -> Iterator[Requirement]:
 
 @pytest.mark.parametrize("python", ["3.10", "3.11", "3.12", "3.13", "3.14"])
 @pytest.mark.parametrize("system", ["linux x86_64", "linux aarch64", "darwin arm64"])
-def test_the_lock_has_what_is_asked_for(python: str, system: str) -> None:
+def test_the_lock_meets_all_requirements(python: str, system: str) -> None:
     platform, machine = system.split()
     environment = {"python_version": python, "python_full_version": f"{python}.9", "extra": ""}
     environment |= {"sys_platform": platform, "platform_machine": machine}
@@ -237,7 +237,7 @@ def test_the_lock_has_what_is_asked_for(python: str, system: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["Dockerfile", "Dockerfile.ros2"])
-def test_images_are_made_of_what_is_sent_to_be_built(name: str) -> None:
+def test_container_images_have_all_they_build_from(name: str) -> None:
     lines = (ROOT / ".dockerignore").read_text().splitlines()
     sent = [line[1:] for line in lines if line.startswith("!")]
     assert all((ROOT / path).exists() for path in sent)

@@ -374,21 +374,12 @@ def examine(
     return report
 
 
-def compare(
-    a: Path | Sequence[Path],
-    b: Path | Sequence[Path],
-    *,
-    ignore_pixels: Sequence[str] = (),
-    limit: int = 5,
-    start: int = -(2**63),
-    end: int = 2**64,
-) -> list[str]:
+def compare(a: Path | Sequence[Path], b: Path | Sequence[Path], **options: Any) -> list[str]:
     """Differences of two recordings, one sentence each; none when they are equal.
 
-    See `examine` for the arguments and errors.
+    See `examine` for the options and errors.
     """
-    found = examine(a, b, ignore_pixels=ignore_pixels, limit=limit, start=start, end=end)
-    return found.differences
+    return examine(a, b, **options).differences
 
 
 def table(report: Report) -> str:

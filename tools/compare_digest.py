@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import Any, cast
 
 import numpy as np
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
@@ -180,15 +181,8 @@ def protobuf_fields(data: bytes) -> Iterator[tuple[int, int, int, int]]:
 
 def data_field_number(descriptor_set: bytes, type_name: str) -> int:
     """Number of the field ``data`` of a message, which a schema may choose freely."""
-
-    def values(data: bytes, wanted: int) -> list[bytes]:
-        return [data[v:end] for n, v, _, end in protobuf_fields(data) if n == wanted]
-
-    package, _, name = type_name.rpartition(".")
-    for file in values(descriptor_set, 1):
-        for message in values(file, 4) if package.encode() in values(file, 2) else ():
-            for entry in values(message, 2) if name.encode() in values(message, 1) else ():
-                if b"data" in values(entry, 1):
-                    start = next(s for n, _, s, _ in protobuf_fields(entry) if n == 3)
-                    return entry[start + 1]
-    raise ValueError(f"{type_name} has no field 'data'")
+    for file in FileDescriptorSet.FromString(descriptor_set).file:
+        for message in file.message_type:
+            if f"{file.package}.{message.name}" == type_name:
+                return next(field.number for field in message.field if field.name == "data")
+    raise ValueError(f"{type_name} has no definition")

@@ -10,7 +10,6 @@ from __future__ import annotations
 import html
 import posixpath
 import re
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ import click
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
-from mkdocs.structure.nav import Navigation
 from mkdocs.structure.pages import Page
 
 import mp4ds
@@ -108,19 +106,6 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     # in tables, GitHub wants a pipe within code escaped, and Python-Markdown does not
     markdown = re.sub("`[^`\n]+`", lambda code: code[0].replace("\\|", "|"), markdown)
     return re.sub(r"(\]\()([^)#\s]*)((?:#[^)\s]*)?\))", changed, markdown)
-
-
-def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
-    """Refuse a page that nobody would find, or that is listed twice."""
-    missing = [file.src_uri for file in files.documentation_pages() if file.page is None]
-    listed = {page.file.src_uri for page in nav.pages}
-    missing += [file.src_uri for file in files.documentation_pages() if file.src_uri not in listed]
-    if missing:
-        raise PluginError(f"mkdocs.yml, nav: has no {', '.join(sorted(set(missing)))}")
-    places = Counter(page.file.src_uri for page in nav.pages)
-    if twice := [place for place, count in places.items() if count > 1]:
-        raise PluginError(f"mkdocs.yml, nav: has {', '.join(twice)} twice")
-    return nav
 
 
 def address(text: str, name: str) -> str:
