@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -47,6 +48,14 @@ def read(path: Path) -> str:
 @pytest.fixture
 def target(tmp_path: Path) -> Path:
     return tmp_path / "out"
+
+
+def refused(target: Path, words: str, **options: Any) -> TargetError:
+    """The error of an output that is refused before anything is made."""
+    options = {"force": False, "owned": nothing, **options}
+    with pytest.raises(TargetError, match=words) as caught, staged(target, **options):
+        pytest.fail("nothing may be made there")
+    return caught.value
 
 
 def only(folder: Path, *names: str) -> bool:
@@ -105,30 +114,23 @@ def test_force_replaces_what_may_be_replaced(kind: str, old: str, target: Path) 
 
 def test_nothing_is_replaced_unasked(target: Path) -> None:
     make(target, "file", "old")
-    with pytest.raises(TargetExistsError, match="`force`") as caught:
-        check_target(target, force=False, owned=anything)
-    assert isinstance(caught.value, FileExistsError)
-    assert caught.value.path == target
-    with pytest.raises(TargetError, match="was not written by mp4ds") as refused:
-        check_target(target, force=True, owned=nothing)
-    assert not isinstance(refused.value, TargetExistsError)
+    error = refused(target, "already exists.*`force`", owned=anything)
+    assert isinstance(error, FileExistsError)
+    assert error.path == target
+    error = refused(target, "was not written by mp4ds", force=True)
+    assert not isinstance(error, TargetExistsError)
     assert read(target) == "old"
 
 
 def test_a_dangling_link_is_something(target: Path) -> None:
     target.symlink_to("nowhere")
-    with pytest.raises(TargetExistsError):
-        check_target(target, force=False, owned=anything)
+    refused(target, "already exists", owned=anything)
 
 
 def test_a_link_is_not_replaced(target: Path) -> None:
     make(target.parent / "precious", "folder", "old")
     target.symlink_to("precious")
-    with (
-        pytest.raises(TargetError, match=r"is a symbolic link.*Give .*precious itself"),
-        staged(target, force=True, owned=anything),
-    ):
-        pytest.fail("nothing may be made there")
+    refused(target, "is a symbolic link.*Give .*precious itself", force=True, owned=anything)
     assert target.is_symlink()
     assert read(target.parent / "precious") == "old"
 
@@ -160,11 +162,7 @@ def test_what_mp4ds_did_not_write_keeps_the_rest_from_being_replaced(
             (target / name).parent.mkdir(exist_ok=True)
             (target / name).write_text("mine")
     before = sorted(target.rglob("*"))
-    with (
-        pytest.raises(TargetError, match=told),
-        staged(target, force=True, owned=lambda _: {"deep/part"}),
-    ):
-        pytest.fail("nothing may be made there")
+    refused(target, told, force=True, owned=lambda _: {"deep/part"})
     assert sorted(target.rglob("*")) == before
     assert only(target.parent, "out")
 
@@ -189,16 +187,14 @@ def test_a_report_within_is_replaced_with_it(target: Path) -> None:
     write_listing(target / "report")
     check_target(target, force=True, owned=lambda _: {"deep/part"})
     (target / "report" / "proxies" / "mine.mp4").touch()
-    with pytest.raises(TargetError, match=r"\(report/proxies/mine\.mp4\)"):
-        check_target(target, force=True, owned=lambda _: {"deep/part"})
+    told = r"\(report/proxies/mine\.mp4\)"
+    refused(target, told, force=True, owned=lambda _: {"deep/part"})
 
 
 def test_the_folder_must_exist(target: Path) -> None:
-    with pytest.raises(TargetError, match="is not a folder"):
-        check_target(target / "deep", force=False, owned=anything)
+    refused(target / "deep", "is not a folder", owned=anything)
     make(target, "file")
-    with pytest.raises(TargetError, match="is not a folder"):
-        check_target(target / "deep", force=False, owned=anything)
+    refused(target / "deep", "is not a folder", owned=anything)
 
 
 @pytest.mark.parametrize("source", ["out", "out/deep", "out/deep/part", ".", "link", "link/deep"])
@@ -209,11 +205,8 @@ def test_an_output_never_overlaps_with_its_source(
     make(target, "folder", "old")
     (target.parent / "link").symlink_to("out")
     monkeypatch.chdir(target.parent)
-    with (
-        pytest.raises(TargetError, match="overlaps with the source"),
-        staged(target, force=force, owned=anything, sources=[Path(source)]),
-    ):
-        pytest.fail("nothing may be made there")
+    sources = [Path(source)]
+    refused(target, "overlaps with the source", force=force, owned=anything, sources=sources)
     assert read(target) == "old"
     assert only(target.parent, "out", "link")
 
@@ -231,11 +224,7 @@ def test_a_folder_that_may_not_be_written(target: Path, monkeypatch: pytest.Monk
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr("tempfile.mkdtemp", refuse)
-    with (
-        pytest.raises(TargetError, match="Permission denied"),
-        staged(target, force=False, owned=nothing),
-    ):
-        pytest.fail("nothing can be made there")
+    refused(target, "Permission denied")
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EROFS])
@@ -304,6 +293,7 @@ def test_names_are_exchanged_at_once_where_that_can_be_done(
 KILLED = """
 import os, sys
 from pathlib import Path
+from typing import Any
 from mp4ds.files import outputs
 from mp4ds.files.outputs import staged
 
@@ -340,8 +330,7 @@ def test_the_next_run_removes_what_a_killed_one_left(
     killed(target, moment)
     assert len(list(tmp_path.glob(".*.part"))) == 1
     assert target.exists() == (moment == "within")
-    with pytest.raises(TargetExistsError), staged(target, force=False, owned=nothing):
-        pytest.fail("it is there")
+    refused(target, "already exists")
     assert target.read_text() == "old"  # also where it had no name when the run was killed
     assert only(tmp_path, name)
 

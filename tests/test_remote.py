@@ -38,9 +38,7 @@ SECRET = "X-Amz-Signature=4711"
 
 @pytest.fixture
 def executor(monkeypatch: pytest.MonkeyPatch) -> InlineExecutor:
-    inline = InlineExecutor()
-    use(monkeypatch, inline)
-    return inline
+    return use(monkeypatch, InlineExecutor())
 
 
 def large_scene(frames: int = 60) -> Scene:
@@ -476,12 +474,10 @@ def test_a_recording_that_changes(
 ) -> None:
     write_bag(tmp_path / "drive.bag", scene("mono8", frames=9))
     url = put(tmp_path / "drive.bag")
-    failing = InlineExecutor(lambda task: task == "00001")
-    use(monkeypatch, failing)
+    use(monkeypatch, InlineExecutor(lambda task: task == "00001"))
     with pytest.raises(PartsFailedError):
         mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
-    going_on = InlineExecutor()
-    use(monkeypatch, going_on)
+    going_on = use(monkeypatch, InlineExecutor())
     write_bag(tmp_path / "other.bag", scene("mono8", frames=9, seed=1))
     stores.put(str(tmp_path / "other.bag"), url)
     with pytest.raises(SourceError, match=r"has changed since packing began"):
@@ -520,15 +516,13 @@ def test_a_signed_address_goes_on_while_it_is_the_same(
 ) -> None:
     write_bag(tmp_path / "web" / "x.bag", scene("mono8", frames=9))
     url, dataset = f"{web.url}/x.bag?{SECRET}", tmp_path / "dataset"
-    failing = InlineExecutor(lambda task: task == "00001")
-    use(monkeypatch, failing)
+    use(monkeypatch, InlineExecutor(lambda task: task == "00001"))
     with pytest.raises(PartsFailedError):
         mp4ds.pack(url, dataset, PackOptions(window=3))
     with pytest.raises(OptionError, match=r"unfinished pack of http.*/x\.bag\.") as refusal:
         mp4ds.pack(f"{web.url}/x.bag?other", dataset, PackOptions(window=3))
     assert "4711" not in str(refusal.value)
-    going_on = InlineExecutor()
-    use(monkeypatch, going_on)
+    going_on = use(monkeypatch, InlineExecutor())
     mp4ds.pack(url, dataset, PackOptions(window=3))
     assert "00000" not in going_on.ran
 
