@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import mp4ds
-from mp4ds.dataset.views import Placement
+from mp4ds.dataset.views import adapted
 from mp4ds.format.models import Calibration, Roi
 from mp4ds.messages.encodings import ENCODINGS as KNOWN
 from mp4ds.plugins.demo import demo
@@ -524,7 +524,7 @@ def test_a_point_is_seen_at_the_pixel_that_shows_it(
     """Pixels with whole coordinates at their middle: their corners are at halves."""
     region = Roi(x_offset=roi[0], y_offset=roi[1], height=0, width=0, do_rectify=0)
     recorded = calibration(binning_x=binning, binning_y=binning, roi=region)
-    made = Placement(crop, size).calibration(recorded)
+    made = adapted(recorded, crop, size)
     for name in ("k", "p"):
         full = seen(getattr(recorded, name), np.array(point))
         image = (full - roi) / max(binning, 1)

@@ -9,7 +9,7 @@ from operator import index as as_integer
 import numpy as np
 
 from mp4ds.errors import OptionError
-from mp4ds.format.models import Calibration, Roi
+from mp4ds.format.models import Calibration
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
 from mp4ds.messages.wire import CalibrationFields
@@ -17,6 +17,8 @@ from mp4ds.video.images import Renderer, encoding_as, shown_format
 from mp4ds.video.pixels import Scale
 
 Matrix = list[list[float]]
+_Part = tuple[int, int, int, int]
+_Size = tuple[int, int]
 
 
 def effective(calibration: CalibrationFields) -> tuple[Matrix, Matrix]:
@@ -73,54 +75,40 @@ def lens_of(calibration: Calibration) -> tuple[str, list[float]]:
     return calibration.distortion_model, list(calibration.d)
 
 
-@dataclass(frozen=True, slots=True)
-class Placement:
-    """The crop of an image, and its size after resizing.
+def adapted(calibration: Calibration, crop: _Part, size: _Size) -> Calibration:
+    """The calibration of a picture; without binning, and without a region of interest.
 
-    Attributes:
+    Pixel centres have integer coordinates, so a picture scaled by s has its principal point at
+    ``(cx + 0.5) * s - 0.5``.
+
+    Args:
+        calibration: That of the image which the picture shows, as recorded.
         crop: x, y, width and height in pixels of the image.
         size: Width and height of the picture.
     """
-
-    crop: tuple[int, int, int, int]
-    size: tuple[int, int]
-
-    def calibration(self, image: Calibration) -> Calibration:
-        """The calibration of the picture; without binning, and without a region of interest.
-
-        Pixel centres have integer coordinates, so a picture scaled by s has its principal point at
-        ``(cx + 0.5) * s - 0.5``.
-
-        Args:
-            image: The calibration of the image, as recorded.
-        """
-        x, y, width, height = self.crop
-        k, p = (np.array(matrix) for matrix in effective(image.fields))
-        for row, offset, scale in (
-            (0, x, self.size[0] / width),
-            (1, y, self.size[1] / height),
-        ):
-            for matrix in (k, p):
-                # by the third row, which is 0 in the matrices of an uncalibrated camera
-                matrix[row] = scale * (matrix[row] - offset * matrix[2])
-                matrix[row] += (0.5 * scale - 0.5) * matrix[2]
-        rectify = image.roi.do_rectify if image.roi else 0
-        return image.model_copy(
-            update={
-                "width": self.size[0],
-                "height": self.size[1],
-                "k": k.ravel().tolist(),
-                "p": p.ravel().tolist(),
-                "binning_x": 0,
-                "binning_y": 0,
-                "roi": _whole(rectify) if rectify else None,
-                "template": None,  # the recorded message differs
-            }
-        )
-
-
-def _whole(do_rectify: int) -> Roi:
-    return Roi(x_offset=0, y_offset=0, height=0, width=0, do_rectify=do_rectify)
+    x, y, width, height = crop
+    k, p = (np.array(matrix) for matrix in effective(calibration.fields))
+    for row, offset, scale in ((0, x, size[0] / width), (1, y, size[1] / height)):
+        for matrix in (k, p):
+            # by the third row, which is 0 in the matrices of an uncalibrated camera
+            matrix[row] = scale * (matrix[row] - offset * matrix[2])
+            matrix[row] += (0.5 * scale - 0.5) * matrix[2]
+    roi = None
+    if calibration.roi and calibration.roi.do_rectify:
+        whole = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+        roi = calibration.roi.model_copy(update=whole)
+    return calibration.model_copy(
+        update={
+            "width": size[0],
+            "height": size[1],
+            "k": k.ravel().tolist(),
+            "p": p.ravel().tolist(),
+            "binning_x": 0,
+            "binning_y": 0,
+            "roi": roi,
+            "template": None,  # the recorded message differs
+        }
+    )
 
 
 # ---------------------------------------------------------------- views
@@ -138,9 +126,6 @@ FORMATS = ("native", "rgb", "bgr", "gray", "depth_m")
 
 _OF_VIDEOS = ("rgb8", "bgr8", "rgba8", "bgra8")
 """Encodings stored in videos as colour pictures; alpha is dropped when they are shown."""
-
-_Part = tuple[int, int, int, int]
-_Size = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +147,7 @@ class View:
     is_plain: bool
     in_metres: bool = False
     scale: Scale | None = None
-    _placement: Placement | None = None
+    _placement: tuple[_Part, _Size] | None = None  # the crop, and its size after resizing
     _renderer: Renderer | None = None
 
     def give(self, pixels: Pixels, out: Pixels) -> None:
@@ -175,7 +160,7 @@ class View:
         if self._renderer is not None:
             self._renderer.render(pixels, out)
         elif self._placement is not None:
-            np.copyto(out, _nearest(pixels, self._placement))
+            np.copyto(out, _nearest(pixels, *self._placement))
         else:
             np.copyto(out, pixels)
 
@@ -183,7 +168,7 @@ class View:
         """The calibration of the result, from that of the image."""
         if image is None or self._placement is None:
             return image
-        return self._placement.calibration(image)
+        return adapted(image, *self._placement)
 
 
 def view_of(
@@ -234,7 +219,7 @@ def view_of(
     scale = Scale(made, *size) if can_scale and made in ("rgb24", "bgr24") else None
     if is_whole and given is encoding and not in_metres:
         return View(given, shape, dtype, is_plain=True, scale=scale)
-    placement = None if is_whole else Placement(part, size)
+    placement = None if is_whole else (part, size)
     is_rendered = not in_metres and (
         format != "native" or (size != cut and _is_interpolated(encoding))
     )
@@ -322,15 +307,15 @@ def _is_interpolated(encoding: Encoding) -> bool:
     return shown_format(encoding) is not None and not encoding.name[0].isdigit()
 
 
-def _nearest(pixels: Pixels, placement: Placement) -> Pixels:
+def _nearest(pixels: Pixels, crop: _Part, size: _Size) -> Pixels:
     """The crop of an image, resized by nearest neighbour."""
-    x, y, width, height = placement.crop
+    x, y, width, height = crop
     part = pixels[y : y + height, x : x + width]
-    if placement.size == (width, height):
+    if size == (width, height):
         return part
     columns, rows = (
         (2 * np.arange(made) + 1) * side // (2 * made)
-        for made, side in zip(placement.size, (width, height), strict=True)
+        for made, side in zip(size, (width, height), strict=True)
     )
     found: Pixels = part[rows[:, None], columns]
     return found

@@ -15,7 +15,7 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import ChannelGroup, MessageSource, Part
 from mp4ds.dataset.rebuild import CalibrationMessages, message_at
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import Placement
+from mp4ds.dataset.views import adapted
 from mp4ds.errors import ConversionError, FormatError, OptionError, Refused
 from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.wire import Slots, WireError
@@ -74,8 +74,8 @@ def resized(
     Raises:
         Refused: They cannot be adapted; says why.
     """
-    placement = Placement((0, 0, *stream.image_size), size)
-    made = [placement.calibration(calibration) for calibration in infos.info.calibrations]
+    whole = (0, 0, *stream.image_size)
+    made = [adapted(calibration, whole, size) for calibration in infos.info.calibrations]
     found = CalibrationMessages(
         infos.info.model_copy(update={"calibrations": made}), str(stream.path)
     )
@@ -181,7 +181,7 @@ class Republisher:
         self.thinned: dict[str, int] = {}
         self._emptied: set[int] = set()
         chosen = [item for item in dataset.image_channels() if selected(item.channel.topic)]
-        planned = [(item, self._plan(item)) for item in chosen]
+        planned = [(item, self._plans(item)) for item in chosen]
         for item, plans in planned:
             all_move = sum(plan.is_moved for plan in plans) == len(item.streams)
             if all_move and not item.recorded(dataset.recorded_counts):
@@ -207,12 +207,15 @@ class Republisher:
 
     # ------------------------------------------------------------ what is given how
 
-    def _plan(self, item: ChannelGroup) -> list[_Plan]:
+    def _plans(self, group: ChannelGroup) -> list[_Plan]:
         """The streams of a channel that are converted or thinned, and how."""
-        plans = [self._plan_stream(stream, item.channel.topic) for stream in item.streams]
+        plans = [self._plan(stream) for stream in group.streams]
+        for plan in plans:
+            if plan.is_kept is not None:
+                self._leave_out(plan.stream.topic, plan.stream.count(~plan.is_kept))
         return [plan for plan in plans if plan.frames or plan.is_kept is not None]
 
-    def _plan_stream(self, stream: Stream, topic: str) -> _Plan:
+    def _plan(self, stream: Stream) -> _Plan:
         size = self._reduction.size_of(stream)
         kind = self._kind or (_kind_of(stream) if size else "")
         is_kept = None
@@ -223,21 +226,15 @@ class Republisher:
             try:
                 if not is_done or size:
                     form = self._form(stream, kind, size, is_done=is_done)
-                    frames = frames_of(stream, form)
-                    return self._thinned(_Plan(stream, kind, frames, is_kept, size, not is_done))
+                    return _Plan(stream, kind, frames_of(stream, form), is_kept, size, not is_done)
                 if is_kept is None:
                     raise Refused(f"they are already {KINDS[kind].noun}")
             except Refused as reason:
-                self._keep(topic, str(reason), stream.count(is_kept))
+                self._keep(stream.topic, str(reason), stream.count(is_kept))
         if is_kept is not None and _refers(stream):
-            self._keep(topic, _REFERS, stream.count())
+            self._keep(stream.topic, _REFERS, stream.count())
             is_kept = None
-        return self._thinned(_Plan(stream, "", None, is_kept, None, False))
-
-    def _thinned(self, plan: _Plan) -> _Plan:
-        if plan.is_kept is not None:
-            self._leave_out(plan.stream.topic, plan.stream.count(~plan.is_kept))
-        return plan
+        return _Plan(stream, "", None, is_kept, None, False)
 
     def _leave_out(self, topic: str, count: int) -> None:
         if count:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mp4ds.dataset.columns import marked
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import Placement, View
+from mp4ds.dataset.views import View, adapted
 from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Pixels
@@ -181,7 +181,7 @@ class ExportedCamera:
         found = self.stream.calibration_at(int(self.stream.log_times[self.numbers[0]]))
         if found is None or not found.k[0]:  # an uncalibrated camera has zeros
             return None
-        return Placement((0, 0, *self.stream.image_size), self.size).calibration(found)
+        return adapted(found, (0, 0, *self.stream.image_size), self.size)
 
     @property
     def rate(self) -> float:
