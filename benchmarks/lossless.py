@@ -135,7 +135,7 @@ def check(clip: NDArray[Any], dataset: Path, name: str) -> None:
     missing = dict(zip(stamps, clip, strict=False))
     with mp4ds.open(dataset) as opened:
         found = {frame.stamp_ns: frame.data for topic in opened for frame in topic}
-        for record in opened.recorded_records():
+        for record in opened.messages_file.in_file_order():
             if isinstance(record, Message) and record.channel.topic == TOPIC:
                 image: Any = store.deserialize_cdr(record.data, IMAGE)
                 stamp = image.header.stamp

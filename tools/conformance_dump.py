@@ -288,7 +288,7 @@ def _order(dataset: Dataset, channel: ChannelGroup) -> Values:
         for stream in channel.streams
         for ordinal in stream.columns.ordinal.tolist()
     }
-    count = len(places) + channel.recorded(dataset.recorded_counts)
+    count = len(places) + channel.recorded(dataset.messages_file.counts)
     return {
         "topic": channel.channel.topic,
         "files": [places.get(ordinal, MESSAGES_NAME) for ordinal in range(count)],
@@ -299,7 +299,7 @@ def _messages(dataset: Dataset) -> Values:
     """The contents of messages.mcap."""
     topics = Counter[tuple[str, str]]()
     kinds = Counter[type]()
-    for record in dataset.recorded_records():
+    for record in dataset.messages_file.in_file_order():
         kinds[type(record)] += 1
         if isinstance(record, Message):
             topics[record.channel.topic, record.channel.type_name] += 1

@@ -327,7 +327,7 @@ def _check_verbatim(dataset: Dataset, manifest: Manifest) -> Iterator[FormatErro
     for channel in dataset.channels:
         totals[channel.topic] += counts.get(channel.id, 0)
     topics = {item.topic for item in manifest.verbatim}
-    recorded = {topic: len(dataset.recorded_times(topic)) for topic in topics}
+    recorded = {topic: len(dataset.messages_file.times_of(topic)) for topic in topics}
     for number, item in enumerate(manifest.verbatim):
         recorded[item.topic] -= item.messages
         problem = ""
@@ -352,12 +352,12 @@ def _counted(dataset: Dataset, manifest: Manifest) -> Iterator[Record]:
     """
     counts, place = Counter[int](), dataset.path / MESSAGES_NAME
     times = [message.log_time for stream in dataset.streams for message in _extremes(stream)]
-    for record in dataset.recorded_records():
+    for record in dataset.messages_file.in_file_order():
         if isinstance(record, Message):
             counts[record.channel.id] += 1
             times = [min([record.log_time, *times]), max([record.log_time, *times])]
         yield record
-    told = dataset.recorded_counts
+    told = dataset.messages_file.counts
     for key in counts.keys() | told.keys():
         if counts[key] != told.get(key, 0):
             problem = f"holds {counts[key]} messages of channel {key}, but its index lists "
@@ -381,7 +381,7 @@ def _check_limits(
     """
     storage = ""
     if manifest.format == "rosbag2":
-        storage = recorded_storage(dataset.recorded_records())
+        storage = recorded_storage(dataset.messages_file.in_file_order())
     check_channel, check_message = limits_of(manifest.format, storage)
 
     def refusal(

@@ -310,7 +310,7 @@ class _Source:
         found = []
         for topic in dict.fromkeys(item.topic for item in old):
             own = [times for identity, times in self._times.items() if identity[0] == topic]
-            inside = in_span(self.dataset.recorded_times(topic), self.span)
+            inside = in_span(self.dataset.messages_file.times_of(topic), self.span)
             if len(inside):
                 times = in_span(np.sort(np.concatenate([_NONE, *own])), self.span)
                 entry = Verbatim(
@@ -619,7 +619,7 @@ def _write_messages(
     collector = TransformCollector()
     channels = _channels(sources)
     with McapWriter(path, profile=dataset.profile) as writer:
-        others = (source.dataset.other_records() for source in sources)
+        others = (source.dataset.messages_file.others() for source in sources)
         for record in chain(chain.from_iterable(others), _recorded_messages(sources, channels)):
             write_record(writer, record)
             if isinstance(record, Message):
@@ -628,7 +628,7 @@ def _write_messages(
             if channel.identity not in in_videos:
                 writer.add_channel(channel)
         for source in sources:
-            for schema in source.dataset.unused_schemas:
+            for schema in source.dataset.messages_file.unused_schemas:
                 writer.add_schema(schema)
     return collector.transforms
 

@@ -42,7 +42,7 @@ from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
 from mp4ds.messages.serializations import is_camera
-from mp4ds.records import Channel, Excerpt, Message, Record, Schema
+from mp4ds.records import Channel, Excerpt, Message, Record
 from mp4ds.times import Sync, synchronize
 
 _VIDEOS = (".mp4", ".m4v", ".mov")
@@ -64,6 +64,7 @@ class Dataset:
         path: The folder, or the video or sidecar.
         manifest: Of the folder; None for one video.
         streams: Its streams; none for a video without a sidecar, see `mp4ds.open`.
+        messages_file: Its messages.mcap; without contents where there is none.
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams.
         is_salvaged: Whether messages may be missing; see `mp4ds.dataset.salvage`.
         damage: Which damaged file was left out, as no selected topic needs it; empty if none was.
@@ -113,7 +114,7 @@ class Dataset:
                 raise FormatError("file-missing", self.path, problem)
             sidecars = [sidecar]
         self.streams = [Stream(sidecar, jpeg_quality=jpeg_quality) for sidecar in sidecars]
-        self._file = MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
+        self.messages_file = MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
 
     @classmethod
     def of(
@@ -127,7 +128,7 @@ class Dataset:
         """A folder whose sidecars have already been read, or a video without a sidecar."""
         dataset = cls.__new__(cls)
         dataset.path, dataset.manifest, dataset.jpeg_quality = path, manifest, 95
-        dataset.streams, dataset._file, dataset._video = list(streams), file, video
+        dataset.streams, dataset.messages_file, dataset._video = list(streams), file, video
         return dataset
 
     if not TYPE_CHECKING:  # else every name would pass for known
@@ -209,20 +210,20 @@ class Dataset:
         ids = group.recorded_ids if group else {channel.id}
 
         def recorded(excerpt: Excerpt) -> Iterator[Message]:
-            return (item for item in self._file.in_time(excerpt) if item.channel.id in ids)
+            return (item for item in self.messages_file.in_time(excerpt) if item.channel.id in ids)
 
         messages = recorded(Excerpt(topics=frozenset([channel.topic]), others=False))
         numbers: Iterable[int] = count()
         if group is not None:
-            taken, times = group.places, self._file.times()
+            taken, times = group.places, self.messages_file.times()
             own = [times[key] for key in ids if key in times]
             numbers = np.setdiff1d(np.arange(len(taken) + sum(map(len, own))), taken).tolist()
             if not group.is_in_time(own):
-                messages = group.found_in(self.recorded_records())
+                messages = group.found_in(self.messages_file.in_file_order())
         numbered = zip(numbers, messages, strict=False)
         with_info = (item for item in self.streams if item.topic == channel.topic)
         calibrated = next((item for item in with_info if item.calibrations), None)
-        path = self._file.path or self.path
+        path = self.messages_file.path or self.path
         return verbatim_images(path, channel, numbered, recorded, calibrated)
 
     def __getitem__(self, topic: str) -> Topic:
@@ -272,23 +273,6 @@ class Dataset:
     def _listed_topics(self) -> list[str]:
         return [entry.topic for entry in self.manifest.streams] if self.manifest else []
 
-    @property
-    def unused_schemas(self) -> Sequence[Schema]:
-        """Definitions of the recording that no channel refers to."""
-        return self._file.unused_schemas
-
-    @property
-    def recorded_counts(self) -> Mapping[int, int]:
-        """Number of messages in messages.mcap by channel id, from its index."""
-        return self._file.counts
-
-    @property
-    def salvaged_topics(self) -> list[str]:
-        """Topics of which messages are left in a damaged messages.mcap."""
-        if not self._file.is_salvaged:
-            return []
-        return [item.topic for item in self._file.channels if self._file.counts.get(item.id)]
-
     def verify_messages(self) -> None:
         """Check messages.mcap against its SHA-256: not all of its contents have their own checksum.
 
@@ -296,7 +280,7 @@ class Dataset:
             FormatError: See `verify_file`.
         """
         if self.manifest and not self.is_salvaged:
-            self._file.verify(self.manifest)
+            self.messages_file.verify(self.manifest)
 
     def verify_sidecars(self, selected: Callable[[str], bool] = lambda _: True) -> None:
         """Check sidecars against their SHA-256: an edited one may look valid.
@@ -314,22 +298,14 @@ class Dataset:
             if selected(stream.topic) or (info and selected(info.channel.topic)):
                 verify_file(stream.path, self.manifest.file(stream.path.name))
 
-    def other_records(self) -> Iterator[Record]:
-        """The attachments and metadata records."""
-        return self._file.others()
-
-    def recorded_records(self) -> Iterator[Record]:
-        """Everything in messages.mcap, in file order."""
-        return self._file.in_file_order()
-
     @cached_property
     def _groups(self) -> list[ChannelGroup]:
-        return channel_groups(self.streams, self._file.channels)
+        return channel_groups(self.streams, self.messages_file.channels)
 
     @cached_property
     def _verbatim_channels(self) -> list[Channel]:
         split = {channel_id for group in self._groups for channel_id in group.recorded_ids}
-        return [channel for channel in self._file.channels if channel.id not in split]
+        return [channel for channel in self.messages_file.channels if channel.id not in split]
 
     def image_channels(self) -> list[ChannelGroup]:
         """The channels with images in videos."""
@@ -357,7 +333,7 @@ class Dataset:
                 f"{self.path} has no topic {unknown[0]!r}; there are: {', '.join(known) or 'none'}"
             )
         wanted = None if topics is None else frozenset(topics)
-        return as_recorded(self._no_frames(wanted), self._file.path or self.path)
+        return as_recorded(self._no_frames(wanted), self.messages_file.path or self.path)
 
     def _no_frames(self, wanted: frozenset[str] | None) -> Iterator[Message]:
         ids = {channel.id for channel in self._verbatim_channels}
@@ -369,7 +345,7 @@ class Dataset:
                 calibrations.append(self._group_messages(group, group.sources()))
             elif wanted is not None:
                 ids |= group.recorded_ids
-        found = self._file.in_time(Excerpt(topics=wanted))
+        found = self.messages_file.in_time(Excerpt(topics=wanted))
         recorded = (message for message in found if message.channel.id in ids)
         return by_time(recorded, *calibrations)
 
@@ -457,7 +433,7 @@ class Dataset:
         Args:
             topics: Only of these topics; None for all.
         """
-        recorded = dict(self._file.times())
+        recorded = dict(self.messages_file.times())
         found = {}
         for group in self._groups:
             own = [recorded.pop(key) for key in group.recorded_ids if key in recorded]
@@ -491,22 +467,16 @@ class Dataset:
 
     def counts(self) -> dict[int, int]:
         """Number of messages by channel id; decodes nothing."""
-        found = dict(self._file.counts)
+        found = dict(self.messages_file.counts)
         for group in self._groups:
             recorded = sum(found.pop(key, 0) for key in group.recorded_ids)
             found[group.channel.id] = recorded + sum(map(len, group.parts))
         return found
 
-    def recorded_times(self, topic: str) -> NDArray[np.int64]:
-        """Sorted log times, nanoseconds, of a topic's messages that are in messages.mcap."""
-        times = self._file.times()
-        found = [times[c.id] for c in self._file.channels if c.topic == topic and c.id in times]
-        return np.sort(np.concatenate([np.empty(0, np.int64), *found]))
-
     @property
     def is_in_time(self) -> bool:
         """Whether the messages of a time span are consecutive in each channel."""
-        recorded = self._file.times()
+        recorded = self.messages_file.times()
         return all(
             group.is_in_time([recorded[key] for key in group.recorded_ids if key in recorded])
             for group in self._groups
@@ -516,7 +486,7 @@ class Dataset:
         """Topics with missing messages according to the columns, and what is missing."""
         if self.manifest is None:
             return
-        recorded = self._file.counts
+        recorded = self.messages_file.counts
         for group in self._groups:
             gap = group.gap(group.recorded(recorded))
             if gap:
@@ -525,14 +495,14 @@ class Dataset:
     def _verbatim_records(self, topics: Collection[str] | None) -> Iterator[Record]:
         channels = self._verbatim_channels
         wanted = {item.id for item in channels if topics is None or item.topic in topics}
-        for record in self.recorded_records():
+        for record in self.messages_file.in_file_order():
             if not isinstance(record, Message) or record.channel.id in wanted:
                 yield record
 
     def recorded_messages(self, excerpt: Excerpt) -> Iterator[Message]:
         """Messages in messages.mcap, by log time, on their channels."""
         owners = {key: group.channel for group in self._groups for key in group.recorded_ids}
-        for message in self._file.in_time(excerpt):
+        for message in self.messages_file.in_time(excerpt):
             owner = owners.get(message.channel.id)
             yield replace(message, channel=owner) if owner else message
 
@@ -543,7 +513,7 @@ class Dataset:
         ahead: Ahead = iter,
     ) -> Iterator[Message]:
         """One channel's messages from all its files, in the channel's order."""
-        recorded = ahead(group.found_in(self.recorded_records()))
+        recorded = ahead(group.found_in(self.messages_file.in_file_order()))
         # a pair on its own has only its own messages
         is_whole = self.manifest is not None and not self.is_salvaged
         return group.merged(own, recorded, str(self.path) if is_whole else None)

@@ -119,6 +119,14 @@ class MessagesFile:
         with _damage_told():
             return self._reader.times() if self._reader else {}
 
+    def times_of(self, topic: str) -> NDArray[np.int64]:
+        """Sorted log times, nanoseconds, of a topic's messages."""
+        times = self.times()
+        found = [
+            times[item.id] for item in self.channels if item.topic == topic and item.id in times
+        ]
+        return np.sort(np.concatenate([np.empty(0, np.int64), *found]))
+
     @cached_property
     def _salvaged_times(self) -> Mapping[int, NDArray[np.int64]]:
         with _damage_told():

@@ -64,7 +64,7 @@ class DatasetReader(BagReader):
     @property
     def unused_schemas(self) -> Sequence[Schema]:
         """Definitions that no channel refers to."""
-        return self._dataset.unused_schemas
+        return self._dataset.messages_file.unused_schemas
 
     @property
     def position(self) -> int:
@@ -96,7 +96,7 @@ class DatasetReader(BagReader):
             yield from filter(span.has, dataset.records(self.sources, topics=topics))
             return
         if excerpt.others:
-            yield from dataset.other_records()
+            yield from dataset.messages_file.others()
         if excerpt.has_messages:
             yield from dataset.records(self.sources, start=start, end=end, topics=topics)
 

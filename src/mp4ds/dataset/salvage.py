@@ -69,7 +69,10 @@ def open_selected(
         except (SourceError, FormatError):
             raise error from None
         # nothing vouches for what is still there of a damaged messages.mcap
-        there = dataset.salvaged_topics
+        file = dataset.messages_file
+        there = [
+            item.topic for item in file.channels if file.is_salvaged and file.counts.get(item.id)
+        ]
         lost = (loss for loss in losses if loss.file != MESSAGES_NAME or loss.messages != 0)
         if any(map(selected, there)) or any(lost):
             raise

@@ -314,7 +314,7 @@ def _verbatim(dataset: Dataset) -> list[CameraCalibrations]:
         return []
     found = _Cameras()
     ids = {channel.id for channel in channels}
-    for record in dataset.recorded_records():
+    for record in dataset.messages_file.in_file_order():
         if isinstance(record, Message) and record.channel.id in ids:
             found.take(record)
     return found.cameras(channels)

@@ -184,7 +184,7 @@ class Republisher:
         planned = [(item, self._plans(item)) for item in chosen]
         for item, plans in planned:
             all_move = sum(plan.is_moved for plan in plans) == len(item.streams)
-            if all_move and not item.recorded(dataset.recorded_counts):
+            if all_move and not item.recorded(dataset.messages_file.counts):
                 self._emptied.add(item.channel.id)
         self._declare(dataset, planned)
         for _, plans in planned:

@@ -325,7 +325,7 @@ def _unpack_recording(
     republisher = _republisher(dataset, to, options, selected)
     storage = ""
     if to == "rosbag2":
-        storage = options.storage or recorded_storage(dataset.recorded_records())
+        storage = options.storage or recorded_storage(dataset.messages_file.in_file_order())
     with open_writer(
         path,
         to,
@@ -456,7 +456,7 @@ class _Topics:
             self._channels[channel.id] = channel
             self._writer.add_channel(channel)
             self._summary.messages.setdefault(channel.topic, 0)
-        for schema in dataset.unused_schemas:
+        for schema in dataset.messages_file.unused_schemas:
             self._writer.add_schema(schema)
 
     def _try_to_add(self, channel: Channel) -> None:

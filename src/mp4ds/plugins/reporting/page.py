@@ -168,7 +168,7 @@ def _recorded_bytes(dataset: Dataset) -> dict[str, int]:
     if dataset.manifest is not None:
         if (dataset.path / MESSAGES_NAME).stat().st_size > _MOST_READ:
             return {}
-        for record in dataset.recorded_records():
+        for record in dataset.messages_file.in_file_order():
             if isinstance(record, Message):
                 sizes[record.channel.topic] += len(record.data)
     unknown = set()
