@@ -232,49 +232,26 @@ def test_a_frame_of_a_long_video_is_estimated_without_the_key_frames_of_a_clip()
 # ---------------------------------------------------------------- every kind of source
 
 
-def of_dataset(folder: Path, bag: Path) -> Path:
-    mp4ds.pack(bag, folder / "drive")
-    return folder / "drive"
-
-
-def of_lossy_dataset(folder: Path, bag: Path) -> Path:
-    mp4ds.pack(bag, folder / "drive", PackOptions(quality="crf=10", codec="h264"))
-    return folder / "drive"
-
-
-def of_video(folder: Path, bag: Path) -> Path:
-    video = next(of_lossy_dataset(folder, bag).glob("*.mp4"))
-    shutil.copy(video, folder / "alone.mp4")
-    return folder / "alone.mp4"
-
-
-KINDS: dict[str, Callable[[Path, Path], Path]] = {
-    "dataset": of_dataset,
-    "lossy": of_lossy_dataset,
-    "video": of_video,
-}
+LOSSY = PackOptions(quality="crf=10", codec="h264")
+PACKED = {"dataset": PackOptions(), "lossy dataset": LOSSY, "video": LOSSY}
 
 
 @pytest.mark.one_in(3)
-@pytest.mark.parametrize("kind", KINDS)
-def test_what_was_made_of_a_recording(kind: str, tmp_path: Path) -> None:
-    source = KINDS[kind](tmp_path, recording(tmp_path))
-    found = evaluate(source, QUICK, output=tmp_path / "out")
-    (camera,) = found.cameras
+@pytest.mark.parametrize("kind", ["bag-lz4", "rosbag2-sqlite3-v9", "mcap-unindexed", *PACKED])
+def test_every_kind_of_source(kind: str, tmp_path: Path) -> None:
+    source = recording(tmp_path, "bayer_grbg8", "bag-none" if kind in PACKED else kind)
+    if kind in PACKED:
+        source = mp4ds.pack(source, tmp_path / "drive", PACKED[kind]).dataset
+    if kind == "video":
+        source = Path(shutil.copy(source / "cam_image_raw.mp4", tmp_path / "alone.mp4"))
+    (camera,) = evaluate(source, QUICK, output=tmp_path / "out").cameras
+    if kind not in ("lossy dataset", "video"):  # which are no mosaics any more
+        assert (camera.topic, camera.clip.encoding) == (TOPIC, "bayer_grbg8")
+        assert camera.storage[0].frame_bytes == 96 * 64
     assert camera.clip.image_size == (96, 64)
     assert camera.clip.frames == camera.clip.source_frames == 10
     assert camera.clip.rate == pytest.approx(30, rel=0.02)
-    assert len(camera.cells) == 1
     assert 25 < camera.cells[0].scores["psnr_y"].mean < 60
-
-
-@pytest.mark.one_in(3)
-@pytest.mark.parametrize("source", ["bag-split", "rosbag2-sqlite3-v9", "mcap-unindexed"])
-def test_recordings(source: str, tmp_path: Path) -> None:
-    path = recording(tmp_path, "bayer_grbg8", source)
-    (camera,) = evaluate(path, QUICK, output=tmp_path / "out").cameras
-    assert (camera.topic, camera.clip.encoding) == (TOPIC, "bayer_grbg8")
-    assert camera.storage[0].frame_bytes == 96 * 64
 
 
 @pytest.mark.one_in(3)
@@ -533,23 +510,6 @@ def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
         assert again.cameras[0].cells[0].size == first.cameras[0].cells[0].size
 
 
-@pytest.mark.slow
-def test_an_interrupted_one_goes_on(tmp_path: Path) -> None:
-    path = recording(tmp_path)
-    options = replace(QUICK, crf=["20", "30", "40"])
-
-    def interrupt(what: str, _: float | None) -> None:
-        if "2 of 3 settings" in what:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        evaluate(path, options, output=tmp_path / "out", progress=interrupt)
-    assert not list((tmp_path / "out").glob("work*"))
-    assert not (tmp_path / "out" / "index.html").exists()
-    again = evaluate(path, options, output=tmp_path / "out")
-    assert (again.tried, again.known) == (1, 2)
-
-
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
 @pytest.mark.parametrize(
     "number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
@@ -569,6 +529,8 @@ def test_a_killed_one_goes_on(number: signal.Signals, tmp_path: Path) -> None:
     if number == signal.SIGINT:
         assert process.returncode == 130
         assert "run the same command again" in said
+        assert not list(out.glob("work*"))
+        assert not (out / "index.html").exists()
     known = len(list(out.glob("cells/*.json")))
     again = evaluate(path, replace(QUICK, crf=["20:22"]), output=out)
     assert again.known >= min(known, 2)
