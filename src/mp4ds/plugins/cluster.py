@@ -192,6 +192,8 @@ class ClusterExecutor(Executor):
             if client.status in ("closing", "closed"):
                 self._fail("the connection to the Dask scheduler was lost")
                 return
+            if client.status != "running":
+                continue  # it reconnects, or gives up
             is_waiting = any(not call.done() for call in list(self._calls))
             if is_waiting:
                 refill()
