@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -194,11 +194,11 @@ class PartedPack:
             with suppress(OSError, ValueError):  # it may be just then written, or removed
                 yield parse_facts(path.read_bytes())
 
-    def finish(self, digests: Sequence[Digest]) -> PackSummary:
+    def finish(self, digests: Mapping[str, Digest]) -> PackSummary:
         """Put the parts together, and remove them.
 
         Args:
-            digests: Size and SHA-256 of each file that is hashed.
+            digests: Of the files that are hashed, by their paths.
 
         Raises:
             PartsFailedError: The dataset could not be written; the parts are kept.
@@ -220,7 +220,7 @@ class PartedPack:
         self.folder.remove()
         return summary
 
-    def _join(self, made: Path, digests: Sequence[Digest]) -> PackSummary:
+    def _join(self, made: Path, digests: Mapping[str, Digest]) -> PackSummary:
         plan, whole = self.plan, PartRecord(made)
         places = [self.folder.part(piece) for piece in plan.pieces]
         with ExitStack() as stack:
@@ -368,12 +368,14 @@ def pack_parts(
             pack.begin(anew=options.restart, alone=share is None)
             if options.join:
                 pack.refuse_missing()
-        digests: dict[Path, list[Future[Digest]]] = {}
+        digests: dict[Path, dict[str, Future[Digest]]] = {}
         calls: dict[Future[Any], tuple[PartedPack, Piece | None]] = {}
         for pack in packs:
             sources = pack.plan.hashed if share is None else []
-            digests[pack.target] = [executor.submit(digest_source, source) for source in sources]
-            calls.update((call, (pack, None)) for call in digests[pack.target])
+            digests[pack.target] = {
+                source.path: executor.submit(digest_source, source) for source in sources
+            }
+            calls.update((call, (pack, None)) for call in digests[pack.target].values())
             packer = stack.enter_context(closing(PartPacker(pack.plan, pack.folder.path)))
             missing = pack.missing
             for piece in pack.plan.pieces[number - 1 :: shares]:
@@ -385,7 +387,8 @@ def pack_parts(
         while ready or calls:
             for pack in ready if share is None else ():
                 if not pack.failures:
-                    yield pack.finish([call.result() for call in digests[pack.target]])
+                    found = digests[pack.target]
+                    yield pack.finish({path: call.result() for path, call in found.items()})
             ready = []
             for call in wait(calls, _POLL_SECONDS, FIRST_COMPLETED).done:
                 pack, ended = calls.pop(call)
@@ -394,7 +397,7 @@ def pack_parts(
                 if ended is not None:
                     pack.ended(ended, error)
                 elif error is not None:
-                    name = f"source-{digests[pack.target].index(call)}"
+                    name = f"source-{[*digests[pack.target].values()].index(call)}"
                     pack.failures.append((name, call_error(error)))
                 if not options.keep_going:
                     pack.refuse_failures()

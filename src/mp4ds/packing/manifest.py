@@ -13,6 +13,7 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, SourceError, advising
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.sources import source_name, source_size
+from mp4ds.files.urls import spelled
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
 from mp4ds.format.manifest import (
     About,
@@ -111,19 +112,12 @@ class Origin:
     about: About | None = None
 
     @classmethod
-    def of(
-        cls,
-        reader: BagReader,
-        digests: Iterable[Digest],
-        is_hashed: Sequence[bool],
-        about: About | None,
-    ) -> Origin:
+    def of(cls, reader: BagReader, digests: Mapping[str, Digest], about: About | None) -> Origin:
         """The origin of what was read: recordings, or datasets that are repacked.
 
         Args:
             reader: It; the files of a dataset begin with its manifest.
-            digests: Size in bytes and SHA-256 of the files that were hashed.
-            is_hashed: Which files these are; others were read in part.
+            digests: Of the files that were hashed, by their paths; others were read in part.
             about: Description of the recording; None for that of the datasets, if it is one
                 thing.
 
@@ -134,9 +128,8 @@ class Origin:
         sources: list[Source] = []
         manifests: dict[Path, Manifest] = {}
         hashes: dict[Path, str] = {}
-        known = iter(digests)
-        for path, hashed in zip(reader.files, is_hashed, strict=True):
-            size, sha256 = next(known) if hashed else (source_size(path), None)
+        for path in reader.files:
+            size, sha256 = digests.get(spelled(path)) or (source_size(path), None)
             own = manifests.get(path.parent)
             entry = own and next((item for item in own.files if item.name == path.name), None)
             if own and entry:

@@ -131,9 +131,10 @@ def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> 
     with unchanged(plan.sources), SourceHasher(reader.files) as hasher:
         part = Packer(reader, folder, plan, piece, exact, progress).run()
         if is_slice:  # little of it was read
-            digests = [digest_source(source) for source in plan.hashed]
+            digests = {source.path: digest_source(source) for source in plan.hashed}
         else:
-            digests = [hasher.digest(number) for number in range(len(reader.files))]
+            files = enumerate(plan.hashed)
+            digests = {source.path: hasher.digest(number) for number, source in files}
     write_manifest(part, plan.origin(reader, digests), str(plan.options.quality))
     progress(part, done=True)
     source_bytes = None if is_slice else total

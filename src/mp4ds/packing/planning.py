@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -29,7 +29,7 @@ from mp4ds.messages.serializations import is_camera
 from mp4ds.options import WHOLE, Slice
 from mp4ds.packing.calibrations import find_pairs
 from mp4ds.packing.inspection import depends_on_others
-from mp4ds.packing.manifest import Origin
+from mp4ds.packing.manifest import Digest, Origin
 from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.packing.survey import Decision, survey_channel
 from mp4ds.packing.tracks import TrackPlan
@@ -133,17 +133,19 @@ class Plan:
     @property
     def hashed(self) -> list[SourceState]:
         """The files that are hashed: of a slice, not those that are read only in part."""
-        return [source for source in self.sources if self._is_hashed(location(source.path))]
+        is_part = bool(self.options.slice)
+        return [
+            source
+            for source in self.sources
+            if not is_part or location(source.path).name == MANIFEST_NAME
+        ]
 
-    def _is_hashed(self, path: Path) -> bool:
-        return not self.options.slice or path.name == MANIFEST_NAME
-
-    def origin(self, reader: BagReader, digests: Iterable[tuple[int, str]]) -> Origin:
+    def origin(self, reader: BagReader, digests: Mapping[str, Digest]) -> Origin:
         """What a dataset comes from.
 
         Args:
             reader: The recording.
-            digests: Size and SHA-256 of the files that are hashed.
+            digests: Of the files that are hashed, by their paths.
 
         Raises:
             SourceError: It consists of other files than when it was planned.
@@ -154,8 +156,7 @@ class Plan:
                 "consists of different files than when packing began",
                 "Start over with `restart`.",
             )
-        is_hashed = [self._is_hashed(path) for path in reader.files]
-        return Origin.of(reader, digests, is_hashed, self.about)
+        return Origin.of(reader, digests, self.about)
 
 
 def tools() -> dict[str, str]:
