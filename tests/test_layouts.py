@@ -117,26 +117,9 @@ def test_every_word_comes_back(dtype: str) -> None:
         assert bits_of(through(layout, pixels)) == bits_of(pixels)
 
 
-# ---------------------------------------------------------------- what the spec says of each
+# ---------------------------------------------------------------- single layouts
 
-
-@pytest.mark.parametrize(("width", "height"), SIZES)
-def test_tiles_are_where_the_spec_says(width: int, height: int) -> None:
-    """spec/index.md, Layouts, mosaic8."""
-    pixels = np.arange(width * height, dtype=np.uint16).reshape(height, width)
-    (picture,) = bind("mosaic16", ENCODINGS["bayer_rggb16"]).to_picture(pixels)
-    h, w = -(-height // 2), -(-width // 2)
-    assert picture.shape == (2 * h, 2 * w)
-    for y in range(height):
-        for x in range(width):
-            assert picture[(y % 2) * h + y // 2, (x % 2) * w + x // 2] == pixels[y, x]
-    assert set(picture.ravel().tolist()) == set(pixels.ravel().tolist())  # no stray samples
-
-
-def test_signed_samples_keep_their_order() -> None:
-    pixels = np.arange(-128, 128, dtype=np.int8).reshape(16, 16)
-    (picture,) = bind("gray8", ENCODINGS["8SC1"]).to_picture(pixels)
-    assert picture.ravel().tolist() == list(range(256))
+# Where each layout puts its samples is compared with the spec in test_second_reader.py.
 
 
 @pytest.mark.parametrize(
@@ -159,15 +142,6 @@ def test_low_bits_are_folded(bits: int, shift: int, low: int, pixel_format: str)
     assert bits_of(through(layout, values << shift)) == bits_of(values << shift)
 
 
-def test_a_mosaic_is_tiled_before_it_is_folded() -> None:
-    mosaic = np.array([[0x001, 0x012], [0x023, 0x034]], np.uint16)
-    parameters = Parameters(bits=12, shift=0, low=4)
-    (picture,) = bind("mosaic_fold", ENCODINGS["bayer_rggb16"], parameters).to_picture(
-        np.tile(mosaic, (1, 2))
-    )
-    assert picture.tolist() == [[0, 0, 1, 1], [2, 2, 3, 3], [1, 1, 13, 13], [3, 3, 11, 11]]
-
-
 @pytest.mark.parametrize("encoding", ["rgba8", "bgra8", "8UC4"])
 def test_an_alpha_that_is_the_same_is_left_out(encoding: str) -> None:
     known = ENCODINGS[encoding]
@@ -182,36 +156,6 @@ def test_an_alpha_that_is_the_same_is_left_out(encoding: str) -> None:
     assert bits_of(through(layout, pixels)) == bits_of(pixels)
     pixels[2, 3, 3] = 201
     assert "an alpha that is not the stream's, 200" in str(layout.refuses(pixels))
-
-
-def test_bytes_lie_in_two_rows_the_highest_first() -> None:
-    four = np.array([[0x01020304]], np.int32)
-    (picture,) = bind("bytes", ENCODINGS["32SC1"]).to_picture(four)
-    assert picture.tolist() == [[0x81, 2], [3, 4]]
-    eight = np.array([[[0x0102030405060708, 0x1112131415161718]]], np.uint64).view("f8")
-    (picture,) = bind("bytes", ENCODINGS["64FC2"]).to_picture(eight)
-    rows = [[1, 2, 3, 4], [5, 6, 7, 8], [17, 18, 19, 20], [21, 22, 23, 24]]
-    assert picture.tolist() == rows
-
-
-def test_channels_are_stacked() -> None:
-    pixels = np.arange(12, dtype=np.uint8).reshape(2, 3, 2)
-    (picture,) = bind("stack8", ENCODINGS["8UC2"]).to_picture(pixels)
-    assert picture.tolist() == [[0, 2, 4], [6, 8, 10], [1, 3, 5], [7, 9, 11]]
-
-
-@pytest.mark.parametrize(
-    ("encoding", "order"),
-    [
-        *(("rgb16", "rgb"), ("bgr16", "bgr"), ("rgba16", "rgba"), ("bgra16", "bgra")),
-        *(("16UC3", "bgr"), ("16UC4", "bgra")),
-    ],
-)
-def test_planes_of_colours_are_green_blue_red_alpha(encoding: str, order: str) -> None:
-    known = ENCODINGS[encoding]
-    pixel = np.array([[[ord(letter) for letter in order]]], np.uint16)
-    planes = bind(known.general, known).to_picture(pixel)
-    assert "".join(chr(plane.item()) for plane in planes) == "gbra"[: len(order)]
 
 
 YUV = {
@@ -393,19 +337,6 @@ def test_a_table_refuses_what_it_does_not_have() -> None:
         changed = pixels.copy()
         changed[0, 0] = value
         assert "in the stream's table" in str(layout.refuses(changed))
-
-
-def test_a_palette_stands_below_the_numbers() -> None:
-    encoding = ENCODINGS["16SC1"]
-    layout = bind("palette", encoding, Parameters(entries=256))
-    pixels = np.array([[-3, 1000, -3], [7, 7, 1000]], np.int16)
-    (picture,) = layout.to_picture(pixels)
-    assert picture.shape == (2 + 171, 3) == layout.picture_size(3, 2)[::-1]
-    assert picture[:2].tolist() == [[0, 2, 0], [1, 1, 2]]
-    listed = picture[2:].ravel()
-    assert listed[:4].tolist() == [0x7F, 0x80, 0x83, 0x83]
-    assert listed[256:260].tolist() == [0xFD, 0x07, 0xE8, 0xE8]
-    assert listed[512:].tolist() == [0]
 
 
 @pytest.mark.parametrize("encoding", ["mono16", "16SC1", "32FC1"])

@@ -18,6 +18,7 @@ import yaml
 from av.video.reformatter import ColorRange
 from numpy.typing import NDArray
 
+import images
 import mp4ds
 from chromium import Tab, played, video_player
 from coded_scenes import CODED
@@ -258,39 +259,20 @@ def ffmpeg(path: Path, pixel_format: str, *filters: str) -> bytes:
     return done.stdout
 
 
-def pixels_of(frame: NDArray[np.uint8], video: dict[str, Any]) -> NDArray[Any]:
-    """Pixels of a picture of one sample, by the words of spec/index.md, Layouts."""
-    layout = video["layout"]
-    if "fold" in layout:
-        bits, shift, low = (video["parameters"][name] for name in ("bits", "shift", "low"))
-        assert bits - low <= 8
-        high, rest = np.split(frame.astype(np.uint16), 2)
-        inverted = np.where(high % 2 == 1, 2**low - 1 - rest, rest)
-        frame = ((high << low) | inverted) << shift
-    return untile(frame) if "mosaic" in layout else frame
-
-
-def untile(picture: NDArray[Any]) -> NDArray[Any]:
-    """spec/index.md, Layouts, mosaic8."""
-    h, w = picture.shape[0] // 2, picture.shape[1] // 2
-    y, x = np.mgrid[: 2 * h, : 2 * w]
-    mosaic: NDArray[Any] = picture[(y % 2) * h + y // 2, (x % 2) * w + x // 2]
-    return mosaic
-
-
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", [name for name in CASES if CASES[name].raw])
 def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: Datasets) -> None:
-    """Without mp4ds: by ffmpeg, and the words of the spec."""
+    """Without mp4ds: by ffmpeg, and the reader of the conformance suite."""
     case, path = CASES[name], video_of(datasets[name])
-    video = yaml.safe_load(path.with_suffix(".yaml").read_bytes())["video"]
+    side = yaml.safe_load(path.with_suffix(".yaml").read_bytes())
     frames = np.frombuffer(ffmpeg(path, case.raw), np.uint8).reshape(FRAMES, -1)
     for frame, image in zip(frames, case.images(), strict=True):
         data = np.frombuffer(bytes(image.values["data"]), np.uint8)
         if case.kind in CODED:
             data = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
         if case.raw == "gray":
-            frame = pixels_of(frame.reshape(case.height, WIDTH), video)
+            planes = [frame.reshape(case.height, WIDTH)]
+            frame = images.pixels(side["image"], side["video"], planes)
         assert np.array_equal(np.ravel(frame).view(np.uint8), np.ravel(data).view(np.uint8))
 
 

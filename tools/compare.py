@@ -354,7 +354,7 @@ def examine(
     files = [[x] if isinstance(x, Path) else list(x) for x in (a, b)]
     one = read(files[0], Digester(ignore_pixels), start, end)
     two = read(files[1], Digester(ignore_pixels))
-    if crossed := _crossed(one, two):
+    if crossed := _crossed(one, two):  # known only when both were read: read them once more
         one = read(files[0], Digester(ignore_pixels, crossed), start, end)
         two = read(files[1], Digester(ignore_pixels, crossed))
     report = Report(notes=one.notes + two.notes)

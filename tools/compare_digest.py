@@ -62,6 +62,7 @@ class Digester:
         try:
             store = typestore(channel.type, channel.encoding, channel.definition)
             decode = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
+            # a list: what goes wrong is to go wrong here
             return iter(list(field_bytes(decode(payload, name), skip_data=skip_data)))
         except Exception:  # whatever the generated deserialiser trips over
             self.undecodable.add(channel.topic)
