@@ -16,7 +16,7 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import PublishError
 from mp4ds.plugins.playing import pace
 from mp4ds.plugins.playing.options import PlayOptions, Wanted
-from mp4ds.plugins.playing.pace import Lateness, Pace, Ticks
+from mp4ds.plugins.playing.pace import Pace, Ticks
 from mp4ds.plugins.playing.player import Player, PlaySummary
 from mp4ds.plugins.playing.timeline import Timeline
 from mp4ds.records import Message
@@ -150,15 +150,24 @@ def test_lateness_is_told_apart() -> None:
         [(60, True, 0), (90, True, 0), (130, True, 130), (50, True, 0), (110, True, 110)],  # slow
         [(-5, True, 0), (90, False, 0), (160, True, 0), (220, True, 130)],  # both
     ):
-        late = Lateness()
-        for by, was_awaited, waits in steps:
-            assert late.record(by * MS, was_awaited=was_awaited) == waits * MS
-    late = Lateness()
-    late.record(9 * NS, was_awaited=False)
-    assert not late.suspended()
-    late.record(11 * NS, was_awaited=False)
-    assert late.suspended() == 11 * NS  # Ctrl-Z
-    assert late.record(0, was_awaited=False) == 0
+        assert [*waits(steps)] == [waiting * MS for _, _, waiting in steps]
+
+
+def waits(steps: list[tuple[int, bool, int]]) -> Iterator[int]:
+    clock = Pace(2.0, steady=lambda: 0)
+    for by, was_awaited, _ in steps:
+        due, before = clock.now() - 2 * by * MS, clock.now()
+        waited = clock.hold_back(due, was_awaited=was_awaited)
+        assert before - clock.now() == 2 * waited
+        yield waited
+
+
+def test_a_clock_does_not_catch_up_after_a_suspension() -> None:
+    clock = Pace(steady=lambda: 0)
+    for seconds, back in ((9, 0), (11, 11), (0, 0)):  # Ctrl-Z
+        before = clock.now()
+        assert clock.hold_back(before - seconds * NS, was_awaited=False) == 0
+        assert before - clock.now() == back * NS
 
 
 class Machine:

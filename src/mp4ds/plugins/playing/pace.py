@@ -37,6 +37,8 @@ class Pace:
         self._is_running = False
         self._at = 0  # recording time ...
         self._since = steady()  # ... at this time of the monotonic clock
+        # how late messages are, nanoseconds: not ready in time, or the player was not scheduled
+        self._unready = self._stalled = 0
 
     @property
     def rate(self) -> float:
@@ -62,6 +64,7 @@ class Pace:
     def jump(self, time_ns: int) -> None:
         """Continue from another recording time; stay paused if it is paused."""
         self._at, self._since = time_ns, self._steady()
+        self._unready = self._stalled = 0
 
     def resume(self) -> None:
         """Let time pass."""
@@ -79,6 +82,36 @@ class Pace:
         If it is paused, as if it were resumed now.
         """
         return (time_ns - self.now()) / self._rate / NS
+
+    def hold_back(self, time_ns: int, *, was_awaited: bool) -> int:
+        """Let the clock wait for a message that was not ready in time.
+
+        After the machine was busy elsewhere, it catches up, as every player does. If messages are
+        read or decoded more slowly than they are played, the clock has to wait for them.
+
+        Args:
+            time_ns: When the message is due, in recording time.
+            was_awaited: Whether the player had to wait until it was ready.
+
+        Returns:
+            How long the clock waits, real nanoseconds.
+        """
+        late = -round(self.seconds_until(time_ns) * NS)
+        more = late - self._unready - self._stalled
+        if late <= 0:
+            self._unready = self._stalled = 0
+        elif more > 0:
+            self._unready += more if was_awaited else 0
+            self._stalled += 0 if was_awaited else more
+        else:
+            self._stalled = max(0, self._stalled + more)
+            self._unready = late - self._stalled
+        waiting = self._unready if self._unready > CATCH_UP_NS else 0
+        suspended = self._stalled if self._stalled > _SUSPENDED_NS else 0
+        self._unready -= waiting
+        self._stalled -= suspended
+        self._at -= round((waiting + suspended) * self._rate)
+        return waiting
 
     def wall_of(self, time_ns: int) -> int:
         """The wall-clock time of a recording time, in nanoseconds since 1970."""
@@ -110,48 +143,6 @@ class Ticks:
     def seconds_left(self) -> float:
         """Seconds until the next one."""
         return max(0.0, self._next - time.monotonic())
-
-
-class Lateness:
-    """Why messages are late: not ready in time, or the player was not scheduled. In nanoseconds.
-
-    After the machine was busy elsewhere, the player catches up, as every player does. If messages
-    are read or decoded more slowly than they are played, the clock has to wait for them.
-    """
-
-    def __init__(self) -> None:
-        self._unready = 0
-        self._stalled = 0
-
-    def clear(self) -> None:
-        """Start over, as after a seek."""
-        self._unready = self._stalled = 0
-
-    def record(self, late: int, *, was_awaited: bool) -> int:
-        """Note how late the next message is; returns by how much to hold back the clock.
-
-        Args:
-            late: How late it is; negative if it is early.
-            was_awaited: Whether the player had to wait until the message was ready.
-        """
-        more = late - self._unready - self._stalled
-        if late <= 0:
-            self.clear()
-        elif more > 0:
-            self._unready += more if was_awaited else 0
-            self._stalled += 0 if was_awaited else more
-        else:
-            self._stalled = max(0, self._stalled + more)
-            self._unready = late - self._stalled
-        waiting = self._unready if self._unready > CATCH_UP_NS else 0
-        self._unready -= waiting
-        return waiting
-
-    def suspended(self) -> int:
-        """How long the player was suspended, for which it should not catch up."""
-        gone = self._stalled if self._stalled > _SUSPENDED_NS else 0
-        self._stalled -= gone
-        return gone
 
 
 class FollowedClock:

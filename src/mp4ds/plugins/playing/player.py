@@ -14,7 +14,7 @@ from typing import Any
 
 from mp4ds.errors import OptionError, PublishError, Refused
 from mp4ds.plugins.playing.options import PlayOptions
-from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Lateness, Pace, Ticks
+from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Pace, Ticks
 from mp4ds.plugins.playing.timeline import ReadAhead, Restamper, Timeline
 from mp4ds.plugins.ros.node import Node, Service, action, quick_switches
 from mp4ds.records import Channel, Message
@@ -125,7 +125,6 @@ class Player:
         self._burst: _Burst | None = None
         self._target: int | None = self._start  # where to continue
         self._has_looped = False
-        self._lateness = Lateness()
         self._was_awaited = False  # whether the next message was not ready in time
         self._followed = FollowedClock(steady=steady)
         self._replies = 1  # on the lock-step topic
@@ -186,7 +185,6 @@ class Player:
         with self._changed:
             self._is_paused = is_paused
             self._burst = None
-            self._lateness.clear()
             if is_paused:
                 self._pace.jump(self._time())
                 self._pace.pause()
@@ -202,7 +200,6 @@ class Player:
             return False
         with self._changed:
             self._pace.rate = rate
-            self._lateness.clear()
             self._changed.notify_all()
         return True
 
@@ -427,7 +424,6 @@ class Player:
             now = min(self._pace.now(), due.log_time)
             self._pace.pause()
             self._pace.jump(now)
-            self._lateness.clear()
         return math.inf, f"waiting for {topic}"
 
     def _is_ahead(self) -> bool:
@@ -444,11 +440,8 @@ class Player:
             self._pace.jump(due.log_time)
         seconds = self._pace.seconds_until(due.log_time)
         if not self._options.drop:
-            waited = self._lateness.record(-round(seconds * NS), was_awaited=self._was_awaited)
+            waited = self._pace.hold_back(due.log_time, was_awaited=self._was_awaited)
             self._done.slowed_s += waited / NS
-            behind = (waited + self._lateness.suspended()) * self._pace.rate
-            if behind:
-                self._pace.jump(self._pace.now() - round(behind))
         self._was_awaited = False
         return max(seconds, 0.0)
 
@@ -480,7 +473,6 @@ class Player:
             self._is_resting = self._was_awaited = False
             self._pace.pause()
             self._pace.jump(time_ns)
-            self._lateness.clear()
         if self._has_looped and self._node.world == "ros2":
             self._wait(self._options.delay, "waiting")
         self._has_looped = False
