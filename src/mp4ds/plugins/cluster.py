@@ -43,6 +43,8 @@ _WORKER_SECONDS = 5 * 60.0
 _BATCH_WORKER_SECONDS = 12 * 3600.0
 _MOST_JOBS = 16
 _SETTINGS = "~/.config/dask/jobqueue.yaml"
+_DROPPED = "the connection to the Dask scheduler was lost, or it dropped the tasks"
+_IS_IT_RUNNING = "Check whether it is still running."
 _GO_ON = "Finished work is kept: run the same command again to resume."
 
 
@@ -162,7 +164,7 @@ class ClusterExecutor(Executor):
         except CallError as error:
             failure = error
         except OSError:
-            self._fail("the connection to the Dask scheduler was lost, or it dropped the tasks")
+            self._fail(_DROPPED, _IS_IT_RUNNING)
             return
         except Exception as error:  # of many kinds: its workers died, or lack what is called
             lines = str(error.__cause__ or error).strip().splitlines() or [type(error).__name__]
@@ -177,10 +179,9 @@ class ClusterExecutor(Executor):
                 call.set_exception(failure)
         self._calls.pop(call, None)
 
-    def _fail(self, problem: str) -> None:
+    def _fail(self, problem: str, hint: str) -> None:
         """Let all calls fail: the cluster is lost."""
-        hint = f"Check whether it is still running. {_GO_ON}"
-        self._lost = ClusterError(self._address, problem, hint)
+        self._lost = ClusterError(self._address, problem, f"{hint} {_GO_ON}")
         for call in list(self._calls):
             with suppress(InvalidStateError):  # it is done
                 call.set_exception(self._lost)
@@ -190,7 +191,7 @@ class ClusterExecutor(Executor):
         seen = time.monotonic()
         while not self._closed.wait(_LOOK_SECONDS) and self._lost is None:
             if client.status in ("closing", "closed"):
-                self._fail("the connection to the Dask scheduler was lost")
+                self._fail(_DROPPED, _IS_IT_RUNNING)
                 return
             if client.status != "running":
                 continue  # it reconnects, or gives up
@@ -203,7 +204,8 @@ class ClusterExecutor(Executor):
             if has_workers or not is_waiting:
                 seen = time.monotonic()
             elif time.monotonic() - seen >= patience:
-                self._fail(f"has had no worker for {patience:g} s")
+                problem = f"has had no worker for {patience:g} s"
+                self._fail(problem, "Start some, or find out why they ended.")
 
 
 def _attempt(call: Callable[[], _T]) -> _T:
