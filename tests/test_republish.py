@@ -29,8 +29,8 @@ from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.options import UnpackOptions, UnpackSummary
+from mp4ds.unpacking.pictures import KINDS
 from mp4ds.unpacking.republish import Republished, free_topic, republished_topic
-from mp4ds.unpacking.types import KINDS
 from pictures import YUV, picture, sample_format
 from republished import (
     CAMERAS,

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from mp4ds.options import WHAT, SliceOptions, force, jpeg_quality, latched, option
 from mp4ds.records import Loss
-from mp4ds.unpacking.pictures import ReductionOptions
+from mp4ds.unpacking.pictures import KINDS, ReductionOptions
 from mp4ds.unpacking.republish import Republished
-from mp4ds.unpacking.types import KINDS
 
 
 @dataclass(frozen=True, kw_only=True)

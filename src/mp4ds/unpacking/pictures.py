@@ -1,11 +1,11 @@
-"""The images of a stream in another form, frame by frame."""
+"""The images of a stream in another form, frame by frame: its kind, size and number."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -31,11 +31,102 @@ from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
 from mp4ds.options import WHAT, Parsed, TopicOptions, option, parse_resize
 from mp4ds.times import intervals, usual_interval
-from mp4ds.unpacking.types import KINDS, packet_format
+from mp4ds.video.codecs import CODECS
 from mp4ds.video.images import ImageFile
 from mp4ds.video.packets import PacketReader
 
 _NS = 1_000_000_000
+
+# ---------------------------------------------------------------- kinds
+
+_ENCODERS = {"h264": "libx264", "h265": "hevc_nvenc"}  # decoders in ROS 1 go by these
+_VIDEO = "string frame_id\nuint8[] data\nstring format\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What images can be converted to.
+
+    Attributes:
+        type_name: Type of the messages, as ROS 2 spells it.
+        family: ``raw``, ``file`` or ``video``.
+        noun: What the images are, for people.
+        suffix: Last part of the topic that image_transport gives them; None if it has none.
+        definitions: Message encoding -> definition, of a type that is not standard.
+    """
+
+    type_name: str
+    family: str
+    noun: str
+    suffix: str | None
+    definitions: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def ros1_type(self) -> str:
+        """Type of the messages, as ROS 1 spells it."""
+        return self.type_name.replace("/msg/", "/")
+
+
+KINDS: Mapping[str, Kind] = {
+    "raw": Kind("sensor_msgs/msg/Image", "raw", "raw images", None),
+    "jpeg": Kind("sensor_msgs/msg/CompressedImage", "file", "JPEG files", "compressed"),
+    "png": Kind("sensor_msgs/msg/CompressedImage", "file", "PNG files", "compressed"),
+    "compressed-video": Kind(
+        "foxglove_msgs/msg/CompressedVideo",
+        "video",
+        "CompressedVideo",
+        "compressed_video",
+        {
+            "ros1": f"time timestamp\n{_VIDEO}",
+            "cdr": f"builtin_interfaces/Time timestamp\n{_VIDEO}",
+        },
+    ),
+    "ffmpeg": Kind(
+        "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+        "video",
+        "FFMPEGPackets",
+        "ffmpeg",
+        {
+            "ros1": "Header header\nuint8[] data\nint32 img_width\nint32 img_height\n"
+            "string encoding\nuint64 pts\nuint8 flags\n",
+            "cdr": "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\n"
+            "uint64 pts\nuint8 flags\nbool is_bigendian\nuint8[] data\n",
+        },
+    ),
+}
+"""Names of kinds, as users write them."""
+
+FAMILIES = {kind.type_name.rpartition("/")[2]: kind.family for kind in KINDS.values()}
+"""Last part of the name of a camera's type -> its family."""
+FAMILIES["RawImage"] = FAMILIES["Image"]  # Foxglove's
+
+
+def packet_format(kind: str, sidecar: StreamSidecar, pixel_format: str, *, ros1: bool) -> str:
+    """What messages say about the coding of their packets.
+
+    Args:
+        kind: ``compressed-video`` or ``ffmpeg``.
+        sidecar: Of the video.
+        pixel_format: Of the video as ffmpeg calls it.
+        ros1: Whether they are messages of ROS 1.
+    """
+    if kind == "compressed-video":
+        return sidecar.video.codec
+    codec = CODECS[sidecar.video.codec].ffmpeg
+    if ros1:
+        return _ENCODERS.get(sidecar.video.codec, codec)
+    encoding = sidecar.image.encoding
+    known = ENCODINGS[encoding]
+    if known.channels == 1 and not known.mosaic and known.rows == 1:
+        before = shown = "mono8"
+    else:
+        before = "bgr8"
+        shown = "rgb8" if encoding.startswith("rgb") else "bgr8"
+    pixel_format = pixel_format.replace("yuvj", "yuv")  # the video itself has its range
+    return ";".join((codec, pixel_format, before, shown))
+
+
+# ---------------------------------------------------------------- fewer, and smaller
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.bags.convert import Converter
+from mp4ds.bags.types import RosVersion, make_store, ros1_version, ros2_version, types_of
 from mp4ds.dataset.columns import Choice, everything, marked
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import ChannelGroup, MessageSource, Part
@@ -17,10 +19,12 @@ from mp4ds.dataset.rebuild import CalibrationMessages, message_at
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import adapted
 from mp4ds.errors import ConversionError, FormatError, OptionError, Refused
-from mp4ds.messages.serializations import is_camera
-from mp4ds.messages.wire import Slots, WireError
-from mp4ds.records import Channel, Message
+from mp4ds.messages.serializations import is_camera, plain_message
+from mp4ds.messages.wire import NS, Fields, Slots, WireError
+from mp4ds.records import HASH_KEY, Channel, Message, Schema
 from mp4ds.unpacking.pictures import (
+    FAMILIES,
+    KINDS,
     Frames,
     Given,
     ImageForm,
@@ -29,7 +33,6 @@ from mp4ds.unpacking.pictures import (
     holds_files,
     is_inverse_depth,
 )
-from mp4ds.unpacking.types import FAMILIES, KINDS, Types
 from mp4ds.video.packets import PacketReader
 
 _TRANSPORTS = ("compressed", "compressedDepth", "ffmpeg", "foxglove", "compressed_video")
@@ -172,7 +175,6 @@ class Republisher:
         self._encoding = encoding
         self._jpeg_quality = jpeg_quality
         self._types: dict[tuple[str, str], Types] = {}
-        self._omitted: Counter[str] = Counter()
         self._made: set[int] = set()
         self.channels: list[Channel] = []
         self.sources: dict[Part, MessageSource] = {}
@@ -195,7 +197,7 @@ class Republisher:
     @property
     def omitted(self) -> Mapping[str, int]:
         """What the new messages cannot hold: a phrase -> how many."""
-        return self._omitted + sum((Counter(t.omitted) for t in self._types.values()), Counter())
+        return sum((types.omitted for types in self._types.values()), Counter())
 
     def empties(self, channel: Channel) -> bool:
         """Whether all messages of a channel of the dataset are expected to go to new channels."""
@@ -368,8 +370,6 @@ class Republisher:
                 )
             except WireError as error:
                 raise ConversionError(recorded.topic, f"message {index}: {error}") from None
-            if slots.seq is not None and not types.has_seq:
-                self._omitted[types.no_seq] += 1
             yield ordinal, message_at(columns, index, made or recorded, payload)
         due = stream.count(plan.is_kept)
         if choice is everything and count != due:
@@ -421,3 +421,131 @@ def _refers(stream: Stream) -> bool:
     codec = stream.sidecar.video.codec
     with PacketReader(stream.video_path, codec=codec, frames=len(stream)) as reader:
         return not all(reader.keyframes)
+
+
+# ---------------------------------------------------------------- types
+
+_DISTRIBUTION = "humble"
+_WIRES = {"ros1": "ros1", "cdr": "cdr-le"}
+_HASHES = {"ros1": "md5sum", "cdr": HASH_KEY}
+_DEFINITION = "message_definition"
+_REMEMBERED = "ros1:"  # begins keys that tell what a ROS 2 channel was in ROS 1
+_OF_TYPE = ("type", "md5sum", _DEFINITION)
+
+
+class Types:
+    """Channels and messages of one kind for one target.
+
+    Args:
+        encoding: Message encoding of the target: ``ros1`` or ``cdr``.
+        kind: One of `KINDS`.
+    """
+
+    def __init__(self, encoding: str, kind: str) -> None:
+        self.encoding = encoding
+        self._kind = kind
+        self._versions = {"ros1": ros1_version(), "cdr": ros2_version(_DISTRIBUTION)}
+        self._converter = Converter({"ros1": "ros1", "cdr": "ros2"}[encoding])
+        self._has_seq = encoding == "ros1" and kind != "compressed-video"
+        self._without_seq = 0
+
+    @property
+    def omitted(self) -> Counter[str]:
+        """What was recorded and the target cannot hold: a phrase -> how many."""
+        without = "ROS 2" if self.encoding == "cdr" else "CompressedVideo"
+        no_seq = f"messages with a header sequence number, which {without} does not have"
+        return Counter(self._converter.omitted) + Counter({no_seq: self._without_seq})
+
+    def channel(self, source: Channel, channel_id: int, topic: str) -> Channel:
+        """The channel for the images of another one.
+
+        Latching, QoS and the publisher's name are kept; whatever belongs to the type is the new
+        type's.
+
+        Args:
+            source: As recorded.
+            channel_id: Of the channel to make.
+            topic: Of the channel to make.
+        """
+        encoding = source.message_encoding
+        if encoding not in self._versions:
+            encoding = self.encoding
+        schema, digest = self._defined(encoding)
+        kept = {key: value for key, value in source.metadata.items() if _is_kept(key)}
+        kept[_HASHES[encoding]] = digest
+        for key in ("topic",) if encoding == "ros1" else (f"{_REMEMBERED}topic",):
+            if key in kept:  # a ROS 1 connection header may repeat it
+                kept[key] = topic
+        if encoding == "cdr" and f"{_REMEMBERED}type" in source.metadata:
+            known, md5sum = self._defined("ros1")
+            values = (known.name, md5sum, known.data.decode())
+            kept |= dict(zip((_REMEMBERED + key for key in _OF_TYPE), values, strict=True))
+        made = self._converter.channel(Channel(channel_id, topic, encoding, schema, kept))
+        if self._kind != "ffmpeg" or encoding == self.encoding:
+            return made
+        schema, digest = self._defined(self.encoding)  # the other ROS has a different type
+        return replace(
+            made, schema=schema, metadata={**made.metadata, _HASHES[self.encoding]: digest}
+        )
+
+    def _defined(self, encoding: str) -> tuple[Schema, str]:
+        """The type's definition, and its md5sum or hash."""
+        kind, version = KINDS[self._kind], self._versions[encoding]
+        text = kind.definitions.get(encoding, "")
+        schema = Schema(kind.type_name, version.schema_encoding if text else "", text.encode())
+        return _generated(schema, version)
+
+    def message(
+        self,
+        slots: Slots,
+        frame_id: str,
+        fields: Fields,
+        body: bytes | memoryview,
+        *,
+        is_key: bool = False,
+    ) -> bytes:
+        """A message.
+
+        Args:
+            slots: Stamp, the sequence number that ROS 1 has, and the presentation time of
+                packets.
+            frame_id: Coordinate frame.
+            fields: Of the image.
+            body: Its pixels, file or packet.
+            is_key: For a packet, whether decoding can begin with it.
+
+        Raises:
+            WireError: The serialization cannot represent the stamp or a number.
+        """
+        self._without_seq += slots.seq is not None and not self._has_seq
+        stamp = _wrapped(slots.stamp, signed=self.encoding == "cdr")
+        slots = Slots(stamp, slots.seq, slots.pts)
+        wire, name = _WIRES[self.encoding], KINDS[self._kind].type_name
+        return plain_message(wire, name, frame_id, fields, slots, body, flags=int(is_key))
+
+
+def _is_kept(key: str) -> bool:
+    """Whether metadata belongs to the topic, and not to the type of its messages."""
+    plain = key.removesuffix(";base64").removeprefix(_REMEMBERED)
+    return plain not in (*_OF_TYPE, HASH_KEY) and key != "topic;base64"
+
+
+def _generated(schema: Schema, version: RosVersion) -> tuple[Schema, str]:
+    store = make_store(types_of(schema, version), version)
+    if version.encoding == "ros1":
+        text, digest = store.generate_msgdef(schema.name, 1)
+        name = schema.name.replace("/msg/", "/")  # as ROS 1 spells it
+    else:
+        text, digest = store.generate_msgdef(schema.name, 2)[0], store.hash_rihs01(schema.name)
+        name = schema.name
+    return Schema(name, version.schema_encoding, text.encode()), digest
+
+
+def _wrapped(stamp: int, *, signed: bool) -> int:
+    """A stamp whose seconds have the same bits as in the other ROS."""
+    seconds, nanoseconds = divmod(stamp, NS)
+    if -(2**31) <= seconds < 2**32:
+        seconds %= 2**32
+        if signed and seconds >= 2**31:
+            seconds -= 2**32
+    return seconds * NS + nanoseconds
