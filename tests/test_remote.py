@@ -22,6 +22,7 @@ from mp4ds.errors import OptionError, PartsFailedError, RemoteError, SourceError
 from mp4ds.files.ranges import BLOCK, KEPT_BYTES, Blocks, RemoteFile
 from mp4ds.files.urls import RemotePath, location
 from mp4ds.packing.options import PackOptions
+from mp4ds.packing.packer import Packer
 from mp4ds.plugins.info import info
 from mp4ds.plugins.intrinsics import intrinsics
 from mp4ds.records import Excerpt, Message
@@ -488,16 +489,22 @@ def test_a_recording_that_changes(
     assert "00001" in going_on.ran
 
 
-def test_a_recording_that_changes_while_it_is_packed(tmp_path: Path, put: Put, stores: Any) -> None:
+def test_a_recording_that_changes_while_it_is_packed(
+    tmp_path: Path, put: Put, stores: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_bag(tmp_path / "drive.bag", scene("mono8", frames=9))
     write_bag(tmp_path / "other.bag", scene("mono8", frames=9, seed=1))
     url = put(tmp_path / "drive.bag")
+    run = Packer.run
 
-    def progress(_: object) -> None:
+    def changing(packer: Packer) -> Any:
+        made = run(packer)
         stores.put(str(tmp_path / "other.bag"), url)
+        return made
 
+    monkeypatch.setattr(Packer, "run", changing)
     with pytest.raises(SourceError, match=r"changed while it was being read"):
-        mp4ds.pack(url, tmp_path / "dataset", progress=progress)
+        mp4ds.pack(url, tmp_path / "dataset")
     assert leftovers(tmp_path) == []
 
 

@@ -18,13 +18,13 @@ Fetch = Callable[[Sequence[Range]], list[bytes]]
 KEPT_BYTES = 32 * 2**20
 """Kept per open file, for other readers of the same bytes."""
 
-BLOCK = 2**14
+BLOCK = 2**12
 """What is fetched begins and ends at multiples of this many bytes, or at the file's end."""
 
 # in blocks
 _IDLE, _KEPT = 2**20 // BLOCK, KEPT_BYTES // BLOCK
 _LEAST, _MOST = 2**17 // BLOCK, 2**22 // BLOCK  # read-ahead: at first, and after reading in order
-_FILL, _FIRST_BATCH, _BATCH = 2 * _MOST, 2**19 // BLOCK, 2**23 // BLOCK
+_FILL, _FIRST_BATCH, _BATCH = 2 * _MOST, 2**18 // BLOCK, 2**23 // BLOCK
 _GAP = 2**16 // BLOCK  # smaller gaps cost less to fetch than a second request
 
 
