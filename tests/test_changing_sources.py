@@ -79,6 +79,12 @@ def recording(kind: str, folder: Path) -> tuple[Path, Path]:
     return path, file
 
 
+@pytest.fixture(autouse=True)
+def told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pack tells of its progress after every record, however fast it is."""
+    monkeypatch.setattr("mp4ds.packing.packer._REPORT_SECONDS", 0)
+
+
 def changes_once(change: Callable[[Path], None], file: Path) -> Callable[[object], None]:
     """What changes a file when a pack first tells of its progress."""
     waiting = [change]
