@@ -225,7 +225,7 @@ def test_what_the_index_says_is_compared(
             PacketReader, "packet", lambda self, index: whole(self, index)[:-1] + b"\0"
         )
     else:
-        column = writer._ticks if fault == "tick" else writer._sizes
+        column = getattr(writer._written, f"{fault}s")
         column[1] += 1
     with pytest.raises(VideoError, match="as written"):
         writer.close()

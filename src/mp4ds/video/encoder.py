@@ -20,9 +20,8 @@ from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.encodings import MAX_SIDE, Encoding, Picture, Pixels
 from mp4ds.messages.layouts import Layout, fit
 from mp4ds.plan import Purpose
-from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import CODECS, Recipe, codecs_to_try, recipe_for
-from mp4ds.video.media import new_mp4, raise_if_scarce
+from mp4ds.video.media import TIME_BASE, new_mp4, raise_if_scarce, rate_hint
 from mp4ds.video.pixels import PictureConverter, picture_to_frame
 
 _THREADS = Path("/proc/self/task")
@@ -63,10 +62,8 @@ def _classes() -> dict[int, int]:
 
 # ---------------------------------------------------------------- encoder
 
-_TIME_BASE = Fraction(1, TIMESCALE)
 _MATRICES = {"gbr": 0, "bt709": 1, "smpte170m": 6}  # as H.273 numbers them
 _BT709 = 1  # of primaries and transfer characteristics
-_LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz, what every encoder takes
 _NARROW = 64  # columns
 _SLICE_BYTES = 10_000_000  # of samples, chroma counted whole; FFV1 takes some 14 million
 _SLICE_COUNTS = sorted({rows * n for rows in range(1, 17) for n in range(rows, 2 * rows + 1)})
@@ -124,16 +121,14 @@ class VideoEncoder:
             ) from None
 
     def _open_stream(self, threads: int, rate: float | None) -> None:
-        # the rate gives the last frame its duration: one of no ticks would be cut off
-        hint = min(max(rate or _USUAL_RATE, _LOWEST_RATE), _HIGHEST_RATE)
         stream: Any = self._container.add_stream(
             self.recipe.encoder,
-            rate=Fraction(hint).limit_denominator(1000),
+            rate=rate_hint(rate),  # a last frame of no ticks would be cut off
             options=dict(self.options),
         )
-        stream.time_base = _TIME_BASE
+        stream.time_base = TIME_BASE
         context = stream.codec_context
-        context.time_base = _TIME_BASE
+        context.time_base = TIME_BASE
         open_encoder(context, self.recipe, self.width, self.height, threads=threads)
         self._stream = stream
 
@@ -155,7 +150,7 @@ class VideoEncoder:
             full_range=self.recipe.full_range,
         )
         frame.pts = tick
-        frame.time_base = _TIME_BASE
+        frame.time_base = TIME_BASE
         frame.color_range = color_range(self.recipe)
         self._mux(self._encoded(frame))
         self.frames += 1

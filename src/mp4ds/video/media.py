@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -200,6 +201,22 @@ class _Source:
         except RemoteError:
             self._has_failed = True
             raise
+
+
+TIME_BASE = Fraction(1, TIMESCALE)
+"""Of the tracks of all mp4 files that are written."""
+
+_LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz, what every encoder takes
+
+
+def rate_hint(rate: float | None) -> Fraction:
+    """The frame rate to give to a new track: it becomes the duration of its last frame.
+
+    Args:
+        rate: Frames per second, if known.
+    """
+    hint = min(max(rate or _USUAL_RATE, _LOWEST_RATE), _HIGHEST_RATE)
+    return Fraction(hint).limit_denominator(1000)
 
 
 def new_mp4(path: Path) -> Any:

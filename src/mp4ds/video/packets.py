@@ -7,7 +7,6 @@ import struct
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,17 @@ from av.error import FFmpegError
 from mp4ds.errors import Mp4dsError, Refused, VideoError, path_text
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import CODECS
-from mp4ds.video.media import Media, new_mp4, open_input, pixel_format_of, raise_if_scarce
+from mp4ds.video.media import (
+    TIME_BASE,
+    Media,
+    new_mp4,
+    open_input,
+    pixel_format_of,
+    raise_if_scarce,
+    rate_hint,
+)
 from mp4ds.video.mp4 import SampleEntry, read_sample_entry
 
-_TIME_BASE = Fraction(1, TIMESCALE)
-_LOWEST_RATE, _USUAL_RATE, _HIGHEST_RATE = 0.1, 30.0, 240.0  # Hz
 _IVF = {"av1": b"AV01", "vp9": b"VP90"}
 
 
@@ -55,18 +60,16 @@ class PacketWriter:
         self.width, self.height = width, height
         self._path = path
         self._parameters = parameters
-        rate = min(max(rate or _USUAL_RATE, _LOWEST_RATE), _HIGHEST_RATE)
-        self._rate = Fraction(rate).limit_denominator(1000)
+        self._rate = rate_hint(rate)
         self._container: Any = None
         self._stream: Any = None
-        self._ticks = array("q")
-        self._sizes = array("q")
+        self._written = _Written()
         self._first = self._last = b""
 
     @property
     def frames(self) -> int:
         """Packets written."""
-        return len(self._ticks)
+        return len(self._written.ticks)
 
     def write(self, body: bytes | memoryview, tick: int, *, keyframe: bool) -> None:
         """Write the next packet.
@@ -83,13 +86,12 @@ class PacketWriter:
         plain = self._parser.plain(body)
         if self._container is None:
             self.begin(body)
-        if not self._ticks:
+        if not self.frames:
             self._first = plain
         duration = round(TIMESCALE / self._rate)
         packet = _packet_at(plain, self._stream, tick, duration, is_key=keyframe)
         self._container.mux(packet)
-        self._ticks.append(tick)
-        self._sizes.append(len(plain))
+        self._written.add(tick, len(plain), is_key=keyframe)
         self._last = plain
 
     def begin(self, body: bytes | memoryview) -> None:
@@ -115,7 +117,7 @@ class PacketWriter:
                     raise Refused("its first picture cannot be decoded")
                 self._container = new_mp4(self._path)
                 self._stream = self._container.add_stream_from_template(template, opaque=True)
-        self._stream.time_base = _TIME_BASE
+        self._stream.time_base = TIME_BASE
 
     def close(self) -> None:
         """Finish the file and compare its index with what was written.
@@ -124,14 +126,14 @@ class PacketWriter:
             VideoError: The file does not hold every packet as it was written.
             OSError: It cannot be written.
         """
-        if not self._ticks:
+        if not self.frames:
             self.abandon()
             return
         self._container.close()
         with PacketReader(self._path, codec=self.codec, frames=self.frames) as reader:
-            same = reader.ticks == self._ticks and reader.sizes == self._sizes
+            is_same = self._written.is_in(reader)
             for index, plain in ((0, self._first), (self.frames - 1, self._last)):
-                if not same or self._parser.body(reader.packet(index), None) != plain:
+                if not is_same or self._parser.body(reader.packet(index), None) != plain:
                     raise VideoError(
                         "decode-failed", self._path, "does not hold the packets as written"
                     )
@@ -402,14 +404,14 @@ def _write(
     Returns:
         The number of frames.
     """
-    entry = _common_entry(segments)
+    entry, written = _common_entry(segments), _Written()
     try:
         with closing(Media(segments[0])) as source, closing(new_mp4(target)) as container:
-            written = _Written(source.track.codec_context.codec.canonical_name)
+            codec = source.track.codec_context.codec.canonical_name
             stream = _new_stream(container, source.track, entry)
             try:
                 for segment in segments:
-                    with PacketReader(segment, codec=written.codec) as reader:
+                    with PacketReader(segment, codec=codec) as reader:
                         _copy(reader, numbers, ticks, container, stream, duration, written)
                 if next(ticks, None) is not None:
                     raise VideoError(
@@ -422,7 +424,7 @@ def _write(
                 raise
             with _damage_told(target, "cannot be completed"):
                 container.close()
-        written.check(target, entry)
+        _check(target, codec, written, entry)
     except BaseException:
         target.unlink(missing_ok=True)
         raise
@@ -430,10 +432,9 @@ def _write(
 
 
 class _Written:
-    """The expected index of the new file."""
+    """The expected index of a new file."""
 
-    def __init__(self, codec: str) -> None:
-        self.codec = codec
+    def __init__(self) -> None:
         self.ticks, self.sizes = array("q"), array("q")
         self.keyframes = bytearray()
 
@@ -443,28 +444,25 @@ class _Written:
         self.sizes.append(size)
         self.keyframes.append(is_key)
 
-    def check(self, path: Path, entry: SampleEntry) -> None:
-        """Compare it with the file.
+    def is_in(self, reader: PacketReader) -> bool:
+        """Whether a file has that index."""
+        found = reader.ticks, reader.sizes, reader.keyframes
+        return found == (self.ticks, self.sizes, self.keyframes)
 
-        Raises:
-            VideoError: They differ.
-        """
-        if not self._is_in(path):
-            raise VideoError(
-                "decode-failed", path, "would not hold the packets unchanged: one is damaged"
-            )
-        if difference := entry.differences(read_sample_entry(path)):
-            raise VideoError(
-                "decode-failed", path, f"differs from the segments it was made of in {difference}"
-            )
 
-    def _is_in(self, path: Path) -> bool:
-        try:
-            with PacketReader(path, codec=self.codec, frames=len(self.ticks)) as reader:
-                found = (reader.ticks, reader.sizes, reader.keyframes)
-                return found == (self.ticks, self.sizes, self.keyframes)
-        except VideoError:
-            return False  # the muxer continues after some damages, and the index is wrong then
+def _check(path: Path, codec: str, written: _Written, entry: SampleEntry) -> None:
+    """Compare a file with what was written, and with the segments' description."""
+    try:
+        with PacketReader(path, codec=codec, frames=len(written.ticks)) as reader:
+            is_whole = written.is_in(reader)
+    except VideoError:
+        is_whole = False  # the muxer continues after some damages, and the index is wrong then
+    if not is_whole:
+        problem = "would not hold the packets unchanged: one is damaged"
+        raise VideoError("decode-failed", path, problem)
+    if difference := entry.differences(read_sample_entry(path)):
+        problem = f"differs from the segments it was made of in {difference}"
+        raise VideoError("decode-failed", path, problem)
 
 
 def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
@@ -474,7 +472,7 @@ def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
     packets that the segment's track does not state.
     """
     stream = container.add_stream_from_template(template, opaque=True)
-    stream.time_base = _TIME_BASE
+    stream.time_base = TIME_BASE
     stream.codec_context.bit_rate = 0
     stream.codec_context.sample_aspect_ratio = entry.aspect_ratio
     return stream
@@ -522,7 +520,7 @@ def _packet_at(data: bytes, stream: Any, tick: int, duration: int, *, is_key: bo
     packet = av.Packet(len(data))  # padded, since parsers read on
     packet.update(data)
     packet.stream = stream
-    packet.time_base = _TIME_BASE
+    packet.time_base = TIME_BASE
     packet.pts = packet.dts = tick
     packet.duration = duration
     packet.is_keyframe = is_key
