@@ -222,3 +222,11 @@ def _yuv(encoding: str, colour: NDArray[np.float64]) -> NDArray[np.uint8]:
         return np.vstack([luma, pairs.reshape(-1, width)])
     order = (luma, chroma.reshape(height, width))
     return np.stack(order if encoding in ("yuyv", "yuv422_yuy2") else order[::-1], axis=-1)
+
+
+def blocks(picture: NDArray[Any]) -> NDArray[np.float64]:
+    """Mean colours of a grid of 8 x 6 blocks."""
+    height, width = picture.shape[0] // 6, picture.shape[1] // 8
+    part = picture[: 6 * height, : 8 * width].astype(float)
+    means: NDArray[np.float64] = part.reshape(6, height, 8, width, 3).mean(axis=(1, 3))
+    return means

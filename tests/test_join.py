@@ -24,8 +24,8 @@ from mp4ds.video.codecs import Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.mp4 import read_sample_entry
 from mp4ds.video.packets import PacketReader, PacketWriter, join_segments
+from pictures import blocks as means_of_blocks
 from test_packets import write as write_packets
-from test_players import blocks as means_of_blocks
 from test_video import LOSSLESS, LOSSY, decode, encode, noise, same, scene_pictures, video_decoder
 
 GOP = 4

@@ -24,7 +24,7 @@ from chromium import Tab, played, video_player
 from coded_scenes import CODED
 from definitions import PICTURES
 from mp4ds.packing.options import PackOptions
-from pictures import CAREFUL
+from pictures import CAREFUL, blocks
 from scenes import Record, Scene
 from sources import SOURCES, scene
 from test_video import video_decoder
@@ -315,14 +315,6 @@ def test_ffmpeg_shows_the_same_colours(name: str, datasets: Datasets) -> None:
         apart = np.abs(frame.astype(int) - picture)
         assert apart.max() <= most
         assert apart.mean() < mean
-
-
-def blocks(picture: NDArray[Any]) -> NDArray[np.float64]:
-    """Mean colours of a grid of 8 x 6 blocks."""
-    height, width = picture.shape[0] // 6, picture.shape[1] // 8
-    part = picture[: 6 * height, : 8 * width].astype(float)
-    means: NDArray[np.float64] = part.reshape(6, height, 8, width, 3).mean(axis=(1, 3))
-    return means
 
 
 # ---------------------------------------------------------------- PyAV
