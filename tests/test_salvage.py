@@ -854,6 +854,18 @@ def test_what_is_asked_apart_changes_no_losses(intact: Intact, tmp_path: Path) -
         assert list(reader.losses) == losses
 
 
+def test_two_readings_at_a_time_are_not_mixed(intact: Intact, tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    path.write_bytes(intact("mcap-zstd")[0])
+    with open_sources([path], salvage=True) as reader:
+        first = reader.records()
+        next(first)
+        whole = len(list(reader.records()))
+        assert whole > 20
+        with pytest.raises(RuntimeError, match="salvaged once at a time"):
+            list(first)
+
+
 def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     write_mcap(path, scene("mono8", frames=1500, width=160, height=120, noisy=False))
