@@ -43,7 +43,7 @@ def test_mutated_files_keep_the_rules(kinds: dict[str, Any], tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("broken", "rule"),
     [
-        (("mp4ds.bags.salvage.ros1.Ros1Salvage._pass", lambda *_: iter(())), "salvage"),
+        (("mp4ds.bags.salvage.ros1.Ros1Salvage._scanned", lambda *_: iter(())), "salvage"),
         (("mp4ds.validate", lambda *_, deep=False: [] if deep else ["?"]), "deep does not find"),
         (("mp4ds.unpack", lambda *_: None), "what was packed is not unpacked"),
     ],
