@@ -27,7 +27,7 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
-from commands import call, program, start
+from commands import call, start
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.format.models import Calibration
 from mp4ds.plugins.reporting.cameras import (
@@ -691,20 +691,3 @@ def test_serving_until_interrupted(copy: Path) -> None:
     finally:
         process.kill()
         process.communicate()
-
-
-@pytest.mark.slow
-def test_the_commands_of_its_page(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "report.md").read_text()
-    lines = [
-        line.replace("demo demo.mcap", "demo demo.mcap --seconds 1.7")
-        for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
-        for line in block.splitlines()
-    ]
-    assert len(lines) == 8
-    program("bash", "-ec", "\n".join(lines), cwd=tmp_path)
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    shown = program("-c", code, cwd=tmp_path)
-    assert re.search(r"index\.html \[\('/left/image_raw', '(video|nothing)'\), \(", shown.out)
-    for name in ("still.png", "sheet.jpg", "mosaic.png", "page/index.html"):
-        assert (tmp_path / name).stat().st_size > 1000

@@ -1,4 +1,4 @@
-"""Tutorials, exporting.md and hub.md: each command and snippet in order, and what it prints.
+"""Tutorials, and pages like them: each command and snippet in order, and what it prints.
 
 A page has blocks. ``sh`` and ``python`` are run; a command that is to fail says so behind it
 (``# exit code 2``). ``text`` right after a block is what this prints, of which numbers may differ
@@ -27,7 +27,7 @@ from test_examples import ROOT
 
 DOCS = ROOT / "docs"
 PAGES = sorted((DOCS / "tutorials").glob("*.md"))
-OTHERS = [DOCS / "exporting.md", DOCS / "hub.md"]
+OTHERS = [DOCS / f"{name}.md" for name in ("exporting", "hub", "report")]
 NEEDS = {"--ros2": "cyclonedds", "mp4ds.torch": "torch"}
 """What a line needs beside the package -> the module of it; the page is skipped without."""
 
