@@ -360,8 +360,6 @@ class McapWriter(BagWriter):
         OSError: It cannot be written.
     """
 
-    format = "mcap"
-
     def __init__(
         self,
         path: Path,

@@ -238,8 +238,6 @@ class BagWriter(ABC):
     caller removes what is left. What the format cannot hold is counted.
     """
 
-    format: str
-
     def __init__(self) -> None:
         self._omitted: Counter[str] = Counter()
 
@@ -340,9 +338,6 @@ class HoldBack:
         self._heap: list[tuple[int, int, int, Message]] = []
         self._added = 0
         self._bytes = 0
-
-    def __len__(self) -> int:
-        return len(self._heap)
 
     def add(self, message: Message, place: int = 0) -> None:
         """Add a message.

@@ -40,8 +40,6 @@ class Ros1Writer(BagWriter):
         OSError: It cannot be written.
     """
 
-    format = "bag"
-
     def __init__(self, path: Path, compression: Literal["none", "bz2", "lz4"] = "none") -> None:
         if compression not in _COMPRESSORS:
             raise OptionError(f"compression {compression!r} is not known. Use none, bz2 or lz4.")

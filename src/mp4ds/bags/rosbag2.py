@@ -345,8 +345,6 @@ class Rosbag2Writer(BagWriter):
         OSError: It cannot be written.
     """
 
-    format = "rosbag2"
-
     def __init__(
         self,
         folder: Path,
