@@ -129,7 +129,7 @@ def merged(one: Recording, other: Recording) -> dict[Key, Columns]:
     result = {}
     for key, parts in groups.items():
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        order = np.lexsort((columns[0], columns[1]))
+        order = np.lexsort((columns[0], columns[1]))  # its last key is the first to count
         result[key] = [column[order] for column in columns]
     return result
 

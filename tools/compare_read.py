@@ -181,6 +181,7 @@ def _bag_channel(header: Header, data: bytes) -> Channel:
     text = {key: value.decode("utf-8", "surrogateescape") for key, value in fields.items()}
     topic = header["topic"].decode("utf-8", "surrogateescape")
     metadata = {key: value for key, value in text.items() if key not in ROS1_FORMAT}
+    # a filter may have renamed the topic: then the publisher's own header has the old name
     if text.get("topic", topic) != topic:
         metadata["topic"] = text["topic"]
     definition = ("ros1msg", fields["message_definition"])
@@ -272,7 +273,7 @@ def _sqlite_channel(row: Mapping[str, Any], database: sqlite3.Connection, define
 
 def _read_folder(path: Path, recording: Recording) -> None:
     recording.folder = True
-    metadata = path / "metadata.yaml"
+    metadata = path / "metadata.yaml"  # a recorder that was killed leaves none
     if not metadata.is_file():
         files = [p for p in path.iterdir() if p.suffix in (".db3", ".mcap")]
         recording.notes.append(f"{path}: no metadata.yaml; files were read in the order of names")

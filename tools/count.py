@@ -103,6 +103,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         packed(Path(name), 0.1)  # what is imported once
         long, short = packed(Path(name), 3.0), packed(Path(name), 2.0)
+        # what one image costs is what a longer recording calls more often
         more = sorted(module for module in long if long[module] > short[module])
         print(f"{len(more):6} modules for one more image in pack: {' '.join(more)}")
         with mp4ds.open(Path(name) / "3.0") as dataset:
