@@ -6,6 +6,7 @@ Exit codes: 0 success; 1 failure, or problems were found; 2 wrong input or optio
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from importlib import import_module
 from typing import Any, NoReturn
@@ -101,4 +102,7 @@ def commands(context: click.Context, version: bool, verbose: bool) -> None:
 def main() -> NoReturn:
     """Run the command line and exit."""
     prepare_process()
-    sys.exit(exit_code_of(lambda: commands.main(sys.argv[1:])))
+    code = exit_code_of(lambda: commands.main(sys.argv[1:]))
+    # all is cleaned up: one more Ctrl-C while Python ends its threads would print a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    sys.exit(code)
