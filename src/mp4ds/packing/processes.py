@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
@@ -94,7 +94,7 @@ class _Call:
     is_again: bool = False
 
 
-class ProcessExecutor(ThreadPoolExecutor):
+class ProcessExecutor(Executor):
     """Runs calls in processes of its own, each of them one call at a time, waited for by a thread.
 
     Other than of a `ProcessPoolExecutor`, its processes do not import the caller's main module,
@@ -109,53 +109,55 @@ class ProcessExecutor(ThreadPoolExecutor):
     """
 
     def __init__(self, processes: int, *, nice: int = 0) -> None:
-        super().__init__(processes)
-        self._nice = nice
-        self._is_ended = False
-        self._own = threading.local()  # the process of a thread
+        self._most, self._nice = processes, nice
+        self._is_closed = self._is_ended = False
+        self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()  # None ends a thread
+        self._threads: list[threading.Thread] = []
         self._processes: set[_Process] = set()
 
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Make a call in a process, of a function that can be pickled."""
+        if self._is_closed:
+            raise RuntimeError("no more calls after shutdown")
         call = _Call(Future(), pickle.dumps(fn), pickle.dumps((args, kwargs)))
-        self._hand_out(call)
+        self._calls.put(call)
+        if len(self._threads) < self._most:
+            # a daemon, unlike those of a ThreadPoolExecutor: a process that is interrupted again
+            # while it ends its calls waits for none of them
+            thread = threading.Thread(target=self._work, daemon=True)
+            self._threads.append(thread)
+            thread.start()
         return call.future
 
-    def _hand_out(self, call: _Call) -> None:
-        turn = super().submit(self._make, call)
-        turn.add_done_callback(lambda turn: turn.cancelled() and call.future.cancel())
+    def _work(self) -> None:
+        """Make calls, one after another; in a thread."""
+        process: _Process | None = None
+        while (call := self._calls.get()) is not None:
+            if not call.is_again and not call.future.set_running_or_notify_cancel():
+                continue
+            try:
+                if process is None or not process.is_ready:
+                    process = self._in_place_of(process)
+            except OSError as error:
+                call.future.set_exception(error)
+                continue
+            answer = process.make(call)
+            if not isinstance(answer, BaseException):
+                call.future.set_result(answer)
+            elif process.was_killed and not call.is_again and not self._is_closed:
+                call.is_again = True
+                self._calls.put(call)
+            else:
+                call.future.set_exception(answer)
 
-    def _make(self, call: _Call) -> None:
-        """Make a call; in a thread."""
-        if not call.is_again and not call.future.set_running_or_notify_cancel():
-            return
-        try:
-            process = self._ready()
-        except OSError as error:
-            call.future.set_exception(error)
-            return
-        answer = process.make(call)
-        if not isinstance(answer, BaseException):
-            call.future.set_result(answer)
-            return
-        if process.was_killed and not call.is_again:
-            call.is_again = True
-            with suppress(RuntimeError):  # it takes no more calls
-                self._hand_out(call)
-                return
-        call.future.set_exception(answer)
-
-    def _ready(self) -> _Process:
-        """The process of this thread."""
-        process: _Process | None = getattr(self._own, "process", None)
-        if process is None or not process.is_ready:
-            if process is not None:
-                self._processes.discard(process)
-                process.close()
-            process = self._own.process = _Process(self._nice)
-            self._processes.add(process)
-            if self._is_ended:
-                process.terminate()
+    def _in_place_of(self, old: _Process | None) -> _Process:
+        if old is not None:
+            self._processes.discard(old)
+            old.close()
+        process = _Process(self._nice)
+        self._processes.add(process)
+        if self._is_ended:
+            process.terminate()
         return process
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -165,15 +167,22 @@ class ProcessExecutor(ThreadPoolExecutor):
             wait: Wait for those that were taken.
             cancel_futures: Drop those that are waiting, and end those that are running.
         """
-        super().shutdown(wait=False, cancel_futures=cancel_futures)
+        self._is_closed = True
         if cancel_futures:
             self._is_ended = True
+            with suppress(queue.Empty):
+                while True:
+                    if call := self._calls.get_nowait():
+                        call.future.cancel()
             ended = list(self._processes)
             for process in ended:
                 process.terminate()
             for process in ended:
                 process.wait_or_kill()
-        super().shutdown(wait=wait)
+        for _ in self._threads:
+            self._calls.put(None)
+        for thread in self._threads if wait else ():
+            thread.join()
         while wait and self._processes:
             self._processes.pop().close()
 
