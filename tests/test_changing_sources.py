@@ -79,12 +79,6 @@ def recording(kind: str, folder: Path) -> tuple[Path, Path]:
     return path, file
 
 
-@pytest.fixture(autouse=True)
-def told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pack tells of its progress after every record, however fast it is."""
-    monkeypatch.setattr("mp4ds.packing.packer._REPORT_SECONDS", 0)
-
-
 def changes_once(change: Callable[[Path], None], file: Path) -> Callable[[object], None]:
     """What changes a file when a pack first tells of its progress."""
     waiting = [change]
@@ -108,14 +102,13 @@ CASES = [
 @pytest.mark.parametrize(("kind", "change"), CASES)
 @pytest.mark.parametrize("salvage", [False, True])
 def test_a_source_that_changes_while_it_is_packed(
-    kind: str, change: str, salvage: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, change: str, salvage: bool, tmp_path: Path
 ) -> None:
     if salvage and kind == "images":
         pytest.skip("images are not salvaged")
     path, file = recording(kind, tmp_path / "source")
     images = mp4ds.ImageFolder() if kind == "images" else None
     options = mp4ds.PackOptions(images=images, codec="ffv1", salvage=salvage)
-    monkeypatch.setattr("mp4ds.packing.packer._REPORT_SECONDS", 0.0)
     progress = changes_once(CHANGES[change], file)
     with pytest.raises(SourceError, match="changed while it was being read"):
         mp4ds.pack(path, tmp_path / "dataset", options, progress=progress)

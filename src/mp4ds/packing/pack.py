@@ -7,6 +7,7 @@ machines, which are kept until all are done, and then put together.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -105,13 +106,18 @@ def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> 
         for topic, own in by_topic(cameras).items()
     }
 
+    next_report = 0.0
+
     def progress(part: PartRecord, *, done: bool = False) -> None:
-        if is_slice:
-            share = sum(topic.messages for topic in part.topics.values()) / max(1, due)
-        else:
+        nonlocal next_report
+        if not is_slice:  # close behind the reader: a store's bytes are kept for a moment only
             hasher.advance(reader.position)
+        now = time.monotonic()
+        if report is not None and (done or now >= next_report):
+            next_report = now + _REPORT_SECONDS
             share = reader.position / max(1, total)
-        if report is not None:
+            if is_slice:
+                share = sum(topic.messages for topic in part.topics.values()) / max(1, due)
             state = PackProgress(
                 dataset=parted.target,
                 phase="packing",
@@ -144,6 +150,7 @@ def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> 
 # ---------------------------------------------------------------- pack
 
 _USUAL = PackOptions()
+_REPORT_SECONDS = 0.2
 
 
 def pack(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -60,7 +59,6 @@ NOT_SURVEYED = (
 
 # ---------------------------------------------------------------- threads
 
-_REPORT_SECONDS = 0.2
 _AHEAD = 2  # jobs of a thread that may wait: each holds an image
 
 
@@ -449,7 +447,7 @@ class Packer:
         plan: How.
         piece: What.
         exact: Streams that must be lossless although a score is asked for, and why.
-        progress: Called several times a second with what was packed so far.
+        progress: Called after each record with what was packed so far.
 
     Attributes:
         part: What was packed so far.
@@ -511,7 +509,7 @@ class Packer:
         return part
 
     def _read(self) -> None:
-        part, next_time = self.part, time.monotonic() + _REPORT_SECONDS
+        part = self.part
         with StreamThreads(self.plan.workers if self.plan.workers > 1 else 0) as self.threads:
             for record in self.reader.records(self._excerpt):
                 if isinstance(record, Message):
@@ -520,9 +518,7 @@ class Packer:
                     self._verbatim.add_attachment(record)
                 else:
                     self._verbatim.add_metadata(record)
-                if time.monotonic() >= next_time:
-                    self._progress(part)
-                    next_time = time.monotonic() + _REPORT_SECONDS
+                self._progress(part)
             for camera in self._cameras.values():
                 camera.settle()
         if self._excerpt.others:
