@@ -620,11 +620,11 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "to-empty": (("unpack", "DATASET", "--to", "", "-o", "OUT"), "bag, rosbag2, mcap"),
     "storage": (
         ("unpack", "DATASET", "--to", "rosbag2", "--storage", "zip", "-o", "OUT"),
-        "sqlite3 or mcap",
+        "sqlite3, mcap",
     ),
     "image-format": (
         ("unpack", "DATASET", "--to", "images", "--image-format", "gif", "-o", "OUT"),
-        "png or jpeg",
+        "png, jpeg",
     ),
     "unpack-topics": (("unpack", "DATASET", "--to", "bag", "-o", "OUT", "-t", "/no"), "/imu"),
     "unpack-exclude": (("unpack", "DATASET", "--to", "bag", "-o", "OUT", "-x", "/no"), "/imu"),
