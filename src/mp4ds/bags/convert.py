@@ -28,7 +28,6 @@ from mp4ds.bags.types import (
     incomprehensible,
     make_store,
     ros1_version,
-    ros2_store,
     ros2_version,
     same_wire,
     shapes_of,
@@ -99,17 +98,15 @@ class Converter:
 
     Args:
         target: ``ros1``, ``ros2``, or None to convert nothing.
-        distribution: The distribution of ROS 2 whose standard types are used.
 
     Raises:
-        OptionError: The target or the distribution is not known.
+        OptionError: The target is not known.
     """
 
-    def __init__(self, target: str | None, *, distribution: str = "humble") -> None:
+    def __init__(self, target: str | None) -> None:
         if target not in ("ros1", "ros2", None):
             raise OptionError(f"Messages cannot be converted to {target!r}. Use ros1 or ros2.")
-        ros2_store(distribution)  # is known
-        self._to, self._distribution = target, distribution
+        self._to = target
         self._plans: dict[Schema, _Plan] = {}
         self._omitted: Counter[str] = Counter()
 
@@ -120,7 +117,7 @@ class Converter:
 
     @cached_property
     def _ros2(self) -> RosVersion:
-        return ros2_version(self._distribution)
+        return ros2_version()
 
     @property
     def _source(self) -> RosVersion:
@@ -373,7 +370,6 @@ Raises:
     WireError: The payload is not of its channel's type.
 """
 
-_DISTRIBUTION = "humble"  # its standard types replace definitions that were not recorded
 _ADVICE = "use its raw bytes instead, `RecordedMessage.raw`"
 
 
@@ -404,7 +400,7 @@ def _ros(channel: Channel) -> Decoder:
     if schema is None or not schema.name:
         raise _undecodable(channel, "its message type is not known")
     is_ros1 = channel.message_encoding == "ros1"
-    version = ros1_version() if is_ros1 else ros2_version(_DISTRIBUTION)
+    version = ros1_version() if is_ros1 else ros2_version()
     try:
         types = types_of(schema, version)
         if has_empty_items(types, sizes_of(types)):

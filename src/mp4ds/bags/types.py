@@ -23,7 +23,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores import empty
 
-from mp4ds.errors import OptionError, Refused
+from mp4ds.errors import Refused
 from mp4ds.records import Schema
 
 if TYPE_CHECKING:
@@ -299,30 +299,12 @@ def ros1_version() -> RosVersion:
     return RosVersion("ros1", "ros1msg", standard)
 
 
-def ros2_version(distribution: str) -> RosVersion:
-    """ROS 2 with the types of a distribution, such as ``humble``.
-
-    Raises:
-        OptionError: The distribution is not known.
-    """
-    store = ros2_store(distribution)
+def ros2_version(distribution: str = "humble") -> RosVersion:
+    """ROS 2 with the types of a distribution, for definitions that were not recorded."""
     # including later types: a recording without definitions may have them
     latest = get_typestore(Stores.LATEST).fielddefs
-    standard = {**latest, **get_typestore(store).fielddefs}
+    standard = {**latest, **get_typestore(Stores(f"ros2_{distribution}")).fielddefs}
     return RosVersion("cdr", "ros2msg", standard)
-
-
-def ros2_store(distribution: str) -> Stores:
-    """What rosbags calls a distribution of ROS 2.
-
-    Raises:
-        OptionError: It is not known.
-    """
-    known = {store.value[5:]: store for store in Stores if store.value.startswith("ros2_")}
-    if distribution not in known:
-        names = ", ".join(known)
-        raise OptionError(f"ROS 2 distribution {distribution!r} is not known. Use {names}.")
-    return known[distribution]
 
 
 def name_of(schema: Schema) -> str:

@@ -425,7 +425,6 @@ def _refers(stream: Stream) -> bool:
 
 # ---------------------------------------------------------------- types
 
-_DISTRIBUTION = "humble"
 _WIRES = {"ros1": "ros1", "cdr": "cdr-le"}
 _HASHES = {"ros1": "md5sum", "cdr": HASH_KEY}
 _DEFINITION = "message_definition"
@@ -444,7 +443,7 @@ class Types:
     def __init__(self, encoding: str, kind: str) -> None:
         self.encoding = encoding
         self._kind = kind
-        self._versions = {"ros1": ros1_version(), "cdr": ros2_version(_DISTRIBUTION)}
+        self._versions = {"ros1": ros1_version(), "cdr": ros2_version()}
         self._converter = Converter({"ros1": "ros1", "cdr": "ros2"}[encoding])
         self._has_seq = encoding == "ros1" and kind != "compressed-video"
         self._without_seq = 0

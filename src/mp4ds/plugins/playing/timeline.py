@@ -351,7 +351,6 @@ class _Part:
 
 # ---------------------------------------------------------------- stamps
 
-_DISTRIBUTION = "humble"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _POSE = 7 * 8  # bytes: a translation and a quaternion of doubles
 _ENCAPSULATION = 4
@@ -408,7 +407,7 @@ def _stamped(channel: Channel) -> str:
     if name in _TRANSFORMS:
         return name
     is_ros1 = channel.message_encoding == "ros1"
-    version = ros1_version() if is_ros1 else ros2_version(_DISTRIBUTION)
+    version = ros1_version() if is_ros1 else ros2_version()
     try:
         fields = fields_of(types_of(schema, version), name)
         is_first = fields and field_shape(fields[0][1]) == FieldShape("", HEADER, 0, None, None)
