@@ -430,7 +430,7 @@ def test_qos_that_hears_all_publishers() -> None:
         ([latched, latched], True, True),
         ([latched, reliable], True, False),
     ):
-        asked = asked_qos(offered, 100)
+        asked = asked_qos(offered)
         assert (asked.is_reliable, asked.is_latched, asked.depth) == (is_reliable, is_latched, 100)
 
 

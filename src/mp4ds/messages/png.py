@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -480,7 +479,7 @@ def rebuild(pixels: Pixels, recipe: PngRecipe) -> bytes:
     try:
         before, after = (base64.b64decode(text) for text in (recipe.before, recipe.after))
         deflated = bytes.fromhex(recipe.zlib_header) + _deflate(rows, recipe)
-    except (ValueError, binascii.Error, zlib.error, OverflowError):
+    except (ValueError, zlib.error, OverflowError):
         raise Refused("its PNG recipe holds unknown values") from None
     size = recipe.chunk_bytes or len(deflated)
     chunks = (

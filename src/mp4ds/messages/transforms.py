@@ -226,15 +226,13 @@ class TransformCollector:
     """The static transforms of a recording: the latest of each child frame.
 
     A convenience copy of what is stored verbatim: messages that do not parse and transforms that
-    tf2 would refuse are left out, and so are child frames beyond the limit.
+    tf2 would refuse are left out, and so are child frames beyond `MAX_TRANSFORMS`.
 
     Args:
         known: Those of earlier messages, in order.
-        limit: Maximum number of child frames.
     """
 
-    def __init__(self, known: Iterable[Transform] = (), *, limit: int = MAX_TRANSFORMS) -> None:
-        self._limit = limit
+    def __init__(self, known: Iterable[Transform] = ()) -> None:
         self._latest: dict[str, Transform] = {}
         self._parsers: dict[tuple[str, Schema | None], Parser | None] = {}
         self._take(known)
@@ -259,7 +257,8 @@ class TransformCollector:
     def _take(self, transforms: Iterable[Transform]) -> None:
         for transform in transforms:
             child = _name(transform.child)
-            if transform.is_usable and (child in self._latest or len(self._latest) < self._limit):
+            has_room = child in self._latest or len(self._latest) < MAX_TRANSFORMS
+            if transform.is_usable and has_room:
                 self._latest[child] = transform
 
     def _parser(self, channel: Channel) -> Parser | None:

@@ -340,7 +340,7 @@ class PartsFolder:
 
     def remove(self) -> None:
         """Remove all that is made here."""
-        with suppress(OSError, TargetError):
+        with suppress(OSError):
             self.clear()
             (self.path / "lock").unlink(missing_ok=True)
             self.path.rmdir()

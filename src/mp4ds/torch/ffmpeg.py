@@ -16,11 +16,8 @@ from mp4ds.errors import Mp4dsError, OptionError
 _NAME = re.compile(r"(lib(?:av|sw)[a-z]+)-[0-9a-f]+(\.so\.[0-9]+)[0-9.]*")
 
 
-def link_libraries(folder: Path | None = None) -> Path:
-    """Make a folder in which PyAV's libraries have their usual names.
-
-    Args:
-        folder: Where; None for one in the user's cache.
+def link_libraries() -> Path:
+    """Make a folder in the user's cache in which PyAV's libraries have their usual names.
 
     Returns:
         The folder, for ``LD_LIBRARY_PATH``.
@@ -32,9 +29,8 @@ def link_libraries(folder: Path | None = None) -> Path:
     names = {part.name: Path(str(part.locate())).resolve() for part in parts}
     if not names:
         raise OptionError("This PyAV does not bundle shared libraries (.so).")
-    if folder is None:
-        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(cache) / "mp4ds" / f"ffmpeg-av{version('av')}"
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(cache) / "mp4ds" / f"ffmpeg-av{version('av')}"
     folder.mkdir(parents=True, exist_ok=True)
     for name, path in names.items():
         match = _NAME.fullmatch(name)

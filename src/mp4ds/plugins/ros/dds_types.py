@@ -254,7 +254,7 @@ def announced_definition(kind: Any, type_hash: str) -> str:
     """
     try:
         texts = dict(_structures(kind))
-    except (Refused, AttributeError, TypeError, ValueError):
+    except (AttributeError, TypeError, ValueError):
         return ""
     return described_definition(texts, next(iter(texts)), type_hash)
 

@@ -16,6 +16,7 @@ from mp4ds.records import QOS_KEY, Channel
 
 _NS = 10**9
 _MAX_DEPTH = 2**31 - 1
+_RECEIVED = 100  # depth of a subscription: messages are taken out at once
 _INFINITE_SECONDS = 2**31 - 1  # the smallest of the values that middlewares use for infinity
 _INFINITE = {"sec": 2**63 // _NS, "nsec": 2**63 % _NS - 1}
 _NAMES = {
@@ -104,15 +105,14 @@ def _as_subscribers_see(qos: Qos) -> Qos:
     )
 
 
-def asked_qos(profiles: Sequence[Qos], depth: int) -> Qos:
+def asked_qos(profiles: Sequence[Qos]) -> Qos:
     """The QoS that matches all publishers, chosen as rosbag2 does; the default if there are none.
 
     Args:
         profiles: What the publishers offer.
-        depth: Depth of the subscription.
     """
     return Qos(
-        depth=depth,
+        depth=_RECEIVED,
         reliability="reliable" if all(one.is_reliable for one in profiles) else "best_effort",
         durability="transient_local"
         if profiles and all(one.is_latched for one in profiles)

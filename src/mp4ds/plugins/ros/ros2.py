@@ -29,8 +29,6 @@ from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, asked_qos, offered_qos, qos_te
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
-RECEIVED = 100
-"""Depth of subscriptions: messages are taken out at once."""
 
 _NS = 10**9
 _LITTLE = b"\0\1\0\0"
@@ -195,7 +193,7 @@ class Ros2Node(Node):
         while not self._ended.wait(_LOOK_S):
             for kind in {*self._kinds_of(topic)} - known:
                 known.add(kind)
-                asked = asked_qos(self._announced(topic, kind)[0], RECEIVED)
+                asked = asked_qos(self._announced(topic, kind)[0])
                 qos = replace(asked, durability="volatile")  # no message of the past
                 try:
                     self._read(topic, kind, qos, lambda *_: on_message(None))
@@ -208,7 +206,7 @@ class Ros2Node(Node):
         schema = Schema(kind, _ENCODING if definition else "", definition.encode())
         metadata = {QOS_KEY: qos_text(offered), **({HASH_KEY: type_hash} if type_hash else {})}
         channel = Channel(len(self._received), name, "cdr", schema, metadata)
-        qos = self._options.overrides.get(topic) or asked_qos(offered, RECEIVED)
+        qos = self._options.overrides.get(topic) or asked_qos(offered)
         try:
             self._received[topic] = self._read(topic, kind, qos, partial(receive, channel))
         except ConversionError as error:
