@@ -100,7 +100,7 @@ REACHED = {
     "pages": {("00000", "nothing"), ("00001", "mp4"), ("00001", "yaml"), ("joined", "yaml")},
     "files": {
         ("00000", "nothing"),
-        ("00001", "part.json"),
+        ("00001", "yaml"),
         ("joined", "nothing"),
         ("joined", "yaml"),
     },
@@ -110,7 +110,7 @@ REACHED = {
 
 def _state(work: Path) -> str:
     """The last file, in the order of their making, of which something was written."""
-    order = ["plan.json", "mp4", "messages.mcap", "yaml", "part.json", "dataset.yaml"]
+    order = ["plan.json", "part.json", "mp4", "messages.mcap", "yaml", "dataset.yaml"]
     found = {path.name for path in work.rglob("*") if path.is_file() and path.stat().st_size}
     kinds = {name if name in order else name.rpartition(".")[2] for name in found}
     return max((kind for kind in kinds if kind in order), key=order.index, default="nothing")
