@@ -27,7 +27,7 @@ import mp4ds
 from chromium import chromium
 from coded_scenes import CODED
 from commands import call, typed
-from mp4ds.cli.evaluate import print_evaluation
+from mp4ds.cli.report import print_evaluation
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, TargetError
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
 from mp4ds.packing.options import PackOptions

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from mp4ds.cli.keyboard import Keyboard, keys_in
+from mp4ds.cli.nodes import Keyboard, keys_in
 from mp4ds.cli.play import player_keys
 from waiting import until
 
@@ -141,7 +141,7 @@ def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
 
 PLAYER = """
 import sys, time
-from mp4ds.cli.keyboard import Keyboard
+from mp4ds.cli.nodes import Keyboard
 from mp4ds.cli.play import player_keys
 from mp4ds.cli.process import prepare_process
 class Player:

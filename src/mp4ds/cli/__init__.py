@@ -35,7 +35,7 @@ COMMANDS = {
     ),
     "frames": ("report", "Save one frame as an image, or many frames as a contact sheet."),
     "evaluate": (
-        "evaluate",
+        "report",
         "Compare encoder settings on clips of a recording: quality, size and time.",
     ),
     "validate": (

@@ -58,13 +58,13 @@ from mp4ds.packing.planning import (
     dataset_at,
     divide,
     open_recording,
+    plugin,
     processes_for,
     surveyed,
 )
 from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.packing.spool import recover
 from mp4ds.plan import LOSSLESS, Purpose, QualitySetting, parse_quality
-from mp4ds.registry import plugin
 from mp4ds.video.codecs import DEFAULT_LOSSY, check_codec, fastest_preset
 from mp4ds.video.scores import find_ffmpeg
 

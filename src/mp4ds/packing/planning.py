@@ -7,8 +7,10 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +36,6 @@ from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.packing.survey import Decision, survey_channel
 from mp4ds.packing.tracks import TrackPlan
 from mp4ds.records import EVERYTHING, Channel, Excerpt
-from mp4ds.registry import plugin
 from mp4ds.video.encoder import tool_versions
 
 PIECE_NAME = r"all|whole-[0-9]{1,9}|[0-9]{5,9}"
@@ -428,3 +429,18 @@ def surveyed(plan: Plan, reader: BagReader, known: Collection[str] = ()) -> Plan
         for channel in _independent(reader, channels)
     }
     return replace(plan, decisions=decisions)
+
+
+# ---------------------------------------------------------------- plugins
+
+_PLUGINS = {
+    "images": "importing.layouts:open_images",
+    "cluster": "cluster:ClusterExecutor",
+}
+"""What the core asks for -> module of `mp4ds.plugins`, and its name there."""
+
+
+def plugin(name: str) -> Any:
+    """What a plugin offers to the core, by one of the names above."""
+    module, _, found = _PLUGINS[name].partition(":")
+    return getattr(import_module(f"mp4ds.plugins.{module}"), found)
