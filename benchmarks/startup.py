@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 
 import mp4ds
 from measure import cpu_seconds, isolated, parser_of, print_machine, print_table, python
-from mp4ds.dataset.columns import columns_model, decode_columns, digests_model
-from mp4ds.format.fields import Columns
+from mp4ds.format.fields import Columns, columns_model, decode_columns, digests_model
 from mp4ds.format.models import StreamSidecar
 from mp4ds.format.sidecars import dump_document, load_document, load_stream, schema_text
 from recordings import times, write_bag, write_mcap

@@ -9,7 +9,7 @@ from rosbags.rosbag1 import Reader
 
 from coded_tools import decodes, jpeg, mutations, refusal, scene
 from conftest import real
-from mp4ds.messages.jpeg import JpegInfo, parse
+from mp4ds.video.coded import JpegInfo, parse_jpeg
 
 PICTURE = next(scene(1))
 BASE = jpeg(PICTURE, subsampling=2)
@@ -49,7 +49,7 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_headers_are_read(kind: str) -> None:
     data = KINDS[kind]
-    assert parse(memoryview(data)) == JpegInfo(64, 48, 1 if kind == "grey" else 3)
+    assert parse_jpeg(memoryview(data)) == JpegInfo(64, 48, 1 if kind == "grey" else 3)
     assert decodes("mjpeg", [data]) == 1
 
 
@@ -62,7 +62,7 @@ def test_every_sampling_taken_is_one_that_decodes(luma: int) -> None:
     for chroma in FACTORS:
         for last in {chroma, 0x11}:
             data = patched(at11=luma, at14=chroma, at17=last)
-            if refusal(parse, data):
+            if refusal(parse_jpeg, data):
                 continue
             taken += 1
             assert decodes("mjpeg", [data]) == 1
@@ -71,8 +71,8 @@ def test_every_sampling_taken_is_one_that_decodes(luma: int) -> None:
 
 def test_fill_bytes_before_markers() -> None:
     at = BASE.index(b"\xff\xdb")
-    assert parse(BASE[:at] + b"\xff\xff" + BASE[at:]).width == 64
-    assert parse(BASE[:-2] + b"\xff\xff" + BASE[-2:]).width == 64
+    assert parse_jpeg(BASE[:at] + b"\xff\xff" + BASE[at:]).width == 64
+    assert parse_jpeg(BASE[:-2] + b"\xff\xff" + BASE[-2:]).width == 64
 
 
 @pytest.mark.parametrize(
@@ -110,25 +110,25 @@ def test_fill_bytes_before_markers() -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_refusals(data: bytes, reason: str) -> None:
-    assert reason in refusal(parse, data)
+    assert reason in refusal(parse_jpeg, data)
 
 
 def test_cmyk_is_refused() -> None:
     data = jpeg(np.zeros((48, 64, 4), np.uint8), mode="CMYK")
-    assert "4 colour components" in refusal(parse, data)
+    assert "4 colour components" in refusal(parse_jpeg, data)
 
 
 @pytest.mark.parametrize("kind", ["420", "progressive", "exif", "restarts"])
 def test_every_cut_is_refused(kind: str) -> None:
     data = KINDS[kind]
     for length in range(len(data)):
-        assert refusal(parse, data[:length])
+        assert refusal(parse_jpeg, data[:length])
 
 
 @pytest.mark.parametrize("kind", ["420", "progressive", "exif"])
 def test_damage_is_refused_or_read(kind: str) -> None:
     for damaged in mutations(KINDS[kind], 600):
-        refusal(parse, damaged)  # and raises nothing else
+        refusal(parse_jpeg, damaged)  # and raises nothing else
 
 
 def test_real_camera() -> None:
@@ -136,4 +136,4 @@ def test_real_camera() -> None:
         topics = [c for c in reader.connections if c.topic.endswith("compressed")]
         payloads = [payload for _, _, payload in reader.messages(connections=topics)]
     data = payloads[0][payloads[0].index(b"\xff\xd8") :]
-    assert parse(data) == JpegInfo(1280, 720, 3)
+    assert parse_jpeg(data) == JpegInfo(1280, 720, 3)

@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mp4ds
 from definitions import PACKET
-from mp4ds.dataset.columns import Choice, DecodedColumns, everything
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.format.fields import Choice, DecodedColumns, everything
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
 from mp4ds.unpacking.republish import Republisher

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from coded_scenes import CODED
-from mp4ds.dataset.columns import DecodedColumns, everything
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, VideoError
+from mp4ds.format.fields import DecodedColumns, everything
 from mp4ds.records import Message, Record
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.mp4 import read_sample_table

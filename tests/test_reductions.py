@@ -19,9 +19,9 @@ import mp4ds
 from coded_scenes import CODED, MakeScene
 from commands import call
 from definitions import COMPRESSED, IMAGE, INFO
-from mp4ds.dataset.columns import DecodedColumns
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, OptionError
+from mp4ds.format.fields import DecodedColumns
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message

@@ -22,13 +22,12 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from mp4ds.dataset.checks import Problem, validate
-from mp4ds.dataset.columns import DecodedColumns
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import ChannelGroup
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Mp4dsError, SourceError
 from mp4ds.files.urls import location
-from mp4ds.format.fields import MESSAGES_NAME
+from mp4ds.format.fields import MESSAGES_NAME, DecodedColumns
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import MANIFEST_NAME, THE_TOP
 from mp4ds.records import Attachment, Message, MetadataRecord

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import WHOLE, RecordingSlice, in_span, write_record
-from mp4ds.dataset.columns import DecodedColumns, columns_model, digests_model, within
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import by_time
 from mp4ds.dataset.stream import Stream
@@ -33,7 +32,11 @@ from mp4ds.format.fields import (
     MAX_VARIANTS,
     MESSAGES_NAME,
     Columns,
+    DecodedColumns,
+    columns_model,
+    digests_model,
     exceeds_padding,
+    within,
 )
 from mp4ds.format.manifest import (
     FileEntry,

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.columns import Choice, everything, within
 from mp4ds.dataset.images import Images, VerbatimImages, VideoImages, verbatim_images
 from mp4ds.dataset.messages import (
     ChannelGroup,
@@ -38,7 +37,7 @@ from mp4ds.errors import (
 )
 from mp4ds.files.sources import HOW_TO_OPEN, is_folder, video_at
 from mp4ds.files.urls import location
-from mp4ds.format.fields import MESSAGES_NAME
+from mp4ds.format.fields import MESSAGES_NAME, Choice, everything, within
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
 from mp4ds.messages.serializations import is_camera

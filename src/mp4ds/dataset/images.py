@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.columns import DecodedColumns
 from mp4ds.dataset.views import Crop, Resize, View, view_of
 from mp4ds.errors import FormatError, Refused, VideoError
+from mp4ds.format.fields import DecodedColumns
 from mp4ds.format.models import Calibration
 from mp4ds.messages import depth, png
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, pixel_view

@@ -17,10 +17,10 @@ from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.protocols import Format, times_of
 from mp4ds.bags.rosbag2_metadata import RECORD
 from mp4ds.bags.salvage.mcap import McapSalvage
-from mp4ds.dataset.columns import Choice, everything
 from mp4ds.dataset.rebuild import CalibrationMessages
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import FormatError, SourceError
+from mp4ds.format.fields import Choice, everything
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import verify_file
 from mp4ds.messages.wire import WireError

@@ -9,9 +9,8 @@ from functools import cached_property
 import numpy as np
 import xxhash
 
-from mp4ds.dataset.columns import Choice, DecodedColumns, decode_columns, everything
 from mp4ds.errors import FormatError, Refused
-from mp4ds.format.fields import decode_base64
+from mp4ds.format.fields import Choice, DecodedColumns, decode_base64, decode_columns, everything
 from mp4ds.format.models import CameraInfo, StreamSidecar
 from mp4ds.messages import depth, png
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, pixel_view, put_padding

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.columns import Choice, DecodedColumns, decode_columns, everything, unbroken
 from mp4ds.dataset.images import Images
 from mp4ds.dataset.rebuild import CalibrationMessages, MessageRebuilder, message_at
 from mp4ds.errors import FormatError, OptionError, VideoError
 from mp4ds.files.outputs import digest_file
+from mp4ds.format.fields import Choice, DecodedColumns, decode_columns, everything, unbroken
 from mp4ds.format.models import Calibration, StreamSidecar
 from mp4ds.format.sidecars import load_stream
 from mp4ds.messages import depth

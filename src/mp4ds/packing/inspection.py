@@ -13,10 +13,9 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from mp4ds.dataset.columns import columns_model
 from mp4ds.errors import Refused
-from mp4ds.format.fields import MAX_VARIANTS, Body, Columns
-from mp4ds.messages import depth, jpeg, png
+from mp4ds.format.fields import MAX_VARIANTS, Body, Columns, columns_model
+from mp4ds.messages import depth, png
 from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, row_padding
 from mp4ds.messages.layouts import why_not
 from mp4ds.messages.png import PNG_ENCODINGS
@@ -33,7 +32,7 @@ from mp4ds.messages.wire import (
 from mp4ds.records import Channel, Message
 from mp4ds.times import INT64_MAX, INT64_MIN
 from mp4ds.video.codecs import CODECS, packet_codec
-from mp4ds.video.coded import StreamParser
+from mp4ds.video.coded import StreamParser, parse_jpeg
 from mp4ds.video.decoder import jpeg_pixels
 
 _ModelT = TypeVar("_ModelT")
@@ -172,7 +171,7 @@ class MessageInspector:
         )
 
     def _jpeg_image(self, message: Message, form: Form, parts: Parts) -> CameraMessage:
-        found = jpeg.parse(parts.body)
+        found = parse_jpeg(parts.body)
         encoding = "mono8" if found.components == 1 else "rgb8"
         if not self._transcode:
             key = _coded_key(form, "packet", "mjpeg", encoding, found.width, found.height)

@@ -15,9 +15,8 @@ import xxhash
 
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import BagReader
-from mp4ds.dataset.columns import digests_model
 from mp4ds.errors import Refused
-from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, exceeds_padding
+from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, digests_model, exceeds_padding
 from mp4ds.format.models import (
     CameraInfo,
     ChannelModel,

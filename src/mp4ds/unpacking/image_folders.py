@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.columns import DecodedColumns, marked
 from mp4ds.dataset.images import Images, VerbatimImages
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import View
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import csv_cell
+from mp4ds.format.fields import DecodedColumns, marked
 from mp4ds.unpacking.options import UnpackOptions
 from mp4ds.unpacking.pictures import files_of, resized_view
 from mp4ds.video.images import ImageFile

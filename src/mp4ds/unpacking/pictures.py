@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.columns import Choice, DecodedColumns, everything, unbroken
 from mp4ds.dataset.images import Images
 from mp4ds.dataset.rebuild import form_for
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import View, size_after
 from mp4ds.errors import OptionError, Refused
+from mp4ds.format.fields import Choice, DecodedColumns, everything, unbroken
 from mp4ds.format.models import Header, StreamSidecar
 from mp4ds.messages.depth import (
     DEPTHS,

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.types import RosVersion, make_store, ros1_version, ros2_version, types_of
-from mp4ds.dataset.columns import Choice, everything, marked
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import ChannelGroup, MessageSource, Part
 from mp4ds.dataset.rebuild import CalibrationMessages, message_at
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import adapted
 from mp4ds.errors import ConversionError, FormatError, OptionError, Refused
+from mp4ds.format.fields import Choice, everything, marked
 from mp4ds.messages.serializations import is_camera, plain_message
 from mp4ds.messages.wire import NS, Fields, Slots, WireError
 from mp4ds.records import HASH_KEY, Channel, Message, Schema

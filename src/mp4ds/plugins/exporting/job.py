@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.columns import marked
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import View, adapted
 from mp4ds.errors import OptionError
+from mp4ds.format.fields import marked
 from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera

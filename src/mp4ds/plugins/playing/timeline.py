@@ -25,9 +25,9 @@ from mp4ds.bags.types import (
     ros2_version,
     types_of,
 )
-from mp4ds.dataset.columns import DecodedColumns, everything, last_of
 from mp4ds.dataset.dataset import Ahead, Dataset
 from mp4ds.errors import ConversionError, OptionError, Refused
+from mp4ds.format.fields import DecodedColumns, everything, last_of
 from mp4ds.plugins.playing.options import KINDS, PlayOptions, Wanted, rooted
 from mp4ds.plugins.playing.pace import NS
 from mp4ds.plugins.ros.node import World
