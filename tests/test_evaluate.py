@@ -167,19 +167,21 @@ def test_clips_are_from_the_middle_or_a_given_time() -> None:
 
 @pytest.mark.parametrize("curve", [1.0, 2.0, 0.3])
 def test_the_search_finds_the_largest_crf(curve: float) -> None:
+    tried: list[int] = []
+
     def score(crf: int) -> float:
+        tried.append(crf)
         return float(100 - 40 * (crf / 63) ** curve)
 
-    tried = []
     for due in range(1, 64):
         for guess in (1, 18, 63):
-            found, reached, count = largest_crf(score, score(due), guess=guess, largest=63)
-            assert (found, reached) == (due, True)
-            tried.append(count)
-    assert max(tried) <= 14
-    assert largest_crf(lambda crf: 90 - crf, 95, guess=20, largest=63)[:2] == (1, False)
-    assert largest_crf(lambda _: 99.0, 95, guess=20, largest=63)[:2] == (63, True)
-    assert largest_crf(lambda _: 95.0, 95, guess=1, largest=1)[:2] == (1, True)
+            target = score(due)
+            tried.clear()
+            assert largest_crf(score, target, guess=guess, largest=63) == (due, True)
+            assert len(tried) <= 14
+    assert largest_crf(lambda crf: 90 - crf, 95, guess=20, largest=63) == (1, False)
+    assert largest_crf(lambda _: 99.0, 95, guess=20, largest=63) == (63, True)
+    assert largest_crf(lambda _: 95.0, 95, guess=1, largest=1) == (1, True)
 
 
 def cell(crf: int, score: float, size: float, cpu: float, preset: str = "fast") -> Cell:

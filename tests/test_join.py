@@ -160,7 +160,7 @@ def joined(elsewhere: Path, tmp_path_factory: pytest.TempPathFactory) -> Joined:
         make_segment(segments[2], kind, 2)
         segments[1] = elsewhere / f"{IDS[KINDS.index(kind)]}.mp4"
         ticks = (number * STEP for number in range(TOTAL))
-        assert join_segments(segments, ticks, folder / "joined.mp4") == TOTAL
+        join_segments(segments, ticks, folder / "joined.mp4")
         return folder / "joined.mp4", segments, told
 
     return make
@@ -212,7 +212,7 @@ def test_the_file_is_as_one_encoder_writes_it(kind: Kind, joined: Joined, tmp_pa
 def test_one_segment_is_the_file_itself(kind: Kind, joined: Joined, tmp_path: Path) -> None:
     segment = joined(kind)[1][0]
     target = tmp_path / "alone.mp4"
-    assert join_segments([segment], [n * STEP for n in range(LENGTHS[0])], target) == LENGTHS[0]
+    join_segments([segment], [n * STEP for n in range(LENGTHS[0])], target)
     left_out = LEFT_OUT[recipe_of(kind).codec]
     assert differing(segment, target) <= left_out
     if not left_out:
@@ -306,7 +306,7 @@ def test_copied_packets_give_the_uncut_file(name: str, tmp_path: Path) -> None:
         at += len(part)
     write_packets(tmp_path / "uncut.mp4", codec, [body for body, _ in bodies], ticks)
     target = tmp_path / "joined.mp4"
-    assert join_segments(segments, ticks, target) == len(bodies)
+    join_segments(segments, ticks, target)
     assert target.read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
     with av.open(str(target)) as container:
         frames = list(container.decode(video=0))
@@ -414,7 +414,7 @@ def test_rates_that_change_between_segments(codec: str, tmp_path: Path) -> None:
         encoder.write(noise("yuv420p", *size.values(), 1)[0], 0)
         encoder.close()
     paths = {name: tmp_path / f"{name}.mp4" for name in "abc"}
-    assert join_segments([paths["a"], paths["b"]], range(2), tmp_path / "j.mp4") == 2
+    join_segments([paths["a"], paths["b"]], range(2), tmp_path / "j.mp4")
     with pytest.raises(Mp4dsError, match=r"avcC|hvcC|av1C"):
         join_segments([paths["a"], paths["c"]], range(2), tmp_path / "j.mp4")
 
@@ -431,7 +431,7 @@ def test_parameter_sets_that_change_between_segments(codec: str, tmp_path: Path)
     write_packets(tmp_path / "a.mp4", codec, bodies)
     write_packets(tmp_path / "b.mp4", codec, with_options(codec, CHANGED[codec]))
     for path in ("a", "b"):
-        assert join_segments([tmp_path / f"{path}.mp4"] * 2, range(8), tmp_path / "j.mp4") == 8
+        join_segments([tmp_path / f"{path}.mp4"] * 2, range(8), tmp_path / "j.mp4")
     (tmp_path / "j.mp4").unlink()
     with pytest.raises(Mp4dsError, match=r"avcC|hvcC"):
         join_segments([tmp_path / "a.mp4", tmp_path / "b.mp4"], range(8), tmp_path / "j.mp4")
@@ -582,7 +582,7 @@ small, segment, target, count, copies = map(str, sys.argv[1:])
 join_segments([Path(small)], range(3), Path(target))
 before = peak()
 ticks = range(int(count) * int(copies))
-assert join_segments([Path(segment)] * int(copies), ticks, Path(target)) == len(ticks)
+join_segments([Path(segment)] * int(copies), ticks, Path(target))
 print(peak() - before)
 """
 

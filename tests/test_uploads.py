@@ -140,7 +140,7 @@ def test_a_pack_is_uploaded_the_manifest_last(
 def test_large_files_go_in_parts(store: Store, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(os.urandom(40_000_000))
     target = RemotePath(f"{store.folder}/file")
-    assert target.upload(tmp_path / "file").stat().st_size == 40_000_000
+    target.upload(tmp_path / "file")
     assert store.server.put().count("file") == 3
     assert store.files.cat(target.url) == (tmp_path / "file").read_bytes()
 

@@ -241,12 +241,8 @@ class FileNames:
     def __init__(self) -> None:
         self._taken: set[str] = set()
 
-    def name_for(self, topic: str) -> tuple[str, bool]:
-        """A stem for the stream's files.
-
-        Returns:
-            The stem, and whether another stream had taken the plain one.
-        """
+    def name_for(self, topic: str) -> str:
+        """A stem for the stream's files."""
         stem = re.sub(r"[^A-Za-z0-9._-]+", "_", topic.strip("/")).strip("._-") or "topic"
         if len(stem) > _MAX_NAME:
             stem = f"{stem[: _MAX_NAME - 17]}-{xxhash.xxh64(topic.encode()).hexdigest()}"
@@ -257,7 +253,7 @@ class FileNames:
             number += 1
             name = f"{stem}-{number}"
         self._taken.add(name.casefold())
-        return name, name != stem
+        return name
 
     def claim(self, stem: str) -> None:
         """Take a stem that a file says another run gave a stream.

@@ -41,7 +41,6 @@ from mp4ds.format.fields import (
 from mp4ds.format.manifest import (
     FileEntry,
     LossEntry,
-    Manifest,
     StreamEntry,
     TimeRange,
     Verbatim,
@@ -85,7 +84,7 @@ def concat(
     selected: Callable[[str], bool] = lambda _: True,
     changes: dict[str, Any] | None = None,
     report: Callable[[str], None] = lambda _: None,
-) -> tuple[Manifest, list[StreamSidecar]]:
+) -> None:
     """Make one dataset of several that follow one another, or a copy of one or of a part of it.
 
     All that is read is checked: whole files against their manifest, what is cut out of a file
@@ -101,9 +100,6 @@ def concat(
         selected: Whether a topic is to be copied.
         changes: Fields of the manifest that differ from those of the first dataset.
         report: Called with the name of each file when it is begun, perhaps in another thread.
-
-    Returns:
-        The new manifest and sidecars, already written.
 
     Raises:
         Refused: It cannot be copied; says why. Nothing was written.
@@ -163,7 +159,6 @@ def concat(
         }
     )
     (folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
-    return manifest, sidecars
 
 
 # ---------------------------------------------------------------- what is copied
@@ -382,9 +377,7 @@ def _write_streams(
     """Write videos and sidecars; each sidecar is returned with its name."""
     names = FileNames()
     firsts = [stream.segments[0].stream for stream in streams]
-    stems = [
-        first.video_path.stem if is_one else names.name_for(first.topic)[0] for first in firsts
-    ]
+    stems = [first.video_path.stem if is_one else names.name_for(first.topic) for first in firsts]
 
     def write(stem: str, stream: _JoinedStream) -> tuple[str, StreamSidecar]:
         report(f"{stem}.mp4")

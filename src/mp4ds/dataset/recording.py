@@ -19,7 +19,7 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import MessageSource, Part
 from mp4ds.errors import OptionError, Refused, advising
 from mp4ds.files.outputs import digest_file
-from mp4ds.format.manifest import About, EarlierDataset, Manifest
+from mp4ds.format.manifest import About, EarlierDataset
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.options import Slice
 from mp4ds.records import Channel, ChannelStats, Excerpt, Message, Record, Schema
@@ -138,7 +138,7 @@ def copy_part(
     part: RecordingSlice = WHOLE,
     selected: Callable[[str], bool] = lambda _: True,
     about: About | None = None,
-) -> Manifest:
+) -> None:
     """Copy a dataset, or a part of it, into one derived from it; see `concat`.
 
     Args:
@@ -161,7 +161,7 @@ def copy_part(
         "sources": [source.within(part.span) for source in old.sources],
         "derived_from": [*old.derived_from, earlier],
     }
-    return concat([dataset], folder, part=part, selected=selected, changes=changes)[0]
+    concat([dataset], folder, part=part, selected=selected, changes=changes)
 
 
 @contextmanager

@@ -348,11 +348,8 @@ class RemotePath(_Path):
         """Whether its kind of store accepts uploads."""
         return not self._on_web
 
-    def upload(self, local: Path) -> RemotePath:
+    def upload(self, local: Path) -> None:
         """Upload a file here, replacing what is there.
-
-        Returns:
-            A path with the new state.
 
         Raises:
             TargetError: The store denies access.
@@ -366,7 +363,6 @@ class RemotePath(_Path):
         if sizes[0] != sizes[1]:
             problem = f"could not be uploaded: only {sizes[0]} of {sizes[1]} bytes arrived"
             raise RemoteError(self, problem)
-        return now
 
     def remove(self) -> None:
         """Remove the file here, if there is one.

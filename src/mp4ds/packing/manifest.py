@@ -276,7 +276,7 @@ def _topics_in(made: Dataset, known: Mapping[str, TopicSummary]) -> dict[str, To
             topics[stream.infos.channel.topic].frames += len(stream.infos)
         if video.quality is not None:
             topic.notes.append(str(video.quality))
-        if stream.path.stem != FileNames().name_for(stream.topic)[0]:
+        if stream.path.stem != FileNames().name_for(stream.topic):
             topic.notes.append(f"stored as {video.file}: its usual name was taken")
     for entry in made.manifest.verbatim if made.manifest else ():
         topics[entry.topic].verbatim[entry.reason] = (entry.messages, entry.first)

@@ -570,7 +570,7 @@ class Packer:
         Raises:
             Refused: The encoder does not take such pictures.
         """
-        stem = self.part.folder / self._names.name_for(seen.message.channel.topic)[0]
+        stem = self.part.folder / self._names.name_for(seen.message.channel.topic)
         stream = StreamWriter(stem, len(self._streams), seen, plan, self.plan.threads, rate)
         self._streams.append(stream)
         return stream

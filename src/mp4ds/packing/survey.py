@@ -189,7 +189,7 @@ def _start_crf(coder: WindowCoder, samples: Sequence[CameraMessage]) -> int:
             return known[crf]
 
         least = LEAST_CRF[codec]
-        crf, reached, _ = largest_crf(
+        crf, reached = largest_crf(
             score,
             due,
             guess=coder.coding.crf,

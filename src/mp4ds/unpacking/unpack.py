@@ -564,7 +564,7 @@ def _unpack_images(
 
     for images in found:
         if images.count:
-            stem, _ = names.name_for(images.topic)
+            stem = names.name_for(images.topic)
             summary.messages[images.topic] = images.write(path / stem, tell)
         for reason, count in images.refused.items():
             summary.unconvertible.setdefault(images.topic, {})[reason] = count

@@ -354,7 +354,7 @@ def cut_segment(source: Path, numbers: range, ticks: Sequence[int], target: Path
     _write([source], iter(ticks), target, duration, numbers)
 
 
-def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> int:
+def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) -> None:
     """Concatenate the packets of videos into one file.
 
     The file is as one `VideoEncoder` or `PacketWriter` would have made it of the same packets:
@@ -369,9 +369,6 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
             increasing.
         target: The file to make, not one of the segments. It is removed if it cannot be finished.
 
-    Returns:
-        The number of packets written.
-
     Raises:
         Mp4dsError: A segment has another codec, size, colour or parameter sets than the
             first.
@@ -382,7 +379,7 @@ def join_segments(segments: Sequence[Path], ticks: Iterable[int], target: Path) 
     """
     if not segments:
         raise ValueError("there are no segments to join")
-    return _write(segments, iter(ticks), target, _last_duration(segments[-1]))
+    _write(segments, iter(ticks), target, _last_duration(segments[-1]))
 
 
 def _write(
@@ -391,7 +388,7 @@ def _write(
     target: Path,
     duration: int,
     numbers: range | None = None,
-) -> int:
+) -> None:
     """Write frames of videos to a new file, which is removed if it cannot be finished.
 
     Args:
@@ -400,9 +397,6 @@ def _write(
         target: The file.
         duration: Of the last frame, in ticks.
         numbers: Those of the frames of the only video; None: all.
-
-    Returns:
-        The number of frames.
     """
     entry, written = _common_entry(segments), _Written()
     try:
@@ -428,7 +422,6 @@ def _write(
     except BaseException:
         target.unlink(missing_ok=True)
         raise
-    return len(written.ticks)
 
 
 class _Written:

@@ -445,7 +445,7 @@ def largest_crf(
     smallest: int = 1,
     fall: float | None = None,
     most: int | None = None,
-) -> tuple[int, bool, int]:
+) -> tuple[int, bool]:
     """Find the largest crf that reaches a target; scores fall as crf grows.
 
     Between two known crf, try where a straight line through their scores meets the target; if that
@@ -461,8 +461,7 @@ def largest_crf(
         most: Maximum number of trials, after which the best so far is taken; None: no limit.
 
     Returns:
-        The crf, whether it reaches the target, and the number of trials. If none reaches it, the
-        crf is the smallest one tried.
+        The crf, and whether it reaches the target. If none does, the crf is the smallest one tried.
     """
     known: dict[int, float] = {}
 
@@ -493,8 +492,8 @@ def largest_crf(
         else:  # a half at the most: small crf differ more
             crf = max(bad - step, bad // 2, smallest)
     if good in known:
-        return good, True, len(known)
-    return min(known), False, len(known)
+        return good, True
+    return min(known), False
 
 
 def _between(good: int, bad: int, known: dict[int, float], target: float) -> int:

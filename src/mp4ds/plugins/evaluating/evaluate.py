@@ -239,7 +239,7 @@ def evaluate(
                         topic = cameras[number].topic
                         progress(f"{topic}: {what}", (number + share) / len(cameras))
 
-                name, _ = names.name_for(camera.topic)
+                name = names.name_for(camera.topic)
                 try:
                     with TemporaryDirectory(dir=work) as folder:
                         result.cameras.append(

@@ -273,7 +273,7 @@ def write_colmap(jobs: Sequence[ExportJob]) -> None:
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     known: list[tuple[ExportedCamera, Sequence[str]]] = []
     for camera in job.png_cameras():
-        place, _ = names.name_for(camera.topic)
+        place = names.name_for(camera.topic)
         files = [f"{place}/{time}.png" for time in camera.times.tolist()]
         job.write_png_files(camera, f"images/{place}", [f"images/{file}" for file in files])
         model = colmap_model(camera.calibration) if camera.calibration else None

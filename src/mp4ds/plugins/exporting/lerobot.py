@@ -198,7 +198,7 @@ def _add_videos(
 ) -> None:
     names = FileNames()
     for camera in cameras:
-        feature = f"observation.images.{names.name_for(camera.topic)[0]}"
+        feature = f"observation.images.{names.name_for(camera.topic)}"
         path = job.path / episode.path(f"videos/{feature}", "mp4")
         path.parent.mkdir(parents=True, exist_ok=True)
         used, repeats = np.unique(nearest(camera.times, episode.times), return_counts=True)

@@ -116,7 +116,7 @@ def _check(video: Path, described: Path, old: StreamSidecar) -> None:
 def _part_of(video: Path, old: StreamSidecar, folder: Path) -> PartRecord:
     """The stream and an empty messages.mcap, made in a folder."""
     channel = old.channel.to_record(0)
-    stem, _ = FileNames().name_for(channel.topic)
+    stem = FileNames().name_for(channel.topic)
     path = folder / f"{stem}.mp4"
     stamps = old.columns.stamp.decode(old.frames).tolist()
     clock = PresentationClock()
