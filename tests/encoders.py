@@ -103,24 +103,24 @@ def rvl(depth: NDArray[np.uint16]) -> bytes:
     return struct.pack(f"<{len(words)}I", *words)
 
 
-def quantised(metres: Pixels, *, step: float = 100.0, far: float = 10.0) -> tuple[Pixels, bytes]:
+def quantised(metres: Pixels) -> tuple[Pixels, bytes]:
     """Inverse depth as compressed_depth_image_transport computes it, and its two parameters.
 
     Returns:
-        uint16, 0 where nothing was seen or beyond `far`; two little-endian float32.
+        uint16, 0 where nothing was seen or beyond 10 m; two little-endian float32.
     """
-    a = np.float32(step) * np.float32(step + 1)
-    b = np.float32(1) - a / np.float32(far)
-    seen = metres < far  # false for NaN
+    a = np.float32(100) * np.float32(101)
+    b = np.float32(1) - a / np.float32(10)
+    seen = metres < 10  # false for NaN
     inverse = np.where(seen, a / np.where(seen, metres, 1) + b, 0)
     return inverse.astype(np.uint16), struct.pack("<2f", a, b)
 
 
-def compressed_depth(depth: Pixels, codec: str, parameters: bytes, *, png_level: int = 9) -> bytes:
+def compressed_depth(depth: Pixels, codec: str, parameters: bytes) -> bytes:
     """A 12-byte header (int32 format 0, 8 bytes of parameters), then PNG, or size and RVL."""
     head = struct.pack("<i", 0) + parameters
     if codec == "png":
-        return head + cv(depth, ".png", cv2.IMWRITE_PNG_COMPRESSION, png_level)
+        return head + cv(depth, ".png", cv2.IMWRITE_PNG_COMPRESSION, 9)
     return head + struct.pack("<2I", *depth.shape[::-1]) + rvl(depth)
 
 

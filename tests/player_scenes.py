@@ -258,14 +258,14 @@ def text(said: str) -> bytes:
     return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
 
 
-def make_ros2(path: Path, *, seconds: float = 1.0) -> Path:
+def make_ros2(path: Path) -> Path:
     """An MCAP of ROS 2 without a camera: /chatter at 20 Hz, /tf_static of four publishers, /map."""
     channels = {
         "/chatter": ros2_channel(0, "/chatter", "std_msgs/msg/String"),
         "/tf_static": static_channel(1, 1, 1, 1),
         "/map": ros2_channel(2, "/map", "std_msgs/msg/String", profiles(0)),
     }
-    rows = [(START + n * STEP, "/chatter", text(f"{n}")) for n in range(round(seconds * 20))]
+    rows = [(START + n * STEP, "/chatter", text(f"{n}")) for n in range(20)]
     rows += [
         (START + (n + 1) * MS, "/tf_static", static_transform(child))
         for n, child in enumerate(STATIC)

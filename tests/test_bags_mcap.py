@@ -334,8 +334,8 @@ def text(value: str) -> bytes:
     return struct.pack("<I", len(value.encode())) + value.encode()
 
 
-def channel_record(number: int, topic: str) -> bytes:
-    return record(4, struct.pack("<HH", number, 0) + text(topic) + text("cdr") + text(""))
+def channel_record(topic: str) -> bytes:
+    return record(4, struct.pack("<HH", 1, 0) + text(topic) + text("cdr") + text(""))
 
 
 def message_record(number: int) -> bytes:
@@ -368,7 +368,7 @@ DAMAGED: dict[str, tuple[bytes, str]] = {
         "message 1 belongs to channel 3, which is not defined",
     ),
     "two channels": (
-        file_of(channel_record(1, "/a"), channel_record(1, "/b")),
+        file_of(channel_record("/a"), channel_record("/b")),
         "defined twice and differently",
     ),
     "two schemas": (

@@ -22,8 +22,8 @@ def room() -> np.ndarray[tuple[int, int], np.dtype[np.uint16]]:
     return np.where(rng.random(x.shape) < 0.1, 0, values).astype(np.uint16)
 
 
-def png_of(values: np.ndarray[tuple[int, int], np.dtype[np.uint16]], level: int = 9) -> bytes:
-    return cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, level])[1].tobytes()
+def png_of(values: np.ndarray[tuple[int, int], np.dtype[np.uint16]]) -> bytes:
+    return cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
 
 
 def rebuilt(image: depth.DepthImage) -> bytes:

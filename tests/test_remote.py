@@ -42,9 +42,9 @@ def executor(monkeypatch: pytest.MonkeyPatch) -> InlineExecutor:
     return use(monkeypatch, InlineExecutor())
 
 
-def large_scene(frames: int = 60) -> Scene:
+def large_scene() -> Scene:
     """Noise of 196 kB an image, which no compression makes smaller."""
-    return scene("mono8", frames=frames, width=512, height=384)
+    return scene("mono8", frames=60, width=512, height=384)
 
 
 def covered(ranges: Sequence[tuple[int, int]]) -> int:

@@ -42,8 +42,8 @@ def scene(encoding: str, frames: int = 6, width: int = 96, height: int = 66) -> 
     ]
 
 
-def texture(rng: np.random.Generator, top: int, width: int = 96, height: int = 64) -> Pixels:
-    return rng.integers(0, top, (height, width), np.uint16, endpoint=True)
+def texture(rng: np.random.Generator, top: int) -> Pixels:
+    return rng.integers(0, top, (64, 96), np.uint16, endpoint=True)
 
 
 def video_size(path: Path, samples: Sequence[Pixels], encoding: str, choice: Coding) -> int:
