@@ -89,19 +89,6 @@ class Tab:
             more = {"text": text} if text and kind == "keyDown" else {}
             self.command("Input.dispatchKeyEvent", type=kind, key=key, **more)
 
-    def mouse(self, kind: str, x: float, y: float) -> None:
-        """Press, move or release the mouse: ``mousePressed`` and so on."""
-        down = 1 if kind != "mouseReleased" else 0
-        self.command(
-            "Input.dispatchMouseEvent",
-            type=kind,
-            x=x,
-            y=y,
-            button="left",
-            buttons=down,
-            clickCount=1,
-        )
-
     def screenshot(self, **clip: float) -> bytes:
         """A PNG file of the window, or of a part of the page: x, y, width, height."""
         part = {"clip": clip | {"scale": 1}, "captureBeyondViewport": True} if clip else {}
