@@ -23,6 +23,7 @@ from mp4ds.errors import VideoError
 from mp4ds.plugins.playing.play import open_player
 from mp4ds.records import Loss
 from player_scenes import RecordingPublisher
+from round_trips import packed as packed_scene
 from scenes import Record, Scene
 from sources import SOURCES, scene
 
@@ -448,3 +449,13 @@ def test_an_edited_sidecar_is_not_claimed_to_be_exact(dataset: Path, tmp_path: P
     assert "calibrations, may be altered" in loss.problem
     left = {"/left/image_raw": FRAMES, "/left/camera_info": FRAMES}
     assert left.items() <= summary.messages.items()
+
+
+@pytest.mark.parametrize("span", [{"start": "0"}, {"start": "0.1", "end": "0.2"}])
+def test_a_slice_of_a_damaged_lossy_video(span: dict[str, str], tmp_path: Path) -> None:
+    """It has no digests of messages that would show the damage of a frame."""
+    dataset = packed_scene(tmp_path, scene("rgb8", frames=20, noisy=False), quality="visual")
+    flip(dataset / "cam_image_raw.mp4", 0.4)
+    with pytest.raises(FormatError, match="hash-mismatch"):
+        mp4ds.unpack(dataset, "bag", tmp_path / "again.bag", UnpackOptions(**span))
+    assert not (tmp_path / "again.bag").exists()

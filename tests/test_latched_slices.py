@@ -157,6 +157,18 @@ def test_what_is_too_large_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "/tf_static" not in {row[0] for row in recorded(output)}
 
 
+@pytest.mark.parametrize("way", ["one-pass", "dataset", "unpack"])
+def test_what_is_not_selected_takes_no_room(
+    way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(latched, "MOST_BYTES", 100)  # /tf_static takes more
+    source = made("mcap", tmp_path)
+    summary, output = sliced(way, source, tmp_path, exclude=["/tf_static"])
+    assert summary.latched == {"/map": 2}
+    assert summary.latched_left_out == []
+    assert {"/map", "/chatter"} <= {row[0] for row in recorded(output)}
+
+
 def test_what_is_printed(tmp_path: Path) -> None:
     source = made("mcap", tmp_path)
     for command in (

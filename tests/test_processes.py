@@ -218,6 +218,10 @@ def test_a_call_whose_process_is_killed_is_made_once_more(tmp_path: Path) -> Non
     once = f"import os\nif not os.path.exists({str(mark)!r}):\n open({str(mark)!r}, 'w')\n "
     with ProcessExecutor(1) as executor:
         assert executor.submit(exec, f"{once}os.kill(os.getpid(), 9)").exception() is None
+    mark.unlink()
+    with ProcessExecutor(1) as executor:  # nobody waits for it before all calls are to end
+        call = executor.submit(exec, f"{once}os.kill(os.getpid(), 9)")
+    assert call.exception() is None
 
 
 def test_a_process_makes_many_calls() -> None:

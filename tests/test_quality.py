@@ -11,6 +11,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from numpy.typing import NDArray
 
 import mp4ds
@@ -19,6 +20,7 @@ from commands import call, refused
 from definitions import IMAGE
 from in_parts import InlineExecutor, leftovers, use
 from mp4ds import yamlio
+from mp4ds.bags.formats import open_reader
 from mp4ds.errors import OptionError, ScoringError
 from mp4ds.format.models import Quality
 from mp4ds.packing.options import PackOptions
@@ -26,6 +28,7 @@ from mp4ds.packing.tracks import CrfControl, window_frames
 from mp4ds.plan import QualityTarget, parse_quality
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
+from mp4ds.records import Message
 from mp4ds.video.scores import find_ffmpeg, largest_crf, scores_of
 from round_trips import unpacked
 from scenes import Record, instant, scene, together
@@ -245,6 +248,32 @@ def test_in_parts_too_and_each_time_alike(tmp_path: Path, executor: InlineExecut
 
 
 # ---------------------------------------------------------------- out of reach
+
+
+def test_one_of_two_equal_channels_cannot_have_the_score(
+    tmp_path: Path, compare: Callable[..., list[str]]
+) -> None:
+    """The channel of the first image is not that of the images that cannot have it."""
+    (whole,) = recording(tmp_path, [0.0, 0.0, 30.0])
+    images = [item for item in open_reader(whole).records() if isinstance(item, Message)]
+    small = {"height": 2, "width": 2, "encoding": "nv12", "step": 2, "data": np.zeros(6, np.uint8)}
+    path = tmp_path / "equal.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        definition = images[0].channel.schema
+        schema = writer.register_schema(definition.name, definition.encoding, definition.data)
+        first, second = (writer.register_channel(TOPIC, "cdr", schema) for _ in range(2))
+        time = images[0].log_time - 1
+        writer.add_message(first, time, Record(TOPIC, IMAGE, time, small).payload("cdr"), time)
+        for image in images:
+            writer.add_message(second, image.log_time, image.data, image.publish_time)
+        writer.finish()
+    options = PackOptions(quality="psnr=55", **{**QUICK, "codec": "av1", "preset": "12"})
+    summary = mp4ds.pack(path, tmp_path / "dataset", options)
+    notes = [note for topic in summary.topics for note in topic.notes]
+    assert any("kept lossless: psnr=55 is out of reach" in note for note in notes)
+    assert compare([path], unpacked(tmp_path, "mcap"), ignore_pixels=[TOPIC]) == []
 
 
 def test_what_cannot_have_the_score_is_lossless(

@@ -164,8 +164,15 @@ def _is_tf_static(channel: Channel) -> bool:
     return channel.topic.rpartition("/")[2] == _TF_STATIC
 
 
-def take_slice(reader: BagReader, asked: Slice) -> None:
+def take_slice(
+    reader: BagReader, asked: Slice, selected: Callable[[str], bool] = lambda _: True
+) -> None:
     """Let a reader give a slice of its recording, with latched messages if requested.
+
+    Args:
+        reader: Of the whole recording.
+        asked: The slice.
+        selected: Whether a topic's latched messages are wanted: others take no room of theirs.
 
     Raises:
         OptionError: It is empty, or a time is not valid.
@@ -179,12 +186,16 @@ def take_slice(reader: BagReader, asked: Slice) -> None:
     first, last = min(item.start for item in known), max(item.end for item in known)
     first = max(first, reader.begin or first)
     span = Excerpt(*asked.times(first, last, reader.path))
-    wants_latched = asked.latched and span.start is not None
-    latched = _latched_before(reader, Excerpt(end=span.start)) if wants_latched else ((), ())
-    reader.slice = RecordingSlice(span, *latched)
+    if asked.latched and span.start is not None:
+        latched = _latched_before(reader, Excerpt(end=span.start), selected)
+        reader.slice = RecordingSlice(span, *latched)
+    else:
+        reader.slice = RecordingSlice(span)
 
 
-def _latched_before(reader: BagReader, before: Excerpt) -> tuple[Sequence[Message], Sequence[str]]:
+def _latched_before(
+    reader: BagReader, before: Excerpt, selected: Callable[[str], bool]
+) -> tuple[Sequence[Message], Sequence[str]]:
     """The latched messages from before a slice, by log time; images are never among them.
 
     Returns:
@@ -194,7 +205,8 @@ def _latched_before(reader: BagReader, before: Excerpt) -> tuple[Sequence[Messag
     own = {
         channel.id: channel
         for channel in reader.channels
-        if has_late(channel)
+        if selected(channel.topic)
+        and has_late(channel)
         and not is_camera(channel)
         and channel.id in times
         and len(in_span(times[channel.id], before))

@@ -117,8 +117,8 @@ class DatasetReader(BagReader):
         self._dataset.close()
 
 
-def slice_of(dataset: Dataset, asked: Slice) -> RecordingSlice:
-    """A slice of a dataset, with its latched messages if requested.
+def slice_of(dataset: Dataset, asked: Slice, selected: Callable[[str], bool]) -> RecordingSlice:
+    """A slice of a dataset, with latched messages of selected topics if requested.
 
     Raises:
         OptionError: It is empty, or a time is not valid.
@@ -127,7 +127,7 @@ def slice_of(dataset: Dataset, asked: Slice) -> RecordingSlice:
     if not asked:
         return WHOLE
     reader = DatasetReader(dataset)
-    take_slice(reader, asked)
+    take_slice(reader, asked, selected)
     return reader.slice
 
 

@@ -252,7 +252,7 @@ def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
         selected = options.selected
         selected.check(channel.topic for channel in dataset.channels)
         folder.mkdir()
-        part = slice_of(dataset, options.slice)
+        part = slice_of(dataset, options.slice, selected)
         if options.slice or options.topics or options.exclude:  # whole files are checked as copied
             dataset.verify_messages()
         for stream in dataset.streams:
@@ -514,7 +514,11 @@ def _planned(
             "first."
         )
     with open_recording(
-        paths, salvage=options.salvage, images=options.images, asked=options.slice
+        paths,
+        salvage=options.salvage,
+        images=options.images,
+        asked=options.slice,
+        selected=options.selected,
     ) as reader:
         plan = divide(reader, paths, options, recordings)
         if note is not None:

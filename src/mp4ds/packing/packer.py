@@ -48,7 +48,7 @@ from mp4ds.plan import FileNames
 from mp4ds.records import Attachment, Channel, Message
 from mp4ds.times import PresentationClock
 
-Exact = Mapping[tuple[int, StreamKey], str]
+Exact = Mapping[tuple[Identity, StreamKey], str]
 """Channel id and key of streams that no longer need to reach a score -> why."""
 
 NOT_SURVEYED = (
@@ -121,7 +121,7 @@ class OutOfReach(Exception):  # noqa: N818 - no failure: packing starts anew wit
         reason: What was tried.
     """
 
-    def __init__(self, stream: tuple[int, StreamKey], reason: str) -> None:
+    def __init__(self, stream: tuple[Identity, StreamKey], reason: str) -> None:
         super().__init__(stream, reason)
         self.stream, self.reason = stream, reason
 
@@ -254,7 +254,7 @@ class StreamWriter:
         return sidecar
 
     def _out_of_reach(self, reason: Refused) -> OutOfReach:
-        return OutOfReach((self.channel.id, self._key), str(reason))
+        return OutOfReach((self.channel.identity, self._key), str(reason))
 
     def _header(self, seen: CameraMessage, template: str | None) -> Header:
         """The model of a message's header.
@@ -328,7 +328,7 @@ class _Camera:
         self.first: StreamWriter | None = None
 
     def _route(self, decision: Decision) -> _Route:
-        reason = self._packer.exact.get((self._channel.id, decision.key))
+        reason = self._packer.exact.get((self._channel.identity, decision.key))
         if reason is None:
             return _Route(list(decision.plans), refusal=decision.refusal)
         kept = "partly kept lossless" if self._is_surveyed else "kept lossless"
@@ -427,7 +427,7 @@ def until_in_reach(make: Callable[[Exact], _Made]) -> _Made:
     Args:
         make: Packs from the beginning, given the streams that must be lossless.
     """
-    exact: dict[tuple[int, StreamKey], str] = {}
+    exact: dict[tuple[Identity, StreamKey], str] = {}
     while True:
         try:
             return make(exact)

@@ -21,6 +21,7 @@ import re
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -60,6 +61,7 @@ FACTS_NAME = "part.json"
 _ANEW = "Start over with `restart`."
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAMED = 3
+_TELL_SECONDS = 0.5
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 SHARED = "all machines must share the dataset's folder"
 
@@ -441,9 +443,14 @@ class PartPacker:
         if self._reader is None:
             self._reader = self._plan.open()
 
+        next_time = 0.0
+
         def tell(part: PartRecord) -> None:
-            with suppress(OSError):
-                PartFacts.write(part)
+            nonlocal next_time
+            if (now := time.monotonic()) >= next_time:
+                next_time = now + _TELL_SECONDS
+                with suppress(OSError):
+                    PartFacts.write(part)
 
         part = Packer(self._reader, into, self._plan, piece, exact, tell).run()
         PartFacts.write(part)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -129,6 +129,7 @@ class Plan:
             salvage=options.salvage,
             images=options.images,
             asked=options.slice,
+            selected=options.selected,
         )
 
     @property
@@ -174,6 +175,7 @@ def open_recording(
     salvage: bool = False,
     images: ImageFolder | None = None,
     asked: Slice = WHOLE,
+    selected: Callable[[str], bool] = lambda _: True,
 ) -> BagReader:
     """Open the source to pack.
 
@@ -182,6 +184,7 @@ def open_recording(
         salvage: Read what can be read of damaged recordings.
         images: How to read the folder of images; None for recordings.
         asked: The slice to pack.
+        selected: Which topics are packed; only their latched messages are.
 
     Raises:
         SourceError: It cannot be read.
@@ -190,7 +193,7 @@ def open_recording(
     reader = _open_whole(paths, salvage, images)
     if asked:
         try:
-            take_slice(reader, asked)
+            take_slice(reader, asked, selected)
         except BaseException:
             reader.close()
             raise

@@ -85,13 +85,11 @@ class _Call:
         future: Gets its result.
         function: Pickled; a process keeps the one that it was given last, with all that this holds.
         arguments: Pickled.
-        is_again: Whether a process was killed that made it.
     """
 
     future: Future[Any]
     function: bytes
     arguments: bytes
-    is_again: bool = False
 
 
 class ProcessExecutor(Executor):
@@ -133,22 +131,22 @@ class ProcessExecutor(Executor):
         """Make calls, one after another; in a thread."""
         process: _Process | None = None
         while (call := self._calls.get()) is not None:
-            if not call.is_again and not call.future.set_running_or_notify_cancel():
+            if not call.future.set_running_or_notify_cancel():
                 continue
+            answer: object = None
             try:
-                if process is None or not process.is_ready:
-                    process = self._in_place_of(process)
+                for _ in range(2):  # once more if its process was killed
+                    if process is None or not process.is_ready:
+                        process = self._in_place_of(process)
+                    answer = process.make(call)
+                    if self._is_ended or not process.was_killed:
+                        break
             except OSError as error:
-                call.future.set_exception(error)
-                continue
-            answer = process.make(call)
-            if not isinstance(answer, BaseException):
-                call.future.set_result(answer)
-            elif process.was_killed and not call.is_again and not self._is_closed:
-                call.is_again = True
-                self._calls.put(call)
-            else:
+                answer = error
+            if isinstance(answer, BaseException):
                 call.future.set_exception(answer)
+            else:
+                call.future.set_result(answer)
 
     def _in_place_of(self, old: _Process | None) -> _Process:
         if old is not None:

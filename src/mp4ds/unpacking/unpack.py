@@ -116,6 +116,10 @@ def _unpack_here(
                     losses += examine(stream)
             if not chosen.salvage:
                 whole.verify_sidecars(chosen.selected)
+            if chosen.slice and not chosen.salvage:
+                for stream in whole.streams:  # without digests, nothing else shows a damage
+                    if stream.sidecar.digests is None and chosen.selected(stream.topic):
+                        stream.verify_video()
             if to == "images":
                 reads_all = _needs_messages(whole, chosen)
             else:  # a slice is filtered out where log times do not tell the order
@@ -124,7 +128,7 @@ def _unpack_here(
                 whole.verify_messages()
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
-            part = slice_of(whole, chosen.slice)
+            part = slice_of(whole, chosen.slice, chosen.selected)
             if to == "images" or not _converts_none(chosen):
                 # whose frames are counted from the slice's first one
                 with sliced(whole, part, path.parent, chosen.selected) as opened:

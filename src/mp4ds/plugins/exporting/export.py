@@ -85,7 +85,12 @@ def export(
         )
         opened = [
             stack.enter_context(
-                sliced(one, slice_of(one, chosen.slice), path.parent / str(number), chosen.uses)
+                sliced(
+                    one,
+                    slice_of(one, chosen.slice, chosen.uses),
+                    path.parent / str(number),
+                    chosen.uses,
+                )
             )
             for number, one in enumerate(opened)
         ]
