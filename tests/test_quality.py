@@ -28,7 +28,7 @@ from mp4ds.packing.tracks import CrfControl, window_frames
 from mp4ds.plan import QualityTarget, parse_quality
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
-from mp4ds.records import Message
+from mp4ds.records import Excerpt, Message
 from mp4ds.video.scores import find_ffmpeg, largest_crf, scores_of
 from round_trips import unpacked
 from scenes import Record, instant, scene, together
@@ -255,7 +255,8 @@ def test_one_of_two_equal_channels_cannot_have_the_score(
 ) -> None:
     """The channel of the first image is not that of the images that cannot have it."""
     (whole,) = recording(tmp_path, [0.0, 0.0, 30.0])
-    images = [item for item in open_reader(whole).records() if isinstance(item, Message)]
+    excerpt = Excerpt(topics=frozenset([TOPIC]), others=False)
+    images = [item for item in open_reader(whole).records(excerpt) if isinstance(item, Message)]
     small = {"height": 2, "width": 2, "encoding": "nv12", "step": 2, "data": np.zeros(6, np.uint8)}
     path = tmp_path / "equal.mcap"
     with path.open("wb") as file:
@@ -264,8 +265,8 @@ def test_one_of_two_equal_channels_cannot_have_the_score(
         definition = images[0].channel.schema
         schema = writer.register_schema(definition.name, definition.encoding, definition.data)
         first, second = (writer.register_channel(TOPIC, "cdr", schema) for _ in range(2))
-        time = images[0].log_time - 1
-        writer.add_message(first, time, Record(TOPIC, IMAGE, time, small).payload("cdr"), time)
+        for time in range(images[0].log_time - 8, images[0].log_time):
+            writer.add_message(first, time, Record(TOPIC, IMAGE, time, small).payload("cdr"), time)
         for image in images:
             writer.add_message(second, image.log_time, image.data, image.publish_time)
         writer.finish()
