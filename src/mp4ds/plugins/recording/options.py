@@ -30,7 +30,7 @@ def _parse_duration(value: str | float) -> float:
     try:
         seconds = float(text[:-1] if factor > 1 else text) * factor
     except ValueError:
-        raise OptionError(f"{value!r} is not a number of seconds, such as 2.5.") from None
+        raise OptionError(f"{value!r} is no duration: give seconds, 5m or 2h.") from None
     if not 0 <= seconds < 1e9:
         raise OptionError(f"{seconds:.15g} is not from 0 to 999999999 seconds.")
     return seconds
