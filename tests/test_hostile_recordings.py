@@ -475,7 +475,7 @@ def test_a_message_that_unpacks_to_much() -> None:
 
 
 GIB = 2**30
-MESSAGE = channel_record(1, "/a") + struct.pack("<BQHIQQ", 5, 22 + GIB, 1, 0, 1, 1)
+MESSAGE = channel_record("/a") + struct.pack("<BQHIQQ", 5, 22 + GIB, 1, 0, 1, 1)
 
 
 def lz4_message() -> bytes:
@@ -525,7 +525,7 @@ def test_a_message_is_bounded_whatever_its_ratio(name: str, tmp_path: Path, jail
     path = tmp_path / name
     if name == "a.mcap":
         sent = struct.pack("<HIQQ", 1, 0, 1, 1) + zstd_message(b"")
-        path.write_bytes(file_of(channel_record(1, "/a"), record(5, sent)))
+        path.write_bytes(file_of(channel_record("/a"), record(5, sent)))
     elif name == "a.mcap.zstd":
         start = zstandard.compress(file_of()[:-50])
         path.write_bytes(start + zstd_message() + zstandard.compress(file_of()[-50:]))
@@ -548,7 +548,7 @@ def test_a_message_is_bounded_whatever_its_ratio(name: str, tmp_path: Path, jail
 
 
 def test_the_limit_is_yours_to_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    content = channel_record(1, "/a") + record(5, struct.pack("<HIQQ", 1, 0, 1, 1) + bytes(2**28))
+    content = channel_record("/a") + record(5, struct.pack("<HIQQ", 1, 0, 1, 1) + bytes(2**28))
     path = tmp_path / "a.mcap"
     path.write_bytes(file_of(chunk(zstandard.compress(content), "zstd", crc=0, size=len(content))))
 
