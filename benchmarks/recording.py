@@ -40,7 +40,8 @@ from measure import parser_of, print_machine, print_table, size_of
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from mp4ds.format.sidecars import load_manifest
-from roscore import RECORD, Core, missing, python, wait_until
+from roscore import RECORD, Core, missing, python
+from waiting import until
 
 PUBLISHER = str(Path(__file__).with_name("recording_publisher.py"))
 OTHERS = "/rosout.*|/clock"
@@ -108,7 +109,7 @@ def theirs(bag: Path) -> list[str]:
 
 def publisher(core: Core, *robot: object) -> Any:
     """A robot; see recording_publisher.py."""
-    command = [*core._prefix, *python(PUBLISHER, *map(str, robot))]
+    command = python(PUBLISHER, *map(str, robot))
     path = {"PYTHONPATH": str(Path(PUBLISHER).parent)}
     return subprocess.Popen(
         command, env={**core.environment, **path}, stdout=subprocess.PIPE, text=True
@@ -222,7 +223,7 @@ def kills(core: Core, folder: Path, count: int) -> None:
         dataset.parent.mkdir()
         recorder = core.start(*ours(dataset))
         unfinished = dataset.with_name(f"{dataset.name}.recording")
-        wait_until(lambda path=unfinished: _size(path) > 1_000_000)
+        until(lambda path=unfinished: _size(path) > 1_000_000)
         time.sleep(chance.uniform(1.0, 6.0))
         killed = time.time_ns()
         recorder.kill()
