@@ -459,3 +459,6 @@ def test_a_slice_of_a_damaged_lossy_video(span: dict[str, str], tmp_path: Path) 
     with pytest.raises(FormatError, match="hash-mismatch"):
         mp4ds.unpack(dataset, "bag", tmp_path / "again.bag", UnpackOptions(**span))
     assert not (tmp_path / "again.bag").exists()
+    with pytest.raises(FormatError, match="hash-mismatch"):
+        mp4ds.export(dataset, "euroc", tmp_path / "again", mp4ds.ExportOptions(**span))
+    assert not (tmp_path / "again").exists()

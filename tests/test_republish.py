@@ -24,6 +24,7 @@ import mp4ds
 from coded_scenes import CODED, MakeScene
 from commands import call
 from definitions import CODED_VIDEO, COMPRESSED, IMAGE, PACKET
+from edits import agreed, flip
 from encoders import cv, nal_units
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
@@ -940,6 +941,22 @@ def test_a_damaged_video_is_refused(name: str, kind: str, with_sum: bool, tmp_pa
     with pytest.raises(FormatError):
         made.unpack("mcap", kind)
     assert not (tmp_path / "again.mcap").exists()
+
+
+@pytest.mark.parametrize("with_sum", [True, False])
+def test_no_images_are_made_of_a_damaged_video(with_sum: bool, tmp_path: Path) -> None:
+    made = Packed(tmp_path, scene("rgb8", noisy=False), "mcap-ros2-zstd")
+    flip(made.folder / "dataset" / "cam_image_raw.mp4", 0.6)
+    if not with_sum:
+        without_sum(made.folder / "dataset" / "cam_image_raw.yaml")
+        agreed(made.folder / "dataset")
+    for make in (
+        lambda: mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "again"),
+        lambda: mp4ds.export(made.folder / "dataset", "euroc", tmp_path / "again"),
+    ):
+        with pytest.raises(FormatError, match="hash-mismatch" if with_sum else "digest-mismatch"):
+            make()
+        assert not (tmp_path / "again").exists()
 
 
 def without_sum(sidecar: Path) -> None:

@@ -297,6 +297,19 @@ class Dataset:
             if selected(stream.topic) or (info and selected(info.channel.topic)):
                 verify_file(stream.path, self.manifest.file(stream.path.name))
 
+    def verify_lossy_videos(self, selected: Callable[[str], bool] = lambda _: True) -> None:
+        """Check the videos without digests of messages: in a part of one, nothing else would show.
+
+        Args:
+            selected: Of which topics.
+
+        Raises:
+            FormatError: ``file-missing`` or ``hash-mismatch``.
+        """
+        for stream in () if self.is_salvaged else self.streams:
+            if stream.sidecar.digests is None and selected(stream.topic):
+                stream.verify_video()
+
     @cached_property
     def _groups(self) -> list[ChannelGroup]:
         return channel_groups(self.streams, self.messages_file.channels)

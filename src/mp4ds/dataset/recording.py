@@ -147,10 +147,16 @@ def copy_part(
         part: What to copy.
         selected: Whether a topic is to be copied.
         about: Description of the recording; None to keep the dataset's.
+
+    Raises:
+        Refused: It cannot be copied; says why.
+        FormatError: It is damaged.
     """
     old = dataset.manifest
     if old is None:
         raise Refused("it is a single video, not a dataset")
+    if part != WHOLE:
+        dataset.verify_lossy_videos(selected)
     earlier = EarlierDataset(
         name=dataset.path.name,
         profile=old.profile,

@@ -402,3 +402,14 @@ class Stream(Images):
         if video.sha256 is not None and digest_file(self.video_path)[1] != video.sha256:
             problem = f"does not match the SHA-256 in its sidecar; it has frames of {self.topic}"
             raise FormatError("hash-mismatch", self.video_path, problem)
+
+    def verify_pictures(self) -> None:
+        """Check the video or, if it has no SHA-256, all messages, before pictures are made of it.
+
+        Raises:
+            FormatError: It is damaged.
+        """
+        self.verify_video()
+        if self.sidecar.video.sha256 is None and self.sidecar.digests is not None:
+            for _ in self.payloads():
+                pass

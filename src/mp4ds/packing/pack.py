@@ -255,10 +255,6 @@ def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
         part = slice_of(dataset, options.slice, selected)
         if options.slice or options.topics or options.exclude:  # whole files are checked as copied
             dataset.verify_messages()
-        for stream in dataset.streams:
-            is_cut = options.slice and selected(stream.topic)
-            if is_cut and stream.sidecar.digests is None:  # nothing else shows that it is damaged
-                stream.verify_video()
         copy_part(dataset, folder, part=part, selected=selected, about=about)
         if options.slice:
             for problem in validate(folder, deep=True):

@@ -53,7 +53,7 @@ class _Files:
         """The files, each with its frame's number in the part; None: it has no picture."""
         part, file = self.part, self.file
         if isinstance(part, Stream):
-            part.verify_video()
+            part.verify_pictures()
             if file is None:
                 yield from files_of(part, marked(self.is_kept))
                 return

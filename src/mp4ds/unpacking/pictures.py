@@ -489,7 +489,7 @@ def _packets_of(
 ) -> Iterator[tuple[int, Given]]:
     """The packets of the video, self-contained from each key frame on."""
     if verify:
-        _verify(stream)
+        stream.verify_pictures()
     with _packets(stream) as packets:
         told = packet_format(form.kind, stream.sidecar, packets.pixel_format, ros1=form.ros1)
         fields = CodedFields(told, *stream.image_size)
@@ -552,7 +552,7 @@ def _from_pictures(
 ) -> Iterator[tuple[int, Given | bytes | bytearray]]:
     """From the decoded pictures of files and packets."""
     if verify:
-        _verify(stream)
+        stream.verify_pictures()
     columns, scale = stream.columns, makers[0][0].scale
     with ExitStack() as files:
         packets = None
@@ -567,11 +567,3 @@ def _from_pictures(
 
 def _packets(stream: Stream) -> PacketReader:
     return PacketReader(stream.video_path, codec=stream.sidecar.video.codec, frames=len(stream))
-
-
-def _verify(stream: Stream) -> None:
-    """Check the video against its SHA-256 or, without one, all messages against their digests."""
-    stream.verify_video()
-    if stream.sidecar.video.sha256 is None and stream.sidecar.digests is not None:
-        for _ in stream.payloads():
-            pass

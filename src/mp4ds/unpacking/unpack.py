@@ -116,10 +116,6 @@ def _unpack_here(
                     losses += examine(stream)
             if not chosen.salvage:
                 whole.verify_sidecars(chosen.selected)
-            if chosen.slice and not chosen.salvage:
-                for stream in whole.streams:  # without digests, nothing else shows a damage
-                    if stream.sidecar.digests is None and chosen.selected(stream.topic):
-                        stream.verify_video()
             if to == "images":
                 reads_all = _needs_messages(whole, chosen)
             else:  # a slice is filtered out where log times do not tell the order
@@ -137,6 +133,8 @@ def _unpack_here(
                     else:
                         _unpack_recording(opened, path, to, chosen, summary, progress)
             else:
+                if chosen.slice:
+                    whole.verify_lossy_videos(chosen.selected)
                 _unpack_recording(whole, path, to, chosen, summary, progress, part)
             if to != "images":
                 latched = (item.channel.topic for item in part.latched)

@@ -202,7 +202,7 @@ class ExportedCamera:
         Raises:
             FormatError: The stream is damaged.
         """
-        self.stream.verify_video()
+        self.stream.verify_pictures()
         place_of = np.full(len(self.stream), -1, np.int64)
         place_of[self.numbers] = np.arange(len(self))
         for index, picture in self.stream.pictures_at(marked(place_of >= 0), self.view.scale):
