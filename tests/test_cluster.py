@@ -19,7 +19,7 @@ import pytest
 
 import cluster_tasks
 from clusters import WITH_NANNY, RealCluster
-from mp4ds.errors import ClusterError, OptionError
+from mp4ds.errors import OptionError, RemoteError
 from mp4ds.packing.processes import CallError
 from mp4ds.plugins import cluster as access
 from mp4ds.plugins.cluster import ClusterExecutor
@@ -190,9 +190,9 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
         cluster.scheduler.kill()
         found = [error for call in calls if (error := call.exception())]
         assert found
-        assert all(isinstance(error, ClusterError) for error in found)
+        assert all(isinstance(error, RemoteError) for error in found)
         assert all("run the same command again to resume" in str(error) for error in found)
-        with pytest.raises(ClusterError):
+        with pytest.raises(RemoteError):
             executor.submit(os.getpid)
     kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("0??")}
     assert 0 < len(kept) < len(names)
@@ -264,7 +264,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tcp://no-such-host.invalid:8786"])
 def test_nobody_at_the_address(address: str, tmp_path: Path) -> None:
-    with pytest.raises(ClusterError, match="no Dask scheduler can be reached"):
+    with pytest.raises(RemoteError, match="no Dask scheduler can be reached"):
         errors(ClusterExecutor(address, 1), cluster_tasks.write, tmp_path, "a")
 
 
@@ -292,7 +292,7 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
         thread = threading.Thread(target=serve, args=(server,))
         thread.start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(ClusterError, match=problem):
+        with pytest.raises(RemoteError, match=problem):
             errors(ClusterExecutor(address, 1), cluster_tasks.write, tmp_path, "a")
         thread.join()
     for connection in kept:
@@ -391,7 +391,7 @@ def test_a_job_that_ended_is_submitted_again(
 
 def test_what_the_batch_system_refuses_is_told(batch: Batch, tmp_path: Path) -> None:
     (batch.folder / "refuse").touch()
-    with pytest.raises(ClusterError, match=r"could not be submitted.*invalid partition specified"):
+    with pytest.raises(RemoteError, match=r"could not be submitted.*invalid partition specified"):
         errors(ClusterExecutor("slurm", 2), cluster_tasks.write, tmp_path, "a")
 
 
@@ -405,7 +405,7 @@ def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
         "scheduler-options": {"host": "127.0.0.1", "dashboard_address": ":0"},
     }
     named = {f"jobqueue.{system}.{name}": value for name, value in settings.items()}
-    with dask.config.set(named), pytest.raises(ClusterError, match="could not be submitted"):
+    with dask.config.set(named), pytest.raises(RemoteError, match="could not be submitted"):
         errors(ClusterExecutor(system, 1), cluster_tasks.write, tmp_path, "a")
 
 

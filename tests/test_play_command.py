@@ -190,5 +190,5 @@ def test_what_is_sourced(
     if kind:
         assert chosen_world("play", None) == kind
         return
-    with pytest.raises(mp4ds.PublishError, match="no ROS is sourced"):
+    with pytest.raises(mp4ds.RemoteError, match="no ROS is sourced"):
         chosen_world("play", None)

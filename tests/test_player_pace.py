@@ -13,7 +13,7 @@ import pytest
 import mp4ds
 from mp4ds.bags.formats import open_writer
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.errors import PublishError
+from mp4ds.errors import RemoteError
 from mp4ds.plugins.playing import pace
 from mp4ds.plugins.playing.options import PlayOptions, Wanted
 from mp4ds.plugins.playing.pace import Pace, Ticks
@@ -355,5 +355,5 @@ def test_nothing_that_is_installed_is_an_error(drive: Path) -> None:
     publisher = RecordingPublisher(
         world="ros2", not_installed=frozenset({"tf2_msgs/msg/TFMessage", "std_msgs/msg/String"})
     )
-    with pytest.raises(PublishError, match=r"/chatter \(std_msgs/msg/String\), /map.*, /tf_static"):
+    with pytest.raises(RemoteError, match=r"/chatter \(std_msgs/msg/String\), /map.*, /tf_static"):
         run(drive, publisher)

@@ -17,11 +17,10 @@ from mp4ds.plugins.demo import demo
 
 ROOT = Path(__file__).parents[1]
 NAMES = [
-    "ClusterError", "ConversionError", "Dataset", "EncoderRefusedError", "EvaluateOptions",
+    "ConversionError", "Dataset", "EncoderRefusedError", "EvaluateOptions",
     "Evaluation", "ExportOptions", "ExportSummary", "FormatError", "Frame",
     "FrameNotFoundError", "ImageFolder", "Mp4dsError", "OptionError", "PackOptions",
     "PackSummary", "PartsFailedError", "PathError", "PlayOptions", "PlaySummary", "Problem",
-    "PublishError",
     "RecordOptions", "RecordSummary", "RecordedMessage", "RemoteError", "ReportOptions",
     "ReportSummary", "SampleError", "ScoringError", "SourceError", "SourceNotFoundError",
     "Stream", "Sync", "TargetError", "TargetExistsError", "Topic", "UnpackOptions",
@@ -62,11 +61,10 @@ def test_every_error_is_public() -> None:
 
 BUILTIN: dict[type[Exception], str] = {
     ValueError: "SourceError OptionError FormatError VersionError VideoError ConversionError",
-    OSError: "TargetError WriteError PublishError",
+    OSError: "TargetError WriteError",
     FileNotFoundError: "SourceNotFoundError",
     FileExistsError: "TargetExistsError",
     LookupError: "FrameNotFoundError",
-    ConnectionError: "ClusterError",
     RuntimeError: "SampleError",
     Exception: "PathError RemoteError PartsFailedError ScoringError EncoderRefusedError",
 }

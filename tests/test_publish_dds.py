@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("cyclonedds")
 
 from mp4ds.bags.convert import Converter
-from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.errors import ConversionError, OptionError, RemoteError
 from mp4ds.plugins.ros.dds_types import dds_name, dds_topic, message_type
 from mp4ds.plugins.ros.node import NodeOptions, open_node
 from mp4ds.plugins.ros.qos import Qos
@@ -297,14 +297,14 @@ def test_discovery_may_be_kept_to_this_machine(
 
 def test_a_configuration_that_makes_no_sense_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", "<Nonsense/>")
-    with pytest.raises(PublishError, match="CYCLONEDDS_URI"):
+    with pytest.raises(RemoteError, match="CYCLONEDDS_URI"):
         open_node("ros2", NodeOptions("player"))
 
 
 def test_the_library_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "mp4ds.plugins.ros.dds_node", raising=False)
     monkeypatch.setitem(sys.modules, "cyclonedds.builtin", None)
-    with pytest.raises(PublishError, match=r"pip install 'mp4ds\[dds\]'"):
+    with pytest.raises(RemoteError, match=r"pip install 'mp4ds\[dds\]'"):
         open_node("ros2", NodeOptions("player"))
 
 

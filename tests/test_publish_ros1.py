@@ -406,7 +406,7 @@ def test_no_master(roscore: Core, recording: Path) -> None:
             env = {**roscore.environment, "ROS_MASTER_URI": uri, "PYTHONPATH": str(HERE)}
             done = program(*script, env=env)
             kind, sentence = json.loads(done.out)
-            assert kind == "PublishError"
+            assert kind == "RemoteError"
             assert sentence.startswith(f"{uri}: no ROS master answers")
             assert "ROS_MASTER_URI" in sentence
             assert done.err == ""
@@ -424,9 +424,9 @@ def test_no_rospy() -> None:
     code = (
         "import sys; sys.modules['rospy'] = None\n"
         "from mp4ds.plugins.ros.node import NodeOptions, open_node\n"
-        "from mp4ds.errors import PublishError\n"
+        "from mp4ds.errors import RemoteError\n"
         "try: open_node('ros1', NodeOptions('player'))\n"
-        "except PublishError as error: print(error)\n"
+        "except RemoteError as error: print(error)\n"
     )
     told = program("-c", code).out
     assert told.startswith("ros1: No module named '")

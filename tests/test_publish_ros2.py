@@ -16,7 +16,7 @@ import pytest
 
 import fake_rclpy
 from mp4ds.bags.latched import LATCHED_QOS
-from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
+from mp4ds.errors import ConversionError, OptionError, Refused, RemoteError
 from mp4ds.plugins.playing.player import player_services
 from mp4ds.plugins.ros.names import NodeNames
 from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
@@ -384,7 +384,7 @@ def test_services_may_be_missing_in_a_ros(
 
 def test_without_a_ros_that_is_told(bus: fake_rclpy.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rclpy.context", None)
-    with pytest.raises(PublishError, match="source ROS 2"):
+    with pytest.raises(RemoteError, match="source ROS 2"):
         rclpy_node()
 
 

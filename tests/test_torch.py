@@ -538,7 +538,6 @@ def test_damage_is_named(damaged: Path, workers: int, method: str | None) -> Non
         mp4ds.ConversionError("/topic", "is odd"),
         mp4ds.WriteError("drive", OSError(28, "No space left on device")),
         mp4ds.PartsFailedError("drive", [("0001", "is odd")], 3, 2),
-        mp4ds.ClusterError("tcp://host", "is odd", "Fix it."),
         mp4ds.RemoteError("drive", "is odd"),
         SampleError("is odd"),
     ],

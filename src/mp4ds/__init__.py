@@ -21,56 +21,64 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from mp4ds._version import __version__
-from mp4ds.errors import (
-    ClusterError,
-    ConversionError,
-    EncoderRefusedError,
-    FormatError,
-    FrameNotFoundError,
-    Mp4dsError,
-    OptionError,
-    PartsFailedError,
-    PathError,
-    PublishError,
-    RemoteError,
-    SampleError,
-    ScoringError,
-    SourceError,
-    SourceNotFoundError,
-    TargetError,
-    TargetExistsError,
-    VersionError,
-    VideoError,
-    WriteError,
-)
+from mp4ds._version import __version__ as __version__
 
 TYPE_CHECKING = False  # without typing, whose import costs more than all of this
 if TYPE_CHECKING:
     from typing import Any
 
-    from mp4ds.dataset.checks import Problem, validate
-    from mp4ds.dataset.dataset import Dataset
+    from mp4ds.dataset.checks import Problem as Problem
+    from mp4ds.dataset.checks import validate as validate
+    from mp4ds.dataset.dataset import Dataset as Dataset
     from mp4ds.dataset.dataset import open_dataset as open
-    from mp4ds.dataset.messages import RecordedMessage
-    from mp4ds.dataset.stream import Stream
-    from mp4ds.dataset.topic import Frame, Topic
-    from mp4ds.packing.options import ImageFolder, PackOptions, PackSummary
-    from mp4ds.packing.pack import pack, pack_each, pack_share
-    from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
-    from mp4ds.plugins.evaluating.trials import Evaluation
-    from mp4ds.plugins.exporting.export import export
-    from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
-    from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
-    from mp4ds.plugins.playing.options import PlayOptions
-    from mp4ds.plugins.playing.play import play
-    from mp4ds.plugins.playing.player import PlaySummary
-    from mp4ds.plugins.recording.options import RecordOptions
-    from mp4ds.plugins.recording.record import RecordSummary, record
-    from mp4ds.plugins.reporting.report import ReportOptions, ReportSummary, report
-    from mp4ds.times import Sync
-    from mp4ds.unpacking.options import UnpackOptions, UnpackSummary
-    from mp4ds.unpacking.unpack import unpack
+    from mp4ds.dataset.messages import RecordedMessage as RecordedMessage
+    from mp4ds.dataset.stream import Stream as Stream
+    from mp4ds.dataset.topic import Frame as Frame
+    from mp4ds.dataset.topic import Topic as Topic
+    from mp4ds.errors import ConversionError as ConversionError
+    from mp4ds.errors import EncoderRefusedError as EncoderRefusedError
+    from mp4ds.errors import FormatError as FormatError
+    from mp4ds.errors import FrameNotFoundError as FrameNotFoundError
+    from mp4ds.errors import Mp4dsError as Mp4dsError
+    from mp4ds.errors import OptionError as OptionError
+    from mp4ds.errors import PartsFailedError as PartsFailedError
+    from mp4ds.errors import PathError as PathError
+    from mp4ds.errors import RemoteError as RemoteError
+    from mp4ds.errors import SampleError as SampleError
+    from mp4ds.errors import ScoringError as ScoringError
+    from mp4ds.errors import SourceError as SourceError
+    from mp4ds.errors import SourceNotFoundError as SourceNotFoundError
+    from mp4ds.errors import TargetError as TargetError
+    from mp4ds.errors import TargetExistsError as TargetExistsError
+    from mp4ds.errors import VersionError as VersionError
+    from mp4ds.errors import VideoError as VideoError
+    from mp4ds.errors import WriteError as WriteError
+    from mp4ds.packing.options import ImageFolder as ImageFolder
+    from mp4ds.packing.options import PackOptions as PackOptions
+    from mp4ds.packing.options import PackSummary as PackSummary
+    from mp4ds.packing.pack import pack as pack
+    from mp4ds.packing.pack import pack_each as pack_each
+    from mp4ds.packing.pack import pack_share as pack_share
+    from mp4ds.plugins.evaluating.evaluate import EvaluateOptions as EvaluateOptions
+    from mp4ds.plugins.evaluating.evaluate import evaluate as evaluate
+    from mp4ds.plugins.evaluating.trials import Evaluation as Evaluation
+    from mp4ds.plugins.exporting.export import export as export
+    from mp4ds.plugins.exporting.job import ExportOptions as ExportOptions
+    from mp4ds.plugins.exporting.job import ExportSummary as ExportSummary
+    from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4 as import_ros_mp4
+    from mp4ds.plugins.playing.options import PlayOptions as PlayOptions
+    from mp4ds.plugins.playing.play import play as play
+    from mp4ds.plugins.playing.player import PlaySummary as PlaySummary
+    from mp4ds.plugins.recording.options import RecordOptions as RecordOptions
+    from mp4ds.plugins.recording.record import RecordSummary as RecordSummary
+    from mp4ds.plugins.recording.record import record as record
+    from mp4ds.plugins.reporting.report import ReportOptions as ReportOptions
+    from mp4ds.plugins.reporting.report import ReportSummary as ReportSummary
+    from mp4ds.plugins.reporting.report import report as report
+    from mp4ds.times import Sync as Sync
+    from mp4ds.unpacking.options import UnpackOptions as UnpackOptions
+    from mp4ds.unpacking.options import UnpackSummary as UnpackSummary
+    from mp4ds.unpacking.unpack import unpack as unpack
 
 _HOMES = {
     "dataset.checks": "Problem validate",
@@ -78,6 +86,12 @@ _HOMES = {
     "dataset.messages": "RecordedMessage",
     "dataset.stream": "Stream",
     "dataset.topic": "Frame Topic",
+    "errors": (
+        "ConversionError EncoderRefusedError FormatError FrameNotFoundError Mp4dsError "
+        "OptionError PartsFailedError PathError RemoteError SampleError ScoringError "
+        "SourceError SourceNotFoundError TargetError TargetExistsError VersionError "
+        "VideoError WriteError"
+    ),
     "packing.options": "ImageFolder PackOptions PackSummary",
     "packing.pack": "pack pack_each pack_share",
     "plugins.evaluating.evaluate": "EvaluateOptions evaluate",
@@ -97,63 +111,7 @@ _HOMES = {
 }
 """Modules that are imported when one of their names is first used -> the names."""
 
-__all__ = [
-    "ClusterError",
-    "ConversionError",
-    "Dataset",
-    "EncoderRefusedError",
-    "EvaluateOptions",
-    "Evaluation",
-    "ExportOptions",
-    "ExportSummary",
-    "FormatError",
-    "Frame",
-    "FrameNotFoundError",
-    "ImageFolder",
-    "Mp4dsError",
-    "OptionError",
-    "PackOptions",
-    "PackSummary",
-    "PartsFailedError",
-    "PathError",
-    "PlayOptions",
-    "PlaySummary",
-    "Problem",
-    "PublishError",
-    "RecordOptions",
-    "RecordSummary",
-    "RecordedMessage",
-    "RemoteError",
-    "ReportOptions",
-    "ReportSummary",
-    "SampleError",
-    "ScoringError",
-    "SourceError",
-    "SourceNotFoundError",
-    "Stream",
-    "Sync",
-    "TargetError",
-    "TargetExistsError",
-    "Topic",
-    "UnpackOptions",
-    "UnpackSummary",
-    "VersionError",
-    "VideoError",
-    "WriteError",
-    "__version__",
-    "evaluate",
-    "export",
-    "import_ros_mp4",
-    "open",
-    "pack",
-    "pack_each",
-    "pack_share",
-    "play",
-    "record",
-    "report",
-    "unpack",
-    "validate",
-]
+__all__ = sorted(["__version__", *" ".join(_HOMES.values()).split()])
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,7 @@
     │   ├── TargetError (OSError)      2  an output that cannot be written there
     │   │   └── TargetExistsError (FileExistsError)
     │   ├── WriteError (OSError)       1  an output could not be written
-    │   └── RemoteError                1  a store or web server that fails
+    │   └── RemoteError                1  a store, web server, cluster or ROS that fails
     ├── OptionError (ValueError)       2  options that are unknown or contradict each other
     ├── FrameNotFoundError (LookupError) 2  no frame has the requested time
     ├── FormatError (ValueError)       1  a dataset that breaks a rule of the format
@@ -19,9 +19,7 @@
     ├── PartsFailedError               1  parts of a pack failed, the others are kept
     ├── EncoderRefusedError            1  pictures that an encoder does not support
     ├── ScoringError                   1  an ffmpeg with libvmaf that is missing or failed
-    ├── SampleError (RuntimeError)     1  a sample of a data loader that cannot be read
-    ├── ClusterError (ConnectionError) 1  a cluster that does not respond, or was lost
-    └── PublishError (OSError)         1  ROS or another receiver that is missing or was lost
+    └── SampleError (RuntimeError)     1  a sample of a data loader that cannot be read
 
 The classes build their sentence from their fields: what, where, and what to do.
 The exit code is that of the command line. `Refused` is not one of them: users never see it.
@@ -33,8 +31,10 @@ import errno
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 class Mp4dsError(Exception):
@@ -110,7 +110,7 @@ def interrupted(error: KeyboardInterrupt | SystemExit, text: str) -> BaseExcepti
 
 
 class PathError(Mp4dsError):
-    """Something is wrong with a file or folder.
+    """Something is wrong with a file or folder, or with what is at an address.
 
     Args:
         path: Which.
@@ -119,7 +119,7 @@ class PathError(Mp4dsError):
     """
 
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
-        self.path = Path(path) if isinstance(path, str) else path
+        self.path = path
         self.problem = problem
         super().__init__(f"{path_text(path)}: {problem}." + (f" {remedy}" if remedy else ""))
 
@@ -278,7 +278,7 @@ class PartsFailedError(Mp4dsError):
     def __init__(
         self, dataset: Path | str, failures: Sequence[tuple[str, str]], total: int, exit_code: int
     ) -> None:
-        self.dataset = Path(dataset)
+        self.dataset = dataset
         self.failures = list(failures)
         self.exit_code = exit_code
         listed = " ".join(
@@ -291,39 +291,12 @@ class PartsFailedError(Mp4dsError):
         )
 
 
-class ClusterError(Mp4dsError, ConnectionError):
-    """A cluster does not answer, refuses, or was lost.
-
-    Args:
-        address: The address as the user gave it.
-        problem: What is wrong, without a full stop.
-        remedy: What the user can do.
-    """
-
-    def __init__(self, address: str, problem: str, remedy: str) -> None:
-        self.address = address
-        super().__init__(f"{address}: {problem}. {remedy}")
-
-
 class RemoteError(PathError):
-    """A store or web server did not answer, or the network failed, while reading or uploading.
+    """A store, web server, cluster or ROS is missing, does not answer, or was lost.
 
     It is neither a `ValueError` nor an `OSError` on purpose: handlers of a damaged recording or a
     full disk must not catch it.
     """
-
-
-class PublishError(Mp4dsError, OSError):
-    """Messages cannot be published: a master or client library is missing, or was lost.
-
-    Args:
-        where: A topic, or the address that does not respond.
-        problem: What is wrong and what to do, without a full stop.
-    """
-
-    def __init__(self, where: str, problem: str) -> None:
-        self.where = where
-        super().__init__(f"{where}: {problem}.")
 
 
 class ScoringError(Mp4dsError):

@@ -16,10 +16,10 @@ from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.concat import concat
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import (
-    ClusterError,
     FormatError,
     OptionError,
     PartsFailedError,
+    RemoteError,
     SourceError,
     TargetError,
     WriteError,
@@ -360,7 +360,7 @@ def pack_parts(
 
     Raises:
         PartsFailedError: Pieces failed.
-        ClusterError: The cluster was lost.
+        RemoteError: The cluster was lost.
     """
     number, shares = share or (1, 1)
     with _claimed(packs, alone=share is None), executor, ExitStack() as stack:
@@ -392,7 +392,7 @@ def pack_parts(
             ready = []
             for call in wait(calls, _POLL_SECONDS, FIRST_COMPLETED).done:
                 pack, ended = calls.pop(call)
-                if isinstance(error := call.exception(), ClusterError):
+                if isinstance(error := call.exception(), RemoteError):
                     raise error
                 if ended is not None:
                     pack.ended(ended, error)

@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from urllib.parse import urlsplit
 
-from mp4ds.errors import ClusterError, OptionError
+from mp4ds.errors import OptionError, RemoteError
 from mp4ds.packing.processes import CallError, call_error, release_memory
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class ClusterExecutor(Executor):
     It is connected at the first call and stays so: batch jobs, which may have had to queue, serve
     all calls. A call whose worker dies is made on another one, as often as the scheduler's
     ``distributed.scheduler.allowed-failures`` allows; one that raises is not. If the connection
-    breaks, or the cluster has no workers for long, all calls fail with a `ClusterError`.
+    breaks, or the cluster has no workers for long, all calls fail with a `RemoteError`.
 
     A context manager: leaving it with an exception drops waiting calls; on a cluster that keeps
     running, running calls finish, since a worker's thread cannot be stopped from outside. Whatever
@@ -78,13 +78,13 @@ class ClusterExecutor(Executor):
         self._client: Client | None = None
         self._calls: dict[Future[Any], Any] = {}  # -> Dask's; what nobody holds is not made
         self._closed = threading.Event()
-        self._lost: ClusterError | None = None
+        self._lost: RemoteError | None = None
 
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Make a call on a worker.
 
         Raises:
-            ClusterError: No scheduler responds within 15 s, the batch system refuses the jobs, or
+            RemoteError: No scheduler responds within 15 s, the batch system refuses the jobs, or
                 the cluster was lost.
             OptionError: The configuration of Dask lacks something.
         """
@@ -181,7 +181,7 @@ class ClusterExecutor(Executor):
 
     def _fail(self, problem: str, hint: str) -> None:
         """Let all calls fail: the cluster is lost."""
-        self._lost = ClusterError(self._address, problem, f"{hint} {_GO_ON}")
+        self._lost = RemoteError(self._address, problem, f"{hint} {_GO_ON}")
         for call in list(self._calls):
             with suppress(InvalidStateError):  # it is done
                 call.set_exception(self._lost)
@@ -261,7 +261,7 @@ def _check_scheduler(address: str) -> None:
     """Check that a scheduler answers: a client waits forever if something else listens.
 
     Raises:
-        ClusterError: None does.
+        RemoteError: None does.
         OptionError: There are no certificates.
     """
     with ThreadPoolExecutor(1) as thread:  # the caller's thread may have a running loop
@@ -284,15 +284,15 @@ async def _greet(address: str) -> None:
     except (OSError, asyncio.TimeoutError) as error:
         raise _unreachable(address, error) from None
     except Exception:  # of any kind, since it interprets what it reads as lengths
-        raise ClusterError(
+        raise RemoteError(
             address, "the server there is not a Dask scheduler", "Check the port."
         ) from None
     comm.abort()
 
 
-def _unreachable(address: str, error: Exception) -> ClusterError:
+def _unreachable(address: str, error: Exception) -> RemoteError:
     reason = str(error.__cause__ or error)
-    return ClusterError(
+    return RemoteError(
         address,
         "no Dask scheduler can be reached" + (f" ({reason})" if reason else ""),
         "Check the address, that `dask scheduler` is running there, and that no firewall "
@@ -327,7 +327,7 @@ def _batch_cluster(system: str, jobs: int) -> Iterator[JobQueueCluster]:
     """Submit jobs, and cancel them at the end.
 
     Raises:
-        ClusterError: The batch system refuses the jobs.
+        RemoteError: The batch system refuses the jobs.
         OptionError: The configuration lacks something.
     """
     import dask
@@ -349,7 +349,7 @@ def _batch_cluster(system: str, jobs: int) -> Iterator[JobQueueCluster]:
         ) from None
     with cluster:
         if problem := _submit_jobs(cluster, jobs):
-            raise ClusterError(
+            raise RemoteError(
                 system,
                 f"the jobs could not be submitted: {problem.rstrip('.')}",
                 f"The settings are in {_SETTINGS}.",

@@ -41,7 +41,7 @@ def play(
     Raises:
         OptionError: An option is wrong.
         ConversionError: A topic cannot be published there; names it.
-        PublishError: ROS is not available, or the connection was lost.
+        RemoteError: ROS is not available, or the connection was lost.
         FormatError: A dataset is damaged.
     """
     with open_player(datasets, options, progress=progress) as player:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from mp4ds.errors import OptionError, PublishError, Refused
+from mp4ds.errors import OptionError, Refused, RemoteError
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Pace, Ticks
 from mp4ds.plugins.playing.timeline import ReadAhead, Restamper, Timeline
@@ -270,7 +270,7 @@ class Player:
 
         Raises:
             ConversionError: A topic cannot be published there.
-            PublishError: The connection was lost, or none of the message types is installed.
+            RemoteError: The connection was lost, or none of the message types is installed.
             FormatError: A dataset is damaged; names the topic and the message.
         """
         began = time.monotonic()
@@ -330,7 +330,7 @@ class Player:
         named = ", ".join(sorted({f"{one.topic} ({one.type_name})" for one in missing}))
         if len(self._missing) == len(self._advertised):
             problem = f"no message type of the recording is installed: {named}"
-            raise PublishError(self._node.address, problem)
+            raise RemoteError(self._node.address, problem)
         warnings.warn(
             f"These topics are not played, as their message types are not installed: {named}; "
             "install their packages, or leave the topics out with `exclude`.",

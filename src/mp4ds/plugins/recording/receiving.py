@@ -72,7 +72,7 @@ class Source:
         `ros2 bag record` does: earlier messages would have none, and latched ones still arrive.
 
         Raises:
-            PublishError: The middleware refuses.
+            RemoteError: The middleware refuses.
         """
         names = self._options.names
         if self._options.use_sim_time or names.use_sim_time or self._node.wants_clock:

@@ -117,7 +117,7 @@ def record(
 
     Raises:
         OptionError: An option is wrong.
-        PublishError: There is no ROS, or it cannot be reached.
+        RemoteError: There is no ROS, or it cannot be reached.
         TargetError: The dataset cannot be written there.
         WriteError: The disk is full, or failed. What was recorded before is in the folder
             ``NAME.recording``; `mp4ds.pack` with `salvage` makes a dataset of it.

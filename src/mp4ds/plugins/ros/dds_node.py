@@ -37,7 +37,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from mp4ds.bags.types import by_library, make_store
-from mp4ds.errors import ConversionError, OptionError, PublishError, Refused
+from mp4ds.errors import ConversionError, OptionError, Refused, RemoteError
 from mp4ds.plugins.ros.dds_types import (
     FILLER,
     DdsType,
@@ -90,7 +90,7 @@ def _open_participant(domain: int) -> Any:
     so, as in ROS 2.
 
     Raises:
-        PublishError: It cannot join the domain.
+        RemoteError: It cannot join the domain.
     """
     try:
         if not _is_local():
@@ -102,7 +102,7 @@ def _open_participant(domain: int) -> Any:
         return participant
     except DDSException as error:
         problem = f"cannot be joined: {error.msg}; check the network and CYCLONEDDS_URI"
-        raise PublishError(f"DDS domain {domain}", problem) from None
+        raise RemoteError(f"DDS domain {domain}", problem) from None
 
 
 def _is_local() -> bool:
@@ -231,14 +231,14 @@ class _DdsWriter:
             problem = (
                 "a subscriber has received nothing for 15 s: stop it, or offer best_effort QoS"
             )
-            raise PublishError(self._name, problem)
+            raise RemoteError(self._name, problem)
         self._under_way += len(payload)
         try:
             self._writer.write(self._kind.writes(payload))
         except DDSException as error:
             if error.code == DDSException.DDS_RETCODE_BAD_PARAMETER:
                 raise ConversionError(self._name, "a message is not of its type") from None
-            raise PublishError(self._name, f"DDS refuses a message: {error.msg}") from None
+            raise RemoteError(self._name, f"DDS refuses a message: {error.msg}") from None
 
     def _check(self, message: bytes) -> None:
         if len(message) < 4:
@@ -306,7 +306,7 @@ class DdsNode(Ros2Node):
 
     Raises:
         OptionError: There is no such domain, or an option needs rclpy.
-        PublishError: There is no network.
+        RemoteError: There is no network.
     """
 
     discovery_s = 2 * _SETTLE_S

@@ -14,7 +14,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Literal, TypeVar, cast, get_args
 
-from mp4ds.errors import OptionError, PublishError
+from mp4ds.errors import OptionError, RemoteError
 from mp4ds.plugins.ros.names import PLAIN, NodeNames
 from mp4ds.plugins.ros.qos import Qos
 from mp4ds.records import Channel
@@ -127,7 +127,7 @@ class Node(ABC):
         Raises:
             Refused: Its message type is not installed.
             ConversionError: It cannot be published; names the topic.
-            PublishError: The connection is lost.
+            RemoteError: The connection is lost.
         """
 
     @abstractmethod
@@ -141,7 +141,7 @@ class Node(ABC):
 
         Raises:
             ConversionError: The message is not of its type.
-            PublishError: The connection is lost.
+            RemoteError: The connection is lost.
         """
 
     @abstractmethod
@@ -187,7 +187,7 @@ class Node(ABC):
             Topic -> its wanted types.
 
         Raises:
-            PublishError: Nobody who knows the topics responds.
+            RemoteError: Nobody who knows the topics responds.
         """
 
     def subscribed_topics(self) -> set[str]:
@@ -257,7 +257,7 @@ def chosen_world(command: str, asked: str | None) -> World:
 
     Raises:
         OptionError: There is no such ROS.
-        PublishError: Neither is sourced.
+        RemoteError: Neither is sourced.
     """
     version = asked or f"ros{os.environ.get('ROS_VERSION', '')}"
     if version in get_args(World):
@@ -268,7 +268,7 @@ def chosen_world(command: str, asked: str | None) -> World:
     for module, world in libraries.items():
         if find_spec(module) is not None:
             return world
-    raise PublishError(
+    raise RemoteError(
         command,
         "no ROS is sourced: source its setup file, or choose `ros1`, `ros2` (works without ROS "
         "after pip install 'mp4ds[dds]')",
@@ -284,7 +284,7 @@ def open_node(world: World, options: NodeOptions) -> Node:
 
     Raises:
         OptionError: An option is not valid.
-        PublishError: Something is missing: a library, a network or a master.
+        RemoteError: Something is missing: a library, a network or a master.
     """
     kind = world if world == "ros1" else "rclpy" if find_spec("rclpy") is not None else "dds"
     module, name, remedy = _NODES[kind]
@@ -292,7 +292,7 @@ def open_node(world: World, options: NodeOptions) -> Node:
     try:
         node: type[Node] = getattr(import_module(f"mp4ds.plugins.ros.{module}"), name)
     except ImportError as error:
-        raise PublishError(kind, f"{error}; {remedy}") from None
+        raise RemoteError(kind, f"{error}; {remedy}") from None
     finally:
         logging.setLoggerClass(before)  # rosgraph sets its own for the whole process
     return node(options)

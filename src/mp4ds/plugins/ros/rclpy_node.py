@@ -26,7 +26,7 @@ from rclpy.qos import (
 )
 from rosidl_runtime_py.utilities import get_message, get_service
 
-from mp4ds.errors import ConversionError, PublishError, Refused
+from mp4ds.errors import ConversionError, Refused, RemoteError
 from mp4ds.plugins.ros.node import NodeOptions, Service
 from mp4ds.plugins.ros.qos import Qos
 from mp4ds.plugins.ros.ros2 import (
@@ -53,7 +53,7 @@ class _RclpyWriter:
         try:
             self._publisher.publish(payload)
         except Exception as error:  # rclpy's errors have no common base
-            raise PublishError(self._topic, f"ROS 2 refuses a message: {error}") from None
+            raise RemoteError(self._topic, f"ROS 2 refuses a message: {error}") from None
 
     def wait(self, seconds: float) -> bool:
         left = -1.0 if math.isinf(seconds) else seconds  # rclpy takes a negative one for infinite

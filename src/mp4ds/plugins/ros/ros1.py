@@ -32,7 +32,7 @@ from rospy.impl.tcpros_base import init_tcpros_server
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import is_ros1
 from mp4ds.bags.ros1 import make_channel
-from mp4ds.errors import ConversionError, OptionError, PublishError
+from mp4ds.errors import ConversionError, OptionError, RemoteError
 from mp4ds.plugins.ros.names import NodeNames
 from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions, Receive, Service
 from mp4ds.records import Channel
@@ -242,7 +242,7 @@ def _start_node(node: str, names: NodeNames) -> str:
 
     Raises:
         OptionError: The address of the master is not valid.
-        PublishError: No master answers.
+        RemoteError: No master answers.
     """
     try:
         master = str(rosgraph.get_master_uri())
@@ -252,9 +252,9 @@ def _start_node(node: str, names: NodeNames) -> str:
         raise OptionError(f"The address of the ROS master is not valid: {error}.") from None
     if not has_master:
         problem = "no ROS master answers; start roscore, or set ROS_MASTER_URI"
-        raise PublishError(master, problem)
+        raise RemoteError(master, problem)
     if rospy.core.is_initialized() or rospy.is_shutdown():
-        raise PublishError(
+        raise RemoteError(
             master, "a process can be a ROS node only once, and this one was; start a new process"
         )
     arguments = (("name", names.node), ("ns", names.namespace))
@@ -270,7 +270,7 @@ def _start_node(node: str, names: NodeNames) -> str:
             )
             _receive_many()
     except (rospy.ROSException, ValueError, OSError) as error:
-        raise PublishError(master, f"cannot start a node ({error})") from None
+        raise RemoteError(master, f"cannot start a node ({error})") from None
     return master
 
 
@@ -382,7 +382,7 @@ class Ros1Node(Node):
 
     Raises:
         OptionError: The address of the master is not valid.
-        PublishError: No master answers.
+        RemoteError: No master answers.
     """
 
     world = "ros1"
@@ -438,7 +438,7 @@ class Ros1Node(Node):
 
     def _check_alive(self) -> None:
         if not self.is_alive:
-            raise PublishError(self._master, "the node was shut down from outside; play again")
+            raise RemoteError(self._master, "the node was shut down from outside; play again")
 
     def _kind(self, channel: Channel) -> Any:
         if channel.message_encoding != "ros1":
@@ -482,9 +482,9 @@ class Ros1Node(Node):
         try:
             found = _answer(call, _ANSWER_S)
         except (OSError, rospy.ROSException) as error:
-            raise PublishError(self._master, f"lost the ROS master ({error})") from None
+            raise RemoteError(self._master, f"lost the ROS master ({error})") from None
         if found is None:
-            raise PublishError(self._master, "the ROS master does not respond")
+            raise RemoteError(self._master, "the ROS master does not respond")
         return found
 
     def follow_clock(self, on_time: Callable[[int], None]) -> None:

@@ -45,7 +45,7 @@ class Writer(Protocol):
 
         Raises:
             ConversionError: It is not of its type.
-            PublishError: It cannot be sent.
+            RemoteError: It cannot be sent.
         """
 
     def wait(self, seconds: float) -> bool:
