@@ -31,9 +31,9 @@ from in_parts import InlineExecutor, facts, leftovers, use
 from mp4ds.errors import Refused, SourceError
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import ImageFolder
-from mp4ds.plugins.importing import parsing
+from mp4ds.plugins.importing.calibrations import ros_calibration
 from mp4ds.plugins.importing.layouts import open_images
-from mp4ds.plugins.importing.parsing import ros_calibration
+from mp4ds.plugins.importing.lists import ROUNDED, ListReader, at_rate
 from mp4ds.video.images import read_image
 from test_version0 import FIXTURE, STAMPS, TOPICS, document, nanoseconds, write_text
 
@@ -202,16 +202,16 @@ def test_what_cannot_be_had_as_it_is_is_refused(tmp_path: Path) -> None:
 )
 def test_decimal_seconds_are_exact(text: str) -> None:
     rounded: Counter[str] = Counter()
-    assert parsing.of_unit("s", rounded)(text) == int(Decimal(text) * 10**9)
+    assert ListReader("s", rounded).time(text) == int(Decimal(text) * 10**9)
     assert not rounded
 
 
 def test_finer_times_are_rounded_and_counted() -> None:
     rounded: Counter[str] = Counter()
-    assert parsing.of_unit("s", rounded)("0.0000000015") == 2
-    assert parsing.of_unit("us", rounded)("1.2345") == 1234
-    assert parsing.of_unit("us", rounded)("1.234") == 1234
-    assert rounded == {parsing.ROUNDED: 2}
+    assert ListReader("s", rounded).time("0.0000000015") == 2
+    assert ListReader("us", rounded).time("1.2345") == 1234
+    assert ListReader("us", rounded).time("1.234") == 1234
+    assert rounded == {ROUNDED: 2}
 
 
 @pytest.mark.parametrize(
@@ -219,15 +219,15 @@ def test_finer_times_are_rounded_and_counted() -> None:
 )
 def test_invalid_times_are_refused(text: str) -> None:
     with pytest.raises(Refused):
-        parsing.of_unit("s", Counter())(text)
+        ListReader("s", Counter()).time(text)
 
 
 def test_rates_are_exact() -> None:
-    found = parsing.at_rate(1000, "30000/1001").tolist()
+    found = at_rate(1000, "30000/1001").tolist()
     assert found == [round(Fraction(number * 1001 * 10**9, 30000)) for number in range(1000)]
     for rate in ("0", "-1", "x", "1/0", ""):
         with pytest.raises(Refused):
-            parsing.at_rate(3, rate)
+            at_rate(3, rate)
 
 
 # ---------------------------------------------------------------- plain folders
@@ -637,10 +637,11 @@ SPOILT: dict[str, tuple[str, bytes | None, str]] = {
     "no-name": ("cam0/data.csv", b"123456\n", "line 1 is not a time and a file name"),
     "late": ("cam0/data.csv", b"9999999999999999999,x.png\n", "2038"),
     "bad-yaml": ("cam0/sensor.yaml", b"a: [1\n", "YAML"),
-    "no-model": ("cam0/sensor.yaml", b"intrinsics: [1, 2, 3, 4]\n", "camera_model is missing"),
+    "no-model": ("cam0/sensor.yaml", b"intrinsics: [1, 2, 3, 4]\n", "camera_model: Field required"),
     "omni": ("cam0/sensor.yaml", b"intrinsics: [1, 2, 3, 4]\ncamera_model: omni\n", "pinhole"),
     "no-rotation": ("cam0/sensor.yaml", b"T_BS: %a\n" % ([2] * 16), "rotation is not valid"),
     "short-imu": ("imu0/data.csv", b"1403636579758555392,1,2\n", "has 3 values, not 7"),
+    "long-line": ("imu0/data.csv", b"1,1,2,3,4,5,6,%s7\n" % (b" " * 65_600), "line 1 is too long"),
     "no-number": ("imu0/data.csv", b"1,1,2,3,4,5,x\n", "than numbers"),
     "damaged-image": ("cam0/data/*", b"\x89PNG", "cannot be read as an image"),
     # Pillow runs Ghostscript for it, whatever the file is called
@@ -716,8 +717,11 @@ def test_bad_plain_folders_are_refused(
     [
         (ROS_CALIBRATION.replace("32", "33", 1), "33x24"),
         (ROS_CALIBRATION.replace("plumb_bob", "fov"), "known are plumb_bob"),
-        ("image_width: 3\nimage_height: 3\n", "camera_matrix is missing"),
-        (ROS_CALIBRATION.replace("30.5", ".nan"), "'.nan'"),
+        ("image_width: 3\nimage_height: 3\n", "camera_matrix: Field required"),
+        (
+            ROS_CALIBRATION.replace("30.5", ".nan"),
+            "camera_matrix.0: Input should be a valid number",
+        ),
         ("a: !!opencv-matrix {}\n", "tags"),
     ],
 )

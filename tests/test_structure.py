@@ -85,7 +85,7 @@ HOMES = {
     "cyclonedds": ("plugins/ros",),
     "pyarrow": ("plugins/exporting",),
     "yaml": ("yamlio.py", "bags", "plugins/ros"),
-    "pydantic": ("format", "dataset/checks.py", "plugins/evaluating"),
+    "pydantic": ("format", "dataset/checks.py", "plugins/evaluating", "plugins/importing"),
     "jsonschema": ("dataset/checks.py",),
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +16,14 @@ from mp4ds.files.sources import members
 from mp4ds.files.urls import remote
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.packing.options import ImageFolder
-from mp4ds.plugins.importing.parsing import (
-    Rows,
-    at_rate,
+from mp4ds.plugins.importing.calibrations import (
     euroc_calibration,
     euroc_pose,
-    is_number,
-    lines_of,
-    listed_images,
-    of_unit,
-    read_table,
-    read_times,
     read_yaml,
     ros_calibration,
-    split,
-    unit_of,
 )
-from mp4ds.plugins.importing.reader import ImagesReader
+from mp4ds.plugins.importing.lists import ListReader, Row, at_rate, is_number, rows_of, unit_of
+from mp4ds.plugins.importing.reader import ImagesReader, reading
 from mp4ds.video.images import STILL_SUFFIXES, image_size
 
 
@@ -54,7 +46,7 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
         raise SourceError(folder, "is not a folder of images")
     if options.topic is not None and not options.topic.strip("/"):
         raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
-    try:
+    with reading(folder):
         reader = ImagesReader(folder)
         if _is_euroc(folder):
             options.check_for("euroc")
@@ -64,10 +56,6 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
             _add_tum(reader, options)
         else:
             _add_plain(reader, options)
-    except OSError as error:
-        if isinstance(error, SourceError):
-            raise
-        raise SourceError(error.filename or folder, f"cannot be read: {error.strerror}") from None
     if options.calibration:
         reader.add_file(Path(options.calibration), is_kept=True)
     reader.finish()
@@ -117,22 +105,28 @@ def _is_euroc(folder: Path) -> bool:
 
 def _add_euroc(reader: ImagesReader) -> None:
     """Add cameras, IMUs and poses."""
-    sensors = _sensors(reader.path)
+    sensors, lists = _sensors(reader.path), ListReader("ns", reader.left_out)
     for sensor in sensors:
-        name, is_camera = sensor.name, (sensor / "data").is_dir()
-        described = _described(reader, sensor / "sensor.yaml")
+        name, is_camera, path = sensor.name, (sensor / "data").is_dir(), sensor / _LIST
+        described: dict[str, Any] = {}
+        if (sensor / "sensor.yaml").is_file():
+            reader.add_file(sensor / "sensor.yaml", is_kept=True)
+            described = read_yaml(sensor / "sensor.yaml")
         if is_camera or name.startswith("imu"):
             reader.transforms += euroc_pose(sensor / "sensor.yaml", described, _BODY, name)
         if is_camera:
-            _add_euroc_camera(reader, sensor, described)
+            _add_euroc_camera(reader, sensor, described, lists)
         elif name.startswith("imu"):
-            times, rows = read_table(sensor / _LIST, of_unit("ns", reader.left_out), 6)
-            reader.add_table(f"/{name}", "imu", name, times, rows)
-            reader.add_file(sensor / _LIST)
+            reader.add_table(f"/{name}", "imu", name, *lists.table(path, 6))
         elif name.startswith(_POSES):
-            _add_euroc_poses(reader, sensor)
+            # position and w, x, y, z of the quaternion; a pose holds no velocities and biases
+            shortened = f"rows of {name} of which only the pose was taken"
+            stamps, rows = lists.table(path, 7, shortened=shortened)
+            reader.add_table(f"/{name}", "pose", _WORLD, stamps, rows[:, [0, 1, 2, 4, 5, 6, 3]])
         else:
             reader.leave_out(sensor, f"{name}, which is not a camera, IMU or pose")
+            continue
+        reader.add_file(path)
     for path in sorted(_root(reader.path).iterdir()):
         if path.is_file() and path.suffix == ".yaml":
             reader.add_file(path, is_kept=True)
@@ -140,37 +134,18 @@ def _add_euroc(reader: ImagesReader) -> None:
             reader.leave_out(path, f"{path.name}, which has no {_LIST}")
 
 
-def _described(reader: ImagesReader, path: Path) -> dict[str, Any]:
-    """The contents of a sensor.yaml, which is kept."""
-    if not path.is_file():
-        return {}
-    reader.add_file(path, is_kept=True)
-    return read_yaml(path)
-
-
-def _add_euroc_camera(reader: ImagesReader, sensor: Path, described: dict[str, Any]) -> None:
-    path, images = sensor / _LIST, sensor / "data"
-    files, stamps = listed_images(path, images, of_unit("ns", reader.left_out))
+def _add_euroc_camera(
+    reader: ImagesReader, sensor: Path, described: dict[str, Any], lists: ListReader
+) -> None:
+    images = sensor / "data"
+    files, stamps = lists.images(sensor / _LIST, images)
     if unlisted := len(members(images)) - len(set(files)):
         what = f"files in {images.name} of {sensor.name} that {_LIST} does not list"
         reader.left_out[what] = unlisted
-    calibration = None
-    if "intrinsics" in described:
-        calibration = euroc_calibration(sensor / "sensor.yaml", described)
+    calibration = euroc_calibration(sensor / "sensor.yaml", described)
     topic = f"/{sensor.name}/image_raw"
     reader.add_camera(topic, sensor.name, files, stamps, calibration=calibration)
-    reader.add_file(path)
     reader.add_file(images)
-
-
-def _add_euroc_poses(reader: ImagesReader, sensor: Path) -> None:
-    """Position and w, x, y, z of the quaternion; a pose cannot hold velocities and biases."""
-    path = sensor / _LIST
-    stamps, rows = read_table(path, of_unit("ns", reader.left_out), 7, more=True)
-    reader.add_table(f"/{sensor.name}", "pose", _WORLD, stamps, rows[:, [0, 1, 2, 4, 5, 6, 3]])
-    reader.add_file(path)
-    if any(len(split(line)) > 8 for _, line in lines_of(path)):
-        reader.left_out[f"rows of {sensor.name} of which only the pose was taken"] = len(rows)
 
 
 # ---------------------------------------------------------------- tum
@@ -189,12 +164,12 @@ def _is_tum(folder: Path) -> bool:
 
 def _add_tum(reader: ImagesReader, options: ImageFolder) -> None:
     """Add the colour and depth images, accelerometer and poses."""
-    folder, seconds = reader.path, of_unit("s", reader.left_out)
+    folder, lists = reader.path, ListReader("s", reader.left_out)
     listed: dict[Path, set[Path]] = {}
     for name, encoding in _CAMERAS.items():
         path = folder / f"{name}.txt"
         if path.is_file():
-            files, stamps = listed_images(path, folder, seconds)
+            files, stamps = lists.images(path, folder)
             topic = f"/{name}/image_raw"
             calibration = _calibration(options, topic, files)
             reader.add_camera(
@@ -210,8 +185,7 @@ def _add_tum(reader: ImagesReader, options: ImageFolder) -> None:
     for name, (kind, values, frame_id) in _TABLES.items():
         path = folder / f"{name}.txt"
         if path.is_file():
-            stamps, rows = read_table(path, seconds, values)
-            reader.add_table(f"/{name}", kind, frame_id, stamps, rows)
+            reader.add_table(f"/{name}", kind, frame_id, *lists.table(path, values))
             reader.add_file(path)
     for path in sorted(folder.iterdir()):
         if path not in reader.files:
@@ -321,15 +295,19 @@ def _by_list(
     reader: ImagesReader, images: list[Path], path: Path, unit: str | None
 ) -> tuple[list[Path], NDArray[np.int64]]:
     """The images of a list of times, which may also name them."""
-    rows: Rows = [(number, split(line)) for number, line in lines_of(path)]
-    header = rows.pop(0)[1] if rows and not any(map(is_number, rows[0][1])) else []
-    if not rows:
+    rows = rows_of(path)
+    first = next(rows, None)
+    header: list[str] = []
+    if first and not any(map(is_number, first[1])):
+        header = first[1]
+        first = next(rows, None)
+    if first is None:
         raise SourceError(path, "holds no times")
-    time, name = _columns(path, *rows[0])
+    time, name = _columns(path, *first)
     if path.parent.resolve() != reader.path.resolve():
         reader.add_file(path)
-    chosen: Rows = []
-    for number, values in rows:
+    chosen: list[Row] = []
+    for number, values in chain([first], rows):
         if len(values) <= max(time, name or 0):
             raise SourceError(path, f"line {number} has {len(values)} values, fewer than before")
         chosen.append((number, [values[time], *([] if name is None else [values[name]])]))
@@ -338,10 +316,10 @@ def _by_list(
     unit = unit or unit_of([values[0] for _, values in chosen if is_number(values[0])])
     if unit is None:
         raise OptionError(f"{path}: its times are integers of an unknown unit. Give `unit`.")
-    read = of_unit(unit, reader.left_out)
+    lists = ListReader(unit, reader.left_out)
     if name is not None:
-        return listed_images(path, reader.path, read, chosen)
-    stamps = read_times(path, chosen, read)
+        return lists.images(path, reader.path, chosen)
+    stamps = lists.times(path, chosen)
     if len(stamps) != len(images):
         raise SourceError(
             path, f"has {len(stamps)} times, but there are {len(images)} images in {reader.path}"
@@ -373,11 +351,11 @@ def _by_name(reader: ImagesReader, images: list[Path], unit: str | None) -> NDAr
             "holds images whose names are not times in nanoseconds or decimal seconds",
             "Give `stamps` FILE, `rate` HZ, or the `unit` of the names.",
         )
-    read = of_unit(unit, reader.left_out)
+    lists = ListReader(unit, reader.left_out)
     stamps = np.empty(len(images), np.int64)
     for place, path in enumerate(images):
         try:
-            stamps[place] = read(path.stem)
+            stamps[place] = lists.time(path.stem)
         except Refused as error:
             raise SourceError(path, f"has a name that is not a time: {error}") from None
     return stamps

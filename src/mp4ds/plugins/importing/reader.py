@@ -7,6 +7,7 @@ import heapq
 import io
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,6 +65,21 @@ _TABLES: Mapping[str, tuple[str, Callable[[Sequence[float]], Sequence[float]]]] 
     # position x, y, z in metres, then the quaternion x, y, z, w
     "pose": ("geometry_msgs/msg/PoseStamped", lambda row: row),
 }
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn errors of the system into one that a user can meet.
+
+    Raises:
+        SourceError: A file, or else this path, cannot be read.
+    """
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, SourceError):
+            raise
+        raise SourceError(error.filename or path, f"cannot be read: {error.strerror}") from None
 
 
 @dataclass(frozen=True)
@@ -264,15 +280,16 @@ class ImagesReader(BagReader):
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Attachments, then messages by log time."""
         self.position = 0
-        if excerpt.others:
-            yield from self._attachments()
         orders = [track.order(place, excerpt) for place, track in enumerate(self._tracks)]
-        for time, place, number in heapq.merge(*orders):
-            track = self._tracks[place]
-            if track.files:
-                self.position += _size(track.files[number])
-            yield Message(track.channel, time, time, 0, track.make(number))
-        self.position = sum(map(source_size, self.files))
+        with reading(self.path):
+            if excerpt.others:
+                yield from self._attachments()
+            for time, place, number in heapq.merge(*orders):
+                track = self._tracks[place]
+                if track.files:
+                    self.position += track.files[number].stat().st_size
+                yield Message(track.channel, time, time, 0, track.make(number))
+            self.position = sum(map(source_size, self.files))
 
     def _attachments(self) -> Iterator[Attachment]:
         """What messages cannot hold: the original calibrations, and the file names."""
@@ -280,7 +297,7 @@ class ImagesReader(BagReader):
         for path in self.kept:
             is_yaml = path.suffix in (".yaml", ".yml")
             media_type = "application/yaml" if is_yaml else "text/plain"
-            yield self._attachment(source_name(path, self.path), media_type, _bytes(path))
+            yield self._attachment(source_name(path, self.path), media_type, path.read_bytes())
 
     def _attachment(self, name: str, media_type: str, data: bytes) -> Attachment:
         return Attachment(name, media_type, self._start, self._start, data)
@@ -304,24 +321,10 @@ class ImagesReader(BagReader):
 # ---------------------------------------------------------------- messages
 
 
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError as error:
-        raise SourceError(path, f"cannot be read: {error.strerror}") from None
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise SourceError(path, f"cannot be read: {error.strerror}") from None
-
-
 def _image(path: Path, encoding: str | None) -> tuple[Fields, bytes]:
     """The fields of an image's message, and its pixels, or the file if it is JPEG."""
     if path.suffix.lower() in _JPEG:
-        return CodedFields("jpeg"), _bytes(path)
+        return CodedFields("jpeg"), path.read_bytes()
     found, pixels = read_image(path)
     wanted = ENCODINGS[encoding or found]
     if not _suits(wanted, pixels):
