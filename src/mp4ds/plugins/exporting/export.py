@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -29,7 +27,7 @@ NOTE_NAME = "mp4ds_export.json"
 FORMATS = {"euroc": "EuRoC", "tum": "TUM", "colmap": "COLMAP", "lerobot": "LeRobot"}
 """Formats -> display name."""
 
-_Writer = Callable[[Sequence[ExportJob]], None]
+_Writer = Callable[..., None]
 _WRITERS = {"euroc": write_euroc, "tum": write_tum, "colmap": write_colmap}
 
 
@@ -94,12 +92,23 @@ def export(
             )
             for number, one in enumerate(opened)
         ]
-        # LeRobot's videos are in colour
-        make = partial(ExportJob, path=path, options=chosen, in_colour=to == "lerobot")
-        jobs = [make(one, tell=progress or (lambda *_: None)) for one in opened]
-        write(jobs)
-        summary = _summary(jobs, target, to)
-        if not any(summary.messages.values()):
+        summary = ExportSummary(target, to)
+        jobs = [
+            ExportJob(
+                one,
+                path,
+                chosen,
+                summary,
+                progress or (lambda *_: None),
+                where=f"{one.path.name}: " if len(opened) > 1 else "",
+                in_colour=to == "lerobot",  # its videos are
+            )
+            for one in opened
+        ]
+        write(*jobs)
+        for job in jobs:
+            job.leave_out_rest(FORMATS[to])
+        if not summary.messages:
             why = [f"{topic}: {next(iter(found))}" for topic, found in summary.left_out.items()]
             raise OptionError(
                 f"{FORMATS[to]} cannot hold any topic of {opened[0].path}: "
@@ -140,23 +149,6 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
         )
     options.check_for(to)
     _ = options.reduction  # refuses invalid ones
-
-
-def _summary(jobs: Sequence[ExportJob], target: Path, to: str) -> ExportSummary:
-    summary = ExportSummary(target, to)
-    left_out: dict[str, Counter[str]] = {}
-    messages = Counter[str]()
-    for job in jobs:
-        job.leave_out_rest(FORMATS[to])
-        messages.update(job.exported)
-        for topic, reasons in job.left_out.items():
-            left_out.setdefault(topic, Counter()).update(reasons)
-        where = f"{job.dataset.path.name}: " if len(jobs) > 1 else ""
-        summary.notes.extend(where + note for note in job.notes)
-        summary.places.update(job.places)
-    summary.messages.update({topic: count for topic, count in messages.items() if count})
-    summary.left_out.update({topic: dict(reasons) for topic, reasons in left_out.items()})
-    return summary
 
 
 def _export_names(path: Path) -> set[str] | None:

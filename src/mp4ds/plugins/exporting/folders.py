@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,16 +106,13 @@ _POSE_HEAD = (
 )
 
 
-def write_euroc(jobs: Sequence[ExportJob]) -> None:
+def write_euroc(job: ExportJob) -> None:
     """Write mav0/cam0, imu0 ... with data.csv and sensor.yaml: the format of the ASL data sets."""
-    (job,) = jobs
     poses, cameras, imus = _poses(job), [*job.png_cameras()], _imus(job)
     frames = [*(imu.frame_id for imu in imus), *(camera.frame_id for camera in cameras)]
     body = frames[0] if frames else ""
     tree = StaticTree(job.dataset)
-    root = job.path / "mav0"
-    root.mkdir(parents=True)
-    (root / "body.yaml").write_text(f"comment: {json.dumps(body)}\n", encoding="utf-8")
+    job.write_lines("mav0/body.yaml", [f"comment: {json.dumps(body)}"])
 
     def write_sensor(
         place: str, kind: str, topic: str, pose: Pose | None, lines: Sequence[str] = ()
@@ -122,8 +120,7 @@ def write_euroc(jobs: Sequence[ExportJob]) -> None:
         text = [f"sensor_type: {kind}", f"comment: {json.dumps(topic)}"]
         if pose is not None:
             text += ["T_BS:", "  cols: 4", "  rows: 4", f"  data: {pose.ravel().tolist()}"]
-        path = job.path / place / "sensor.yaml"
-        path.write_text("\n".join([*text, *lines, ""]), encoding="utf-8")
+        job.write_lines(f"{place}/sensor.yaml", [*text, *lines])
 
     def pose_of(frame: str, topic: str) -> Pose | None:
         pose = tree.pose(frame, body)
@@ -137,21 +134,21 @@ def write_euroc(jobs: Sequence[ExportJob]) -> None:
         names = [f"{time}.png" for time in camera.times.tolist()]
         job.write_png_files(camera, place, [f"{place}/data/{name}" for name in names])
         lines = [f"{time},{name}" for time, name in zip(camera.times.tolist(), names, strict=True)]
-        text = "\n".join(["#timestamp [ns],filename", *lines, ""])
-        (job.path / place / "data.csv").write_text(text, encoding="utf-8")
+        job.write_lines(f"{place}/data.csv", ["#timestamp [ns],filename", *lines])
         write_sensor(place, "camera", camera.topic, pose, _described(job, camera))
     for number, imu in enumerate(imus):
         place = f"mav0/imu{number}"
         pose = pose_of(imu.frame_id, imu.topic)
         rows = _csv(_IMU_HEAD, imu.rows())
-        job.write_lines(place, imu.topic, f"{place}/data.csv", rows)
+        job.write_lines(f"{place}/data.csv", rows, place=place, topic=imu.topic)
         write_sensor(place, "imu", imu.topic, pose)
         job.note(f"{imu.topic}: orientation and covariances have no place in an IMU's data.csv")
     if poses is not None:
         job.note(f"{poses.topic}: only position and orientation are kept")
         place = "mav0/pose0"
         turned = ((time, (*v[:3], v[6], *v[3:6])) for time, v in poses.rows())
-        job.write_lines(place, poses.topic, f"{place}/data.csv", _csv(_POSE_HEAD, turned))
+        rows = _csv(_POSE_HEAD, turned)
+        job.write_lines(f"{place}/data.csv", rows, place=place, topic=poses.topic)
         write_sensor(place, "pose", poses.topic, tree.pose(poses.body, body))
 
 
@@ -195,9 +192,8 @@ def euroc_distortion(calibration: Calibration) -> tuple[str, list[float]]:
 # ---------------------------------------------------------------- tum
 
 
-def write_tum(jobs: Sequence[ExportJob]) -> None:
+def write_tum(job: ExportJob) -> None:
     """Write rgb, depth, and lists of files by time: the format of the TUM RGB-D benchmark."""
-    (job,) = jobs
     poses, cameras, imus = _poses(job), [*job.png_cameras()], _imus(job)
     for kind, wanted in (("rgb", False), ("depth", True)):
         alike = [camera for camera in cameras if _is_depth(camera) is wanted]
@@ -235,8 +231,7 @@ def _write_tum_images(job: ExportJob, kind: str, camera: ExportedCamera) -> None
         heads.append(f"unit: {unit}")
         job.note(f"{camera.topic}: depths are in units {unit}")
     lines = map(" ".join, zip(times, names, strict=True))
-    text = "\n".join([*_commented(*heads, "timestamp filename"), *lines, ""])
-    (job.path / f"{kind}.txt").write_text(text, encoding="utf-8")
+    job.write_lines(f"{kind}.txt", [*_commented(*heads, "timestamp filename"), *lines])
 
 
 def _write_tum_rows(job: ExportJob, name: str, topic: str, head: str, rows: Iterable[Row]) -> None:
@@ -245,7 +240,7 @@ def _write_tum_rows(job: ExportJob, name: str, topic: str, head: str, rows: Iter
         for time, values in rows:
             yield " ".join([seconds_text(time), *map(repr, values)])
 
-    job.write_lines(name, topic, name, lines())
+    job.write_lines(name, lines(), place=name, topic=topic)
 
 
 def _commented(*heads: str) -> list[str]:
@@ -259,17 +254,15 @@ _MODEL = "sparse/0"
 _HALF_PIXEL = 0.5  # COLMAP counts from the corner of a pixel, ROS and OpenCV from its centre
 
 
-def write_colmap(jobs: Sequence[ExportJob]) -> None:
+def write_colmap(job: ExportJob) -> None:
     """Write images, and a sparse model of cameras, and of poses if known."""
-    (job,) = jobs
     poses = _poses(job)
     if poses is not None and not poses.body:
         raise OptionError(
             f"`poses` {poses.topic} does not say whose pose it gives, which is needed for a "
             "camera's pose. Use an Odometry or TransformStamped topic."
         )
-    folder, names = job.path / _MODEL, FileNames()
-    folder.mkdir(parents=True)
+    names = FileNames()
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     known: list[tuple[ExportedCamera, Sequence[str]]] = []
     for camera in job.png_cameras():
@@ -288,15 +281,16 @@ def write_colmap(jobs: Sequence[ExportJob]) -> None:
         known.append((camera, files))
         width, height = camera.size
         lines.append(f"{len(known)} {model[0]} {width} {height} {' '.join(map(repr, model[1]))}")
-    (folder / "cameras.txt").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    job.write_lines(f"{_MODEL}/cameras.txt", lines)
     # COLMAP refuses a model without these two
-    (folder / "points3D.txt").write_text("# no points\n", encoding="utf-8")
-    with (folder / "images.txt").open("w", encoding="utf-8") as file:
-        file.write("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# no points\n")
-        if poses is None:
-            job.note("images.txt is empty: it needs the pose of each image (--poses TOPIC)")
-        else:
-            file.writelines(_image_lines(job, known, poses))
+    job.write_lines(f"{_MODEL}/points3D.txt", ["# no points"])
+    heads = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# no points"]
+    images: Iterable[str] = []
+    if poses is None:
+        job.note("images.txt is empty: it needs the pose of each image (--poses TOPIC)")
+    else:
+        images = _image_lines(job, known, poses)
+    job.write_lines(f"{_MODEL}/images.txt", chain(heads, images))
 
 
 def colmap_model(calibration: Calibration) -> tuple[str, list[float]] | None:
@@ -338,13 +332,13 @@ def _image_lines(
             seen = inverse(pose @ place)
             x, y, z, w = quaternion_of(seen[:3, :3])
             values = [w, x, y, z, *seen[:3, 3].tolist()]
-            yield f"{image} {' '.join(map(repr, values))} {number} {name}\n\n"
+            yield f"{image} {' '.join(map(repr, values))} {number} {name}\n"
         if missing:
             job.note(
                 f"{camera.topic}: {missing} of {len(camera)} images are before the first or "
                 "after the last pose, so they are not in images.txt"
             )
-    job.exported[poses.topic] += len(track.times)
+    job.keep(poses.topic, len(track.times))
     job.places[f"{_MODEL}/images.txt"] = poses.topic
     job.note(f"{poses.topic}: poses of images are interpolated between the recorded ones")
 

@@ -209,18 +209,6 @@ class ExportedCamera:
             yield int(place_of[index]), self.stream.pixels(picture, self.view, index)
 
 
-def _view(stream: Stream, options: ExportOptions, in_colour: bool, notes: list[str]) -> View:
-    known = ENCODINGS[stream.encoding]
-    is_converted = not known.is_plain and (in_colour or not (known.mosaic and options.native))
-    if is_converted:
-        kind = "a Bayer mosaic, which --native keeps" if known.mosaic else "YUV"
-        notes.append(f"{stream.topic}: its pixels are converted from {kind}")
-    # depths and other measurements have no colours
-    has_colours = encoding_as(known, "rgb") is not None
-    colours = "rgb" if has_colours and (in_colour or is_converted) else "native"
-    return stream.view(colours, options.reduction.resize)
-
-
 # ---------------------------------------------------------------- numbers
 
 Row = tuple[int, tuple[float, ...]]
@@ -361,25 +349,24 @@ _TELL_EVERY = 16  # frames
 
 
 class ExportJob:
-    """A dataset being exported, which counts its messages.
+    """A dataset being exported; every message of it is counted in the summary.
 
     Args:
         dataset: The dataset.
         path: Where to write.
         options: How.
+        summary: Gets what is kept, and left out, of this dataset too.
         tell: Called now and then with a phrase, and the share of frames done.
+        where: What notes begin with, if there are several datasets.
         in_colour: Whether all images with colours become RGB.
 
     Attributes:
         dataset: The dataset.
         path: Where to write.
         options: How.
+        places: Those of the summary: part of the output -> the topic that is in it.
         tell: Called now and then with a phrase, and the share of frames done.
         cameras: Its selected streams: calibrated ones first, then by topic.
-        places: Part of the output -> the topic that is in it.
-        exported: Messages exported, by topic.
-        left_out: Topic -> reason -> messages.
-        notes: Other deviations from the recording.
 
     Raises:
         OptionError: No topic matches, or frames of a stream cannot be converted that way.
@@ -391,16 +378,18 @@ class ExportJob:
         dataset: Dataset,
         path: Path,
         options: ExportOptions,
+        summary: ExportSummary,
         tell: Callable[[str, float | None], None],
         *,
+        where: str,
         in_colour: bool,
     ) -> None:
         self.dataset, self.path, self.options, self.tell = dataset, path, options, tell
-        self.places: dict[str, str] = {}
-        self.exported: Counter[str] = Counter()
-        self.left_out: dict[str, Counter[str]] = {}
-        self.notes = [dataset.damage] if dataset.damage else []
+        self.places, self._summary, self._where = summary.places, summary, where
+        self._counted: Counter[str] = Counter()
         self._in_colour, self._written = in_colour, 0
+        if dataset.damage:
+            self.note(dataset.damage)
         options.selected.check(dataset.all_topics)
         dataset.verify_sidecars(options.chosen)
         streams = [stream for stream in dataset.streams if options.selected(stream.topic)]
@@ -410,15 +399,23 @@ class ExportJob:
             found = self._matched(found, options.tolerance_ns)
         self.cameras = [camera for camera in found if len(camera)]
 
+    def keep(self, topic: str, count: int = 1) -> None:
+        """Count messages that are kept."""
+        if count:
+            self._counted[topic] += count
+            self._summary.messages[topic] = self._summary.messages.get(topic, 0) + count
+
     def leave_out(self, topic: str, reason: str, count: int) -> None:
         """Count messages that are left out."""
         if count:
-            self.left_out.setdefault(topic, Counter())[reason] += count
+            self._counted[topic] += count
+            reasons = self._summary.left_out.setdefault(topic, {})
+            reasons[reason] = reasons.get(reason, 0) + count
 
     def note(self, sentence: str) -> None:
         """Note a deviation from the recording, once."""
-        if sentence not in self.notes:
-            self.notes.append(sentence)
+        if self._where + sentence not in self._summary.notes:
+            self._summary.notes.append(self._where + sentence)
 
     def leave_out_rest(self, name: str) -> None:
         """Count the remaining messages with their reason.
@@ -437,8 +434,7 @@ class ExportJob:
                 reason = "stored as recorded in messages.mcap, not as video"
             else:
                 reason = f"{name} has no place for {channels[topic].type_name or 'such messages'}"
-            known = self.exported[topic] + sum(self.left_out.get(topic, {}).values())
-            self.leave_out(topic, reason, total - known)
+            self.leave_out(topic, reason, total - self._counted[topic])
 
     def topics_of(self, type_name: str) -> list[str]:
         """The selected topics with a ROS type, such as ``sensor_msgs/Imu``."""
@@ -464,8 +460,19 @@ class ExportJob:
         if times is not columns.stamp:
             self.note(f"{stream.topic}: its stamps do not increase, so log times are used instead")
         kept = kept[np.argsort(times[kept], kind="stable")]
-        view = _view(stream, self.options, self._in_colour, self.notes)
-        yield ExportedCamera(stream, kept, times[kept], view)
+        yield ExportedCamera(stream, kept, times[kept], self._view(stream))
+
+    def _view(self, stream: Stream) -> View:
+        known = ENCODINGS[stream.encoding]
+        is_native = known.mosaic and self.options.native
+        is_converted = not known.is_plain and (self._in_colour or not is_native)
+        if is_converted:
+            kind = "a Bayer mosaic, which --native keeps" if known.mosaic else "YUV"
+            self.note(f"{stream.topic}: its pixels are converted from {kind}")
+        # depths and other measurements have no colours
+        has_colours = encoding_as(known, "rgb") is not None
+        colours = "rgb" if has_colours and (self._in_colour or is_converted) else "native"
+        return stream.view(colours, self.options.reduction.resize)
 
     def _matched(self, cameras: list[ExportedCamera], tolerance_ns: int) -> list[ExportedCamera]:
         """The frames that every camera has, frame n of each taken at the same time."""
@@ -502,7 +509,7 @@ class ExportJob:
             used = camera.stream.calibration_at(int(camera.stream.log_times[camera.numbers[0]]))
             same = [number for number, item in enumerate(info.calibrations) if item is used]
             is_same = np.isin(columns.variant, same)
-            self.exported[topic] += 1
+            self.keep(topic)
             self.leave_out(topic, "repeats the exported calibration", int(is_same.sum()) - 1)
             reason = "a different calibration: only one per camera is exported"
             self.leave_out(topic, reason, int((~is_same).sum()))
@@ -528,21 +535,25 @@ class ExportJob:
             (self.path / names[position]).write_bytes(file.encode(pixels))
         self._written += len(camera)
         self.places[place] = camera.topic
-        self.exported[camera.topic] += len(camera)
+        self.keep(camera.topic, len(camera))
 
-    def write_lines(self, place: str, topic: str, name: str, lines: Iterable[str]) -> None:
-        """Write a text file; each line but those that begin with # is a message of a topic.
+    def write_lines(
+        self, name: str, lines: Iterable[str], *, place: str = "", topic: str = ""
+    ) -> None:
+        """Write a text file.
 
         Args:
-            place: The part of the output it is listed under.
-            topic: The topic.
             name: Path of the file from the output's folder.
             lines: Its lines.
+            place: The part of the output under which a topic is listed.
+            topic: Of which each line that is no comment is a message.
         """
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("w", encoding="utf-8") as file:
             for line in lines:
                 file.write(f"{line}\n")
-                self.exported[topic] += not line.startswith("#")
-        self.places[place] = topic
+                if topic:
+                    self.keep(topic, not line.startswith("#"))
+        if topic:
+            self.places[place] = topic

@@ -116,7 +116,7 @@ class Episode:
         return f"{folder}/{_FILE.format(chunk=chunk, file=file)}.{suffix}"
 
 
-def write(jobs: Sequence[ExportJob]) -> None:
+def write(*jobs: ExportJob) -> None:
     """Write the format."""
     cameras = [_shown(job) for job in jobs]
     path, task = jobs[0].path, jobs[0].options.task
@@ -213,7 +213,7 @@ def _add_videos(
 def _count(
     job: ExportJob, camera: ExportedCamera, used: Integers, times: Integers, fps: int
 ) -> None:
-    job.exported[camera.topic] += len(used)
+    job.keep(camera.topic, len(used))
     is_within = (camera.times >= times[0]) & (camera.times <= times[-1])
     is_unused = np.ones(len(camera), np.bool_)
     is_unused[used] = False
@@ -323,7 +323,7 @@ def _vector(
     own = np.array([time for time, _ in rows], np.int64)
     places = nearest(own, times)
     used = len(np.unique(places))
-    job.exported[topic] += used
+    job.keep(topic, used)
     reason = f"another message is nearer at {fps} frames per second"
     job.leave_out(topic, reason, len(rows) - used)
     away = int(np.abs(own[places] - times).max())
