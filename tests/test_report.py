@@ -30,16 +30,9 @@ from coded_scenes import CODED
 from commands import call, start
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.format.models import Calibration
-from mp4ds.plugins.reporting.cameras import (
-    axis_of,
-    nearest_offsets,
-    overlay_of,
-    pack_column,
-    timing_of,
-)
-from mp4ds.plugins.reporting.page import as_script
+from mp4ds.plugins.reporting.cameras import axis_of, overlay_of, pack_column
 from mp4ds.plugins.reporting.proxies import Look, proxy_size
-from mp4ds.plugins.reporting.report import ReportOptions, report
+from mp4ds.plugins.reporting.report import ReportOptions, as_script, report
 from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.times import lost_frames
 from report_scenes import (
@@ -47,7 +40,6 @@ from report_scenes import (
     DEPTH,
     FRAMES,
     HEIGHT,
-    LATE,
     WIDTH,
     blocks,
     pack_cameras,
@@ -136,8 +128,6 @@ def test_two_hours_at_60_hz_are_small_and_left_to_numpy() -> None:
 
     def work() -> None:
         packed.extend(pack_column(column) for column in (stamps, logs, ticks))
-        timing_of(stamps, logs, None)
-        nearest_offsets(stamps, logs)
 
     assert lines_run(work) < 200_000  # one in ten of the values
     assert sum(len(column["values"]) for column in packed) < 6_000_000
@@ -145,45 +135,10 @@ def test_two_hours_at_60_hz_are_small_and_left_to_numpy() -> None:
     assert sum(byte < 128 for byte in found) == 432_000 - 1
 
 
-def test_figures_of_a_camera() -> None:
-    steps = [20, 21, 19, 20, 61, 20, 0, 20, -5, 20]
-    stamps = np.cumsum([1_000, *steps]) * 1_000_000
-    seq = np.array([0, 1, 2, 3, 4, 7, 8, 9, 10, 11, 12])
-    timing = timing_of(stamps, stamps + 4_500_000, seq)
-    assert (timing["frames"], timing["lost"], timing["gaps"]) == (11, 2, 1)
-    assert (timing["repeated"], timing["backward"], timing["seq_missing"]) == (1, 1, 2)
-    assert (timing["median_ms"], timing["rate_hz"], timing["longest_ms"]) == (20, 50, 61)
-    assert timing["jitter_ms"] == pytest.approx(np.std(steps))
-    assert (timing["delay_median_ms"], timing["delay_least_ms"], timing["delay_most_ms"]) == (
-        4.5,
-        4.5,
-        4.5,
-    )
-
-
-@pytest.mark.parametrize(
-    ("stamps", "rate"), [([5], None), ([5, 5, 5], None), ([9, 8, 7], None), ([0, 10**9], 1.0)]
-)
-def test_figures_where_there_are_none(stamps: list[int], rate: float | None) -> None:
-    column = np.array(stamps, np.int64)
-    timing = timing_of(column, column, None)
-    assert (timing["rate_hz"], timing["lost"], timing["seq_missing"]) == (rate, 0, None)
-
-
 def test_lost_frames_by_the_rule() -> None:
     steps = np.array([10, 10, 10, 15, 15.1, 24.9, 25, 10, 100, 10, 0, -30, 10], float)
     assert lost_frames(steps).tolist() == [0, 0, 0, 0, 1, 1, 2, 0, 9, 0, 0, 0, 0]
     assert not len(lost_frames(np.empty(0)))
-
-
-def test_offsets_to_the_nearest_frame() -> None:
-    rng = np.random.default_rng(1)
-    own = rng.integers(0, 1000, 200) + 10**18
-    other = rng.integers(0, 1000, 50) + 10**18
-    found = nearest_offsets(own, other)
-    for stamp, offset in zip(own.tolist(), found.tolist(), strict=True):
-        assert abs(offset) == min(abs(stamp - value) for value in other.tolist())
-        assert stamp - int(offset) in other
 
 
 def test_the_axis_is_that_of_the_stamps_where_they_are_of_one_clock() -> None:
@@ -295,10 +250,7 @@ def test_the_report_of_a_dataset(copy: Path) -> None:
             with av.open(str(stream.streams[0].video_path)) as container:
                 ticks = [p.pts for p in container.demux(video=0) if p.pts is not None]
             assert unpacked(columns["ticks"], count) == ticks
-    depth, colour = data["cameras"]
-    assert (depth["timing"]["lost"], depth["timing"]["repeated"]) == (1, 1)
-    assert (colour["timing"]["lost"], colour["timing"]["repeated"]) == (0, 0)
-    assert abs(colour["offset"]["median_ms"]) == pytest.approx(LATE / 1e6, abs=0.3)
+    _, colour = data["cameras"]
     assert len(colour["calibrations"]) == 1
     assert colour["calibrations"][0]["overlay"]["lines"]
 
@@ -400,7 +352,7 @@ def test_a_failure_leaves_what_was_there(copy: Path, monkeypatch: pytest.MonkeyP
     def fail(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mp4ds.plugins.reporting.report.write_folder", fail)
+    monkeypatch.setattr("mp4ds.plugins.reporting.report.notes_of", fail)
     with pytest.raises(KeyboardInterrupt):
         report(copy)
     assert sorted(p.relative_to(copy) for p in copy.rglob("*")) == before

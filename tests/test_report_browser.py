@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 import mp4ds
 from chromium import Tab, chromium
-from mp4ds.plugins.reporting.cameras import nearest_offsets, pack_column
+from mp4ds.plugins.reporting.cameras import pack_column
 from mp4ds.plugins.reporting.proxies import Look
 from mp4ds.plugins.reporting.report import ReportOptions, report
 from mp4ds.plugins.reporting.server import ReportServer
@@ -25,6 +26,7 @@ from report_scenes import (
     DEPTH,
     FRAMES,
     HEIGHT,
+    LATE,
     REPEATED,
     WIDTH,
     blocks,
@@ -255,7 +257,8 @@ def test_plots_have_the_numbers_of_the_columns(page: Tab, recorded: Recorded) ->
         assert series(page, "lost", camera).tolist() == [0, *lost.tolist()]
         delay = (recorded.logs[camera] - recorded.stamps[camera]) / 1e6
         np.testing.assert_allclose(series(page, "delay", camera), delay, rtol=1e-12)
-    offsets = nearest_offsets(recorded.stamps[1], recorded.stamps[0]) / 1e6
+    own, other = recorded.stamps[1], recorded.stamps[0]
+    offsets = [min((int(a - b) for b in other), key=abs) / 1e6 for a in own]
     np.testing.assert_allclose(series(page, "offset"), offsets, rtol=1e-12)
 
 
@@ -264,14 +267,45 @@ def test_the_figures_of_the_table(page: Tab, recorded: Recorded) -> None:
         "[...document.querySelectorAll('#timing tbody tr')]"
         ".map(row => [...row.cells].map(cell => cell.textContent))"
     )
-    for row, stamps in zip(rows, recorded.stamps, strict=True):
-        steps = intervals(stamps) / 1e6
-        assert row[1] == str(len(stamps))
-        assert row[3] == f"{np.median(steps[steps > 0]):.3f}"
-        assert row[4] == f"{steps.std():.3f}"
+    for row, stamps, logs in zip(rows, recorded.stamps, recorded.logs, strict=True):
+        steps, delays = intervals(stamps) / 1e6, (logs - stamps) / 1e6
+        usual = np.median(steps[steps > 0])
         lost = lost_frames(steps)
-        assert row[7] == (f"{lost.sum()} in {(lost > 0).sum()} gaps" if lost.any() else "0")
-        assert row[8] == str((steps == 0).sum())
+        assert row[1:10] == [
+            str(len(stamps)),
+            f"{1000 / usual:.2f}",
+            f"{usual:.3f}",
+            f"{steps.std():.3f}",
+            f"{np.percentile(abs(steps - usual), 99):.3f}",
+            f"{steps.max():.1f}",
+            f"{lost.sum()} in {(lost > 0).sum()} gaps" if lost.any() else "0",
+            str((steps == 0).sum()),
+            "0",
+        ]
+        found = [float(number) for number in re.findall(r"[-\d.]+", row[11])]
+        assert found == pytest.approx([np.median(delays), delays.min(), delays.max()], rel=0.01)
+    assert rows[0][12] == "reference"
+    assert float(rows[1][12].split()[0]) == pytest.approx(-LATE / 1e6, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("steps", "figures"),
+    [
+        (
+            [20, 21, 19, 20, 61, 20, 0, 20, -5, 20],
+            {"median": 20, "rate": 50, "missing": 2, "gaps": 1, "repeated": 1, "backward": 1},
+        ),
+        ([1000], {"median": 1000, "rate": 1, "longest": 1000, "missing": 0}),
+        ([], {"median": None, "rate": None, "jitter": None, "longest": None, "missing": 0}),
+        ([0, 0], {"median": None, "rate": None, "within": None, "repeated": 2, "missing": 0}),
+        ([-1, -1], {"median": None, "rate": None, "backward": 2, "missing": 0}),
+    ],
+)
+def test_figures_where_times_are_odd(
+    steps: list[int], figures: dict[str, float | None], page: Tab
+) -> None:
+    found = page.evaluate(f"mp4dsColumns.timing(Float64Array.from([NaN, ...{steps}]))")
+    assert {name: found[name] for name in figures} == figures
 
 
 @pytest.mark.parametrize(

@@ -16,71 +16,14 @@ from mp4ds.errors import FormatError
 from mp4ds.format.models import Calibration
 from mp4ds.plugins.intrinsics import calibration_changes
 from mp4ds.plugins.reporting.proxies import why_not_seen
-from mp4ds.times import (
-    Floats,
-    Integers,
-    differences,
-    intervals,
-    lost_frames,
-    nearest,
-    usual_interval,
-)
+from mp4ds.times import Floats, Integers, differences, intervals
 
 # ---------------------------------------------------------------- timing
 
-_MS = 1e6  # nanoseconds
 _WIDER = 2  # times the span of the log times; beyond it, stamps come from several clocks
 _SLACK_NS = 10 * 10**9
 _DAY_NS = 86_400 * 10**9
 _NO_STAMPS, _OTHER_CLOCK = "no header stamps", "stamps from another clock"
-
-
-def timing_of(stamps: Integers, log_times: Integers, seq: Integers | None) -> dict[str, Any]:
-    """The timing of one camera, in milliseconds; None where there are too few frames.
-
-    Args:
-        stamps: Header stamps, nanoseconds, at least one.
-        log_times: Log times, nanoseconds.
-        seq: Numbers in the headers, or None.
-    """
-    steps = intervals(stamps)
-    usual = usual_interval(steps)
-    lost = lost_frames(steps)
-    delays = differences(log_times, stamps) / _MS
-    return {
-        "frames": len(stamps),
-        # rate and median of the positive intervals, and how far the others are from it
-        "rate_hz": 1e9 / usual if usual else None,
-        "median_ms": usual / _MS if usual else None,
-        "jitter_ms": float(steps.std()) / _MS if len(steps) else None,
-        "p99_ms": float(np.percentile(np.abs(steps - usual), 99)) / _MS if usual else None,
-        "longest_ms": float(steps.max()) / _MS if len(steps) else None,
-        # see `lost_frames`
-        "lost": sum(lost[lost > 0].tolist()),
-        "gaps": int((lost > 0).sum()),
-        "repeated": int((steps == 0).sum()),
-        "backward": int((steps < 0).sum()),
-        "seq_missing": None if seq is None else _missing_numbers(seq),
-        "delay_median_ms": float(np.median(delays)),
-        "delay_least_ms": float(delays.min()),
-        "delay_most_ms": float(delays.max()),
-    }
-
-
-def _missing_numbers(seq: Integers) -> int:
-    steps = np.diff(seq)
-    return sum((steps[steps > 1] - 1).tolist())
-
-
-def nearest_offsets(stamps: Integers, reference: Integers) -> Floats:
-    """How much later each frame is than the nearest reference frame, nanoseconds.
-
-    Args:
-        stamps: Of a camera.
-        reference: Of the camera that it is compared with, at least one; in any order.
-    """
-    ordered = np.sort(reference)
-    return differences(stamps, ordered[nearest(ordered, stamps)])
 
 
 def untimed(cameras: Sequence[Mapping[str, Integers]]) -> list[str]:
@@ -385,15 +328,15 @@ class ReportedCamera:
             place = f"{self.stream.path} at video.quality.scores"
             raise FormatError("scores-invalid", place, str(error)) from None
 
-    def facts(self, number: int, reference: ReportedCamera | None, untimed: str) -> dict[str, Any]:
-        """What the page shows about it besides its columns.
+    def facts(self, number: int, untimed: str) -> dict[str, Any]:
+        """What the page shows about it besides its columns, and what it computes of them.
 
         Args:
             number: Of the camera on the page.
-            reference: The camera whose stamps it is compared with; None: none.
-            untimed: Why its stamps are not compared; empty: they are.
+            untimed: Why its stamps are not compared with others; empty: they are.
         """
-        stream, sidecar = self.stream, self.stream.sidecar
+        sidecar, seq = self.stream.sidecar, self.stream.columns.seq
+        steps = np.empty(0, np.int64) if seq is None else np.diff(seq)
         return {
             "name": self.name,
             "columns": f"report/columns-{number}.js",
@@ -409,9 +352,8 @@ class ReportedCamera:
             "note": self.note,
             "caption": self.caption,
             "shown": self._shown(),
-            "timing": timing_of(stream.stamps, stream.log_times, stream.columns.seq),
+            "seq_missing": None if seq is None else sum((steps[steps > 1] - 1).tolist()),
             "untimed": untimed,
-            "offset": None if reference is None else _offset(stream, reference.stream),
             **self._calibrations(),
         }
 
@@ -449,13 +391,3 @@ class ReportedCamera:
             "calibration_topic": info.channel.topic if info else "",
             "calibrations_more": max(0, len(changes) - _MOST_CALIBRATIONS),
         }
-
-
-def _offset(stream: Stream, reference: Stream) -> dict[str, float]:
-    """Statistics of the offsets to another camera, milliseconds."""
-    offsets = nearest_offsets(stream.stamps, reference.stamps) / 1e6
-    return {
-        "median_ms": float(np.median(offsets)),
-        "p99_ms": float(np.percentile(np.abs(offsets), 99)),
-        "most_ms": float(np.abs(offsets).max()),
-    }

@@ -7,6 +7,7 @@ the dataset's own videos if browsers can, else small proxies; its columns are ex
 from __future__ import annotations
 
 import html
+import json
 import os
 import shutil
 from collections import Counter
@@ -14,11 +15,17 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
+from mp4ds._version import __version__
 from mp4ds.dataset.collections import Paths, datasets_in, each
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.stream import Stream
 from mp4ds.errors import (
     FormatError,
     Mp4dsError,
@@ -37,10 +44,11 @@ from mp4ds.files.outputs import (
     write_synced,
 )
 from mp4ds.files.urls import remote
+from mp4ds.format.fields import MESSAGES_NAME
+from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import WHERE, Options, force, iso_text, option
-from mp4ds.plugins.info import Brief, brief
-from mp4ds.plugins.reporting.cameras import ReportedCamera
-from mp4ds.plugins.reporting.page import FOLDER_NAME, INDEX_NAME, PAGE, write_folder
+from mp4ds.plugins.info import Brief, brief, notes_of, topics_of
+from mp4ds.plugins.reporting.cameras import ReportedCamera, axis_of, untimed
 from mp4ds.plugins.reporting.proxies import (
     Look,
     make_proxy,
@@ -51,7 +59,18 @@ from mp4ds.plugins.reporting.proxies import (
     why_not_seen,
 )
 from mp4ds.plugins.reporting.stills import StillOptions, frames
+from mp4ds.records import Message
 
+_PAGE = files("mp4ds.plugins.reporting") / "page"
+"""The page's static files."""
+
+_INDEX = "index.html"
+_FOLDER = "report"
+
+_DATA_SIGN = b"/* made by mp4ds report */\n"
+_MOST_NOTES = 200
+_MOST_READ = 2**30
+"""Maximum size of messages.mcap up to which it is read to measure each topic's share."""
 _PROXIES, _PICTURES = "proxies", "pictures"
 _PICTURE_WIDTH = 240
 
@@ -148,7 +167,7 @@ def report(
         folder = Path(os.path.abspath(chosen.output or opened.path))  # noqa: PTH100 - as named
         if folder.exists():
             _check_index(folder, chosen)
-            check_target(folder / FOLDER_NAME, force=True, owned=listed_names)
+            check_target(folder / _FOLDER, force=True, owned=listed_names)
         else:
             check_target(folder, force=False, owned=listed_names)
         try:
@@ -172,7 +191,7 @@ def _check_local(path: Path) -> None:
 
 def _check_index(folder: Path, options: ReportOptions) -> None:
     """Refuse to replace a page of the user's."""
-    index = folder / INDEX_NAME
+    index = folder / _INDEX
     if os.path.lexists(index) and not is_page(index) and not options.force:
         raise TargetExistsError(index)
 
@@ -180,7 +199,7 @@ def _check_index(folder: Path, options: ReportOptions) -> None:
 def _write(
     dataset: Dataset, folder: Path, options: ReportOptions, tell: Callable[[str], None]
 ) -> ReportSummary:
-    target = folder / FOLDER_NAME
+    target = folder / _FOLDER
     problems: list[str] = []
     with staged(target, force=True, owned=listed_names) as path:
         path.mkdir()
@@ -193,9 +212,9 @@ def _write(
                 problems.append(str(error))
             cameras.append(camera)
         tell("topics")
-        write_folder(path, dataset, cameras, problems)
+        _write_folder(path, dataset, cameras, problems)
         write_listing(path)
-    write_synced(folder / INDEX_NAME, (PAGE / INDEX_NAME).read_bytes())
+    write_synced(folder / _INDEX, (_PAGE / _INDEX).read_bytes())
     return _summary(folder, cameras, problems)
 
 
@@ -236,12 +255,12 @@ def _give_video(
         size = proxy_size(stream.image_size, options.proxy_width)
         name = proxy_name(stream, size)
         (made / _PROXIES).mkdir(exist_ok=True)
-        old, new = folder / FOLDER_NAME / _PROXIES / name, made / _PROXIES / name
+        old, new = folder / _FOLDER / _PROXIES / name, made / _PROXIES / name
         look = Look.of(stream, size)
         # an old video may have no digest, by which to tell whether it has changed
         if stream.sidecar.video.sha256 is None or not _taken(old, new):
             make_proxy(stream, new, look, size=size, times=camera.times, progress=tell)
-        camera.video, camera.caption = f"{FOLDER_NAME}/{_PROXIES}/{quote(name)}", look.caption
+        camera.video, camera.caption = f"{_FOLDER}/{_PROXIES}/{quote(name)}", look.caption
         camera.is_proxy = True
     elif not unplayable:
         path = os.path.relpath(stream.video_path.resolve(), folder.resolve())
@@ -262,11 +281,11 @@ def _taken(old: Path, new: Path) -> bool:
 
 
 def _summary(folder: Path, cameras: list[ReportedCamera], problems: list[str]) -> ReportSummary:
-    own = [folder / INDEX_NAME, *(p for p in (folder / FOLDER_NAME).rglob("*") if p.is_file())]
+    own = [folder / _INDEX, *(p for p in (folder / _FOLDER).rglob("*") if p.is_file())]
     videos = [c.stream.video_path.resolve() for c in cameras if c.video and not c.is_proxy]
     base = Path(os.path.commonpath([folder.resolve(), *(video.parent for video in videos)]))
     return ReportSummary(
-        index=folder / INDEX_NAME,
+        index=folder / _INDEX,
         files={_place(path, base): path for path in (*own, *videos)},
         cameras=[
             CameraSummary(
@@ -282,6 +301,167 @@ def _summary(folder: Path, cameras: list[ReportedCamera], problems: list[str]) -
 def _place(path: Path, base: Path) -> str:
     resolved = path.parent.resolve() / path.name
     return f"/{resolved.relative_to(base).as_posix()}"
+
+
+# ---------------------------------------------------------------- data of the page
+
+
+def _write_folder(
+    folder: Path, dataset: Dataset, cameras: list[ReportedCamera], problems: list[str]
+) -> None:
+    """Write all of the report except index.html and proxies.
+
+    Args:
+        folder: Where to.
+        dataset: The dataset.
+        cameras: In the order of the page.
+        problems: What could not be shown of the dataset; gets what cannot be read now.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    for part in _PAGE.iterdir():
+        if part.name.endswith((".js", ".css")):
+            (folder / part.name).write_bytes(part.read_bytes())
+    for number, camera in enumerate(cameras):
+        columns = _call("columns", number, camera.columns())
+        (folder / f"columns-{number}.js").write_bytes(columns)
+    facts = _data(dataset, cameras, problems)
+    (folder / "data.js").write_bytes(_DATA_SIGN + _call("dataset", facts))
+
+
+def _call(name: str, *values: Any) -> bytes:
+    """A script that passes values to the page."""
+    return f"mp4dsReport.{name}({', '.join(map(as_script, values))});\n".encode()
+
+
+def as_script(value: Any) -> str:
+    """A value as JavaScript: ASCII, and safe inside an HTML element.
+
+    Numbers that are not finite become null.
+    """
+    return json.dumps(_finite(value), separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value
+
+
+def _data(dataset: Dataset, cameras: list[ReportedCamera], problems: list[str]) -> dict[str, Any]:
+    manifest = dataset.manifest
+    both = [{"stamp": c.stream.stamps, "log_time": c.stream.log_times} for c in cameras]
+    axis, reasons = axis_of(both), untimed(both)
+    # running maximum: the page shows a frame from the latest time so far
+    base = min((int(columns[axis][0]) for columns in both), default=0)
+    timed = [number for number, reason in enumerate(reasons) if not reason]
+    try:
+        topics = _topic_rows(dataset)
+    except (FormatError, SourceError) as error:
+        problems.append(str(error))
+        topics = []
+    notes = list(dict.fromkeys([*problems, *notes_of(dataset)]))
+    more = [f"and {len(notes) - _MOST_NOTES} more"] if len(notes) > _MOST_NOTES else []
+    return {
+        "name": dataset.path.resolve().name,
+        "version": __version__,
+        "axis": axis,
+        "base": str(base),
+        "summary": _figures(dataset, topics),
+        "reference": timed[0] if len(timed) > 1 else None,
+        "cameras": [camera.facts(number, reasons[number]) for number, camera in enumerate(cameras)],
+        "topics": topics,
+        "transforms": [item.model_dump() for item in manifest.transforms] if manifest else [],
+        "notes": [*notes[:_MOST_NOTES], *more],
+    }
+
+
+def _figures(dataset: Dataset, topics: list[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of the whole dataset: bytes, and nanoseconds as text, as BigInt reads them."""
+    manifest = dataset.manifest
+    summary: dict[str, Any] = {
+        "messages": sum(row["messages"] for row in topics),
+        "topics": len(topics),
+    }
+    if manifest is None:
+        return summary | {"profile": dataset.streams[0].sidecar.profile}
+    if span := manifest.time_range:
+        summary |= {"start": str(span.start), "end": str(span.end)}
+    return summary | {
+        "profile": manifest.profile,
+        "format": manifest.format,
+        "bytes": sum(entry.size for entry in manifest.files),
+        "source_bytes": sum(source.size for source in manifest.sources),
+        "sources": [source.name for source in manifest.sources][:_MOST_NOTES],
+    }
+
+
+# ---------------------------------------------------------------- topics
+
+
+def _topic_rows(dataset: Dataset) -> list[dict[str, Any]]:
+    """The topics by name, with the bytes that each had in the recording.
+
+    Raises:
+        FormatError: The dataset is damaged.
+        SourceError: messages.mcap cannot be read.
+    """
+    recorded = _recorded_bytes(dataset)
+    rows = []
+    for item in topics_of(dataset):
+        size = recorded.get(item.topic)
+        rows.append(
+            {
+                "topic": item.topic,
+                "type_name": item.type_name,
+                "messages": item.messages,
+                "rate_hz": item.rate_hz,
+                "stored": item.stored or MESSAGES_NAME,
+                "recorded_bytes": size,
+                "stored_bytes": item.bytes,
+                "ratio": size / item.bytes if size and item.bytes else None,
+            }
+        )
+    return rows
+
+
+def _recorded_bytes(dataset: Dataset) -> dict[str, int]:
+    """Bytes of each topic's messages as recorded, where known without reading a large file."""
+    sizes: Counter[str] = Counter(dict.fromkeys(dataset.all_topics, 0))
+    if dataset.manifest is not None:
+        if (dataset.path / MESSAGES_NAME).stat().st_size > _MOST_READ:
+            return {}
+        for record in dataset.messages_file.in_file_order():
+            if isinstance(record, Message):
+                sizes[record.channel.topic] += len(record.data)
+    unknown = set()
+    for stream in dataset.streams:
+        size = _image_bytes(stream)
+        if size is None:
+            unknown.add(stream.topic)
+        sizes[stream.topic] += size or 0
+        if stream.sidecar.camera_info is not None:
+            unknown.add(stream.sidecar.camera_info.channel.topic)
+    return {topic: size for topic, size in sizes.items() if topic not in unknown}
+
+
+def _image_bytes(stream: Stream) -> int | None:
+    """Bytes of a stream's images as recorded; None if files were converted to pixels.
+
+    Packets count as the size of their video.
+    """
+    sidecar = stream.sidecar
+    if sidecar.body == "pixels":
+        image = sidecar.image
+        return len(stream) * ENCODINGS[image.encoding].size(image.step, image.height)
+    if sidecar.body == "packet" and stream.video_path.is_file():
+        return stream.video_path.stat().st_size
+    return None
 
 
 # ---------------------------------------------------------------- many datasets
@@ -337,9 +517,9 @@ def reports(
     rows, problems = [], []
     try:
         place.mkdir(exist_ok=True)
-        with staged(place / FOLDER_NAME, force=True, owned=listed_names) as made:
+        with staged(place / _FOLDER, force=True, owned=listed_names) as made:
             (made / _PICTURES).mkdir(parents=True)
-            (made / "report.css").write_bytes((PAGE / "report.css").read_bytes())
+            (made / "report.css").write_bytes((_PAGE / "report.css").read_bytes())
             work = partial(_shown, options=chosen, pictures=made / _PICTURES)
             numbered = [*enumerate(found)]
             for (number, path), (known, wrong) in each(work, numbered, jobs):
@@ -348,10 +528,10 @@ def reports(
                 rows.append(_row(path, known, number, place, made))
             write_listing(made)
         page = _page(html.escape(place.name), _facts(found, problems), rows)
-        write_synced(place / INDEX_NAME, page.encode())
+        write_synced(place / _INDEX, page.encode())
     except OSError as error:
         raise as_write_error(error, place) from error
-    return OverviewSummary(place / INDEX_NAME, len(found), problems)
+    return OverviewSummary(place / _INDEX, len(found), problems)
 
 
 def _shown(
@@ -377,7 +557,7 @@ def _shown(
 
 
 def _page(title: str, facts: str, rows: Sequence[str]) -> str:
-    page = (PAGE / "overview.html").read_text(encoding="utf-8")
+    page = (_PAGE / "overview.html").read_text(encoding="utf-8")
     for name, text in (("title", title), ("facts", facts), ("rows", "\n".join(rows))):
         page = page.replace(f"<!--{name}-->", text)
     return page
@@ -390,11 +570,11 @@ def _facts(found: Sequence[Path], problems: Sequence[str]) -> str:
 
 
 def _row(path: Path, known: Brief | None, number: int, place: Path, made: Path) -> str:
-    link = quote(Path(os.path.relpath(path / INDEX_NAME, place)).as_posix())
+    link = quote(Path(os.path.relpath(path / _INDEX, place)).as_posix())
     name = html.escape(os.path.relpath(path, place))
     picture = ""
     if (made / _PICTURES / f"{number}.jpg").exists():
-        picture = f'<img src="{FOLDER_NAME}/{_PICTURES}/{number}.jpg" alt="" loading="lazy">'
+        picture = f'<img src="{_FOLDER}/{_PICTURES}/{number}.jpg" alt="" loading="lazy">'
     cells = ["", "", "", "", ""]
     if known is not None:
         if known.title:

@@ -60,7 +60,32 @@ var mp4dsColumns = (() => {
     return out;
   }
 
-  /** Frames lost before each frame (above 0), by the rule of intervals.py; repeated or earlier stamps are -1. */
+  /** The number up to which a share of sorted ones is, between two if need be; NaN of none. */
+  function quantile(sorted, share) {
+    const at = share * (sorted.length - 1), low = Math.floor(at);
+    return sorted.length ? sorted[low] + (sorted[Math.ceil(at)] - sorted[low]) * (at - low) : NaN;
+  }
+
+  /** Figures of intervals, entry 0 being none; those that too few frames have are null. */
+  function timing(intervals) {
+    const steps = intervals.subarray(1), advancing = steps.filter(step => step > 0).sort();
+    const median = advancing.length ? quantile(advancing, 0.5) : null, missing = lost(intervals, median);
+    let sum = 0, squares = 0;
+    for (const step of steps) sum += step;
+    for (const step of steps) squares += (step - sum / steps.length) ** 2;
+    const count = test => steps.reduce((found, step, i) => found + test(step, missing[i + 1]), 0);
+    return {
+      median, lost: missing,
+      rate: median && 1000 / median,
+      jitter: steps.length ? Math.sqrt(squares / steps.length) : null,
+      within: median && quantile(steps.map(step => Math.abs(step - median)).sort(), 0.99),
+      longest: steps.length ? steps.reduce((most, step) => Math.max(most, step)) : null,
+      missing: missing.reduce((found, frames) => found + Math.max(0, frames), 0),
+      gaps: count((_, frames) => frames > 0), repeated: count(step => step === 0), backward: count(step => step < 0),
+    };
+  }
+
+  /** Frames lost before each frame (above 0), by the rule of `lost_frames` in times.py; repeated or earlier stamps are -1. */
   function lost(steps, usual) {
     const out = new Float64Array(steps.length);
     const short = i => i > 0 && i < steps.length ? Math.min(Math.max(usual - steps[i], 0), usual) : 0;
@@ -100,5 +125,5 @@ var mp4dsColumns = (() => {
     return out;
   }
 
-  return {decode, decodeFloats, lastAtMost, intervals, lost, delays, offsets, positions};
+  return {decode, decodeFloats, lastAtMost, intervals, quantile, timing, delays, offsets, positions};
 })();

@@ -21,7 +21,7 @@ var mp4dsPlayer = (() => {
     take(columns) {
       Object.assign(this, columns);
       const mean = (this.position.at(-1) - this.position[0]) / Math.max(1, this.frames - 1);
-      this.usual = this.facts.timing.median_ms ? this.facts.timing.median_ms * 1e6 : mean;
+      this.usual = this.timing.median ? this.timing.median * 1e6 : mean;
       if (this.video && this.ticks) this.open();
     }
 

@@ -196,7 +196,7 @@ var mp4dsReport = (() => {
       if (!camera.facts.untimed) add(delay, camera, mp4dsColumns.delays(camera.logTime, camera.stamp));
       if (!camera.hasStamps) continue;
       add(interval, camera, camera.interval);
-      const median = camera.facts.timing.median_ms || 0;
+      const median = camera.timing.median || 0;
       jitter.add({name: camera.facts.name, colour: camera.colour, y: camera.interval.map(value => value - median), shown: shown(camera)});
       add(lost, camera, camera.lost.values);
     }
@@ -205,7 +205,7 @@ var mp4dsReport = (() => {
     const reference = player.cameras[data.reference];
     if (reference) {
       const offset = timePlot("offset", `Offset to ${reference.facts.name}`, "ms");
-      for (const camera of cameras) if (camera.facts.offset) add(offset, camera, mp4dsColumns.offsets(camera.stamp, reference.stamp));
+      for (const camera of cameras) if (camera.offsets) add(offset, camera, camera.offsets);
       leaveOut(offset, strange);
     }
     const measures = new Set(cameras.flatMap(camera => Object.keys(camera.scores)));
@@ -325,11 +325,12 @@ var mp4dsReport = (() => {
       waiting.set(camera.number, packed => {
         const count = packed.frames, base = BigInt(data.base);
         const stamp = mp4dsColumns.decode(packed.stamp, count), logTime = mp4dsColumns.decode(packed.log_time, count);
-        const interval = mp4dsColumns.intervals(stamp), lost = mp4dsColumns.lost(interval, camera.facts.timing.median_ms);
+        const interval = mp4dsColumns.intervals(stamp), timing = mp4dsColumns.timing(interval);
         const scores = {};
         for (const [name, text] of Object.entries(packed.scores)) scores[name] = mp4dsColumns.decodeFloats(text);
         camera.take({
-          stamp, logTime, interval, scores, hasStamps: stamp.some(Boolean), lost: {values: lost, reduction: new mp4dsPlots.Reduction(lost)},
+          stamp, logTime, interval, timing, scores, hasStamps: stamp.some(Boolean),
+          lost: {values: timing.lost, reduction: new mp4dsPlots.Reduction(timing.lost)},
           position: mp4dsColumns.positions(data.axis === "stamp" ? stamp : logTime, base),
           ticks: packed.ticks ? Float64Array.from(mp4dsColumns.decode(packed.ticks, count), Number) : null,
         });
@@ -349,6 +350,10 @@ var mp4dsReport = (() => {
     player = report.player = new mp4dsPlayer.Player(cameras, 0);
     arrange();
     await Promise.all(cameras.map(load));
+    const reference = cameras[data.reference];
+    for (const camera of cameras) {
+      if (reference && camera !== reference && !camera.facts.untimed) camera.offsets = mp4dsColumns.offsets(camera.stamp, reference.stamp);
+    }
     player.end = Math.max(0, ...cameras.map(camera => camera.position.at(-1)));
     view = report.view = new mp4dsPlots.View(player.end);
     timeline = new mp4dsTimeline.Timeline(find("timeline"), player, view);
@@ -356,7 +361,7 @@ var mp4dsReport = (() => {
     find("subtitle").textContent = [facts.start && mp4dsTables.dateText(BigInt(facts.start)).replace(/\.\d+/, ""), facts.format && `from ${facts.format}`, (facts.sources || []).slice(0, 4).join(", ")].filter(Boolean).join(" · ");
     const length = facts.start ? Number(BigInt(facts.end) - BigInt(facts.start)) / 1e9 : player.end / 1e9;
     mp4dsTables.summary(find("summary"), data, length);
-    find("timing-hint").textContent = mp4dsTables.timing(find("timing"), data);
+    find("timing-hint").textContent = mp4dsTables.timing(find("timing"), cameras, reference);
     mp4dsTables.topics(find("topics"), data);
     find("calibration-section").hidden = !mp4dsTables.calibrations(find("calibrations"), data);
     find("transform-section").hidden = !mp4dsTables.transforms(find("transforms"), data);

@@ -72,19 +72,21 @@ var mp4dsTables = (() => {
 
   const NUMBER = {number: true};
 
-  function timing(place, data) {
-    const reference = data.reference === null ? "" : data.cameras[data.reference].name;
+  function timing(place, cameras, compared) {
+    const {quantile, delays} = mp4dsColumns, reference = compared ? compared.facts.name : "";
     const head = [["Camera", {long: true}], ["Frames", NUMBER], ["Rate, Hz", NUMBER], ["Interval, ms", NUMBER], ["Jitter, ms", NUMBER],
       ["99 % within", NUMBER], ["Longest, ms", NUMBER], ["Lost", NUMBER], ["Repeated", NUMBER], ["Backward", NUMBER],
       ["seq missing", NUMBER], ["Record − stamp, ms", NUMBER]];
     if (reference) head.push(["Offset, ms", NUMBER]);
-    table(place, head, data.cameras.map(camera => {
-      const t = camera.timing, count = (value, more = "") => [grouped(value) + more, {bad: value > 0}];
-      const row = [camera.name, grouped(t.frames), optional(t.rate_hz, 2), optional(t.median_ms, 3), optional(t.jitter_ms, 3), optional(t.p99_ms, 3),
-        optional(t.longest_ms, 1), count(t.lost, t.gaps ? ` in ${grouped(t.gaps)} gaps` : ""), count(t.repeated), count(t.backward), t.seq_missing === null ? "" : count(t.seq_missing),
-        camera.untimed || `${numberText(t.delay_median_ms)} (${numberText(t.delay_least_ms)} to ${numberText(t.delay_most_ms)})`];
-      const offset = camera.offset;
-      if (reference) row.push(offset ? `${numberText(offset.median_ms)} (99 % within ${numberText(offset.p99_ms)})` : camera.untimed || "reference");
+    table(place, head, cameras.map(camera => {
+      const {timing: t, facts, offsets} = camera, count = (value, more = "") => [grouped(value) + more, {bad: value > 0}];
+      const delay = delays(camera.logTime, camera.stamp).sort();
+      const row = [facts.name, grouped(camera.frames), optional(t.rate, 2), optional(t.median, 3), optional(t.jitter, 3), optional(t.within, 3),
+        optional(t.longest, 1), count(t.missing, t.gaps ? ` in ${grouped(t.gaps)} gaps` : ""), count(t.repeated), count(t.backward),
+        facts.seq_missing === null ? "" : count(facts.seq_missing),
+        facts.untimed || `${numberText(quantile(delay, 0.5))} (${numberText(delay[0])} to ${numberText(delay.at(-1))})`];
+      const share = values => `${numberText(quantile(values.slice().sort(), 0.5))} (99 % within ${numberText(quantile(values.map(Math.abs).sort(), 0.99))})`;
+      if (reference) row.push(offsets ? share(offsets) : facts.untimed || "reference");
       return row;
     }));
     return "Interval is the median interval between header stamps, jitter its standard deviation. An interval longer than 1.5 medians counts as lost frames, unless shorter neighbouring intervals make up for it; "
