@@ -707,26 +707,6 @@ def torchcodec() -> None:
         pytest.skip(f"torchcodec cannot be used: {error}")
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("torchcodec")
-def test_torchcodec_with_the_ffmpeg_of_pyav(drives: list[Path], tmp_path: Path) -> None:
-    if not list((Path(av.__file__).parents[1] / "av.libs").glob("libavcodec*")):
-        pytest.skip("this PyAV has no libraries of its own")
-    env = {"XDG_CACHE_HOME": str(tmp_path)}
-    for _ in range(2):
-        found = program(sys.executable, "-m", "mp4ds.torch.ffmpeg", env=env)
-    code = (
-        "import sys; from torchcodec._core import ffmpeg_major_version as major\n"
-        "from mp4ds.torch import FrameDataset\n"
-        f"FrameDataset(sys.argv[1], topics=['{LEFT}'], backend='torchcodec')[3]; print(major)"
-    )
-    env["LD_LIBRARY_PATH"] = found.out.strip()
-    assert (
-        int(program("-c", code, drives[0], env=env).out)
-        == av.library_versions["libavcodec"][0] - 54
-    )
-
-
 @pytest.mark.usefixtures("torchcodec")
 def test_torchcodec_gives_the_same_frames(drives: list[Path]) -> None:
     """The right ones, in colours that are nearly the same."""

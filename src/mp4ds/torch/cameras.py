@@ -46,67 +46,65 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=gc.freeze)
 
 
-@dataclass(frozen=True, slots=True)
 class Pictures:
     """How the frames of all cameras become tensors.
 
-    Attributes:
-        views: Format, size and crop of each camera, as `Topic.read` takes them.
+    Args:
+        topics: The cameras.
+        format: Of the frames; like `resize` and `crop` one for all, or a mapping by topic.
+        resize: Factor, or width and height.
+        crop: x, y, width, height.
         dtype: ``native``, ``uint8`` or ``float32``.
         channels_first: (C, H, W) instead of (H, W, C).
         backend: The decoding backend.
         device: Where the tensors are.
-    """
 
-    views: tuple[dict[str, Any], ...]
-    dtype: str
-    channels_first: bool
-    backend: str
-    device: str
-
-
-def pictures_from(
-    topics: Sequence[str],
-    *,
-    format_: str | Mapping[str, str],
-    resize: Resize | Mapping[str, Resize],
-    crop: Crop | Mapping[str, Crop],
-    dtype: str,
-    channels_first: bool,
-    backend: str,
-    device: str,
-) -> Pictures:
-    """The user's choices.
+    Attributes:
+        views: Format, size and crop of each camera, as `Topic.read` takes them.
 
     Raises:
         OptionError: One is unknown, or for a topic that does not exist.
     """
-    dtype = str(dtype).removeprefix("torch.")
-    _one_of("dtype", dtype, _DTYPES)
-    _one_of("backend", backend, _BACKENDS)
-    formats = _each("format", format_, topics, "rgb")
-    sizes = _each("resize", resize, topics, None)
-    crops = _each("crop", crop, topics, None)
-    for name in formats:
-        _one_of("format", name, FORMATS)
-    for topic, size in zip(topics, sizes, strict=True):
-        if size is not None:  # now, rather than in a worker
-            size_after(topic, (1, 1), size)
-    views = tuple(
-        {"format": one, "resize": size, "crop": area}
-        for one, size, area in zip(formats, sizes, crops, strict=True)
-    )
-    if backend == "mp4ds" and device != "cpu":
-        raise OptionError(f"device={device!r} needs backend='torchcodec'.")
-    is_changed = any(view["format"] != "rgb" or view["resize"] is not None for view in views)
-    if backend == "torchcodec" and is_changed:
-        raise OptionError(
-            "backend='torchcodec' only gives format='rgb' without resize; use a transform."
-        )
-    return Pictures(views, dtype, channels_first, backend, device)
+
+    def __init__(
+        self,
+        topics: Sequence[str],
+        *,
+        format: str | Mapping[str, str],  # noqa: A002 - as of Topic.read
+        resize: Resize | Mapping[str, Resize],
+        crop: Crop | Mapping[str, Crop],
+        dtype: str,
+        channels_first: bool,
+        backend: str,
+        device: str,
+    ) -> None:
+        self.dtype = str(dtype).removeprefix("torch.")
+        self.channels_first, self.backend, self.device = channels_first, backend, device
+        one_of("dtype", self.dtype, _DTYPES)
+        one_of("backend", backend, _BACKENDS)
+        formats = _each("format", format, topics, "rgb")
+        sizes = _each("resize", resize, topics, None)
+        crops = _each("crop", crop, topics, None)
+        for name in formats:
+            one_of("format", name, FORMATS)
+        for topic, size in zip(topics, sizes, strict=True):
+            if size is not None:  # now, rather than in a worker
+                size_after(topic, (1, 1), size)
+        self.views: list[dict[str, Any]] = [
+            {"format": one, "resize": size, "crop": area}
+            for one, size, area in zip(formats, sizes, crops, strict=True)
+        ]
+        if backend == "mp4ds" and device != "cpu":
+            raise OptionError(f"device={device!r} needs backend='torchcodec'.")
+        is_changed = any(view["format"] != "rgb" or view["resize"] for view in self.views)
+        if backend == "torchcodec" and is_changed:
+            raise OptionError(
+                "backend='torchcodec' only gives format='rgb' without resize; use a transform."
+            )
 
 
-def _one_of(name: str, value: str, known: Sequence[str]) -> None:
+def one_of(name: str, value: str, known: Sequence[str]) -> None:
+    """Refuse an unknown value of an argument."""
     if value not in known:
         raise OptionError(f"{name} is {value!r}, not one of {', '.join(known)}.")
 
@@ -348,8 +346,7 @@ class TorchcodecReader:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
             raise OptionError(
                 f"torchcodec is installed but cannot be used: {reason} If it finds no FFmpeg, "
-                "install it, or use the one in PyAV: LD_LIBRARY_PATH=$(python -m "
-                "mp4ds.torch.ffmpeg) python ..."
+                "install that."
             ) from None
         try:
             # with exact seeking, frame n is the n-th shown, whatever its presentation time
@@ -576,18 +573,27 @@ class OpenCameras:
         """A camera of a recording, opened if needed; other threads wait until it is left.
 
         Raises:
-            FormatError: It breaks a rule of the format.
+            SampleError: It breaks a rule of the format, or a frame cannot be read; names the
+                dataset and topic.
         """
         lock, opened = self._opened.setdefault(os.getpid(), (threading.RLock(), OrderedDict()))
-        with lock:
-            source = recording.sources[camera]
-            found = opened.pop(source.place, None)
-            if found is None:
-                while len(opened) >= self._most:
-                    opened.popitem(last=False)[1].close()
-                found = OpenCamera(source, self._pictures.views[camera], self._pictures)
-            opened[source.place] = found
-            yield found
+        source = recording.sources[camera]
+        where = f"{recording.path}, topic {source.topic}"
+        try:
+            with lock:
+                found = opened.pop(source.place, None)
+                if found is None:
+                    while len(opened) >= self._most:
+                        opened.popitem(last=False)[1].close()
+                    found = OpenCamera(source, self._pictures.views[camera], self._pictures)
+                opened[source.place] = found
+                yield found
+        except OptionError:
+            raise
+        except SampleError as error:
+            raise SampleError(f"{where}, {error}") from None
+        except Mp4dsError as error:
+            raise SampleError(f"{where}: {error}") from None
 
     def close(self) -> None:
         """Close the cameras of this process."""

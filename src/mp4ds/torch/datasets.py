@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import prod
 from operator import index as as_integer
 from reprlib import repr as shortened
@@ -16,15 +14,16 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from mp4ds.dataset.views import Crop, Resize
-from mp4ds.errors import Mp4dsError, OptionError, SampleError, absent, counted
+from mp4ds.errors import OptionError, absent, counted
 from mp4ds.torch.cameras import (
     Backend,
     Dtype,
     OpenCamera,
     OpenCameras,
     Paths,
+    Pictures,
     Recording,
-    pictures_from,
+    one_of,
     recordings_of,
 )
 
@@ -32,19 +31,46 @@ Unit = Literal["frames", "seconds"]
 _MOST_SECONDS = 10**9
 
 
-@dataclass(frozen=True, slots=True)
 class Offsets:
-    """Offsets of a sample's frames from its own row, in rows or in nanoseconds.
+    """Which frames a sample has, relative to its own row, in rows or by time.
+
+    Args:
+        values: The offsets.
+        unit: ``frames`` or ``seconds``.
+        tolerance_ns: How far a frame may be from its time; None: half a period of the camera.
 
     Attributes:
-        steps: The offsets.
-        timed: Whether they are nanoseconds.
-        tolerance_ns: How far a frame may be from its time; None: half a period of the camera.
+        steps: The offsets, in rows or nanoseconds.
+        is_single: Whether a sample has its own frame alone, and no dimension for more.
+
+    Raises:
+        OptionError: There are none, or they are not valid in that unit.
     """
 
-    steps: tuple[int, ...] = (0,)
-    timed: bool = False
-    tolerance_ns: int | None = None
+    def __init__(self, values: Sequence[float], unit: Unit, tolerance_ns: int | None) -> None:
+        if not isinstance(values, Iterable):
+            raise OptionError(f"offsets is {values!r}, but a list such as (-1, 0).")
+        given = tuple(values)
+        if not given:
+            raise OptionError("offsets is empty; use (0,) for the sample's own frame alone.")
+        one_of("offsets_in", unit, ("frames", "seconds"))
+        self._timed = unit == "seconds"
+        self._tolerance_ns = tolerance_ns
+        if not self._timed:
+            if any(isinstance(value, bool) or value != int(value) for value in given):
+                raise OptionError(
+                    f"offsets are {given}, but offsets in frames must be integers; "
+                    'for seconds, give offsets_in="seconds".'
+                )
+            if tolerance_ns is not None:
+                raise OptionError('tolerance_ns belongs to offsets_in="seconds".')
+        elif not all(abs(value) <= _MOST_SECONDS for value in given):
+            raise OptionError(f"offsets are {given}, but offsets in seconds can be at most 1e9.")
+        elif tolerance_ns is not None and tolerance_ns < 0:
+            raise OptionError(f"tolerance_ns is {tolerance_ns}, but must not be negative.")
+        scale = 10**9 if self._timed else 1
+        self.steps = np.array([round(value * scale) for value in given], np.int64)
+        self.is_single = given == (0,) and not self._timed
 
     def frames(
         self, recording: Recording, camera: int, timeline: OpenCamera, rows: NDArray[np.int64]
@@ -60,47 +86,17 @@ class Offsets:
         Returns:
             Two arrays of shape (N, offsets).
         """
-        steps = np.array(self.steps, np.int64)
-        if not self.timed:
-            wanted = rows[:, None] + steps
+        if not self._timed:
+            wanted = rows[:, None] + self.steps
             there = np.clip(wanted, 0, recording.rows - 1)
             return recording.frames(there, camera), there != wanted
         own = recording.frames(rows, camera)[:, None]
         stamps = timeline.stamps
-        times = stamps[own] + steps
+        times = stamps[own] + self.steps
         # with equal stamps, the frame nearest to its own time may be a different one
-        found = np.where(steps == 0, own, timeline.nearest(times))
-        tolerance = timeline.period_ns // 2 if self.tolerance_ns is None else self.tolerance_ns
+        found = np.where(self.steps == 0, own, timeline.nearest(times))
+        tolerance = timeline.period_ns // 2 if self._tolerance_ns is None else self._tolerance_ns
         return found, np.abs(stamps[found] - times) > tolerance
-
-
-def offsets_from(values: Sequence[float], unit: Unit, tolerance_ns: int | None) -> Offsets:
-    """The user's offsets.
-
-    Raises:
-        OptionError: There are none, or they are not valid in that unit.
-    """
-    if not isinstance(values, Iterable):
-        raise OptionError(f"offsets is {values!r}, but a list such as (-1, 0).")
-    given = tuple(values)
-    if not given:
-        raise OptionError("offsets is empty; use (0,) for the sample's own frame alone.")
-    if unit == "frames":
-        if any(isinstance(value, bool) or value != int(value) for value in given):
-            raise OptionError(
-                f"offsets are {given}, but offsets in frames must be integers; "
-                'for seconds, give offsets_in="seconds".'
-            )
-        if tolerance_ns is not None:
-            raise OptionError('tolerance_ns belongs to offsets_in="seconds".')
-        return Offsets(tuple(int(value) for value in given))
-    if unit != "seconds":
-        raise OptionError(f"offsets_in is {unit!r}, not one of frames, seconds.")
-    if not all(abs(value) <= _MOST_SECONDS for value in given):
-        raise OptionError(f"offsets are {given}, but offsets in seconds can be at most 1e9.")
-    if tolerance_ns is not None and tolerance_ns < 0:
-        raise OptionError(f"tolerance_ns is {tolerance_ns}, but must not be negative.")
-    return Offsets(tuple(round(value * 10**9) for value in given), True, tolerance_ns)
 
 
 # ---------------------------------------------------------------- samples
@@ -138,136 +134,6 @@ def _longer(like: torch.Tensor, rows: int, *, shared: bool = False) -> torch.Ten
     # as torch's own collate does in a worker
     storage = torch.UntypedStorage._new_shared(prod(shape) * like.itemsize)
     return like.new_empty(0).set_(storage, 0, shape)
-
-
-class Samples:
-    """The samples of several datasets, one after another.
-
-    Args:
-        paths: The datasets, or folders of them.
-        topics: The cameras; None: those of the first dataset.
-        sync_tolerance_ns: Maximum distance of the header stamps of a match, nanoseconds.
-        offsets: Which frames a sample has.
-        transform: Applied to each sample; None for nothing.
-        cache_files: Maximum number of open videos.
-        **view: How frames become tensors: the arguments of `pictures_from`.
-
-    Raises:
-        OptionError: An option is wrong, a topic does not exist, or there are no samples.
-        FormatError: A manifest or sidecar breaks a rule of the format.
-        SourceError: A path is not a dataset.
-    """
-
-    def __init__(
-        self,
-        paths: Paths,
-        topics: Sequence[str] | None,
-        *,
-        sync_tolerance_ns: int,
-        offsets: Offsets,
-        transform: Transform | None,
-        cache_files: int,
-        **view: Any,
-    ) -> None:
-        self.topics, self.recordings = recordings_of(paths, topics, sync_tolerance_ns)
-        starts = np.cumsum([0, *(recording.rows for recording in self.recordings)])
-        self._starts: NDArray[np.int64] = starts.astype(np.int64)
-        self._offsets = offsets
-        self._transform = transform
-        self._pictures = pictures_from(self.topics, **view)
-        self._cameras = OpenCameras(cache_files, self._pictures)
-
-    def __len__(self) -> int:
-        return int(self._starts[-1])
-
-    def describe(self, owner: object) -> str:
-        """Its line for the `repr` of an owner."""
-        count = len(self.recordings)
-        return (
-            f"<{type(owner).__name__}: {len(self)} samples of {counted(count, 'dataset')}, "
-            f"{', '.join(self.topics)}>"
-        )
-
-    def number(self, recording: int, row: int) -> int:
-        """Number of a sample by its recording and row."""
-        return int(self._starts[recording]) + row
-
-    def key_frames(self, number: int) -> NDArray[np.int64]:
-        """Numbers of the key frames of a recording's first camera, in order.
-
-        Raises:
-            SampleError: Its video cannot be read.
-        """
-        with self._camera(self.recordings[number], 0) as camera:
-            return camera.key_frames
-
-    def read(self, numbers: Sequence[int], *, shared: bool = False) -> list[Any]:
-        """Samples; the frames of each camera of a recording are decoded in one pass.
-
-        Their tensors are rows of one tensor for each camera, so that collating copies nothing.
-
-        Args:
-            numbers: 0 or more, less than the length; in any order.
-            shared: Whether other processes need access.
-
-        Raises:
-            SampleError: A frame cannot be read.
-        """
-        wanted = np.array(numbers, np.int64)
-        owners = np.searchsorted(self._starts, wanted, side="right") - 1
-        samples: list[Sample] = [{} for _ in numbers]
-        tensors: dict[str, torch.Tensor] = {}
-        for owner in np.unique(owners).tolist():
-            recording = self.recordings[owner]
-            places = np.flatnonzero(owners == owner).tolist()
-            rows = wanted[places] - self._starts[owner]
-            flags: dict[str, torch.Tensor] = {}
-            stamps: list[int] = []
-            for number, topic in enumerate(self.topics):
-                with self._camera(recording, number) as camera:
-                    frames, padded = self._offsets.frames(recording, number, camera, rows)
-                    like = camera.empty(len(self._offsets.steps))
-                    if topic not in tensors:
-                        tensors[topic] = _longer(like, len(numbers), shared=shared)
-                    outs = [tensors[topic][place] for place in places]
-                    if (outs[0].shape, outs[0].dtype) != (like.shape[1:], like.dtype):
-                        outs = list(_longer(like, len(places)))  # of a recording of other images
-                    camera.read(frames.ravel().tolist(), [frame for row in outs for frame in row])
-                    if number == 0:
-                        stamps = camera.stamps[recording.frames(rows, 0)].tolist()
-                flags[f"{topic}_is_pad"] = torch.from_numpy(padded)
-                for place, out in zip(places, outs, strict=True):
-                    shown = out.movedim(-1, -3) if self._pictures.channels_first else out
-                    samples[place][topic] = shown[0] if self._offsets == Offsets() else shown
-            for n, place in enumerate(places):
-                samples[place] |= {name: padded[n] for name, padded in flags.items()}
-                index = int(wanted[place])
-                samples[place] |= {"stamp_ns": stamps[n], "index": index, "dataset": owner}
-        return samples if self._transform is None else [self._transform(s) for s in samples]
-
-    @contextmanager
-    def _camera(self, recording: Recording, number: int) -> Iterator[OpenCamera]:
-        """A camera, in whose errors are the dataset and topic."""
-        where = f"{recording.path}, topic {self.topics[number]}"
-        try:
-            with self._cameras.using(recording, number) as camera:
-                yield camera
-        except OptionError:
-            raise
-        except SampleError as error:
-            raise SampleError(f"{where}, {error}") from None
-        except Mp4dsError as error:
-            raise SampleError(f"{where}: {error}") from None
-
-    def close(self) -> None:
-        """Close the videos of this process."""
-        self._cameras.close()
-
-
-# ---------------------------------------------------------------- dataset
-
-
-SYNC_TOLERANCE_NS = 20_000_000
 
 
 class FrameDataset(Dataset):
@@ -312,6 +178,10 @@ class FrameDataset(Dataset):
         backend: ``torchcodec`` decodes with torchcodec, whose colours differ slightly.
         device: With ``torchcodec``, where to decode and keep the tensors, such as ``cuda``.
 
+    Attributes:
+        topics: The cameras of a sample.
+        recordings: The samples of each dataset, one after another.
+
     Raises:
         OptionError: An option is wrong, a topic is not there, or there is no sample.
         SourceError: A path is not a dataset.
@@ -326,7 +196,7 @@ class FrameDataset(Dataset):
         offsets: Sequence[float] = (0,),
         offsets_in: Unit = "frames",
         tolerance_ns: int | None = None,
-        sync_tolerance_ns: int = SYNC_TOLERANCE_NS,
+        sync_tolerance_ns: int = 20_000_000,
         format: str | Mapping[str, str] = "rgb",  # noqa: A002 - as of Stream.read
         resize: Resize | Mapping[str, Resize] = None,
         crop: Crop | Mapping[str, Crop] = None,
@@ -340,15 +210,14 @@ class FrameDataset(Dataset):
     ) -> None:
         for name in others:  # of other libraries, too
             raise TypeError(absent(self, name))
-        chosen = offsets_from(offsets, offsets_in, tolerance_ns)
-        self._samples = Samples(
-            paths,
-            topics,
-            sync_tolerance_ns=sync_tolerance_ns,
-            offsets=chosen,
-            transform=transform,
-            cache_files=cache_files,
-            format_=format,
+        self._offsets = Offsets(offsets, offsets_in, tolerance_ns)
+        self.topics, self.recordings = recordings_of(paths, topics, sync_tolerance_ns)
+        starts = np.cumsum([0, *(recording.rows for recording in self.recordings)])
+        self._starts: NDArray[np.int64] = starts.astype(np.int64)
+        self._transform = transform
+        self._pictures = Pictures(
+            self.topics,
+            format=format,
             resize=resize,
             crop=crop,
             dtype=dtype,
@@ -356,33 +225,30 @@ class FrameDataset(Dataset):
             backend=backend,
             device=device,
         )
+        self._cameras = OpenCameras(cache_files, self._pictures)
         self._collates = False
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """The cameras of a sample."""
-        return self._samples.topics
 
     @property
     def paths(self) -> list[str]:
         """The datasets; a sample's ``dataset`` is an index into these."""
-        return [recording.path for recording in self._samples.recordings]
+        return [recording.path for recording in self.recordings]
 
     @property
     def lengths(self) -> list[int]:
         """Number of samples of each dataset."""
-        return [recording.rows for recording in self._samples.recordings]
+        return [recording.rows for recording in self.recordings]
 
     @property
     def unmatched(self) -> list[dict[str, NDArray[np.int64]]]:
         """For each dataset, the numbers of the frames that are not in any sample, by topic."""
-        return [recording.unmatched for recording in self._samples.recordings]
+        return [recording.unmatched for recording in self.recordings]
 
     def __repr__(self) -> str:
-        return self._samples.describe(self)
+        count = counted(len(self.recordings), "dataset")
+        return f"<FrameDataset: {len(self)} samples of {count}, {', '.join(self.topics)}>"
 
     def __len__(self) -> int:
-        return len(self._samples)
+        return int(self._starts[-1])
 
     def __getitem__(self, index: SupportsIndex) -> Any:
         return self.__getitems__([index])[0]
@@ -397,7 +263,51 @@ class FrameDataset(Dataset):
             SampleError: A frame cannot be read.
         """
         wanted = [self._number(index) for index in indices]
-        return self._samples.read(wanted, shared=self._collates and get_worker_info() is not None)
+        return self._read(wanted, shared=self._collates and get_worker_info() is not None)
+
+    def _read(self, numbers: Sequence[int], *, shared: bool) -> list[Any]:
+        """Samples; the frames of each camera of a recording are decoded in one pass.
+
+        Their tensors are rows of one tensor for each camera, so that collating copies nothing.
+
+        Args:
+            numbers: 0 or more, less than the length; in any order.
+            shared: Whether other processes need access.
+
+        Raises:
+            SampleError: A frame cannot be read.
+        """
+        wanted = np.array(numbers, np.int64)
+        owners = np.searchsorted(self._starts, wanted, side="right") - 1
+        samples: list[Sample] = [{} for _ in numbers]
+        tensors: dict[str, torch.Tensor] = {}
+        for owner in np.unique(owners).tolist():
+            recording = self.recordings[owner]
+            places = np.flatnonzero(owners == owner).tolist()
+            rows = wanted[places] - self._starts[owner]
+            flags: dict[str, torch.Tensor] = {}
+            stamps: list[int] = []
+            for number, topic in enumerate(self.topics):
+                with self._cameras.using(recording, number) as camera:
+                    frames, padded = self._offsets.frames(recording, number, camera, rows)
+                    like = camera.empty(len(self._offsets.steps))
+                    if topic not in tensors:
+                        tensors[topic] = _longer(like, len(numbers), shared=shared)
+                    outs = [tensors[topic][place] for place in places]
+                    if (outs[0].shape, outs[0].dtype) != (like.shape[1:], like.dtype):
+                        outs = list(_longer(like, len(places)))  # of a recording of other images
+                    camera.read(frames.ravel().tolist(), [frame for row in outs for frame in row])
+                    if number == 0:
+                        stamps = camera.stamps[recording.frames(rows, 0)].tolist()
+                flags[f"{topic}_is_pad"] = torch.from_numpy(padded)
+                for place, out in zip(places, outs, strict=True):
+                    shown = out.movedim(-1, -3) if self._pictures.channels_first else out
+                    samples[place][topic] = shown[0] if self._offsets.is_single else shown
+            for n, place in enumerate(places):
+                samples[place] |= {name: padded[n] for name, padded in flags.items()}
+                index = int(wanted[place])
+                samples[place] |= {"stamp_ns": stamps[n], "index": index, "dataset": owner}
+        return samples if self._transform is None else [self._transform(s) for s in samples]
 
     def collate(self, samples: Sequence[Any]) -> Any:
         """Like `torch.utils.data.default_collate`, without copying frames.
@@ -415,6 +325,19 @@ class FrameDataset(Dataset):
             return default_collate(samples)
         return {key: _whole([sample[key] for sample in samples]) for key in samples[0]}
 
+    def number(self, recording: int, row: int) -> int:
+        """Number of a sample by the numbers of its dataset and of its row there."""
+        return int(self._starts[recording]) + row
+
+    def key_frames(self, recording: int) -> NDArray[np.int64]:
+        """Numbers of the key frames of a dataset's first camera, in order.
+
+        Raises:
+            SampleError: Its video cannot be read.
+        """
+        with self._cameras.using(self.recordings[recording], 0) as camera:
+            return camera.key_frames
+
     def _number(self, index: SupportsIndex) -> int:
         try:
             number = as_integer(index)
@@ -429,4 +352,4 @@ class FrameDataset(Dataset):
 
     def close(self) -> None:
         """Close this process's videos; they are reopened when needed."""
-        self._samples.close()
+        self._cameras.close()

@@ -10,20 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
-from mp4ds.dataset.views import Crop, Resize
-from mp4ds.errors import OptionError
-from mp4ds.torch.cameras import (
-    Backend,
-    Dtype,
-    Paths,
-    Recording,
-)
-from mp4ds.torch.datasets import (
-    SYNC_TOLERANCE_NS,
-    Offsets,
-    Samples,
-    Transform,
-)
+from mp4ds.errors import OptionError, absent
+from mp4ds.torch.cameras import Paths, Recording
+from mp4ds.torch.datasets import FrameDataset
 
 _T = TypeVar("_T")
 _UNREAD = object()
@@ -105,17 +94,8 @@ class FrameStream(IterableDataset):
     DataLoader. torchdata's StatefulDataLoader saves and restores the position in an epoch.
 
     Args:
-        paths: As for `FrameDataset`, and so are `topics`, `sync_tolerance_ns`, `format`,
-            `resize`, `crop`, `dtype`, `channels_first`, `transform`, `cache_files`, `backend`
-            and `device`.
-        topics: Cameras.
-        sync_tolerance_ns: Of the matches.
-        format: Of the frames.
-        resize: Of the frames.
-        crop: Of the frames.
-        dtype: Of the tensors.
-        channels_first: Of the tensors.
-        transform: Of the samples.
+        paths: As for `FrameDataset`.
+        topics: As for `FrameDataset`.
         window: Samples of a window; the key frames of the first camera make it a little
             shorter or longer. Use several key frame intervals, or decoding costs more.
         shuffle: Whether windows come in random order.
@@ -126,8 +106,7 @@ class FrameStream(IterableDataset):
         drop_last: For distributed training, as in DistributedSampler: leave out the last samples
             that cannot be shared evenly. Otherwise the first ones of the epoch are repeated.
         cache_files: Maximum number of open videos; at least one per camera.
-        backend: Who decodes.
-        device: Where to decode.
+        **options: All others of `FrameDataset`, but for those of offsets.
 
     Raises:
         OptionError: An option is wrong, a topic is not there, or there is no sample.
@@ -140,13 +119,6 @@ class FrameStream(IterableDataset):
         paths: Paths,
         *,
         topics: Sequence[str] | None = None,
-        sync_tolerance_ns: int = SYNC_TOLERANCE_NS,
-        format: str | Mapping[str, str] = "rgb",  # noqa: A002 - as of Stream.read
-        resize: Resize | Mapping[str, Resize] = None,
-        crop: Crop | Mapping[str, Crop] = None,
-        dtype: Dtype = "native",
-        channels_first: bool = True,
-        transform: Transform | None = None,
         window: int = 256,
         shuffle: bool = True,
         seed: int = 0,
@@ -155,25 +127,13 @@ class FrameStream(IterableDataset):
         world_size: int = 1,
         drop_last: bool = False,
         cache_files: int = 16,
-        backend: Backend = "mp4ds",
-        device: str = "cpu",
+        **options: Any,
     ) -> None:
+        for name in ("offsets", "offsets_in", "tolerance_ns"):
+            if name in options:
+                raise TypeError(absent(self, name))
         _check(window=window, seed=seed, buffer=buffer, rank=rank, world_size=world_size)
-        self._samples = Samples(
-            paths,
-            topics,
-            sync_tolerance_ns=sync_tolerance_ns,
-            offsets=Offsets(),
-            transform=transform,
-            cache_files=cache_files,
-            format_=format,
-            resize=resize,
-            crop=crop,
-            dtype=dtype,
-            channels_first=channels_first,
-            backend=backend,
-            device=device,
-        )
+        self._frames = FrameDataset(paths, topics=topics, cache_files=cache_files, **options)
         if cache_files < len(self.topics):
             raise OptionError(
                 f"cache_files is {cache_files}, but must be at least {len(self.topics)}: one per "
@@ -193,15 +153,15 @@ class FrameStream(IterableDataset):
     @property
     def topics(self) -> tuple[str, ...]:
         """The cameras of a sample."""
-        return self._samples.topics
+        return self._frames.topics
 
     @property
     def samples(self) -> int:
         """Number of samples per epoch, over all processes."""
-        return len(self._samples)
+        return len(self._frames)
 
     def __repr__(self) -> str:
-        return self._samples.describe(self)
+        return repr(self._frames).replace("FrameDataset", "FrameStream", 1)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the order of the next epoch; the same number gives the same order.
@@ -281,11 +241,11 @@ class FrameStream(IterableDataset):
             yield sample
 
     def _read(self, place: tuple[int, int]) -> Any:
-        return self._samples.read([self._samples.number(*place)])[0]
+        return self._frames[self._frames.number(*place)]
 
     def _rows(self, order: tuple[int, int], share: int, shares: int) -> Iterator[tuple[int, int]]:
         """The samples of a share, in order: recording and row of each."""
-        recordings = self._samples.recordings
+        recordings = self._frames.recordings
         windows = [
             (number, window)
             for number, recording in enumerate(recordings)
@@ -309,15 +269,15 @@ class FrameStream(IterableDataset):
 
     def _window_rows(self, number: int, window: int) -> range:
         if number not in self._starts:
-            keys = self._samples.key_frames(number)
-            recording = self._samples.recordings[number]
+            keys = self._frames.key_frames(number)
+            recording = self._frames.recordings[number]
             self._starts[number] = window_starts(recording, self._window, keys)
         first, end = self._starts[number][window : window + 2].tolist()
         return range(first, end)
 
     def close(self) -> None:
         """Close the videos that this process has open; they are opened again when needed."""
-        self._samples.close()
+        self._frames.close()
 
 
 def _check(**numbers: int) -> None:
