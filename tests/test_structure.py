@@ -204,8 +204,8 @@ def test_the_columns_of_the_example_decode(examples: tuple[StreamSidecar, Manife
     assert stream.camera_info is not None
     parts.append((stream.camera_info.columns, stream.camera_info.messages))
     for columns, count in parts:
-        for name in columns.names():
-            assert len(getattr(columns, name).decode(count)) == count
+        for _, column in columns:
+            assert column is None or len(column.decode(count)) == count
         times = columns.log_time.decode(count)
         assert manifest.time_range.start <= times[0] < times[-1] <= manifest.time_range.end
     assert stream.digests is not None

@@ -286,7 +286,7 @@ def camera(**changes: Any) -> Document:
     ("content", "word"),
     [
         (broken(camera_info=...), "camera_info"),
-        (broken(camera_info={}), "width"),
+        (broken(camera_info={}), "camera_info.frameid: "),
         (broken(camera_info=None), ""),
         (broken(camera_info=[1]), ""),
         (broken(camera_info="none"), ""),
@@ -295,8 +295,8 @@ def camera(**changes: Any) -> Document:
             for key in ("frameid", "width", "height", "D", "K", "R", "P")
         ),
         (camera(distortion_model=...), "distortion_model"),
-        (camera(width="wide"), "wide"),
-        (camera(width=64.5), "64.5"),
+        (camera(width="wide"), "camera_info.width: "),
+        (camera(width=64.5), "camera_info.width: "),
         (camera(height=None), ""),
         (camera(K=None), ""),
         (camera(K=["x"] * 9), ""),

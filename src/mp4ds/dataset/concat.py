@@ -580,7 +580,7 @@ def _common(sidecar: StreamSidecar) -> tuple[object, ...]:
         info if info and not info.messages else None,  # nothing tells when one applied
         *(sidecar.profile, sidecar.stamps, sidecar.channel, sidecar.wire, sidecar.body),
         *(sidecar.image, video, sidecar.digests is None, sidecar.video.quality is None),
-        *(name in sidecar.columns.names() for name in ("seq", "pts")),
+        *(sidecar.columns.seq is None, sidecar.columns.pts is None),
     )
 
 

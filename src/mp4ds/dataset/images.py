@@ -372,7 +372,7 @@ class VerbatimImages(Images):
         self._recorded, self._calibrated = recorded, calibrated
         numbers = np.array([entry[:4] for entry in entries], np.int64).reshape(-1, 4)
         ordinals, log_times, self._ties, stamps = numbers.T
-        self._columns = DecodedColumns.of_frames(stamps, log_times, ordinals)
+        self._columns = DecodedColumns.of_frames(stamps, log_times, ordinal=ordinals)
         self._frame_ids = [entry[4] for entry in entries]
         self._last: tuple[int, Shown] | None = None
 

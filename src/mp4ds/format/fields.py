@@ -143,10 +143,6 @@ class Columns(Model):
         None, description="Place of each among the channel's messages; absent: 0, 1, 2 ..."
     )
 
-    def names(self) -> list[str]:
-        """Names of the columns that are there."""
-        return [name for name in type(self).model_fields if getattr(self, name) is not None]
-
 
 class Digests(Model):
     """A digest of each original message payload, in frame order."""
@@ -182,22 +178,17 @@ class DecodedColumns:
     publish_time: NDArray[np.int64]
     sequence: NDArray[np.int64]
     stamp: NDArray[np.int64]
-    seq: NDArray[np.int64] | None
-    pts: NDArray[np.int64] | None
     variant: NDArray[np.int64]
     ordinal: NDArray[np.int64]
+    seq: NDArray[np.int64] | None = None
+    pts: NDArray[np.int64] | None = None
 
     @classmethod
     def of_frames(
-        cls,
-        stamp: NDArray[np.int64],
-        log_time: NDArray[np.int64],
-        ordinal: NDArray[np.int64] | None = None,
+        cls, stamp: NDArray[np.int64], log_time: NDArray[np.int64], **others: NDArray[np.int64]
     ) -> DecodedColumns:
-        """Those of frames without a sidecar."""
-        zeros = np.broadcast_to(np.int64(0), stamp.shape)
-        numbers = np.arange(len(stamp)) if ordinal is None else ordinal
-        return cls(log_time, log_time, zeros, stamp, None, None, zeros, numbers)
+        """Columns of which some may be left out: those that follow from the log times."""
+        return cls(**{**_implied(log_time), "stamp": stamp, "log_time": log_time, **others})
 
     def slots(self, index: int) -> Slots:
         """The values that fill a message's blank."""
@@ -208,6 +199,13 @@ class DecodedColumns:
         )
 
 
+def _implied(log_time: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+    """What the columns hold that a sidecar leaves out."""
+    zeros = np.broadcast_to(np.int64(0), log_time.shape)
+    numbers = np.arange(len(log_time), dtype=np.int64)
+    return {"publish_time": log_time, "sequence": zeros, "variant": zeros, "ordinal": numbers}
+
+
 def decode_columns(columns: Columns, count: int, variants: int, place: str) -> DecodedColumns:
     """Decode all columns and check what they refer to.
 
@@ -215,22 +213,13 @@ def decode_columns(columns: Columns, count: int, variants: int, place: str) -> D
         FormatError: ``column-invalid``, naming the column.
     """
     arrays: dict[str, NDArray[np.int64]] = {}
-    for name in columns.names():
+    for name, column in columns:
         try:
-            arrays[name] = getattr(columns, name).decode(count)
+            if column is not None:
+                arrays[name] = column.decode(count)
         except ValueError as error:
             raise FormatError("column-invalid", f"{place} at columns.{name}", str(error)) from None
-    zeros = np.broadcast_to(np.int64(0), (count,))
-    decoded = DecodedColumns(
-        log_time=arrays["log_time"],
-        publish_time=arrays.get("publish_time", arrays["log_time"]),
-        sequence=arrays.get("sequence", zeros),
-        stamp=arrays["stamp"],
-        seq=arrays.get("seq"),
-        pts=arrays.get("pts"),
-        variant=arrays.get("variant", zeros),
-        ordinal=arrays.get("ordinal", np.arange(count, dtype=np.int64)),
-    )
+    decoded = DecodedColumns.of_frames(**arrays)
     if decoded.variant.min() < 0 or decoded.variant.max() >= variants:
         raise FormatError(
             "column-invalid",
@@ -252,18 +241,13 @@ def columns_model(values: Mapping[str, NDArray[np.int64]]) -> Columns:
         values: All that `Columns` has by name, shape (messages,); ``seq`` and ``pts`` if the
             messages have them.
     """
-    log_time, publish_time, ordinal = (
-        values[name] for name in ("log_time", "publish_time", "ordinal")
-    )
-    return Columns(
-        log_time=_column(log_time),
-        publish_time=None if _same(publish_time, log_time) else _column(publish_time),
-        sequence=_unless_zero(values["sequence"]),
-        stamp=_column(values["stamp"]),
-        seq=_column(values["seq"]) if "seq" in values else None,
-        pts=_column(values["pts"]) if "pts" in values else None,
-        variant=_unless_zero(values["variant"]),
-        ordinal=None if _same(ordinal, np.arange(len(ordinal))) else _column(ordinal),
+    implied = _implied(values["log_time"])
+    return Columns.model_validate(
+        {
+            name: encode_column(column)
+            for name, column in values.items()
+            if not np.array_equal(column, implied.get(name, ()))
+        }
     )
 
 
@@ -275,18 +259,6 @@ def digests_model(digests: Iterable[int]) -> Digests:
         for start in range(0, len(words), _DIGESTS_PER_LINE)
     )
     return Digests(algorithm="xxh64", values="\n".join(lines) + "\n")
-
-
-def _same(a: NDArray[np.int64], b: NDArray[np.int64]) -> bool:
-    return bool(np.array_equal(a, b))
-
-
-def _unless_zero(values: NDArray[np.int64]) -> Column | None:
-    return _column(values) if values.any() else None
-
-
-def _column(values: NDArray[np.int64]) -> Column:
-    return Column.model_validate(encode_column(values))
 
 
 # ---------------------------------------------------------------- choices

@@ -8,22 +8,20 @@ from fractions import Fraction
 from functools import cache
 from importlib.resources import files
 from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from mp4ds import yamlio
 from mp4ds.errors import FormatError, SourceError, VersionError
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
-from mp4ds.format.fields import FORMAT_VERSION, document_of, parse_version
+from mp4ds.format.fields import FORMAT_VERSION, Model, document_of, parse_version
 from mp4ds.format.manifest import About, FileEntry, Manifest
 from mp4ds.format.models import StreamSidecar
 from mp4ds.times import encode_column
 
 Document = dict[str, Any]
-
-_VERSION_0_KEYS = {"bagname", "topic_name", "camera_info", "img_timestamp"}
 
 
 def version_of(document: Document) -> str | None:
@@ -45,25 +43,45 @@ def migrate(document: Document, place: str) -> Document:
             document = MIGRATIONS[str(version)](document, place)
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             reason = f"{type(error).__name__}: {error}"
+            if isinstance(error, ValidationError):
+                reason = ": ".join(model_problems(error)[0])
             raise FormatError(
                 "migration-failed", place, f"is not a complete file of version {version} ({reason})"
             ) from None
     return document
 
 
-def _from_0(old: Document, place: str) -> Document:
+class _CameraInfo0(BaseModel):
+    """What is used of version 0's camera_info."""
+
+    model_config = ConfigDict(strict=True)
+
+    frameid: Annotated[str, BeforeValidator(str)]
+    distortion_model: Annotated[str, BeforeValidator(str)]
+    width: int
+    height: int
+    D: list[FiniteFloat]
+    K: list[FiniteFloat]
+    R: list[FiniteFloat]
+    P: list[FiniteFloat]
+
+
+class _Sidecar0(Model):
     """Version 0: one stream, float seconds of record time, the first camera_info."""
-    unknown = set(old) - _VERSION_0_KEYS
-    if unknown:
-        raise ValueError(f"unknown keys {sorted(unknown)}")
-    if not isinstance(old["topic_name"], list):
-        raise ValueError("topic_name is not a list")
-    info_topic, image_topic = map(_text, old["topic_name"])
-    info = old["camera_info"]
+
+    bagname: Any = None
+    topic_name: Annotated[list[str], Field(min_length=2, max_length=2)]
+    camera_info: _CameraInfo0
+    img_timestamp: list[FiniteFloat]
+
+
+def _from_0(document: Document, place: str) -> Document:
+    old = _Sidecar0.model_validate(document)
+    info_topic, image_topic = old.topic_name
+    info = old.camera_info
     # round half even of the exact product: the nearest nanosecond to the stored float
-    times = [round(Fraction(_number(seconds)) * 10**9) for seconds in old["img_timestamp"]]
+    times = [round(Fraction(seconds) * 10**9) for seconds in old.img_timestamp]
     column = encode_column(times)
-    width, height = _integer(info["width"]), _integer(info["height"])
     return {
         "mp4ds": "1.0",
         "kind": "stream",
@@ -74,19 +92,19 @@ def _from_0(old: Document, place: str) -> Document:
         "wire": "ros1",
         "image": {
             "encoding": "bgr8",
-            "width": width,
-            "height": height,
-            "step": 3 * width,
+            "width": info.width,
+            "height": info.height,
+            "step": 3 * info.width,
             "is_bigendian": 0,
         },
-        "headers": [{"frame_id": str(info["frameid"])}],
+        "headers": [{"frame_id": info.frameid}],
         "video": {
             "file": PurePath(place).with_suffix(".mp4").name,
             "layout": "bgr24",
             "codec": "av1",
             "pixel_format": "yuv420p",
-            "width": width,
-            "height": height,
+            "width": info.width,
+            "height": info.height,
             # that tool left the conversion to ffmpeg, which then takes BT.601, limited
             "color": {
                 "primaries": "bt709",
@@ -99,7 +117,9 @@ def _from_0(old: Document, place: str) -> Document:
             "channel": _channel_0(info_topic, "sensor_msgs/CameraInfo"),
             "wire": "ros1",
             "messages": 0,
-            "calibrations": [_calibration_0(info)],
+            "calibrations": [
+                {"frame_id" if key == "frameid" else key.lower(): value for key, value in info}
+            ],
         },
         "columns": {
             "log_time": column,
@@ -116,36 +136,6 @@ def _channel_0(topic: str, type_name: str) -> Document:
         "schema": {"name": type_name, "encoding": "", "text": ""},
         "metadata": {},
     }
-
-
-def _calibration_0(info: Document) -> Document:
-    return {
-        "frame_id": str(info["frameid"]),
-        "height": _integer(info["height"]),
-        "width": _integer(info["width"]),
-        "distortion_model": str(info["distortion_model"]),
-        **{key.lower(): [_number(value) for value in info[key]] for key in "DKRP"},
-    }
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"{value!r} is not a number")
-    if value - value != 0:
-        raise ValueError(f"{value} is not a finite number")
-    return float(value)
-
-
-def _integer(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f"{value!r} is not an integer")
-    return value
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{value!r} is not a string")
-    return value
 
 
 def _from_1_0(old: Document, place: str) -> Document:
