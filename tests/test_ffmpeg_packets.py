@@ -208,7 +208,7 @@ def test_a_video_is_joined_at_a_key_frame(
     choose: Choice = chosen if skipped else everything
     with Dataset(packed("lossless-mono8").folder / "dataset") as dataset:
         republisher = Republisher(
-            dataset, "ffmpeg", encoding="cdr", selected=lambda topic: True, jpeg_quality=95
+            dataset, "ros2", selected=lambda topic: True, converts_all=False, kind="ffmpeg"
         )
         (stream,) = dataset.streams
         start = int(stream.log_times[first])

@@ -34,6 +34,7 @@ from mp4ds.bags.types import (
     sizes_of,
     translate,
     types_of,
+    version_of,
 )
 from mp4ds.errors import ConversionError, OptionError, Refused
 from mp4ds.messages.protobuf import decoder_of_schema
@@ -93,6 +94,10 @@ class _Plan:
     no_message: str
 
 
+ENCODINGS = {"ros1": "ros1", "ros2": "cdr"}
+"""ROS -> encoding of its messages."""
+
+
 class Converter:
     """Converts channels and their messages to ROS 1 or ROS 2.
 
@@ -104,7 +109,7 @@ class Converter:
     """
 
     def __init__(self, target: str | None) -> None:
-        if target not in ("ros1", "ros2", None):
+        if target not in (*ENCODINGS, None):
             raise OptionError(f"Messages cannot be converted to {target!r}. Use ros1 or ros2.")
         self._to = target
         self._plans: dict[Schema, _Plan] = {}
@@ -176,9 +181,7 @@ class Converter:
         return replace(channel, schema=schema, metadata={"md5sum": digest, **channel.metadata})
 
     def _is_done(self, channel: Channel) -> bool:
-        return channel.message_encoding == {"ros1": "ros1", "ros2": "cdr"}.get(
-            self._to or "", channel.message_encoding
-        )
+        return self._to is None or channel.message_encoding == ENCODINGS[self._to]
 
     def _plan(self, channel: Channel) -> _Plan:
         schema = channel.schema
@@ -400,7 +403,7 @@ def _ros(channel: Channel) -> Decoder:
     if schema is None or not schema.name:
         raise _undecodable(channel, "its message type is not known")
     is_ros1 = channel.message_encoding == "ros1"
-    version = ros1_version() if is_ros1 else ros2_version()
+    version = version_of(channel.message_encoding)
     try:
         types = types_of(schema, version)
         if has_empty_items(types, sizes_of(types)):

@@ -307,6 +307,11 @@ def ros2_version(distribution: str = "humble") -> RosVersion:
     return RosVersion("cdr", "ros2msg", standard)
 
 
+def version_of(message_encoding: str) -> RosVersion:
+    """The ROS whose messages have an encoding, ``ros1`` or ``cdr``."""
+    return ros1_version() if message_encoding == "ros1" else ros2_version()
+
+
 def name_of(schema: Schema) -> str:
     """The type's name as ROS 2 spells it."""
     name: str = normalize_msgtype(schema.name)

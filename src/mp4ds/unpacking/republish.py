@@ -1,4 +1,4 @@
-"""Converts the images of topics: to raw images, files or packets; smaller, or fewer."""
+"""A dataset's messages as they go out: for ROS 1 or ROS 2, with images in another form."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.convert import Converter
-from mp4ds.bags.types import RosVersion, make_store, ros1_version, ros2_version, types_of
+from mp4ds.bags.convert import ENCODINGS, Converter
+from mp4ds.bags.types import make_store, types_of, version_of
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import ChannelGroup, MessageSource, Part
 from mp4ds.dataset.rebuild import CalibrationMessages, message_at
@@ -130,9 +130,19 @@ class _Plan:
     size: tuple[int, int] | None
     is_moved: bool
 
+    def chosen(self, choice: Choice) -> Choice:
+        """Those of some frames that are kept."""
+        return choice if self.is_kept is None else marked(self.is_kept, choice)
+
+    def fewer(self, channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
+        """Messages as recorded, some of them left out."""
+        if choice is everything and self.stream.sidecar.digests is None:
+            self.stream.verify_video()
+        return self.stream.messages(channel, self.chosen(choice))
+
 
 class Republisher:
-    """Converts the images of a dataset: planned on creation, done while reading.
+    """Converts the messages of a dataset: planned on creation, done while reading.
 
     Messages that are only resized stay on their channel: raw images, JPEG and PNG files of
     ROS keep their kind, and video packets become raw images, unless a kind is given.
@@ -141,14 +151,17 @@ class Republisher:
 
     Args:
         dataset: The dataset.
-        kind: One of `KINDS`; None for as recorded.
-        encoding: Message encoding of the output: ``ros1`` or ``cdr``.
+        world: ``ros1`` or ``ros2``: what new channels are for.
         selected: Whether a topic is wanted.
+        converts_all: Whether other channels are converted to it, too.
+        kind: What to convert images to, one of `KINDS`; None for as recorded.
         jpeg_quality: Of new JPEG files, 1 to 100.
         reduction: How to reduce images; None for as recorded.
+        renamed: The name that a topic goes out by.
 
     Attributes:
-        channels: The new channels.
+        channels: The selected channels that are expected to have messages: those of the dataset,
+            then the new ones.
         sources: Makes the messages of streams and calibrations; see `Dataset.records`.
         republished: The result for each topic.
         as_recorded: Camera topics with messages that stay as recorded: reason -> how many. Grows
@@ -162,50 +175,84 @@ class Republisher:
     def __init__(
         self,
         dataset: Dataset,
-        kind: str | None,
+        world: str,
         *,
-        encoding: str,
         selected: Callable[[str], bool],
-        jpeg_quality: int,
+        converts_all: bool,
+        kind: str | None = None,
+        jpeg_quality: int = 95,
         reduction: Reduction | None = None,
+        renamed: Callable[[str], str] = lambda topic: topic,
     ) -> None:
         self._reduction = reduction or Reduction()
         check_kind(kind, self._reduction)
         self._kind = kind
-        self._encoding = encoding
+        self._world = world
         self._jpeg_quality = jpeg_quality
+        self._renamed = renamed
+        self._converter = Converter(world if converts_all else None)
+        self._outgoing: dict[int, Channel] = {}  # by id of the channel in `channels`
         self._types: dict[tuple[str, str], Types] = {}
         self._made: set[int] = set()
-        self.channels: list[Channel] = []
         self.sources: dict[Part, MessageSource] = {}
         self.republished: dict[str, Republished] = {}
         self.as_recorded: dict[str, dict[str, int]] = {}
         self.thinned: dict[str, int] = {}
-        self._emptied: set[int] = set()
         chosen = [item for item in dataset.image_channels() if selected(item.channel.topic)]
+        self._cameras = {item.channel.id for item in chosen}
         planned = [(item, self._plans(item)) for item in chosen]
-        for item, plans in planned:
-            all_move = sum(plan.is_moved for plan in plans) == len(item.streams)
-            if all_move and not item.recorded(dataset.messages_file.counts):
-                self._emptied.add(item.channel.id)
-        self._declare(dataset, planned)
+        emptied = {
+            item.channel.id
+            for item, plans in planned
+            if sum(plan.is_moved for plan in plans) == len(item.streams)
+            and not item.recorded(dataset.messages_file.counts)
+        }
+        staying = [channel for channel in dataset.channels if channel.id not in emptied]
+        self.channels = [channel for channel in staying if selected(channel.topic)]
+        self._declare(dataset, planned, {channel.topic for channel in staying})
         for _, plans in planned:
             for plan in plans:
                 self._give_calibrations(plan, selected)
-        self._count_verbatim(dataset, selected)
+        if kind or self._reduction != Reduction():
+            self._count_verbatim(dataset, selected)
 
     @property
     def omitted(self) -> Mapping[str, int]:
-        """What the new messages cannot hold: a phrase -> how many."""
-        return sum((types.omitted for types in self._types.values()), Counter())
-
-    def empties(self, channel: Channel) -> bool:
-        """Whether all messages of a channel of the dataset are expected to go to new channels."""
-        return channel.id in self._emptied
+        """What the target cannot hold: a phrase -> how many."""
+        new = (types.omitted for types in self._types.values())
+        return sum(new, Counter(self._converter.omitted))
 
     def makes(self, channel: Channel) -> bool:
         """Whether a channel is one of the new ones."""
         return channel.id in self._made
+
+    def outgoing(self, channel: Channel) -> Channel:
+        """A channel as it goes out, always the same object.
+
+        Raises:
+            ConversionError: The target cannot hold its messages.
+        """
+        if channel.id not in self._outgoing:
+            made = channel if self.makes(channel) else self._converter.channel(channel)
+            self._outgoing[channel.id] = replace(made, topic=self._renamed(made.topic))
+        return self._outgoing[channel.id]
+
+    def converted(self, message: Message) -> Message:
+        """A message, read with the `sources`, as it goes out.
+
+        Raises:
+            ConversionError: The target cannot hold it.
+        """
+        channel, data = self.outgoing(message.channel), message.data
+        if not self.makes(message.channel):
+            data = self._converter.payload(message.channel, data)
+        return replace(message, channel=channel, data=data)
+
+    def is_frame(self, message: Message) -> bool:
+        """Whether a message that goes out is an image of a stream, converted or not."""
+        channel = message.channel
+        is_camera = self.makes(channel) or channel.id in self._cameras
+        return is_camera and self._outgoing.get(channel.id) is channel
 
     # ------------------------------------------------------------ what is given how
 
@@ -245,20 +292,17 @@ class Republisher:
     def _form(
         self, stream: Stream, kind: str, size: tuple[int, int] | None, *, is_done: bool
     ) -> ImageForm:
-        encoding = self._encoding
-        if is_done:
-            encoding = stream.sidecar.channel.to_record(0).message_encoding
+        encoding = stream.channel.message_encoding if is_done else ENCODINGS[self._world]
         return ImageForm(kind, encoding == "ros1", self._jpeg_quality, size, keeps_format=is_done)
 
     def _is_done(self, stream: Stream, kind: str) -> bool:
         """Whether the messages already have a kind, in either ROS."""
-        sidecar = stream.sidecar
-        channel = sidecar.channel.to_record(0)
+        sidecar, channel = stream.sidecar, stream.channel
         name = channel.type_name.replace("/msg/", "/")
-        if channel.message_encoding not in ("ros1", "cdr") or name != KINDS[kind].ros1_type:
+        if channel.message_encoding not in ENCODINGS.values() or name != KINDS[kind].ros1_type:
             return False
         if kind == "ffmpeg":
-            return channel.message_encoding == self._encoding
+            return channel.message_encoding == ENCODINGS[self._world]
         if kind in ("jpeg", "png"):
             is_file = holds_files(stream, kind) or (kind == "jpeg" and sidecar.body == "jpeg")
             return is_file and not any(header.prefix for header in sidecar.headers)
@@ -266,12 +310,15 @@ class Republisher:
 
     # ------------------------------------------------------------ channels and sources
 
-    def _types_of(self, encoding: str, kind: str) -> Types:
-        return self._types.setdefault((encoding, kind), Types(encoding, kind))
+    def _types_of(self, world: str, kind: str) -> Types:
+        if (world, kind) not in self._types:
+            self._types[world, kind] = Types(world, kind)
+        return self._types[world, kind]
 
-    def _declare(self, dataset: Dataset, planned: list[tuple[ChannelGroup, list[_Plan]]]) -> None:
-        staying = [channel for channel in dataset.channels if channel.id not in self._emptied]
-        taken = {channel.topic for channel in staying}
+    def _declare(
+        self, dataset: Dataset, planned: list[tuple[ChannelGroup, list[_Plan]]], taken: set[str]
+    ) -> None:
+        """Make the new channels, whose topics are none of those taken, and sources for all."""
         next_id = 1 + max((channel.id for channel in dataset.channels), default=0)
         topics: dict[tuple[str, str], str] = {}
         for item, plans in planned:
@@ -283,25 +330,24 @@ class Republisher:
                     topics[recorded.topic, kind] = free_topic(wanted, kind, taken)
                     taken.add(topics[recorded.topic, kind])
                 topic = topics[recorded.topic, kind]
-                types = self._types_of(self._encoding, kind)
-                made[kind] = types.channel(recorded, next_id + len(self.channels), topic)
+                types = self._types_of(self._world, kind)
+                made[kind] = types.channel(recorded, next_id + len(self._made), topic)
+                self._made.add(made[kind].id)
                 self.channels.append(made[kind])
                 instead_of = wanted if topic != wanted else ""
                 known = Republished(topic, made[kind].type_name, instead_of)
                 self.republished.setdefault(recorded.topic, known)
             for plan in plans:
+                if plan.frames is None:
+                    self.sources[plan.stream] = plan.fewer
+                    continue
+                is_ros1 = recorded.message_encoding == ENCODINGS["ros1"]
+                world = self._world if plan.is_moved else ("ros1" if is_ros1 else "ros2")
                 channel = made[plan.kind] if plan.is_moved else None
-                self.sources[plan.stream] = self._source(plan, channel)
-        self._made = {channel.id for channel in self.channels}
-
-    def _source(self, plan: _Plan, made: Channel | None) -> MessageSource:
-        if plan.frames is None:
-            return partial(_fewer, plan)
-        encoding = self._encoding
-        if made is None:
-            encoding = plan.stream.sidecar.channel.to_record(0).message_encoding
-        types = self._types_of(encoding, plan.kind)
-        return partial(self._messages, plan, plan.frames, types, made)
+                types = self._types_of(world, plan.kind)
+                self.sources[plan.stream] = partial(
+                    self._messages, plan, plan.frames, types, channel
+                )
 
     def _give_calibrations(self, plan: _Plan, selected: Callable[[str], bool]) -> None:
         """Adapt the calibrations of a stream whose images are reduced.
@@ -355,7 +401,7 @@ class Republisher:
         stream = plan.stream
         columns, headers = stream.columns, stream.sidecar.headers
         count = 0
-        for index, frame in frames(_chosen(plan, choice), choice is everything):
+        for index, frame in frames(plan.chosen(choice), choice is everything):
             count += 1
             ordinal = int(columns.ordinal[index])
             if not isinstance(frame, Given):
@@ -389,17 +435,6 @@ def check_kind(kind: str | None, reduction: Reduction) -> None:
             f"`resize`, `every` and `max_rate` cannot be combined with `images` {kind}, which "
             "copies the video. Use raw, jpeg or png."
         )
-
-
-def _chosen(plan: _Plan, choice: Choice) -> Choice:
-    return choice if plan.is_kept is None else marked(plan.is_kept, choice)
-
-
-def _fewer(plan: _Plan, channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
-    """Messages as recorded, some of them left out."""
-    if choice is everything and plan.stream.sidecar.digests is None:
-        plan.stream.verify_video()
-    return plan.stream.messages(channel, _chosen(plan, choice))
 
 
 def _kind_of(stream: Stream) -> str:
@@ -436,16 +471,15 @@ class Types:
     """Channels and messages of one kind for one target.
 
     Args:
-        encoding: Message encoding of the target: ``ros1`` or ``cdr``.
+        world: ``ros1`` or ``ros2``.
         kind: One of `KINDS`.
     """
 
-    def __init__(self, encoding: str, kind: str) -> None:
-        self.encoding = encoding
+    def __init__(self, world: str, kind: str) -> None:
+        self.encoding = ENCODINGS[world]
         self._kind = kind
-        self._versions = {"ros1": ros1_version(), "cdr": ros2_version()}
-        self._converter = Converter({"ros1": "ros1", "cdr": "ros2"}[encoding])
-        self._has_seq = encoding == "ros1" and kind != "compressed-video"
+        self._converter = Converter(world)
+        self._has_seq = world == "ros1" and kind != "compressed-video"
         self._without_seq = 0
 
     @property
@@ -467,7 +501,7 @@ class Types:
             topic: Of the channel to make.
         """
         encoding = source.message_encoding
-        if encoding not in self._versions:
+        if encoding not in ENCODINGS.values():
             encoding = self.encoding
         schema, digest = self._defined(encoding)
         kept = {key: value for key, value in source.metadata.items() if _is_kept(key)}
@@ -489,10 +523,17 @@ class Types:
 
     def _defined(self, encoding: str) -> tuple[Schema, str]:
         """The type's definition, and its md5sum or hash."""
-        kind, version = KINDS[self._kind], self._versions[encoding]
+        kind, version = KINDS[self._kind], version_of(encoding)
         text = kind.definitions.get(encoding, "")
         schema = Schema(kind.type_name, version.schema_encoding if text else "", text.encode())
-        return _generated(schema, version)
+        store = make_store(types_of(schema, version), version)
+        if encoding == "ros1":
+            text, digest = store.generate_msgdef(schema.name, 1)
+            name = kind.ros1_type
+        else:
+            text, digest = store.generate_msgdef(schema.name, 2)[0], store.hash_rihs01(schema.name)
+            name = schema.name
+        return Schema(name, version.schema_encoding, text.encode()), digest
 
     def message(
         self,
@@ -527,17 +568,6 @@ def _is_kept(key: str) -> bool:
     """Whether metadata belongs to the topic, and not to the type of its messages."""
     plain = key.removesuffix(";base64").removeprefix(_REMEMBERED)
     return plain not in (*_OF_TYPE, HASH_KEY) and key != "topic;base64"
-
-
-def _generated(schema: Schema, version: RosVersion) -> tuple[Schema, str]:
-    store = make_store(types_of(schema, version), version)
-    if version.encoding == "ros1":
-        text, digest = store.generate_msgdef(schema.name, 1)
-        name = schema.name.replace("/msg/", "/")  # as ROS 1 spells it
-    else:
-        text, digest = store.generate_msgdef(schema.name, 2)[0], store.hash_rihs01(schema.name)
-        name = schema.name
-    return Schema(name, version.schema_encoding, text.encode()), digest
 
 
 def _wrapped(stamp: int, *, signed: bool) -> int:

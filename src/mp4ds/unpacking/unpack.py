@@ -11,7 +11,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from mp4ds.bags.convert import Converter
 from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.protocols import WHOLE, BagReader, BagWriter, RecordingSlice
 from mp4ds.dataset.collections import Paths, datasets_in, each
@@ -125,7 +124,7 @@ def _unpack_here(
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
             part = slice_of(whole, chosen.slice, chosen.selected)
-            if to == "images" or not _converts_none(chosen):
+            if to == "images" or chosen.images or chosen.reduction != Reduction():
                 # whose frames are counted from the slice's first one
                 with sliced(whole, part, path.parent, chosen.selected) as opened:
                     if to == "images":
@@ -321,10 +320,18 @@ def _unpack_recording(
     selected = options.selected
     reader = DatasetReader(dataset)
     reader.slice = part
-    # a recording is restored to its own format unchanged, whatever its serializations
     source = dataset.manifest.format if dataset.manifest else ""
-    converter = Converter(None if source == to else _WORLDS.get(to))
-    republisher = _republisher(dataset, to, options, selected)
+    republisher = Republisher(
+        dataset,
+        _WORLDS.get(to) or ("ros1" if dataset.profile == "ros1" else "ros2"),
+        selected=selected,
+        # a recording is restored to its own format unchanged, whatever its serializations
+        converts_all=to in _WORLDS and to != source,
+        kind=options.images,
+        jpeg_quality=options.jpeg_quality,
+        reduction=options.reduction,
+    )
+    reader.sources = republisher.sources
     storage = ""
     if to == "rosbag2":
         storage = options.storage or recorded_storage(dataset.messages_file.in_file_order())
@@ -336,13 +343,13 @@ def _unpack_recording(
         library=dataset.manifest.library if dataset.manifest else "",
         storage=storage,
     ) as writer:
-        topics = _Topics(writer, converter, selected, summary, may_skip=options.skip_unconvertible)
-        topics.declare(dataset, republisher)
+        topics = _Topics(writer, republisher, summary, may_skip=options.skip_unconvertible)
+        topics.declare()
+        for schema in dataset.messages_file.unused_schemas:
+            writer.add_schema(schema)
         wanted = {item.topic for item in dataset.channels if selected(item.topic)}
         total = _total(dataset, reader, selected)
         done = found = 0
-        if republisher:
-            reader.sources = republisher.sources
         for record in reader.records(Excerpt(topics=frozenset(wanted))):
             if not isinstance(record, Message):
                 _write_other(writer, record, to, source)
@@ -352,20 +359,16 @@ def _unpack_recording(
                 done += 1
                 if progress and done % 16 == 0:
                     progress(UnpackProgress(done, total))
-        if republisher:
-            found += sum(republisher.thinned.values())
+        found += sum(republisher.thinned.values())
         if dataset.is_salvaged:
             _account_for(total - found, summary.losses)
         elif found != total:
             problem = f"holds {found} messages, but should hold {total}"
             raise FormatError("message-count", dataset.path, problem)
-    omitted = Counter(writer.omitted) + Counter(converter.omitted)
-    if republisher:
-        omitted += Counter(republisher.omitted)
-        summary.republished.update(republisher.republished)
-        summary.as_recorded.update(republisher.as_recorded)
-        summary.thinned.update(republisher.thinned)
-    summary.omitted.update(omitted)
+    summary.omitted.update(Counter(writer.omitted) + Counter(republisher.omitted))
+    summary.republished.update(republisher.republished)
+    summary.as_recorded.update(republisher.as_recorded)
+    summary.thinned.update(republisher.thinned)
 
 
 def _total(dataset: Dataset, reader: BagReader, selected: Selection) -> int:
@@ -398,112 +401,68 @@ def _account_for(missing: int, losses: list[Loss]) -> None:
     losses.append(Loss(MANIFEST_NAME, None, None, problem, missing))
 
 
-def _republisher(
-    dataset: Dataset, to: str, options: UnpackOptions, selected: Selection
-) -> Republisher | None:
-    if _converts_none(options):
-        return None
-    world = _WORLDS.get(to) or ("ros1" if dataset.profile == "ros1" else "ros2")
-    return Republisher(
-        dataset,
-        options.images,
-        encoding="ros1" if world == "ros1" else "cdr",
-        selected=selected,
-        jpeg_quality=options.jpeg_quality,
-        reduction=options.reduction,
-    )
-
-
-def _converts_none(options: UnpackOptions) -> bool:
-    """Whether all images stay as recorded."""
-    return options.images is None and options.reduction == Reduction()
-
-
 class _Topics:
-    """The channels of a recording that is written, by their ids in the dataset."""
+    """The channels of a recording that is written."""
 
     def __init__(
         self,
         writer: BagWriter,
-        converter: Converter,
-        selected: Selection,
+        republisher: Republisher,
         summary: UnpackSummary,
         *,
         may_skip: bool,
     ) -> None:
         self._may_skip = may_skip
-        self._refused: dict[int, str] = {}
         self._writer = writer
-        self._converter = converter
-        self._selected = selected
+        self._republisher = republisher
         self._summary = summary
-        self._channels: dict[int, Channel] = {}
-        self._republished: set[int] = set()
+        self._declared: set[int] = set()
+        self._refused: dict[int, str] = {}
 
-    def declare(self, dataset: Dataset, republisher: Republisher | None) -> None:
-        """Declare the selected channels, and the definitions that no channel refers to.
+    def declare(self) -> None:
+        """Declare the channels that are expected to have messages.
 
         Raises:
             ConversionError: The target cannot hold some of them; names all.
         """
-        for channel in dataset.channels:
-            is_emptied = republisher is not None and republisher.empties(channel)
-            if self._selected(channel.topic) and not is_emptied:
-                self._try_to_add(channel)
-        if self._refused and not self._may_skip:
-            topics = {item.id: item.topic for item in dataset.channels}
-            raise _refusal({topics[number]: why for number, why in self._refused.items()})
-        for channel in republisher.channels if republisher else ():
-            self._republished.add(channel.id)
-            self._channels[channel.id] = channel
-            self._writer.add_channel(channel)
-            self._summary.messages.setdefault(channel.topic, 0)
-        for schema in dataset.messages_file.unused_schemas:
-            self._writer.add_schema(schema)
-
-    def _try_to_add(self, channel: Channel) -> None:
-        try:
-            self._add(channel)
-        except ConversionError as error:
-            self._refused[channel.id] = error.problem
-            if self._may_skip:
-                self._summary.unconvertible.setdefault(channel.topic, {}).setdefault(
-                    error.problem, 0
-                )
+        refused: dict[str, str] = {}
+        for channel in self._republisher.channels:
+            try:
+                self._add(channel)
+            except ConversionError as error:
+                refused[channel.topic] = self._refused[channel.id] = error.problem
+                self._skip(channel.topic, error.problem, 0)
+        if refused and not self._may_skip:
+            raise _refusal(refused)
 
     def _add(self, channel: Channel) -> None:
-        converted = self._converter.channel(channel)
-        self._channels[channel.id] = converted
-        self._writer.add_channel(converted)
-        self._summary.messages.setdefault(channel.topic, 0)
-        changed = converted.message_encoding != channel.message_encoding
-        if changed and channel.topic not in self._summary.converted:
-            self._summary.converted.append(channel.topic)
+        made = self._republisher.outgoing(channel)
+        self._declared.add(channel.id)
+        self._writer.add_channel(made)
+        self._summary.messages.setdefault(made.topic, 0)
+        changed = made.message_encoding != channel.message_encoding
+        if changed and made.topic not in self._summary.converted:
+            self._summary.converted.append(made.topic)
 
     def write(self, message: Message) -> bool:
-        """Write a message of a selected channel; returns whether it belongs to one."""
-        source = message.channel
-        if source.id in self._refused:
-            return self._skip(source, self._refused[source.id])
-        if source.id not in self._channels:
-            if not self._selected(source.topic):
-                return False
-            self._add(source)  # it was expected to have no messages left, but has one
-        channel, payload = self._channels[source.id], message.data
+        """Write a message; returns whether the target can hold it."""
+        channel = message.channel
+        if channel.id in self._refused:
+            return self._skip(channel.topic, self._refused[channel.id])
         try:
-            if source.id not in self._republished:
-                payload = self._converter.payload(source, payload)
-            self._writer.write(replace(message, channel=channel, data=payload))
+            if channel.id not in self._declared:
+                self._add(channel)  # it was expected to have no messages left, but has one
+            self._writer.write(self._republisher.converted(message))
         except ConversionError as error:
             if not self._may_skip:
                 raise
-            return self._skip(source, error.problem)
+            return self._skip(channel.topic, error.problem)
         self._summary.messages[channel.topic] += 1
         return True
 
-    def _skip(self, source: Channel, problem: str) -> bool:
-        counts = self._summary.unconvertible.setdefault(source.topic, {})
-        counts[problem] = counts.get(problem, 0) + 1
+    def _skip(self, topic: str, problem: str, count: int = 1) -> bool:
+        counts = self._summary.unconvertible.setdefault(topic, {})
+        counts[problem] = counts.get(problem, 0) + count
         return False
 
 

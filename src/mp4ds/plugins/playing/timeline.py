@@ -7,13 +7,11 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import chain
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import LatchedMessages, has_late, latched_depth
 from mp4ds.bags.types import (
     HEADER,
@@ -21,9 +19,8 @@ from mp4ds.bags.types import (
     field_shape,
     fields_of,
     name_of,
-    ros1_version,
-    ros2_version,
     types_of,
+    version_of,
 )
 from mp4ds.dataset.dataset import Ahead, Dataset
 from mp4ds.errors import ConversionError, OptionError, Refused
@@ -32,7 +29,6 @@ from mp4ds.plugins.playing.options import KINDS, PlayOptions, Wanted, rooted
 from mp4ds.plugins.playing.pace import NS
 from mp4ds.plugins.ros.node import World
 from mp4ds.records import Channel, Message
-from mp4ds.unpacking.pictures import Reduction
 from mp4ds.unpacking.republish import Republisher
 
 # ---------------------------------------------------------------- read ahead
@@ -169,7 +165,7 @@ class Timeline:
 
     Attributes:
         channels: All channels that are published, as far as that is known beforehand.
-        republishers: What converts or reduces images, of each dataset, if anything does.
+        republishers: What converts the messages of each dataset.
         start_ns: Log time of the first message, nanoseconds.
         end_ns: Log time of the last message, nanoseconds.
 
@@ -190,7 +186,7 @@ class Timeline:
         self._options = options
         self._parts = [_Part(dataset, options, wanted, world) for dataset in datasets]
         self.channels = [channel for part in self._parts for channel in part.channels]
-        self.republishers = [part.republisher for part in self._parts if part.republisher]
+        self.republishers = [part.republisher for part in self._parts]
         spans = [part.span for part in self._parts if part.span]
         if not spans:
             raise OptionError("There is no message to play.")
@@ -223,7 +219,7 @@ class Timeline:
 
     def is_frame(self, message: Message) -> bool:
         """Whether a message that is published is an image."""
-        return any(id(message.channel) in part.frames for part in self._parts)
+        return any(part.republisher.is_frame(message) for part in self._parts)
 
     def named(self, option: str, topics: Sequence[str]) -> frozenset[str]:
         """The names that topics are published under.
@@ -250,51 +246,29 @@ def _size_of(message: Message) -> int:
 
 
 class _Part:
-    """A dataset, and its channels as they are published."""
+    """A dataset that is played.
+
+    Attributes:
+        republisher: Converts its messages.
+        channels: Those that are published.
+    """
 
     def __init__(
         self, dataset: Dataset, options: PlayOptions, wanted: Wanted, world: World
     ) -> None:
         self._dataset = dataset
-        self._converter = Converter(world)
-        self._options = options
-        self.republisher: Republisher | None = None
-        if options.publish_as is not None or options.reduction != Reduction():
-            self.republisher = Republisher(
-                dataset,
-                KINDS[options.publish_as] if options.publish_as else None,
-                encoding="ros1" if world == "ros1" else "cdr",
-                selected=wanted,
-                jpeg_quality=options.jpeg_quality,
-                reduction=options.reduction,
-            )
         self._topics = {item.topic for item in dataset.channels if wanted(item.topic)}
-        self._published: dict[int, Channel] = {}  # by id of the dataset's channel
-        self.frames: set[int] = set()  # id() of published channels with images
-        with_frames = {item.channel.id for item in dataset.image_channels()}
-        for channel in dataset.channels:
-            is_emptied = self.republisher is not None and self.republisher.empties(channel)
-            if channel.topic in self._topics and not is_emptied:
-                self._publish(channel, is_frame=channel.id in with_frames)
-        for channel in self.republisher.channels if self.republisher else ():
-            self._publish(channel, is_frame=True)
-
-    def _publish(self, source: Channel, *, is_frame: bool) -> Channel:
-        """The channel that a channel of the dataset or the republisher is published as."""
-        channel = source if self._is_made(source) else self._converter.channel(source)
-        channel = replace(channel, topic=self._options.renamed(channel.topic))
-        self._published[source.id] = channel
-        if is_frame:
-            self.frames.add(id(channel))
-        return channel
-
-    def _is_made(self, channel: Channel) -> bool:
-        return self.republisher is not None and self.republisher.makes(channel)
-
-    @property
-    def channels(self) -> list[Channel]:
-        """The channels that are published."""
-        return list(self._published.values())
+        self.republisher = Republisher(
+            dataset,
+            world,
+            selected=wanted,
+            converts_all=True,
+            kind=KINDS[options.publish_as] if options.publish_as else None,
+            jpeg_quality=options.jpeg_quality,
+            reduction=options.reduction,
+            renamed=options.renamed,
+        )
+        self.channels = [self.republisher.outgoing(item) for item in self.republisher.channels]
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -319,21 +293,15 @@ class _Part:
             return (index for index in due if not is_late(int(times[index])))
 
         records = self._dataset.records(
-            self.republisher.sources if self.republisher else None,
+            self.republisher.sources,
             start=start_ns,
             choose=in_time,
             topics=self._topics,
             ahead=ahead,
         )
-        return (self._as_published(record) for record in records if isinstance(record, Message))
-
-    def _as_published(self, message: Message) -> Message:
-        source, data = message.channel, message.data
-        # images that could not be converted stay on their channel
-        channel = self._published.get(source.id) or self._publish(source, is_frame=True)
-        if not self._is_made(source):
-            data = self._converter.payload(source, data)
-        return replace(message, channel=channel, data=data)
+        return (
+            self.republisher.converted(record) for record in records if isinstance(record, Message)
+        )
 
     def latched(self, time_ns: int) -> Iterator[Message]:
         """The latched messages of each channel at a time."""
@@ -346,7 +314,7 @@ class _Part:
             if isinstance(message, Message) and message.channel.id in kept:
                 kept[message.channel.id].add(message)
         messages = sorted(chain.from_iterable(kept.values()), key=lambda item: item.log_time)
-        return map(self._as_published, messages)
+        return map(self.republisher.converted, messages)
 
 
 # ---------------------------------------------------------------- stamps
@@ -406,10 +374,8 @@ def _stamped(channel: Channel) -> str:
     name = name_of(schema)
     if name in _TRANSFORMS:
         return name
-    is_ros1 = channel.message_encoding == "ros1"
-    version = ros1_version() if is_ros1 else ros2_version()
     try:
-        fields = fields_of(types_of(schema, version), name)
+        fields = fields_of(types_of(schema, version_of(channel.message_encoding)), name)
         is_first = fields and field_shape(fields[0][1]) == FieldShape("", HEADER, 0, None, None)
         return HEADER if is_first else ""
     except Refused:
