@@ -31,7 +31,6 @@ from mp4ds.cli.report import print_evaluation
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, TargetError
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
 from mp4ds.packing.options import PackOptions
-from mp4ds.plan import QualityTarget
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.evaluating.clips import chosen, make_clip, open_cameras
 from mp4ds.plugins.evaluating.evaluate import (
@@ -48,6 +47,7 @@ from mp4ds.plugins.evaluating.trials import (
     reachable_score,
     recommend,
 )
+from mp4ds.video.codecs import QualityTarget
 from mp4ds.video.scores import ScoreSummary, largest_crf
 from scenes import TRAITS, Scene, odd_scene
 from sources import ENCODINGS, SOURCES, scene, write_bag

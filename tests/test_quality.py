@@ -25,10 +25,10 @@ from mp4ds.errors import OptionError, ScoringError
 from mp4ds.format.models import Quality
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.tracks import CrfControl, window_frames
-from mp4ds.plan import QualityTarget, parse_quality
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message
+from mp4ds.video.codecs import QualityTarget, parse_quality
 from mp4ds.video.scores import find_ffmpeg, largest_crf, scores_of
 from round_trips import unpacked
 from scenes import Record, instant, scene, together

@@ -20,9 +20,9 @@ from mp4ds.messages.numbers import SCALES
 from mp4ds.messages.png import RULES, zlib_fingerprint
 from mp4ds.messages.protobuf import FOXGLOVE_TYPES
 from mp4ds.messages.serializations import ROS_TYPES, WIRES
-from mp4ds.plan import VISUAL_TABLE
 from mp4ds.video.codecs import (
     PACKET_CODECS,
+    VISUAL_TABLE,
     codecs_to_try,
     lossless_codecs,
     packet_codec,

@@ -16,8 +16,7 @@ from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE
 from mp4ds.messages.layouts import fit
 from mp4ds.packing.options import PackOptions
-from mp4ds.plan import Purpose
-from mp4ds.video.codecs import lossless_codecs, recipe_for
+from mp4ds.video.codecs import Purpose, lossless_codecs, recipe_for
 from mp4ds.video.encoder import Coding, VideoEncoder, choose, encode_on_trial
 from pictures import picture
 from pixel_kinds import as_message, rounded

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import Field, dataclass, field
 from datetime import datetime, timezone
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from mp4ds.errors import OptionError
-from mp4ds.plan import Selection
 
 _T = TypeVar("_T")
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
@@ -382,6 +382,50 @@ def _span_text(start: int | None, end: int | None) -> str:
 
 WHOLE = Slice()
 """No slice: the whole recording."""
+
+
+# ---------------------------------------------------------------- topics
+
+
+class Selection:
+    """Topics chosen by globs.
+
+    Args:
+        topics: Globs, at least one of which must match; empty for all topics.
+        exclude: Globs, none of which may match.
+    """
+
+    def __init__(self, topics: Sequence[str] = (), exclude: Sequence[str] = ()) -> None:
+        self._topics = tuple(topics)
+        self._exclude = tuple(exclude)
+
+    def __call__(self, topic: str) -> bool:
+        """Whether the topic is chosen."""
+        if self._topics and not _matches(topic, self._topics):
+            return False
+        return not _matches(topic, self._exclude)
+
+    def check(self, topics: Iterable[str]) -> None:
+        """Refuse a pattern that matches nothing: it is a typing error, or data would be missed.
+
+        Raises:
+            OptionError: Names the pattern and the topics there are.
+        """
+        known = sorted(set(topics))
+        for option, patterns in (("topics", self._topics), ("exclude", self._exclude)):
+            for pattern in patterns:
+                if not any(_matches(topic, (pattern,)) for topic in known):
+                    listed = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
+                    raise OptionError(
+                        f"`{option}` {pattern!r} matches no topic. Topics: {listed or 'none'}."
+                    )
+
+
+def _matches(topic: str, patterns: Iterable[str]) -> bool:
+    return any(
+        fnmatchcase(topic, pattern) or fnmatchcase("/" + topic.lstrip("/"), pattern)
+        for pattern in patterns
+    )
 
 
 # ---------------------------------------------------------------- options of several commands

@@ -55,9 +55,8 @@ from mp4ds.format.models import (
     StreamSidecar,
     video_facts,
 )
-from mp4ds.format.sidecars import MANIFEST_NAME, dump_document, verify_file
+from mp4ds.format.sidecars import MANIFEST_NAME, FileNames, dump_document, verify_file
 from mp4ds.messages.transforms import Transform, TransformCollector
-from mp4ds.plan import FileNames
 from mp4ds.records import (
     EVERYTHING,
     MAX_REASONS,

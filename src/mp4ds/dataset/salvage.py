@@ -18,8 +18,7 @@ from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
 from mp4ds.format.manifest import FileEntry, Manifest, StreamEntry, Verbatim
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
-from mp4ds.messages.serializations import is_camera
-from mp4ds.plan import calibration_topics
+from mp4ds.messages.serializations import calibration_topics, is_camera
 from mp4ds.records import Loss
 
 _FORMAT = re.compile(rb"^format: (bag|rosbag2|mcap)\r?$", re.MULTILINE)

@@ -18,9 +18,9 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from mp4ds.errors import FormatError
 from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.messages.wire import Slots
-from mp4ds.plan import MAX_GOP
 from mp4ds.records import Excerpt
 from mp4ds.times import INT64_MAX, INT64_MIN, decode_column, encode_column
+from mp4ds.video.codecs import MAX_GOP
 
 T = TypeVar("T")
 

@@ -40,10 +40,9 @@ from mp4ds.messages.numbers import MAX_TABLE
 from mp4ds.messages.png import PNG_ENCODINGS
 from mp4ds.messages.serializations import WIRES
 from mp4ds.messages.wire import CalibrationFields
-from mp4ds.plan import TOLERANCES, QualityTarget
 from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
-from mp4ds.video.codecs import CODECS, PACKET_CODECS
+from mp4ds.video.codecs import CODECS, PACKET_CODECS, TOLERANCES, QualityTarget
 from mp4ds.video.pixels import shows_colours
 from mp4ds.video.references import (
     MAX_CHARS,

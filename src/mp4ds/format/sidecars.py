@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from fractions import Fraction
@@ -10,6 +11,7 @@ from importlib.resources import files
 from pathlib import Path, PurePath
 from typing import Annotated, Any, TypeVar
 
+import xxhash
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from mp4ds import yamlio
@@ -371,3 +373,32 @@ def schema_text(kind: str) -> str:
         return shipped.read_text(encoding="utf-8")
     # a checkout: the wheel's copy is made from this folder
     return (Path(__file__).parents[3] / "schemas" / name).read_text(encoding="utf-8")
+
+
+# ---------------------------------------------------------------- file names (spec/index.md)
+
+_MAX_NAME = 100
+_RESERVED = {"dataset", "messages", "con", "prn", "aux", "nul"} | {
+    f"{port}{number}" for port in ("com", "lpt") for number in range(10)
+}
+
+
+class FileNames:
+    """Gives each stream a file name that no topic can turn into a path or take from another."""
+
+    def __init__(self) -> None:
+        self._taken: set[str] = set()
+
+    def name_for(self, topic: str) -> str:
+        """A stem for the stream's files."""
+        stem = re.sub(r"[^A-Za-z0-9._-]+", "_", topic.strip("/")).strip("._-") or "topic"
+        if len(stem) > _MAX_NAME:
+            stem = f"{stem[: _MAX_NAME - 17]}-{xxhash.xxh64(topic.encode()).hexdigest()}"
+        if stem.casefold().split(".")[0] in _RESERVED:
+            stem = f"topic_{stem}"
+        name, number = stem, 1
+        while name.casefold() in self._taken:
+            number += 1
+            name = f"{stem}-{number}"
+        self._taken.add(name.casefold())
+        return name

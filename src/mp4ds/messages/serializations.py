@@ -263,6 +263,25 @@ def is_calibration(channel: Channel) -> bool:
     return kind_of(channel) is CalibrationFields
 
 
+INFO_NAMES = ("camera_info", "calibration")
+"""Last words of calibration topics, in ROS and in Foxglove's examples."""
+
+
+TRANSPORTS = frozenset({"compressed", "compressedDepth", "ffmpeg", "foxglove"})
+"""Last words of topics that transport the images of the topic before it."""
+
+
+def calibration_topics(topic: str) -> list[str]:
+    """Usual topics for the calibrations of a topic of images.
+
+    They are next to that of the images: ``/cam/image_raw`` or ``/cam/image_raw/compressed`` has
+    them on ``/cam/camera_info``.
+    """
+    base, _, last = topic.rpartition("/")
+    parent = (base if last in TRANSPORTS else topic).rpartition("/")[0]
+    return [f"{parent}/{name}" for name in INFO_NAMES]
+
+
 def wire_of(message_encoding: str, data: memoryview) -> str:
     """Name of the wire of a payload.
 

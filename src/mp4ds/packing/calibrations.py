@@ -13,6 +13,8 @@ from mp4ds.errors import OptionError, Refused
 from mp4ds.format.fields import MAX_CAMERA_INFOS
 from mp4ds.format.models import Calibration, CameraInfo, ChannelModel
 from mp4ds.messages.serializations import (
+    INFO_NAMES,
+    TRANSPORTS,
     MessageSplitter,
     is_calibration,
     is_camera,
@@ -21,7 +23,6 @@ from mp4ds.messages.serializations import (
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
 from mp4ds.packing.inspection import ColumnsWriter, HeaderTable, MessageInspector
 from mp4ds.packing.options import TopicSummary
-from mp4ds.plan import INFO_NAMES, TRANSPORTS
 from mp4ds.records import Channel, Excerpt, Message
 
 Pairs = Mapping[int, int]

@@ -31,6 +31,7 @@ from mp4ds.format.models import StreamSidecar
 from mp4ds.format.sidecars import (
     COPY_AGAIN,
     MANIFEST_NAME,
+    FileNames,
     dump_document,
     load_manifest,
     verify_file,
@@ -38,8 +39,8 @@ from mp4ds.format.sidecars import (
 from mp4ds.messages.png import zlib_build
 from mp4ds.messages.transforms import Transform
 from mp4ds.packing.options import PackSummary, TopicSummary
-from mp4ds.plan import LOSSLESS, FileNames
 from mp4ds.records import Channel, Loss, bounded
+from mp4ds.video.codecs import LOSSLESS
 from mp4ds.video.encoder import tool_versions
 
 Digest = tuple[int, str]

@@ -24,9 +24,19 @@ from mp4ds.options import (
     latched,
     option,
 )
-from mp4ds.plan import LOSSLESS, MAX_GOP, Purpose, QualitySetting, parse_purpose, parse_quality
 from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
-from mp4ds.video.codecs import ARCHIVE_GOP, LOSSLESS_GOP, LOSSY_GOP, LOSSY_TRAINING_GOP
+from mp4ds.video.codecs import (
+    ARCHIVE_GOP,
+    LOSSLESS,
+    LOSSLESS_GOP,
+    LOSSY_GOP,
+    LOSSY_TRAINING_GOP,
+    MAX_GOP,
+    Purpose,
+    QualitySetting,
+    parse_purpose,
+    parse_quality,
+)
 
 _PLAIN = ("plain",)
 

@@ -64,8 +64,15 @@ from mp4ds.packing.planning import (
 )
 from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.packing.spool import recover
-from mp4ds.plan import LOSSLESS, Purpose, QualitySetting, parse_quality
-from mp4ds.video.codecs import DEFAULT_LOSSY, check_codec, fastest_preset
+from mp4ds.video.codecs import (
+    DEFAULT_LOSSY,
+    LOSSLESS,
+    Purpose,
+    QualitySetting,
+    check_codec,
+    fastest_preset,
+    parse_quality,
+)
 from mp4ds.video.scores import find_ffmpeg
 
 # ---------------------------------------------------------------- in one pass

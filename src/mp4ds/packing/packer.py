@@ -27,7 +27,7 @@ from mp4ds.format.models import (
     VideoModel,
     video_facts,
 )
-from mp4ds.format.sidecars import dump_document
+from mp4ds.format.sidecars import FileNames, dump_document
 from mp4ds.messages.png import PngRecipe, zlib_fingerprint
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
@@ -44,7 +44,6 @@ from mp4ds.packing.manifest import PartRecord
 from mp4ds.packing.planning import Piece, Plan
 from mp4ds.packing.survey import MAX_STREAMS_PER_CHANNEL, SAMPLES, Decision, decide, needs_trial
 from mp4ds.packing.tracks import TrackPlan, open_track
-from mp4ds.plan import FileNames
 from mp4ds.records import Attachment, Channel, Message
 from mp4ds.times import PresentationClock
 

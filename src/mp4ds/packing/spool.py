@@ -27,8 +27,8 @@ from mp4ds.format.fields import Gop, Model, Profile
 from mp4ds.format.manifest import About, LossEntry
 from mp4ds.packing.manifest import PartRecord, dataset_files, summarize
 from mp4ds.packing.options import PackOptions, PackSummary
-from mp4ds.plan import SPEED
 from mp4ds.records import Loss, bounded
+from mp4ds.video.codecs import SPEED
 
 _NAME = re.compile(r"([0-9]{6})(\.mcap)?")
 _ONE_PASS = 10_000_000  # frames of a window: a piece is not divided again

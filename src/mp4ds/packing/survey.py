@@ -18,7 +18,6 @@ from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.tracks import FALLS, TrackPlan, WindowCoder, out_of_reach
-from mp4ds.plan import visual_setting
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import (
@@ -30,6 +29,7 @@ from mp4ds.video.codecs import (
     fastest_preset,
     lossless_codecs,
     recipe_for,
+    visual_setting,
 )
 from mp4ds.video.encoder import Coding, choose
 from mp4ds.video.scores import SMALLEST, largest_crf

@@ -25,8 +25,15 @@ from mp4ds.format.models import Quality as Measured
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage
-from mp4ds.plan import LOSSLESS, QualityTarget
-from mp4ds.video.codecs import LEAST_CRF, MAX_CRF, Recipe, lossless_codecs, recipe_for
+from mp4ds.video.codecs import (
+    LEAST_CRF,
+    LOSSLESS,
+    MAX_CRF,
+    QualityTarget,
+    Recipe,
+    lossless_codecs,
+    recipe_for,
+)
 from mp4ds.video.encoder import Coding, VideoEncoder, coded_size
 from mp4ds.video.packets import PacketWriter, join_segments
 from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes

@@ -29,8 +29,8 @@ from mp4ds.errors import (
 from mp4ds.files.outputs import Owned, staged
 from mp4ds.files.uploads import uploaded
 from mp4ds.files.urls import RemotePath, location, remote
-from mp4ds.format.sidecars import MANIFEST_NAME
-from mp4ds.plan import FileNames, Selection
+from mp4ds.format.sidecars import MANIFEST_NAME, FileNames
+from mp4ds.options import Selection
 from mp4ds.records import (
     Attachment,
     Channel,

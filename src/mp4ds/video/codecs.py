@@ -5,6 +5,7 @@ To add a codec, add an entry to `CODECS`, and to the tables of encodings below i
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -401,3 +402,159 @@ def _sited_left(options: Mapping[str, str]) -> dict[str, str]:
         for key, value in options.items()
     }
     return {key: value for key, value in parts.items() if value}
+
+
+# ---------------------------------------------------------------- what is asked of them
+
+LOSSLESS = "lossless"
+"""The quality at which nothing is lost."""
+
+MAX_GOP = 100_000
+"""Maximum key frame interval that may be asked for, frames."""
+
+VISUAL_TABLE: tuple[tuple[float, int, int], ...] = (
+    (2.0, 18, 7),
+    (5.0, 17, 7),
+    (10.0, 17, 7),
+    (20.0, 18, 7),
+    (30.0, 18, 7),
+    (60.0, 22, 6),
+)
+"""Frame rate in Hz, crf and preset of SVT-AV1 for VMAF 99.5: the paper's rates and crf."""
+
+_UNKNOWN_RATE = 30.0
+
+TOLERANCES = {"vmaf": 0.5, "psnr": 0.5, "ssim": 0.005}
+"""Metric of a target -> how far below it the mean of a single window may be."""
+
+_BOUNDS = {"vmaf": 100.0, "psnr": 60.0, "ssim": 1.0}  # of PSNR, dB: identical planes have it
+
+
+@dataclass(frozen=True, slots=True)
+class QualityTarget:
+    """The score that packed frames have to reach.
+
+    Attributes:
+        metric: ``vmaf`` (0 to 100), or of the luma ``psnr`` (dB) or ``ssim`` (0 to 1).
+        score: Required mean over the frames.
+    """
+
+    metric: str
+    score: float
+
+    @property
+    def tolerance(self) -> float:
+        """How far below the score the mean of a single window may be."""
+        return TOLERANCES[self.metric]
+
+    def __str__(self) -> str:
+        return f"{self.metric}={self.score:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class QualitySetting:
+    """What ``--quality`` asked for.
+
+    Attributes:
+        name: ``lossless``, ``visual``, ``crf`` or ``target``.
+        crf: The constant rate factor, for ``crf`` only.
+        target: The score to reach, for ``target`` only.
+    """
+
+    name: str
+    crf: int | None = None
+    target: QualityTarget | None = None
+
+    @property
+    def lossless(self) -> bool:
+        """Whether every pixel must be restored exactly."""
+        return self.name == LOSSLESS
+
+    def __str__(self) -> str:
+        if self.target is not None:
+            return str(self.target)
+        return self.name if self.crf is None else f"crf={self.crf}"
+
+
+def parse_quality(value: str | QualitySetting) -> QualitySetting:
+    """Parse ``lossless``, ``visual``, ``crf=N``, ``vmaf=SCORE``, ``psnr=DB`` or ``ssim=SCORE``.
+
+    Raises:
+        OptionError: Anything else.
+    """
+    if isinstance(value, QualitySetting):
+        return value
+    if value in (LOSSLESS, "visual"):
+        return QualitySetting(value)
+    match = re.fullmatch(r"crf=([0-9]{1,2})", value)
+    if match and int(match.group(1)) <= 63:
+        return QualitySetting("crf", int(match.group(1)))
+    match = re.fullmatch(r"(vmaf|psnr|ssim)=([0-9]{1,3}(?:\.[0-9]{1,4})?)", value)
+    if match:
+        target = QualityTarget(match.group(1), float(match.group(2)))
+        if 0 < target.score < _BOUNDS[target.metric]:
+            return QualitySetting("target", target=target)
+    raise OptionError(
+        f"{value!r} is not known. Use lossless, visual, crf=N with N from 0 to 63, or a score to "
+        "reach: vmaf=99.5 (below 100), psnr=42 (dB, below 60) or ssim=0.98 (below 1)."
+    )
+
+
+TRAINING, ARCHIVE, SPEED = "training", "archive", "speed"
+_LARGER = 15  # percent that faster reading may cost
+
+
+@dataclass(frozen=True, slots=True)
+class Purpose:
+    """What a dataset is for.
+
+    Attributes:
+        name: ``archive``, ``training`` or ``speed``.
+        larger: For training, percent by which lossless videos may be larger than the smallest.
+    """
+
+    name: str
+    larger: int = 0
+
+    @property
+    def is_training(self) -> bool:
+        """Whether fast reading matters."""
+        return self.name == TRAINING
+
+    @property
+    def is_speed(self) -> bool:
+        """Whether fast packing matters; what is packed in parts then fits together untried."""
+        return self.name == SPEED
+
+    def __str__(self) -> str:
+        return f"{self.name}={self.larger}" if self.is_training else self.name
+
+
+def parse_purpose(value: str | Purpose) -> Purpose:
+    """Parse ``archive``, ``training``, ``training=PERCENT`` or ``speed``.
+
+    Raises:
+        OptionError: Anything else.
+    """
+    if isinstance(value, Purpose):
+        return value
+    match = re.fullmatch(rf"{ARCHIVE}|{SPEED}|{TRAINING}(?:=([0-9]{{1,4}}))?", value)
+    if not match:
+        raise OptionError(
+            f"{value!r} is not known. Use archive, speed, training, or training=PERCENT: how much "
+            f"larger lossless videos may be, {_LARGER} by default."
+        )
+    if value in (ARCHIVE, SPEED):
+        return Purpose(value)
+    return Purpose(TRAINING, int(match[1] or _LARGER))
+
+
+def visual_setting(rate: float | None) -> tuple[int, int]:
+    """The crf and preset of the table row nearest to a frame rate.
+
+    Args:
+        rate: Frames per second, or None if no index gives it; then 30 is assumed.
+    """
+    wanted = rate or _UNKNOWN_RATE
+    _, crf, preset = min(VISUAL_TABLE, key=lambda row: abs(row[0] - wanted))
+    return crf, preset

@@ -19,8 +19,7 @@ from av.error import FFmpegError
 from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.encodings import MAX_SIDE, Encoding, Picture, Pixels
 from mp4ds.messages.layouts import Layout, fit
-from mp4ds.plan import Purpose
-from mp4ds.video.codecs import CODECS, Recipe, codecs_to_try, recipe_for
+from mp4ds.video.codecs import CODECS, Purpose, Recipe, codecs_to_try, recipe_for
 from mp4ds.video.media import TIME_BASE, new_mp4, raise_if_scarce, rate_hint
 from mp4ds.video.pixels import PictureConverter, picture_to_frame
 

@@ -25,10 +25,10 @@ from mp4ds.messages.layouts import Layout, layout_for
 from mp4ds.messages.serializations import is_camera, kind_of
 from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.inspection import MessageInspector, depends_on_others
-from mp4ds.plan import LOSSLESS
 from mp4ds.plugins.evaluating.trials import FRAMES, TICKS, Clip
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import TIMESCALE, PresentationClock
+from mp4ds.video.codecs import LOSSLESS
 from mp4ds.video.planes import PlaneMaker, PlaneSpool
 from mp4ds.video.scores import SMALLEST
 

@@ -22,9 +22,9 @@ from mp4ds._version import __version__
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, counted
 from mp4ds.files.outputs import check_place, refuse_not_ours, work_folder, write_synced
 from mp4ds.files.urls import location
+from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import LONG, WHAT, Parsed, TopicOptions, jobs, option, parse_words
-from mp4ds.plan import FileNames, QualityTarget, parse_quality
 from mp4ds.plugins.evaluating.clips import (
     Camera,
     chosen,
@@ -49,7 +49,15 @@ from mp4ds.plugins.evaluating.trials import (
     try_out,
     versions_of,
 )
-from mp4ds.video.codecs import AV1, LOSSY_GOP, MAX_CRF, check_codec, codec_name
+from mp4ds.video.codecs import (
+    AV1,
+    LOSSY_GOP,
+    MAX_CRF,
+    QualityTarget,
+    check_codec,
+    codec_name,
+    parse_quality,
+)
 from mp4ds.video.images import jpeg_bytes
 from mp4ds.video.planes import rgb_of
 from mp4ds.video.scores import Ffmpeg, find_ffmpeg, scores_of, summary_of

@@ -18,8 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from mp4ds._version import __version__
 from mp4ds.files.outputs import write_synced
 from mp4ds.packing.processes import ProcessExecutor, call_error
-from mp4ds.plan import QualityTarget
-from mp4ds.video.codecs import LOSSY_GOP, Recipe, recipe_for
+from mp4ds.video.codecs import LOSSY_GOP, QualityTarget, Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import png_file
 from mp4ds.video.packets import PacketReader

@@ -14,9 +14,9 @@ from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.views import lens_of
 from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
+from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.transforms import TransformCollector, quaternion_of
 from mp4ds.options import seconds_text
-from mp4ds.plan import FileNames
 from mp4ds.plugins.exporting.job import IMU, ExportedCamera, ExportJob, Measures, Row
 from mp4ds.records import Message
 from mp4ds.times import INT64_MIN

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.topic import Topic
 from mp4ds.errors import OptionError
+from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.encodings import Pixels
-from mp4ds.plan import FileNames
 from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, Integers, Measures
 from mp4ds.times import TIMESCALE, nearest
 from mp4ds.video.codecs import CODECS, recipe_for

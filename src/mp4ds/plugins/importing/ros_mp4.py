@@ -16,7 +16,7 @@ from mp4ds.files.sources import SourceState, unchanged
 from mp4ds.files.urls import location, remote
 from mp4ds.format.manifest import Source
 from mp4ds.format.models import ChannelModel, StreamSidecar, video_facts
-from mp4ds.format.sidecars import dump_document, load_stream
+from mp4ds.format.sidecars import FileNames, dump_document, load_stream
 from mp4ds.packing.manifest import (
     Origin,
     PartRecord,
@@ -25,7 +25,6 @@ from mp4ds.packing.manifest import (
     write_manifest,
 )
 from mp4ds.packing.options import PackSummary
-from mp4ds.plan import FileNames
 from mp4ds.times import PresentationClock
 from mp4ds.video.packets import PacketReader, join_segments
 

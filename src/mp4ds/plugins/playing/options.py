@@ -14,6 +14,7 @@ from mp4ds.options import (
     WHAT,
     WHERE,
     Parsed,
+    Selection,
     argument,
     jpeg_quality,
     option,
@@ -21,7 +22,6 @@ from mp4ds.options import (
     pattern,
     seconds,
 )
-from mp4ds.plan import Selection
 from mp4ds.plugins.ros.names import PLAIN, NodeNames
 from mp4ds.plugins.ros.node import CLOCK
 from mp4ds.unpacking.pictures import ReductionOptions

@@ -12,6 +12,7 @@ from mp4ds.options import (
     WHAT,
     Options,
     Parsed,
+    Selection,
     about,
     argument,
     force,
@@ -19,8 +20,8 @@ from mp4ds.options import (
     parse_size,
     pattern,
 )
-from mp4ds.plan import LOSSLESS, MAX_GOP, QualitySetting, Selection, parse_quality
 from mp4ds.plugins.ros.names import PLAIN, SERVICE_EVENTS, NodeNames
+from mp4ds.video.codecs import LOSSLESS, MAX_GOP, QualitySetting, parse_quality
 
 
 def _parse_duration(value: str | float) -> float:

@@ -20,7 +20,6 @@ from mp4ds.format.sidecars import load_about
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.pack import checked_codec
 from mp4ds.packing.processes import ProcessExecutor
-from mp4ds.plan import SPEED, Purpose
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.receiving import MessageBuffer, Source, TopicProgress
 from mp4ds.plugins.recording.spool import Split
@@ -36,6 +35,7 @@ from mp4ds.plugins.ros.node import (
 from mp4ds.plugins.ros.qos import load_overrides
 from mp4ds.records import Channel, Message, MetadataRecord
 from mp4ds.times import INT64_MAX
+from mp4ds.video.codecs import SPEED, Purpose
 
 _NS = 1_000_000_000
 _REPORT_S = 0.2
