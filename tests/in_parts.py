@@ -16,7 +16,6 @@ from mp4ds.errors import Mp4dsError
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, load_stream
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.parts import PartPacker
-from mp4ds.packing.processes import CallError
 from sources import SOURCES, scene
 
 WORK = ".dataset.mp4ds-part"
@@ -54,10 +53,10 @@ class InlineExecutor(Executor):
             if isinstance(fn, PartPacker):
                 (name,) = (piece.name for piece in args)
                 if self._fails(name):
-                    raise CallError("the disk is full")
+                    raise Mp4dsError("the disk is full")
                 self.ran.append(name)
             future.set_result(fn(*args, **kwargs))
-        except (Mp4dsError, OSError, CallError) as error:
+        except (Mp4dsError, OSError) as error:
             self._has_failed = True
             future.set_exception(error)
         return future

@@ -19,10 +19,11 @@ from typing import Any
 import pytest
 
 from mp4ds.bags.formats import open_sources
-from mp4ds.packing.processes import CallError, ProcessExecutor
+from mp4ds.errors import Mp4dsError
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.record import Recorder, RecordSummary, open_recorder
 from mp4ds.plugins.ros.node import Receive
+from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message
 
 
@@ -127,7 +128,7 @@ def fail_to_pack(piece: int, problem: str, monkeypatch: pytest.MonkeyPatch) -> N
 
     def fail(self: ProcessExecutor, call: Any, folder: Path, number: int, *rest: Any) -> Any:
         if number == piece and not rest:
-            raise CallError(problem)
+            raise Mp4dsError(problem)
         return submit(self, call, folder, number, *rest)
 
     monkeypatch.setattr(ProcessExecutor, "submit", fail)

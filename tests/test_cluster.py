@@ -19,8 +19,7 @@ import pytest
 
 import cluster_tasks
 from clusters import WITH_NANNY, RealCluster
-from mp4ds.errors import OptionError, RemoteError
-from mp4ds.packing.processes import CallError
+from mp4ds.errors import Mp4dsError, OptionError, RemoteError
 from mp4ds.plugins import cluster as access
 from mp4ds.plugins.cluster import ClusterExecutor
 from waiting import until
@@ -97,7 +96,7 @@ def test_errors_of_calls_are_told_and_not_tried_again(cluster: RealCluster, tmp_
         ("memory", "out of memory"),
     ]:
         said = rf"on worker tcp://127.0.0.1:\d+: {re.escape(sentence)}"
-        assert isinstance(found[name], CallError)
+        assert isinstance(found[name], Mp4dsError)
         assert re.fullmatch(said, str(found[name]))
     assert "fine" not in found
     assert all((tmp_path / name).read_text() == "once\n" for name in names)

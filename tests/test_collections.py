@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
-from functools import partial
 from pathlib import Path
 
 import pytest
 
 from commands import call
-from mp4ds.dataset import collections
-from mp4ds.dataset.collections import datasets_in, each
+from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import (
-    Mp4dsError,
     OptionError,
     SourceError,
     SourceNotFoundError,
@@ -29,7 +21,6 @@ from mp4ds.errors import (
 from mp4ds.plugins.info import brief
 from mp4ds.plugins.reporting.report import ReportOptions, reports
 from mp4ds.unpacking.unpack import unpack_each
-from waiting import WATCHDOG_S, until
 
 
 @pytest.fixture
@@ -76,105 +67,6 @@ def test_what_is_not_there(drives: Path) -> None:
     for path in ("empty", "e*"):
         with pytest.raises(SourceError, match="dataset"):
             datasets_in(drives / path)
-
-
-# ---------------------------------------------------------------- side by side
-
-
-def squared(number: int) -> tuple[int, int]:
-    return number * number, os.getpid()
-
-
-def failing(number: int) -> int:
-    if number == 2:
-        raise OptionError("two")
-    return number
-
-
-def dying(number: int) -> int:
-    if number == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
-@pytest.mark.parametrize("jobs", [1, 3])
-def test_items_in_their_order(jobs: int) -> None:
-    found = list(each(squared, range(6), jobs))
-    assert [(item, made[0]) for item, made in found] == [(n, n * n) for n in range(6)]
-    assert (os.getpid() in {made[1] for _, made in found}) == (jobs == 1)
-    with pytest.raises(OptionError, match="two"):
-        list(each(failing, range(5), jobs))
-
-
-def test_a_process_that_dies() -> None:
-    with pytest.raises(Mp4dsError, match="perhaps out of memory"):
-        list(each(dying, range(5), 2))
-
-
-def stubborn(place: Path, number: int) -> int:
-    """Work that one process does not leave for its parent's word."""
-    if number == 0:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        (place / "begun").write_text("")
-        time.sleep(WATCHDOG_S)
-        return number
-    until(lambda: (place / "begun").exists())
-    raise OptionError("two")
-
-
-def test_a_process_that_does_not_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collections, "TIDY_S", 0.1)
-    with pytest.raises(OptionError, match="two"):
-        for _ in each(partial(stubborn, tmp_path), [1, 0], 2):
-            pass
-    assert not multiprocessing.active_children()
-
-
-def held(place: Path, number: int) -> int:
-    """Work that lasts until it is ended, and tidies up then."""
-    made = place / str(number)
-    try:
-        made.write_text("")
-        deadline = time.monotonic() + WATCHDOG_S
-        while time.monotonic() < deadline:
-            time.sleep(0.05)
-        return number
-    finally:
-        made.unlink()
-
-
-_INTERRUPTED = """
-import sys
-from functools import partial
-from pathlib import Path
-sys.path.insert(0, sys.argv[1])
-from mp4ds.dataset.collections import each
-from test_collections import held
-if __name__ == "__main__":
-    try:
-        list(each(partial(held, Path(sys.argv[2])), range(4), 2))
-    except KeyboardInterrupt:
-        print("interrupted")
-"""
-
-
-def test_an_interrupt_ends_all_and_tidies_up(tmp_path: Path) -> None:
-    program, place = tmp_path / "program.py", tmp_path / "place"
-    program.write_text(_INTERRUPTED)
-    place.mkdir()
-    with subprocess.Popen(
-        [sys.executable, program, Path(__file__).parent, place], stdout=subprocess.PIPE, text=True
-    ) as process:
-        deadline = time.monotonic() + WATCHDOG_S
-        while len(list(place.iterdir())) < 2 and time.monotonic() < deadline:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
-        try:
-            out, _ = process.communicate(timeout=WATCHDOG_S)
-        finally:
-            process.kill()
-    assert out == "interrupted\n"
-    assert list(place.iterdir()) == []
 
 
 # ---------------------------------------------------------------- what is made of them

@@ -30,8 +30,8 @@ from mp4ds.errors import Mp4dsError, PartsFailedError, SourceError, TargetError,
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.parts import PartPacker
 from mp4ds.packing.planning import Piece
-from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.plugins.demo import demo
+from mp4ds.processes import ProcessExecutor
 from round_trips import Compare, unpacked
 from waiting import WATCHDOG_S, until
 

@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from mp4ds.errors import Mp4dsError, OptionError
 from mp4ds.packing.packer import StreamThreads
-from mp4ds.packing.processes import CallError, ProcessExecutor
+from mp4ds.processes import ProcessExecutor, each
 from waiting import WATCHDOG_S, until
 
 COUNTS = [0, 1, 2, 5]
@@ -190,7 +191,7 @@ def test_every_call_has_its_outcome(processes: int) -> None:
         calls = {name: executor.submit(exec, code) for name, code in CODE.items()}
         errors = {name: call.exception() for name, call in calls.items()}
     assert {name: str(error) for name, error in errors.items() if error} == SENTENCES
-    assert {error.exit_code for error in errors.values() if isinstance(error, CallError)} == {1, 2}
+    assert {error.exit_code for error in errors.values() if isinstance(error, Mp4dsError)} == {1, 2}
 
 
 def test_results_and_arguments() -> None:
@@ -277,7 +278,7 @@ def test_an_error_of_the_caller_ends_what_runs(tmp_path: Path) -> None:
 def test_a_process_ends_when_its_caller_is_killed(tmp_path: Path) -> None:
     """It works for nobody: the socket of its calls is closed then."""
     caller = (
-        "from mp4ds.packing.processes import ProcessExecutor\n"
+        "from mp4ds.processes import ProcessExecutor\n"
         f"ProcessExecutor(1).submit(exec, {SLEEP.format(str(tmp_path))!r}).result()"
     )
     with subprocess.Popen([sys.executable, "-c", caller]) as process:
@@ -286,3 +287,53 @@ def test_a_process_ends_when_its_caller_is_killed(tmp_path: Path) -> None:
         process.wait()
     (pid,) = (int(path.name) for path in tmp_path.iterdir())
     until(lambda: not is_alive(pid))
+
+
+# ---------------------------------------------------------------- each of several items
+
+
+def squared(number: int) -> tuple[int, int]:
+    return number * number, os.getpid()
+
+
+def failing(number: int) -> int:
+    if number == 2:
+        raise OptionError("two")
+    return number
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_items_in_their_order(jobs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    found = list(each(squared, range(6), jobs))
+    assert [(item, made[0]) for item, made in found] == [(n, n * n) for n in range(6)]
+    assert (os.getpid() in {made[1] for _, made in found}) == (jobs == 1)
+    with pytest.raises(OptionError, match="two"):
+        list(each(failing, range(5), jobs))
+
+
+def held(place: Path, number: int) -> None:
+    """Work that lasts until it is ended, and tidies up then."""
+    made = place / str(number)
+    made.touch()
+    try:
+        time.sleep(WATCHDOG_S)
+    finally:
+        made.unlink()
+
+
+def test_an_interrupt_ends_all_and_tidies_up(tmp_path: Path) -> None:
+    caller = (
+        "from functools import partial; from pathlib import Path\n"
+        "from mp4ds.processes import each; from test_processes import held\n"
+        f"try: list(each(partial(held, Path({str(tmp_path)!r})), range(4), 2))\n"
+        "except KeyboardInterrupt: print('interrupted')"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, "-c", caller]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as process:
+        until(lambda: len(list(tmp_path.iterdir())) == 2, process)
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=WATCHDOG_S)
+    assert out == b"interrupted\n"
+    assert list(tmp_path.iterdir()) == []

@@ -27,13 +27,13 @@ from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, SourceError, TargetExistsError, WriteError
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.packing.spool import SpoolFolder
 from mp4ds.plugins.recording import spool
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.receiving import MessageBuffer
 from mp4ds.plugins.recording.record import RecordProgress
 from mp4ds.plugins.ros.names import NodeNames
+from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message, Schema
 from record_scenes import PlayedNode, fail_to_pack, played, recorded
 from scenes import Scene, scene

@@ -15,7 +15,7 @@ from mp4ds.cli.options import argument, command, datasets_argument, jobs_option,
 from mp4ds.cli.output import number, print_table, say, show
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.checks import Problem, validate
-from mp4ds.dataset.collections import datasets_in, each
+from mp4ds.dataset.collections import datasets_in
 from mp4ds.errors import OptionError, SourceError, counted, path_text, size_text
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
@@ -23,6 +23,7 @@ from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.options import HOW, SliceOptions, iso_text
 from mp4ds.plugins import info as facts
 from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, ListedCalibration, intrinsics
+from mp4ds.processes import each
 
 _TEXTS = {
     "topic": "topic",

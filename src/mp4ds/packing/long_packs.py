@@ -17,6 +17,7 @@ from mp4ds.dataset.concat import concat
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import (
     FormatError,
+    Mp4dsError,
     OptionError,
     PartsFailedError,
     RemoteError,
@@ -42,7 +43,7 @@ from mp4ds.packing.parts import (
     part_facts,
 )
 from mp4ds.packing.planning import Piece, Plan
-from mp4ds.packing.processes import CallError, call_error
+from mp4ds.processes import failure_of
 
 Report = Callable[[PackProgress], None]
 
@@ -74,7 +75,7 @@ class PartedPack:
     report: Report | None
     is_new: bool
     is_shared: bool
-    failures: list[tuple[str, CallError]] = field(default_factory=list)
+    failures: list[tuple[str, Mp4dsError]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.folder = PartsFolder(self.target)
@@ -119,9 +120,9 @@ class PartedPack:
                 self._note_part(piece, facts)
         elif error is None:
             gone = f"its part did not appear in {self.folder.path}; {SHARED}"
-            self.failures.append((piece.name, CallError(gone)))
+            self.failures.append((piece.name, Mp4dsError(gone)))
         else:
-            self.failures.append((piece.name, call_error(error)))
+            self.failures.append((piece.name, failure_of(error)))
         self.tell(now=error is not None)
 
     def _note_part(self, piece: Piece, facts: PartFacts) -> None:
@@ -138,7 +139,7 @@ class PartedPack:
             failures = sorted(self.failures, key=lambda failure: failure[0])
             raise PartsFailedError(
                 self.target,
-                [(name, error.sentence) for name, error in failures],
+                [(name, str(error)) for name, error in failures],
                 len(self.plan.pieces),
                 failures[0][1].exit_code,
             )
@@ -392,13 +393,14 @@ def pack_parts(
             ready = []
             for call in wait(calls, _POLL_SECONDS, FIRST_COMPLETED).done:
                 pack, ended = calls.pop(call)
-                if isinstance(error := call.exception(), RemoteError):
+                error = call.exception()
+                if options.cluster and isinstance(error, RemoteError):  # it was lost
                     raise error
                 if ended is not None:
                     pack.ended(ended, error)
                 elif error is not None:
                     name = f"source-{[*digests[pack.target].values()].index(call)}"
-                    pack.failures.append((name, call_error(error)))
+                    pack.failures.append((name, failure_of(error)))
                 if not options.keep_going:
                     pack.refuse_failures()
                 left[pack.target] -= 1

@@ -62,8 +62,8 @@ from mp4ds.packing.planning import (
     processes_for,
     surveyed,
 )
-from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.packing.spool import recover
+from mp4ds.processes import ProcessExecutor
 from mp4ds.video.codecs import (
     DEFAULT_LOSSY,
     LOSSLESS,

@@ -19,7 +19,6 @@ from mp4ds._version import __version__
 from mp4ds.bags.formats import RECORDING_SUFFIXES, open_reader, open_sources
 from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import BagReader
-from mp4ds.dataset.collections import available_cores
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.recording import DatasetReader
 from mp4ds.errors import OptionError, SourceError, advising
@@ -35,6 +34,7 @@ from mp4ds.packing.manifest import Digest, Origin
 from mp4ds.packing.options import ImageFolder, PackOptions
 from mp4ds.packing.survey import Decision, survey_channel
 from mp4ds.packing.tracks import TrackPlan
+from mp4ds.processes import available_cores
 from mp4ds.records import EVERYTHING, Channel, Excerpt
 from mp4ds.video.encoder import tool_versions
 

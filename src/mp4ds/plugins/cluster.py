@@ -16,8 +16,8 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from urllib.parse import urlsplit
 
-from mp4ds.errors import OptionError, RemoteError
-from mp4ds.packing.processes import CallError, call_error, release_memory
+from mp4ds.errors import Mp4dsError, OptionError, RemoteError
+from mp4ds.processes import failure_of, release_memory
 
 if TYPE_CHECKING:
     from dask_jobqueue import JobQueueCluster
@@ -161,14 +161,14 @@ class ClusterExecutor(Executor):
             if theirs.status == "cancelled":
                 raise ConnectionError  # as if it had broken while the result was fetched
             result = theirs.result()
-        except CallError as error:
+        except Mp4dsError as error:
             failure = error
         except OSError:
             self._fail(_DROPPED, _IS_IT_RUNNING)
             return
         except Exception as error:  # of many kinds: its workers died, or lack what is called
             lines = str(error.__cause__ or error).strip().splitlines() or [type(error).__name__]
-            failure = CallError(
+            failure = Mp4dsError(
                 f"the cluster could not run it: {lines[0].rstrip('.')}. See the logs of its "
                 "workers, which must have the same version of mp4ds."
             )
@@ -212,16 +212,17 @@ def _attempt(call: Callable[[], _T]) -> _T:
     """Make a call in a thread of this worker.
 
     Raises:
-        CallError: It failed.
+        Mp4dsError: It failed.
     """
     from distributed import get_worker
 
     try:
         return call()
     except Exception as error:
-        told = call_error(error)
-        sentence = f"on worker {get_worker().address}: {told.sentence}"
-        raise CallError(sentence, told.exit_code) from None
+        told = failure_of(error)
+        failure = Mp4dsError(f"on worker {get_worker().address}: {told}")
+        failure.exit_code = told.exit_code
+        raise failure from None
     finally:
         release_memory()  # a worker using too much is paused and gets no more calls
 

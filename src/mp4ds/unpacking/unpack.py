@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.protocols import WHOLE, BagReader, BagWriter, RecordingSlice
-from mp4ds.dataset.collections import Paths, datasets_in, each
+from mp4ds.dataset.collections import Paths, datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import recorded_storage
 from mp4ds.dataset.recording import DatasetReader, slice_of, sliced
@@ -31,6 +31,7 @@ from mp4ds.files.uploads import uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import MANIFEST_NAME, FileNames
 from mp4ds.options import Selection
+from mp4ds.processes import each
 from mp4ds.records import (
     Attachment,
     Channel,

@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from mp4ds._version import __version__
 from mp4ds.files.outputs import write_synced
-from mp4ds.packing.processes import ProcessExecutor, call_error
+from mp4ds.processes import ProcessExecutor, failure_of
 from mp4ds.video.codecs import LOSSY_GOP, QualityTarget, Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import png_file
@@ -230,7 +230,7 @@ def try_out(
         for call in as_completed(calls):
             trial, error = calls[call], call.exception()
             if error is not None:
-                new[trial.name] = call_error(error).sentence
+                new[trial.name] = str(failure_of(error))
             else:
                 new[trial.name] = cell = call.result()
                 write_synced(trial.path, _CELL.dump_json(cell, indent=1))

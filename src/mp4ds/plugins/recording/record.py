@@ -19,7 +19,6 @@ from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.pack import checked_codec
-from mp4ds.packing.processes import ProcessExecutor
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.receiving import MessageBuffer, Source, TopicProgress
 from mp4ds.plugins.recording.spool import Split
@@ -33,6 +32,7 @@ from mp4ds.plugins.ros.node import (
     quick_switches,
 )
 from mp4ds.plugins.ros.qos import load_overrides
+from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message, MetadataRecord
 from mp4ds.times import INT64_MAX
 from mp4ds.video.codecs import SPEED, Purpose

@@ -26,10 +26,10 @@ from mp4ds.packing.inspection import begins_anew, depends_on_others
 from mp4ds.packing.manifest import dataset_files, folder_size
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.pack import pack
-from mp4ds.packing.processes import CallError, ProcessExecutor
 from mp4ds.packing.spool import SpoolFolder, SpoolSettings
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.ros.node import World
+from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message, MetadataRecord
 
 _NS = 10**9
@@ -42,7 +42,7 @@ _LATE_NS = _NS
 _GROUP_NS = 60 * _NS
 """How long a piece stays open, at most, for the next key frame of a video."""
 
-_FAILURES = (CallError, CancelledError, OSError)
+_FAILURES = (Mp4dsError, CancelledError, OSError)
 
 
 @dataclass
@@ -274,12 +274,12 @@ class Split:
             self.made = replace(made, topics=topics, source_bytes=self._bytes, is_copy=False)
             self.lock.close()
             self.folder.remove(self._count)
-        except (Mp4dsError, *_FAILURES) as error:
+        except _FAILURES as error:
             self.error = error
 
     def failure(self, error: Exception) -> Exception:
         """What to raise because of an error; what was recorded stays where it is."""
-        if isinstance(error, Mp4dsError):
+        if isinstance(error, Mp4dsError) and error is not self.error:  # of the recorder
             return error
         path, target = (shlex.quote(path_text(path)) for path in (self.folder.path, self.target))
         left = f"It holds what was recorded. Then run: mp4ds pack --salvage {path} -o {target}"

@@ -23,7 +23,7 @@ from urllib.parse import quote
 import numpy as np
 
 from mp4ds._version import __version__
-from mp4ds.dataset.collections import Paths, datasets_in, each
+from mp4ds.dataset.collections import Paths, datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import (
@@ -59,6 +59,7 @@ from mp4ds.plugins.reporting.proxies import (
     why_not_seen,
 )
 from mp4ds.plugins.reporting.stills import StillOptions, frames
+from mp4ds.processes import each
 from mp4ds.records import Message
 
 _PAGE = files("mp4ds.plugins.reporting") / "page"

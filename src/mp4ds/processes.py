@@ -1,6 +1,6 @@
-"""An executor whose calls run in processes of this machine.
+"""Calls that run in processes of this machine.
 
-``python -m mp4ds.packing.processes`` is such a process: it takes calls from a socket that it
+``python -m mp4ds.processes`` is such a process: it takes calls from a socket that it
 inherits, and answers each there.
 """
 
@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import suppress
 from dataclasses import dataclass
@@ -26,37 +26,53 @@ from typing import Any, ParamSpec, TypeVar
 
 from mp4ds.errors import Mp4dsError, sentence_of
 
+_Item = TypeVar("_Item")
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
-class CallError(Exception):
-    """A call failed elsewhere. Its own error, which may not survive pickling, stays there.
+def available_cores() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def each(
+    work: Callable[[_Item], _T], items: Sequence[_Item], jobs: int | None = 1
+) -> Iterator[tuple[_Item, _T]]:
+    """Process items in parallel.
 
     Args:
-        sentence: What happened.
-        exit_code: That of the command line.
+        work: A function that other processes can import, with picklable arguments.
+        items: Its arguments.
+        jobs: Number of processes; if 1, this one; None for one per core.
+
+    Yields:
+        Each item with its result, in order.
+
+    Raises:
+        Mp4dsError: A process died, perhaps out of memory; otherwise whatever the work raises.
     """
+    workers = min(jobs or available_cores(), len(items))
+    if workers < 2:
+        for item in items:
+            yield item, work(item)
+        return
+    with ProcessExecutor(workers) as executor:
+        calls = [executor.submit(work, item) for item in items]
+        for item, call in zip(items, calls, strict=True):
+            yield item, call.result()
 
-    def __init__(self, sentence: str, exit_code: int = 1) -> None:
-        super().__init__(sentence, exit_code)
-        self.sentence = sentence
-        self.exit_code = exit_code
 
-    def __str__(self) -> str:
-        return self.sentence
-
-
-def call_error(error: BaseException) -> CallError:
-    """An error of a call as its caller gets it, wherever the call ran."""
-    if isinstance(error, CallError):
-        return error
+def failure_of(error: BaseException) -> Mp4dsError:
+    """An error of a call as one that users can meet."""
     if isinstance(error, Mp4dsError):
-        return CallError(str(error), error.exit_code)
+        return error
     if isinstance(error, MemoryError):
-        return CallError("out of memory")
+        return Mp4dsError("out of memory")
     said = sentence_of(error) if isinstance(error, OSError) else str(error)
-    return CallError(said or type(error).__name__)
+    return Mp4dsError(said or type(error).__name__)
 
 
 def release_memory() -> None:
@@ -73,7 +89,7 @@ def release_memory() -> None:
 # ---------------------------------------------------------------- processes
 
 _STDERR_BYTES = 2_000
-_TERMINATE_SECONDS = 5.0
+_TERMINATE_SECONDS = 10.0
 _KEPT_BYTES = 400 * 2**20
 
 
@@ -97,7 +113,7 @@ class ProcessExecutor(Executor):
 
     Other than of a `ProcessPoolExecutor`, its processes do not import the caller's main module,
     which would have to be guarded; and where one of them is killed, its call alone is made once
-    more, after all others. Errors that a user can meet arrive as `CallError`.
+    more, after all others. Errors of the system arrive as `Mp4dsError`, which survives pickling.
 
     A context manager: leaving it with an exception ends running calls.
 
@@ -225,19 +241,19 @@ class _Process:
             return self._death()
         except Exception as unpickled:
             return unpickled
-        return result if error is None else CallError(*error)
+        return result if error is None else error
 
-    def _death(self) -> CallError:
+    def _death(self) -> Mp4dsError:
         code = self._process.wait()
         self._stderr.seek(max(0, self._stderr.seek(0, os.SEEK_END) - _STDERR_BYTES))
         lines = self._stderr.read().decode(errors="replace").strip().splitlines()
         said = f": {lines[-1]}" if lines else ""
         if code >= 0:
-            return CallError(f"its process exited with code {code}{said}")
+            return Mp4dsError(f"its process exited with code {code}{said}")
         self.was_killed = True
         name = signal.Signals(-code).name if -code in list(signal.Signals) else str(-code)
         hint = ", perhaps for lack of memory" if -code == signal.SIGKILL else ""
-        return CallError(f"its process was killed by {name}{hint}{said}")
+        return Mp4dsError(f"its process was killed by {name}{hint}{said}")
 
     def terminate(self) -> None:
         """Ask it to end."""
@@ -282,9 +298,9 @@ def _serve() -> None:
             try:
                 result = function(*args, **kwargs)
             except MemoryError:
-                error = ("out of memory; try fewer `jobs`", 1)
-            except (Mp4dsError, OSError, CallError) as caught:
-                error = call_error(caught).args
+                error = Mp4dsError("out of memory; try fewer `jobs`")
+            except (Mp4dsError, OSError) as caught:
+                error = failure_of(caught)
             release_memory()
             # memory fragmented by large encoders is only released by exiting
             caller.send((result, error, error is None and _resident_bytes() < _KEPT_BYTES))
