@@ -125,10 +125,9 @@ def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return FIXTURE / "drive.yaml" if request.param == "kept" else write_pair(tmp_path)
 
 
-@pytest.mark.parametrize("deep", [False, True])
-def test_it_is_valid(pair: Path, deep: bool) -> None:
-    assert mp4ds.validate(pair, deep=deep) == []
-    assert mp4ds.validate(pair.with_suffix(".mp4"), deep=deep) == []
+def test_it_is_valid(pair: Path) -> None:
+    for path in (pair, pair.with_suffix(".mp4")):
+        assert mp4ds.validate(path, deep=True) == []
 
 
 def test_info_says_that_its_times_are_not_exact(pair: Path) -> None:
@@ -243,16 +242,12 @@ def test_times_are_rounded_exactly(stamps: list[float]) -> None:
     assert migrated["frames"] == len(stamps)
 
 
-def test_whole_seconds_may_be_integers(tmp_path: Path) -> None:
-    pair = write_pair(tmp_path, document([5, 6.0, 7]), frames=3)
+@pytest.mark.parametrize("stamps", [[5, 6.0, 7], [5]])
+def test_whole_seconds_may_be_integers(stamps: list[float], tmp_path: Path) -> None:
+    pair = write_pair(tmp_path, document(stamps), frames=len(stamps))
     assert mp4ds.validate(pair, deep=True) == []
     with mp4ds.open(pair) as dataset:
-        assert dataset.streams[0].stamps.tolist() == [5 * 10**9, 6 * 10**9, 7 * 10**9]
-
-
-def test_one_frame(tmp_path: Path) -> None:
-    pair = write_pair(tmp_path, document(STAMPS[:1]), frames=1)
-    assert mp4ds.validate(pair, deep=True) == []
+        assert dataset.streams[0].stamps.tolist() == [int(time) * 10**9 for time in stamps]
 
 
 def test_a_camera_without_distortion(tmp_path: Path) -> None:
@@ -285,40 +280,24 @@ def camera(**changes: Any) -> Document:
 @pytest.mark.parametrize(
     ("content", "word"),
     [
-        (broken(camera_info=...), "camera_info"),
+        (broken(camera_info=...), "camera_info: "),
         (broken(camera_info={}), "camera_info.frameid: "),
-        (broken(camera_info=None), ""),
-        (broken(camera_info=[1]), ""),
-        (broken(camera_info="none"), ""),
-        *(
-            (camera(**{key: ...}), key)
-            for key in ("frameid", "width", "height", "D", "K", "R", "P")
-        ),
-        (camera(distortion_model=...), "distortion_model"),
+        (broken(camera_info=[1]), "camera_info: "),
+        (camera(distortion_model=...), "distortion_model: "),
         (camera(width="wide"), "camera_info.width: "),
         (camera(width=64.5), "camera_info.width: "),
-        (camera(height=None), ""),
-        (camera(K=None), ""),
-        (camera(K=["x"] * 9), ""),
-        (broken(topic_name=[]), ""),
-        (broken(topic_name=TOPICS[:1]), ""),
-        (broken(topic_name=[*TOPICS, "/third"]), ""),
-        (broken(topic_name="ab"), ""),
-        (broken(topic_name=None), ""),
-        (broken(topic_name=[1, 2]), ""),
+        (camera(K=["x"] * 9), "camera_info.K.0: "),
+        (broken(topic_name=TOPICS[:1]), "topic_name: "),
+        (broken(topic_name=[*TOPICS, "/third"]), "topic_name: "),
+        (broken(topic_name="ab"), "topic_name: "),
+        (broken(topic_name=[1, 2]), "topic_name.0: "),
         (broken(img_timestamp=[]), ""),
-        (broken(img_timestamp=None), ""),
-        (broken(img_timestamp=1.5), ""),
-        (broken(img_timestamp="1.5"), ""),
-        (broken(img_timestamp=["a"]), ""),
-        (broken(img_timestamp=["1.5"]), ""),
-        (broken(img_timestamp=[None]), ""),
-        (broken(img_timestamp=[True]), ""),
-        (broken(img_timestamp=[[1.0]]), ""),
-        (broken(img_timestamp=[float("nan")]), ""),
-        (broken(img_timestamp=[float("inf")]), ""),
+        (broken(img_timestamp=1.5), "img_timestamp: "),
+        (broken(img_timestamp=["1.5"]), "img_timestamp.0: "),
+        (broken(img_timestamp=[True]), "img_timestamp.0: "),
+        (broken(img_timestamp=[float("inf")]), "img_timestamp.0: "),
         (broken(img_timestamp=[1e300]), ""),
-        (broken(surprise=1), "surprise"),
+        (broken(surprise=1), "surprise: "),
     ],
 )
 def test_broken_files_are_refused_in_a_sentence(
