@@ -202,9 +202,11 @@ class PictureConverter:
             return np.stack([samples(made, index) for index in order], axis=-1, out=out)
         if self._is_defined(frame):
             return self._rgb(frame, scale.pixel_format, out)
-        if out is None:
-            out = np.empty((frame.height, frame.width, 3), np.uint8)
-        np.copyto(out, _packed(frame, scale.pixel_format, self))
+        pixels = _packed(frame, scale.pixel_format, self)
+        if out is None and frame.format.name != scale.pixel_format and pixels.flags.c_contiguous:
+            return pixels  # new already; a copy would cost as much again in page faults
+        out = np.empty(pixels.shape, np.uint8) if out is None else out
+        np.copyto(out, pixels)
         return out
 
     def _is_defined(self, frame: av.VideoFrame) -> bool:
