@@ -201,16 +201,14 @@ def _latched_before(
     Returns:
         The messages, and the topics left out since the messages are too large.
     """
-    times = reader.times()
     own = {
         channel.id: channel
         for channel in reader.channels
-        if selected(channel.topic)
-        and has_late(channel)
-        and not is_camera(channel)
-        and channel.id in times
-        and len(in_span(times[channel.id], before))
+        if selected(channel.topic) and has_late(channel) and not is_camera(channel)
     }
+    # some readers scan the whole recording for the times
+    times = reader.times() if own else {}
+    own = {key: own[key] for key in own if key in times and len(in_span(times[key], before))}
     if not own:
         return (), ()
     kept = {key: LatchedMessages(channel) for key, channel in own.items()}
