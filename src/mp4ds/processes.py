@@ -38,6 +38,15 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+def memory_bytes() -> int:
+    """This machine's memory, or the container's limit if lower, bytes."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with suppress(OSError, ValueError):
+            total = min(total, int(Path(name).read_text()))
+    return total
+
+
 def each(
     work: Callable[[_Item], _T], items: Sequence[_Item], jobs: int | None = 1
 ) -> Iterator[tuple[_Item, _T]]:

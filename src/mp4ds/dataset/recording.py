@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.bags.formats import RECORDING_SUFFIXES, open_reader
 from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import WHOLE, BagReader, RecordingSlice, stats_of
 from mp4ds.dataset.concat import concat
@@ -20,7 +21,7 @@ from mp4ds.dataset.messages import MessageSource, Part
 from mp4ds.errors import OptionError, Refused, advising
 from mp4ds.files.outputs import digest_file
 from mp4ds.format.manifest import About, EarlierDataset
-from mp4ds.format.sidecars import MANIFEST_NAME
+from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME
 from mp4ds.options import Slice
 from mp4ds.records import Channel, ChannelStats, Excerpt, Message, Record, Schema
 
@@ -115,6 +116,31 @@ class DatasetReader(BagReader):
     def close(self) -> None:
         """Close the dataset."""
         self._dataset.close()
+
+
+_BEST_JPEG = 100  # of the messages of a transcoded stream that is packed again
+
+
+def dataset_at(path: Path) -> Path | None:
+    """The folder of a dataset that is to be repacked; None for a recording."""
+    folder = path.parent if path.name == MANIFEST_NAME else path
+    if folder.suffix in RECORDING_SUFFIXES:  # saves a request for URLs
+        return None
+    try:
+        return folder if (folder / MANIFEST_NAME).is_file() else None
+    except OSError:
+        return None  # opening it will say why
+
+
+def open_source(path: Path) -> BagReader:
+    """Open a recording, or a dataset that is to be repacked."""
+    folder = dataset_at(path)
+    if folder is None:
+        return open_reader(path)
+    with advising(COPY_AGAIN):
+        dataset = Dataset(folder, jpeg_quality=_BEST_JPEG)
+        dataset.verify_sidecars()
+    return DatasetReader(dataset, advice=COPY_AGAIN)
 
 
 def slice_of(dataset: Dataset, asked: Slice, selected: Callable[[str], bool]) -> RecordingSlice:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
 
 from mp4ds.bags.protocols import BagReader, with_own_payload
@@ -21,7 +20,7 @@ from mp4ds.messages.serializations import (
     kind_of,
 )
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
-from mp4ds.packing.inspection import ColumnsWriter, HeaderTable, MessageInspector
+from mp4ds.packing.inspection import MessageInspector, MessageTable
 from mp4ds.packing.options import TopicSummary
 from mp4ds.records import Channel, Excerpt, Message
 
@@ -67,31 +66,47 @@ def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[in
     Raises:
         OptionError: A topic is unknown or of the wrong kind, or is paired with two others.
     """
-    images = by_topic(filter(is_camera, channels))
-    infos = by_topic(filter(is_calibration, channels))
-    known = {channel.topic: channel.type_name for channel in channels}
+    topics = by_topic(channels)
     pairs: dict[int, int] = {}
-    image_of: dict[str, str] = {}
+    chosen: dict[str, str] = {}  # topics of a pair, in both directions
     for choice in dict.fromkeys(choices):
-        image, info = _split_choice(choice, known)
-        _check_kind(choice, image, known, images, "images")
-        _check_kind(choice, info, known, infos, "calibrations")
-        if info in image_of:
+        image, _, info = choice.partition("=")
+        if not image or not info:
             raise OptionError(
-                f"`camera_info` gives {info} to {image_of[info]} and to {image}: a calibration "
-                "topic can belong to one stream only. Leave one of the two out: all messages are "
-                "kept."
+                f"`camera_info` {choice!r} is not of the form IMAGE=INFO, "
+                "such as /left/image_raw=/left/info."
             )
-        if image in image_of.values():
-            other = next(key for key, value in image_of.items() if value == image)
-            raise OptionError(
-                f"`camera_info` gives {other} and {info} to {image}: a stream can have one "
-                "calibration topic only."
-            )
-        image_of[info] = image
-        for own, target in zip(infos[info], images[image], strict=False):
-            pairs[own.id] = target.id
+        for topic, holds, noun in (
+            (image, is_camera, "images"),
+            (info, is_calibration, "calibrations"),
+        ):
+            if not any(map(holds, topics.get(topic, ()))):
+                raise OptionError(_no_such_topic(choice, topic, topics, holds, noun))
+            if topic in chosen:
+                raise OptionError(
+                    f"`camera_info` pairs {topic} with {chosen[topic]}, so {choice} cannot be: a "
+                    "stream has one calibration topic, which belongs to it only. Leave one of the "
+                    "two out: all messages are kept."
+                )
+        chosen[image], chosen[info] = info, image
+        infos, images = filter(is_calibration, topics[info]), filter(is_camera, topics[image])
+        pairs.update((a.id, b.id) for a, b in zip(infos, images, strict=False))
     return pairs
+
+
+def _no_such_topic(
+    choice: str,
+    topic: str,
+    topics: Mapping[str, list[Channel]],
+    holds: Callable[[Channel], bool],
+    noun: str,
+) -> str:
+    wanted = sorted(name for name, own in topics.items() if any(map(holds, own)))
+    listed = ", ".join(wanted[:_LISTED]) + (", ..." if len(wanted) > _LISTED else "")
+    problem = f"{topic!r} is not among the packed topics"
+    if own := topics.get(topic):
+        problem = f"{topic!r} holds {own[0].type_name or 'messages without a type'}, not {noun}"
+    return f"`camera_info` {choice!r}: {problem}. Topics of {noun}: {listed or 'none'}."
 
 
 def by_topic(channels: Iterable[Channel]) -> dict[str, list[Channel]]:
@@ -100,39 +115,6 @@ def by_topic(channels: Iterable[Channel]) -> dict[str, list[Channel]]:
     for channel in sorted(channels, key=lambda channel: channel.id):
         found.setdefault(channel.topic, []).append(channel)
     return found
-
-
-def _split_choice(choice: str, known: Mapping[str, str]) -> tuple[str, str]:
-    places = [place for place, letter in enumerate(choice) if letter == "="]
-    splits = [(choice[:place], choice[place + 1 :]) for place in places]
-    # a topic may have a = in it
-    for image, info in splits:
-        if image in known and info in known:
-            return image, info
-    if not splits or not all(splits[0]):
-        raise OptionError(
-            f"`camera_info` {choice!r} is not of the form IMAGE=INFO, "
-            "such as /left/image_raw=/left/info."
-        )
-    return splits[0]
-
-
-def _check_kind(
-    choice: str,
-    topic: str,
-    known: Mapping[str, str],
-    wanted: Mapping[str, list[Channel]],
-    noun: str,
-) -> None:
-    if topic in wanted:
-        return
-    listed = ", ".join(sorted(wanted)[:_LISTED]) + (", ..." if len(wanted) > _LISTED else "")
-    problem = (
-        f"{topic!r} holds {known[topic] or 'messages without a type'}, not {noun}"
-        if topic in known
-        else f"{topic!r} is not among the packed topics"
-    )
-    raise OptionError(f"`camera_info` {choice!r}: {problem}. Topics of {noun}: {listed or 'none'}.")
 
 
 # ---------------------------------------------------------------- by name
@@ -228,16 +210,17 @@ def _camera(image: Channel) -> str:
 # ---------------------------------------------------------------- by stamp
 
 
-@dataclass(slots=True)
 class _Track:
     """What is known of one channel: its latest stamps, zero for none, and its latest message."""
 
-    channel: Channel
-    stamps: deque[int]
-    messages: int = 0
-    frame_id: str = ""
-    fields: Fields | None = None
-    size: tuple[int, int] = (0, 0)
+    frame_id: str
+    fields: Fields
+    size: tuple[int, int]
+
+    def __init__(self, channel: Channel, window: int) -> None:
+        self.channel = channel
+        self.stamps: deque[int] = deque(maxlen=window)
+        self.messages = 0
 
 
 class StampPairing:
@@ -276,8 +259,7 @@ class StampPairing:
             if len(tracks) == MAX_CHANNELS:
                 self._overflow = True
                 return
-            window = INFO_WINDOW if is_info else IMAGE_WINDOW
-            tracks[channel.id] = _Track(channel, deque(maxlen=window))
+            tracks[channel.id] = _Track(channel, INFO_WINDOW if is_info else IMAGE_WINDOW)
         track = tracks[channel.id]
         track.stamps.append(parts.stamp)
         track.messages += 1
@@ -429,8 +411,7 @@ class _InfoChannel:
         self.pending: list[tuple[Message, int]] = []
         self._channel = channel
         self._forms = MessageSplitter(channel)
-        self._columns = ColumnsWriter()
-        self._heads: HeaderTable[Calibration] | None = None
+        self._table: MessageTable[Calibration] | None = None  # with the form of the first message
 
     def accept(self, message: Message, ordinal: int) -> None:
         """Put a message into the stream.
@@ -443,33 +424,32 @@ class _InfoChannel:
             Refused: It cannot be modelled exactly; nothing was changed.
         """
         form, parts = self._forms.split(message)
-        self._columns.check(message, parts)
-        if len(self._columns) == MAX_CAMERA_INFOS:
-            raise Refused(f"more than {MAX_CAMERA_INFOS} messages")
+        table = self._table or MessageTable[Calibration](form, MAX_CAMERA_INFOS)
+        table.check(message, parts)
         fields = parts.fields
         if not isinstance(fields, CalibrationFields):
             raise Refused("it is not a calibration")
-        heads = self._heads or HeaderTable[Calibration](form)
-        if heads.form.wire != form.wire:
+        if table.form.wire != form.wire:
             raise Refused("its byte order differs from the first one's")
-        variant = heads.number(
+        table.add(
+            message,
             parts,
-            memoryview(message.data),
+            ordinal,
             describe=lambda template: Calibration.of(parts.frame_id, fields, template),
         )
-        self._heads = heads
-        self._columns.append(message, parts, variant=variant, ordinal=ordinal)
+        self._table = table
 
     def to_model(self) -> CameraInfo | None:
         """The model, or None if no message was accepted."""
-        if self._heads is None:
+        table = self._table
+        if table is None:
             return None
         return CameraInfo(
             channel=ChannelModel.from_record(self._channel),
-            wire=self._heads.form.wire,
-            messages=len(self._columns),
-            calibrations=self._heads.items,
-            columns=self._columns.to_model(),
+            wire=table.form.wire,
+            messages=len(table),
+            calibrations=table.headers,
+            columns=table.to_model(),
         )
 
 

@@ -270,28 +270,61 @@ def _raw_image(message: Message, form: Form, parts: Parts, fields: ImageFields) 
 # ---------------------------------------------------------------- columns and headers
 
 
-class ColumnsWriter:
-    """The growing columns of one stream or of its camera_info."""
+class MessageTable(Generic[_ModelT]):
+    """The growing columns of a stream, or of its camera_info, and its distinct headers.
 
-    def __init__(self) -> None:
+    Args:
+        form: Of all messages.
+        most: Messages that there may be.
+
+    Attributes:
+        headers: What `add` describes.
+    """
+
+    def __init__(self, form: Form, most: int) -> None:
+        self.form = form
+        self.headers: list[_ModelT] = []
+        self._most = most
         self._columns = {name: array("q") for name in Columns.model_fields}
+        self._templates: dict[bytes, Template] = {}
+        self._numbers: dict[tuple[bytes, object], int] = {}
 
     def __len__(self) -> int:
         return len(self._columns["log_time"])
 
-    @staticmethod
-    def check(message: Message, parts: Parts) -> None:
-        """Refuse times that a column cannot hold.
+    def check(self, message: Message, parts: Parts) -> None:
+        """Refuse what columns cannot hold.
 
         Raises:
-            Refused: A time does not fit into a signed 64-bit integer.
+            Refused: A time does not fit into a signed 64-bit integer, or there are too many.
         """
         for value in (message.log_time, message.publish_time, parts.pts or 0):
             if not INT64_MIN <= value <= INT64_MAX:
                 raise Refused(f"time {value} ns does not fit into 64 bits with sign")
+        if len(self) == self._most:
+            raise Refused(f"more than {self._most} messages")
 
-    def append(self, message: Message, parts: Parts, *, variant: int, ordinal: int) -> None:
-        """Append one message's values, already checked."""
+    def add(
+        self,
+        message: Message,
+        parts: Parts,
+        ordinal: int,
+        *,
+        describe: Callable[[str | None], _ModelT],
+        extra: object = None,
+    ) -> None:
+        """Add a message that was checked, after rebuilding and comparing it.
+
+        Args:
+            message: The message.
+            parts: Of it.
+            ordinal: Its place among the channel's messages.
+            describe: Makes the model of a new header, from its template or None for a plain one.
+            extra: What else distinguishes headers.
+
+        Raises:
+            Refused: It does not rebuild, or there are too many headers; nothing was changed.
+        """
         values = {
             "log_time": message.log_time,
             "publish_time": message.publish_time,
@@ -299,55 +332,25 @@ class ColumnsWriter:
             "stamp": parts.stamp,
             "seq": parts.seq,
             "pts": parts.pts,
-            "variant": variant,
+            "variant": self._header(message, parts, describe, extra),
             "ordinal": ordinal,
         }
         for name, value in values.items():
             if value is not None:
                 self._columns[name].append(value)
 
-    def to_model(self) -> Columns:
-        """The columns as the sidecar holds them."""
-        found = self._columns.items()
-        return columns_model({name: np.frombuffer(own, np.int64) for name, own in found if own})
-
-
-class HeaderTable(Generic[_ModelT]):
-    """Numbers the distinct blanks of a stream's messages.
-
-    Args:
-        form: Of all messages.
-    """
-
-    def __init__(self, form: Form) -> None:
-        self.form = form
-        self.items: list[_ModelT] = []
-        self._templates: dict[bytes, Template] = {}
-        self._numbers: dict[tuple[bytes, object], int] = {}
-
-    def number(
+    def _header(
         self,
+        message: Message,
         parts: Parts,
-        data: memoryview,
-        *,
         describe: Callable[[str | None], _ModelT],
-        extra: object = None,
+        extra: object,
     ) -> int:
-        """The number of a message's header, after rebuilding and comparing the message.
-
-        Args:
-            parts: Of the message.
-            data: The message.
-            describe: Makes the model of a new header, from its template or None for a plain one.
-            extra: What else distinguishes headers.
-
-        Raises:
-            Refused: It does not rebuild, or there are too many.
-        """
+        """The number of a message's header."""
         blank = parts.blank
         try:
             template = self._templates.get(blank) or self.form.template(blank)
-            exact = prove(template, parts, data)
+            exact = prove(template, parts, memoryview(message.data))
         except WireError as error:
             raise Refused(f"its header does not rebuild: {error}") from None
         if not exact:
@@ -355,10 +358,15 @@ class HeaderTable(Generic[_ModelT]):
         known = self._numbers.get((blank, extra))
         if known is not None:
             return known
-        if len(self.items) == MAX_VARIANTS:
+        if len(self.headers) == MAX_VARIANTS:
             raise Refused(f"more than {MAX_VARIANTS} different message headers")
         plain = self.form.plain(parts.frame_id, parts.fields)
-        self.items.append(describe(None if plain == blank else base64.b64encode(blank).decode()))
+        self.headers.append(describe(None if plain == blank else base64.b64encode(blank).decode()))
         self._templates[blank] = template
-        self._numbers[blank, extra] = len(self.items) - 1
-        return len(self.items) - 1
+        self._numbers[blank, extra] = len(self.headers) - 1
+        return len(self.headers) - 1
+
+    def to_model(self) -> Columns:
+        """The columns as the sidecar holds them."""
+        found = self._columns.items()
+        return columns_model({name: np.frombuffer(own, np.int64) for name, own in found if own})

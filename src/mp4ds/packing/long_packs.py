@@ -239,7 +239,7 @@ class PartedPack:
                 concat(
                     parts,
                     made,
-                    changes=plan.origin(reader, digests).fields(whole),
+                    changes=plan.origin(reader, whole, digests),
                     report=lambda name: self.tell("joining", name, now=True),
                 )
                 # last, since damage of a part would be taken for that of the index

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from mp4ds._version import __version__
-from mp4ds.bags.protocols import BagReader, Format
+from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, SourceError, advising
 from mp4ds.files.outputs import digest_file
@@ -88,99 +88,72 @@ class PartRecord:
 # ---------------------------------------------------------------- manifest
 
 
-@dataclass(frozen=True)
-class Origin:
-    """Where a dataset comes from: fields of its manifest.
+def origin_of(
+    reader: BagReader,
+    part: PartRecord,
+    digests: Mapping[str, Digest] | None = None,
+    about: About | None = None,
+) -> dict[str, Any]:
+    """The fields of a manifest that tell where a dataset came from, and what is missing.
 
-    Attributes:
-        format: ``bag``, ``rosbag2`` or ``mcap``.
-        profile: ``ros1``, ``ros2`` or any other MCAP profile; empty for none.
-        library: The MCAP header's library string; empty for other formats.
-        sources: The files of the original recording; none for a part.
-        derived_from: Datasets that were repacked, the oldest first.
-        losses: What these could not read of the recording.
-        left_out: Topics that they left out.
-        about: Description of the recording.
+    Args:
+        reader: What was read: recordings, or datasets that are repacked, the files of which begin
+            with their manifests.
+        part: What was packed of it.
+        digests: Of the files that were hashed, by their paths; others were read in part. None for
+            a part, which tells no sources.
+        about: Description of the recording; None for that of the datasets, if it is one thing.
+
+    Raises:
+        FormatError: A file does not match its dataset's manifest.
     """
-
-    format: Format
-    profile: str
-    library: str = ""
-    sources: Sequence[Source] = ()
-    derived_from: Sequence[EarlierDataset] = ()
-    losses: Sequence[Loss] = ()
-    left_out: Sequence[str] = ()
-    about: About | None = None
-
-    @classmethod
-    def of(cls, reader: BagReader, digests: Mapping[str, Digest], about: About | None) -> Origin:
-        """The origin of what was read: recordings, or datasets that are repacked.
-
-        Args:
-            reader: It; the files of a dataset begin with its manifest.
-            digests: Of the files that were hashed, by their paths; others were read in part.
-            about: Description of the recording; None for that of the datasets, if it is one
-                thing.
-
-        Raises:
-            FormatError: A file does not match its dataset's manifest.
-        """
-        folder = reader.path if reader.path.is_dir() else None
-        sources: list[Source] = []
-        manifests: dict[Path, Manifest] = {}
-        hashes: dict[Path, str] = {}
-        for path in reader.files:
-            size, sha256 = digests.get(spelled(path)) or (source_size(path), None)
-            own = manifests.get(path.parent)
-            entry = own and next((item for item in own.files if item.name == path.name), None)
-            if own and entry:
-                # of a slice, only the frames of a lossless video were checked, by their digests
-                if sha256 or own.profile != LOSSLESS or path.suffix != ".mp4":
-                    with advising(COPY_AGAIN):
-                        verify_file(path, entry, found=(size, sha256) if sha256 else None)
-            elif path.name == MANIFEST_NAME and sha256:
-                manifests[path.parent], hashes[path.parent] = load_manifest(path), sha256
-                sources += manifests[path.parent].sources
-            else:
-                sources.append(Source(name=source_name(path, folder), size=size, sha256=sha256))
-        earlier: list[EarlierDataset] = []
-        for place, one in manifests.items():
-            this = EarlierDataset(name=place.name, profile=one.profile, sha256=hashes[place])
-            earlier += [*one.derived_from, this]
-        abouts = [one.about for one in manifests.values()]
-        if about is None and abouts and all(item == abouts[0] for item in abouts):
-            about = abouts[0]
-        return cls(
-            reader.format,
-            reader.profile,
-            reader.library,
-            [source.within(reader.slice.span) for source in sources],
-            earlier,
-            [entry.to_record() for one in manifests.values() for entry in one.losses],
-            [topic for one in manifests.values() for topic in one.topics_left_out],
-            about,
-        )
-
-    def fields(self, part: PartRecord) -> dict[str, Any]:
-        """The fields of a manifest that tell where a dataset came from, and what is missing."""
-        return {
-            "about": self.about,
-            "format": self.format,
-            "recording_profile": self.profile,
-            "library": self.library,
-            "sources": list(self.sources),
-            "derived_from": list(self.derived_from),
-            "losses": list(map(LossEntry.from_record, bounded([*self.losses, *part.losses]))),
-            "topics_left_out": list(dict.fromkeys([*self.left_out, *part.left_out])),
-        }
+    folder = reader.path if reader.path.is_dir() else None
+    sources: list[Source] = []
+    manifests: dict[Path, Manifest] = {}
+    earlier: list[EarlierDataset] = []
+    for path in reader.files if digests is not None else ():
+        size, sha256 = (digests or {}).get(spelled(path)) or (source_size(path), None)
+        own = manifests.get(path.parent)
+        if own and (entry := own.file(path.name)):
+            # of a slice, only the frames of a lossless video were checked, by their digests
+            if sha256 or own.profile != LOSSLESS or path.suffix != ".mp4":
+                with advising(COPY_AGAIN):
+                    verify_file(path, entry, found=(size, sha256) if sha256 else None)
+        elif path.name == MANIFEST_NAME and sha256:
+            manifests[path.parent] = own = load_manifest(path)
+            sources += own.sources
+            this = EarlierDataset(name=path.parent.name, profile=own.profile, sha256=sha256)
+            earlier += [*own.derived_from, this]
+        else:
+            sources.append(Source(name=source_name(path, folder), size=size, sha256=sha256))
+    abouts = [one.about for one in manifests.values()]
+    if about is None and abouts and all(item == abouts[0] for item in abouts):
+        about = abouts[0]
+    losses = [entry.to_record() for one in manifests.values() for entry in one.losses]
+    left_out = [topic for one in manifests.values() for topic in one.topics_left_out]
+    return {
+        "about": about,
+        "format": reader.format,
+        "recording_profile": reader.profile,
+        "library": reader.library,
+        "sources": [source.within(reader.slice.span) for source in sources],
+        "derived_from": earlier,
+        "losses": list(map(LossEntry.from_record, bounded([*losses, *part.losses]))),
+        "topics_left_out": list(dict.fromkeys([*left_out, *part.left_out])),
+    }
 
 
-def write_manifest(part: PartRecord, origin: Origin, profile: str) -> None:
+def tools() -> dict[str, str]:
+    """Versions of the software used."""
+    return {"mp4ds": __version__, **tool_versions()}
+
+
+def write_manifest(part: PartRecord, origin: Mapping[str, Any], profile: str) -> None:
     """Write the manifest of what was packed, which completes the dataset.
 
     Args:
         part: All that was packed.
-        origin: What it was read from.
+        origin: Where it came from; see `origin_of`.
         profile: The requested profile.
     """
     videos = [sidecar.video for sidecar in part.streams]
@@ -213,8 +186,8 @@ def write_manifest(part: PartRecord, origin: Origin, profile: str) -> None:
             FileEntry(name=name, size=size, sha256=sha256)
             for name, (size, sha256) in sorted(digests.items())
         ],
-        tools={"mp4ds": __version__, **tool_versions(), "zlib": zlib_build()},
-        **origin.fields(part),
+        tools={**tools(), "zlib": zlib_build()},
+        **origin,
     )
     (part.folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
 

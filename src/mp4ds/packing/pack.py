@@ -18,7 +18,7 @@ from pathlib import Path
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.recording import copy_part, slice_of
+from mp4ds.dataset.recording import copy_part, dataset_at, slice_of
 from mp4ds.errors import (
     FormatError,
     OptionError,
@@ -55,15 +55,15 @@ from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.parts import PartsFolder, PlanNote, digest_source
 from mp4ds.packing.planning import (
-    dataset_at,
+    Plan,
     divide,
     open_recording,
     plugin,
-    processes_for,
     surveyed,
 )
 from mp4ds.packing.spool import recover
-from mp4ds.processes import ProcessExecutor
+from mp4ds.packing.tracks import TrackPlan
+from mp4ds.processes import ProcessExecutor, available_cores, memory_bytes
 from mp4ds.video.codecs import (
     DEFAULT_LOSSY,
     LOSSLESS,
@@ -148,7 +148,7 @@ def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> 
         else:
             files = enumerate(plan.hashed)
             digests = {source.path: hasher.digest(number) for number, source in files}
-    write_manifest(part, plan.origin(reader, digests), str(plan.options.quality))
+    write_manifest(part, plan.origin(reader, part, digests), str(plan.options.quality))
     progress(part, done=True)
     source_bytes = None if is_slice else total
     return summarize(part, parted.target, source_bytes, too_large=reader.slice.left_out)
@@ -389,7 +389,7 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
     except FormatError:
         raise TargetExistsError(target) from None
     folder = dataset_at(source)
-    with open_recording([source], images=options.images, asked=options.slice) as reader:
+    with open_recording([source], replace(options, latched=False)) as reader:
         span = reader.slice.span
         sizes = sorted(map(source_size, reader.files))
     if folder:
@@ -516,13 +516,7 @@ def _planned(
             f"There is nothing to join: {folder.path} holds no pack in progress. Run the shards "
             "first."
         )
-    with open_recording(
-        paths,
-        salvage=options.salvage,
-        images=options.images,
-        asked=options.slice,
-        selected=options.selected,
-    ) as reader:
+    with open_recording(paths, options) as reader:
         plan = divide(reader, paths, options, recordings)
         if note is not None:
             folder.check(PlanNote.of(plan), shared=is_shared)
@@ -543,13 +537,32 @@ def _pack_all(
     return [made[pack.target] for pack in packs if pack.target in made]
 
 
+def _processes_for(plan: Plan) -> int:
+    """Processes that pack at a time: as requested, or as many as cores and memory serve."""
+    encoders = sum(
+        decision.key.width * decision.key.height * _bytes_a_pixel(track)
+        for decisions in plan.decisions.values()
+        for decision in decisions
+        for track in decision.plans[:1]
+    )
+    busy = available_cores() // max(1, plan.threads * plan.workers)
+    return plan.options.jobs or max(1, min(busy, memory_bytes() // 2 // (encoders or 1)))
+
+
+def _bytes_a_pixel(plan: TrackPlan) -> int:
+    """About what an encoder takes; SVT-AV1 looks ahead with many pictures, x264 qp 0 with none."""
+    if plan.coding is None:
+        return 0
+    return 60 if plan.coding.recipe.lossless else 300
+
+
 def _executor(packs: Sequence[PartedPack], options: PackOptions) -> Executor:
     """What packs the pieces."""
     if options.cluster:
         pieces = sum(len(pack.plan.pieces) for pack in packs)
         executor: Executor = plugin("cluster")(options.cluster, pieces)
         return executor
-    return ProcessExecutor(min(processes_for(pack.plan) for pack in packs))
+    return ProcessExecutor(min(_processes_for(pack.plan) for pack in packs))
 
 
 def _paths(sources: Sequence[Path | str] | Path | str) -> list[Path]:

@@ -35,14 +35,20 @@ from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.calibrations import Calibrations, Identity
 from mp4ds.packing.inspection import (
     CameraMessage,
-    ColumnsWriter,
-    HeaderTable,
     MessageInspector,
+    MessageTable,
     StreamKey,
 )
 from mp4ds.packing.manifest import PartRecord
-from mp4ds.packing.planning import Piece, Plan
-from mp4ds.packing.survey import MAX_STREAMS_PER_CHANNEL, SAMPLES, Decision, decide, needs_trial
+from mp4ds.packing.planning import (
+    MAX_STREAMS_PER_CHANNEL,
+    SAMPLES,
+    Decision,
+    Piece,
+    Plan,
+    decide,
+    needs_trial,
+)
 from mp4ds.packing.tracks import TrackPlan, open_track
 from mp4ds.records import Attachment, Channel, Message
 from mp4ds.times import PresentationClock
@@ -157,8 +163,7 @@ class StreamWriter:
         self.camera_info: CameraInfo | None = None
         self.video_path, self._sidecar_path = Path(f"{stem}.mp4"), Path(f"{stem}.yaml")
         self._plan = plan
-        self._columns = ColumnsWriter()
-        self._heads = HeaderTable[Header](seen.form)
+        self._table = MessageTable[Header](seen.form, MAX_FRAMES)
         self._digests = array("Q")
         self._clock = PresentationClock()
         self._track = open_track(plan, self.video_path, seen, threads, rate)
@@ -172,7 +177,7 @@ class StreamWriter:
     @property
     def frames(self) -> int:
         """Messages accepted so far."""
-        return len(self._columns)
+        return len(self._table)
 
     def accept(self, seen: CameraMessage, ordinal: int) -> Callable[[], None]:
         """Take a message whose key is this stream's.
@@ -188,18 +193,16 @@ class StreamWriter:
             Refused: The stream cannot carry it exactly; nothing was changed.
         """
         message, parts = seen.message, seen.parts
-        self._columns.check(message, parts)
-        if self.frames == MAX_FRAMES:
-            raise Refused(f"more than {MAX_FRAMES} messages")
+        self._table.check(message, parts)
         if refusal := self._track.refuses(seen):
             raise Refused(refusal)
-        variant = self._heads.number(
+        self._table.add(
+            message,
             parts,
-            memoryview(message.data),
+            ordinal,
             describe=lambda template: self._header(seen, template),
             extra=seen.wrap,
         )
-        self._columns.append(message, parts, variant=variant, ordinal=ordinal)
         tick = self._clock.tick(parts.stamp, message.log_time)
 
         def write() -> None:
@@ -243,10 +246,10 @@ class StreamWriter:
                 step=key.step,
                 is_bigendian=key.is_bigendian,
             ),
-            headers=self._heads.items,
+            headers=self._table.headers,
             video=VideoModel.model_validate(video),
             camera_info=self.camera_info,
-            columns=self._columns.to_model(),
+            columns=self._table.to_model(),
             digests=digests_model(self._digests) if self._plan.is_exact else None,
         )
         self._sidecar_path.write_bytes(dump_document(sidecar))
@@ -263,7 +266,7 @@ class StreamWriter:
         """
         fields, wrap = seen.parts.fields, seen.wrap
         padding = None if wrap.padding is None else base64.b64encode(wrap.padding).decode()
-        if exceeds_padding((padding, *(head.padding for head in self._heads.items))):
+        if exceeds_padding((padding, *(head.padding for head in self._table.headers))):
             raise Refused("too much padding between rows, different in each image")
         return Header(
             frame_id=seen.parts.frame_id,

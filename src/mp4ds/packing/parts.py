@@ -51,9 +51,9 @@ from mp4ds.files.urls import location, spelled
 from mp4ds.format.fields import document_of, json_parser
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.options import CONTENT, ENCODING
-from mp4ds.packing.manifest import Digest, Origin, PartRecord, write_manifest
+from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools, write_manifest
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
-from mp4ds.packing.planning import PIECE_NAME, Piece, Plan, tools
+from mp4ds.packing.planning import PIECE_NAME, Piece, Plan
 
 _SUFFIX = ".mp4ds-part"
 _PLAN_NAME = "plan.json"
@@ -454,8 +454,7 @@ class PartPacker:
 
         part = Packer(self._reader, into, self._plan, piece, exact, tell).run()
         PartFacts.write(part)
-        origin = Origin(self._reader.format, self._reader.profile, self._reader.library)
-        write_manifest(part, origin, str(self._plan.options.quality))
+        write_manifest(part, origin_of(self._reader, part), str(self._plan.options.quality))
 
     def close(self) -> None:
         """Close the recording."""

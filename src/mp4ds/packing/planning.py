@@ -1,47 +1,284 @@
-"""What is decided about a recording before it is packed: its pieces, and what they agree on."""
+"""What is decided before a recording is packed: how images are stored, and its pieces.
+
+Images are looked at: the first of each kind, or those with which the pieces of a long recording
+begin.
+"""
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import import_module
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds._version import __version__
-from mp4ds.bags.formats import RECORDING_SUFFIXES, open_reader, open_sources
+from mp4ds.bags.formats import open_sources
 from mp4ds.bags.latched import take_slice
+from mp4ds.bags.mcap import compressed_size
 from mp4ds.bags.protocols import BagReader
-from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.recording import DatasetReader
-from mp4ds.errors import OptionError, SourceError, advising
+from mp4ds.dataset.recording import dataset_at, open_source
+from mp4ds.errors import EncoderRefusedError, OptionError, Refused, SourceError
 from mp4ds.files.sources import SourceState
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.manifest import About
-from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about
+from mp4ds.format.sidecars import MANIFEST_NAME, load_about
+from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.layouts import layout_for
 from mp4ds.messages.serializations import is_camera
-from mp4ds.options import WHOLE, Slice
 from mp4ds.packing.calibrations import find_pairs
-from mp4ds.packing.inspection import depends_on_others
-from mp4ds.packing.manifest import Digest, Origin
+from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey, depends_on_others
+from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools
 from mp4ds.packing.options import ImageFolder, PackOptions
-from mp4ds.packing.survey import Decision, survey_channel
-from mp4ds.packing.tracks import TrackPlan
+from mp4ds.packing.tracks import TrackPlan, WindowCoder
 from mp4ds.processes import available_cores
-from mp4ds.records import EVERYTHING, Channel, Excerpt
-from mp4ds.video.encoder import tool_versions
+from mp4ds.records import EVERYTHING, Channel, Excerpt, Message
+from mp4ds.video.codecs import (
+    AV1,
+    DEFAULT_LOSSY,
+    PURPOSE_PRESET,
+    fastest_preset,
+    lossless_codecs,
+    recipe_for,
+    visual_setting,
+)
+from mp4ds.video.encoder import Coding, choose
+
+# ---------------------------------------------------------------- one kind of images
+
+SAMPLES = 6
+"""Images of a stream that show how it is best encoded."""
+
+MAX_STREAMS_PER_CHANNEL = 16
+"""Limit of streams for a channel that keeps changing its geometry."""
+
+_MAX_LOOKS = 64
+_KEPT_JPEG = "JPEG files are kept as they are; --transcode re-encodes them"
+_MANY = 6  # files, after which any number may follow
+_STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
+_NEGLIGIBLE = 1 / 50
+"""Share of the raw size below which a video is kept even if zstd would be smaller."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """How images of one key are stored.
+
+    Attributes:
+        key: What they have in common.
+        plans: The best first, ending with one for every image; none if they get no video.
+        refusal: Why they get none.
+    """
+
+    key: StreamKey
+    plans: Sequence[TrackPlan] = ()
+    refusal: str = ""
+
+    @property
+    def texts(self) -> list[str]:
+        """All of it in words: the same for equal decisions, in every process."""
+        return [str(self.key), *(plan.text for plan in self.plans), self.refusal]
+
+
+def decide(
+    samples: Sequence[CameraMessage],
+    options: PackOptions,
+    threads: int,
+    rate: float | None,
+    known: Collection[str] = (),
+) -> Decision:
+    """How images are stored, by looking at the first of them.
+
+    Args:
+        samples: The first images of one key, at least one, at most `SAMPLES`.
+        options: What was asked for.
+        threads: Of an encoder.
+        rate: Frames per second, where known.
+        known: Texts of plans to prefer, where there is a choice.
+
+    Raises:
+        ScoringError: A score is asked for that cannot be computed.
+    """
+    first = samples[0]
+    try:
+        if first.pixels is None:
+            can_shrink = first.key.codec == "mjpeg" and not options.goal.lossless
+            plans = [TrackPlan(note=_KEPT_JPEG if can_shrink else "")]
+        elif not _is_lossless(first.key, options):
+            plans = _lossy_plans(samples, options, threads, rate)
+        elif options.is_fast:
+            plans = [_fast_plan(first.key, options)]
+        else:
+            plans = _lossless_plans(samples, options, threads, known)
+        return Decision(first.key, plans)
+    except Refused as reason:
+        return Decision(first.key, refusal=str(reason))
+
+
+def needs_trial(seen: CameraMessage, options: PackOptions) -> bool:
+    """Whether `decide` benefits from having several messages."""
+    if seen.pixels is None or options.is_fast:
+        return False
+    is_tried = seen.key.body != "jpeg" and _is_lossless(seen.key, options)
+    return is_tried or options.goal.target is not None
+
+
+def _is_lossless(key: StreamKey, options: PackOptions) -> bool:
+    return options.goal.lossless or ENCODINGS[key.encoding].lossy is None
+
+
+# ---------------------------------------------------------------- lossy
+
+_SCORE_PRESET = "8"
+"""SVT-AV1's preset for a score: a window is encoded several times, and preset 7 at its lowest crf
+gets less close to a noisy original."""
+
+
+def _lossy_plans(
+    samples: Sequence[CameraMessage], options: PackOptions, threads: int, rate: float | None
+) -> list[TrackPlan]:
+    quality = options.goal
+    key, target = samples[0].key, quality.target
+    layout = layout_for(ENCODINGS[key.encoding], lossless=False)
+    crf, preset = quality.crf, options.preset
+    if options.is_fast and target is None:
+        preset = preset or fastest_preset(options.codec or DEFAULT_LOSSY)
+    if crf is None:  # the search for a score starts there
+        crf, table_preset = visual_setting(rate)
+        if options.codec in (None, *AV1):
+            usual = PURPOSE_PRESET if options.purpose else str(table_preset)
+            preset = preset or (_SCORE_PRESET if target else usual)
+    recipe = recipe_for(
+        layout.pixel_format,
+        lossless=False,
+        codec=options.codec,
+        crf=crf,
+        preset=preset,
+        varied=target is not None,
+    )
+    coding = Coding(layout, recipe, options.group_frames)
+    if target is None:
+        return [TrackPlan(coding, str(quality))]
+    coder = WindowCoder(coding, (key.width, key.height), target, threads, rate)
+    is_jpeg = key.body == "jpeg"
+    try:
+        plan = TrackPlan(coding.with_crf(coder.start_crf(samples)), str(target), target)
+    except EncoderRefusedError as error:
+        raise Refused(str(error)) from None
+    except Refused as reason:
+        if is_jpeg:  # which is smaller than any lossless video of its pixels
+            raise
+        return _lossless_plans(samples, options, threads, note=f"kept lossless: {reason}")
+    # for images that cannot reach it
+    return [plan] if is_jpeg else [plan, _general_plan(key, options)]
+
+
+# ---------------------------------------------------------------- lossless
+
+
+def _general_plan(key: StreamKey, options: PackOptions) -> TrackPlan:
+    """For every image of an encoding."""
+    layout = layout_for(ENCODINGS[key.encoding], lossless=True)
+    recipe = recipe_for(layout.pixel_format, lossless=True)
+    return TrackPlan(Coding(layout, recipe, options.group_frames))
+
+
+def _lossless_plans(
+    samples: Sequence[CameraMessage],
+    options: PackOptions,
+    threads: int,
+    known: Collection[str] = (),
+    note: str = "",
+) -> list[TrackPlan]:
+    encoding = ENCODINGS[samples[0].key.encoding]
+    pixels = [seen.pixels for seen in samples if seen.pixels is not None]
+    asked = options.goal.lossless
+    if not (asked or note):
+        note = f"{encoding.name} is kept lossless"
+    tried = partial(
+        choose,
+        pixels,
+        encoding,
+        gop=options.group_frames,
+        threads=threads,
+        purpose=options.purpose,
+        known=known,
+    )
+    codec = options.codec if asked else None  # otherwise they were meant for lossy videos
+    try:
+        try:
+            best = tried(codec=codec, preset=options.preset if asked else None)
+        except (OptionError, EncoderRefusedError) as error:
+            if codec is None:
+                raise
+            best = tried(codec=None, preset=None)
+            note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
+    except EncoderRefusedError as error:
+        raise Refused(str(error)) from None
+    _refuse_noise(samples, best.bytes_per_frame)
+    if codec is None:
+        _refuse_few(samples, best.bytes_per_frame)
+    plan = TrackPlan(best, note=note)
+    if best.layout.name == encoding.general:
+        return [plan]
+    return [plan, _general_plan(samples[0].key, options)]
+
+
+def _fast_plan(key: StreamKey, options: PackOptions) -> TrackPlan:
+    """By what encodes in the least time (spec/notes.md)."""
+    layout = layout_for(ENCODINGS[key.encoding], lossless=True)
+    able = lossless_codecs(layout.pixel_format)
+    codec, preset = options.codec, options.preset
+    if codec is None or codec not in able:  # of those that are, H.264 has the fastest presets
+        codec, preset = ("h264" if "h264" in able else able[0]), None
+    preset = preset or fastest_preset(codec)
+    recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset)
+    return TrackPlan(Coding(layout, recipe, options.group_frames))
+
+
+def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
+    """Refuse images that a video would not make smaller.
+
+    Raises:
+        Refused: Gives both sizes.
+    """
+    bodies = [seen.parts.body for seen in samples]
+    raw = sum(map(len, bodies)) / len(bodies)
+    if video_size <= raw * _NEGLIGIBLE:
+        return
+    verbatim = compressed_size(bodies) / len(bodies)
+    if video_size > verbatim:
+        raise Refused(
+            f"a video would not be smaller: about {video_size / verbatim:.2f} times as large"
+        )
+
+
+def _refuse_few(samples: Sequence[CameraMessage], video_size: float) -> None:
+    """Refuse a few files that are smaller than their video with its index and sidecar.
+
+    Raises:
+        Refused: They are.
+    """
+    is_file = samples[0].key.body in ("png", "rvl")
+    if not is_file or len(samples) >= _MANY:
+        return
+    stored = sum(len(seen.parts.body) for seen in samples)
+    if stored < _STREAM_BYTES + len(samples) * video_size:
+        raise Refused("so few small files take less than a video with its sidecar")
+
+
+# ---------------------------------------------------------------- plan and pieces
 
 PIECE_NAME = r"all|whole-[0-9]{1,9}|[0-9]{5,9}"
 """Pattern of the names of pieces, which are also folder names."""
 
-_BEST_JPEG = 100  # of the messages of a transcoded stream that is packed again
+_USUAL = PackOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,14 +360,7 @@ class Plan:
         Raises:
             SourceError: It cannot be read.
         """
-        options = self.options
-        return open_recording(
-            list(map(location, self.paths)),
-            salvage=options.salvage,
-            images=options.images,
-            asked=options.slice,
-            selected=options.selected,
-        )
+        return open_recording(list(map(location, self.paths)), self.options)
 
     @property
     def hashed(self) -> list[SourceState]:
@@ -142,11 +372,14 @@ class Plan:
             if not is_part or location(source.path).name == MANIFEST_NAME
         ]
 
-    def origin(self, reader: BagReader, digests: Mapping[str, Digest]) -> Origin:
-        """What a dataset comes from.
+    def origin(
+        self, reader: BagReader, part: PartRecord, digests: Mapping[str, Digest]
+    ) -> dict[str, Any]:
+        """The fields of a manifest that tell where a dataset came from.
 
         Args:
             reader: The recording.
+            part: What was packed.
             digests: Of the files that are hashed, by their paths.
 
         Raises:
@@ -158,113 +391,46 @@ class Plan:
                 "consists of different files than when packing began",
                 "Start over with `restart`.",
             )
-        return Origin.of(reader, digests, self.about)
-
-
-def tools() -> dict[str, str]:
-    """Versions of the software used."""
-    return {"mp4ds": __version__, **tool_versions()}
+        return origin_of(reader, part, digests, self.about)
 
 
 # ---------------------------------------------------------------- recordings
 
 
-def open_recording(
-    paths: Sequence[Path],
-    *,
-    salvage: bool = False,
-    images: ImageFolder | None = None,
-    asked: Slice = WHOLE,
-    selected: Callable[[str], bool] = lambda _: True,
-) -> BagReader:
-    """Open the source to pack.
+def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagReader:
+    """Open what is to be packed.
 
     Args:
         paths: Recordings and datasets that belong together, or a folder of images.
-        salvage: Read what can be read of damaged recordings.
-        images: How to read the folder of images; None for recordings.
-        asked: The slice to pack.
-        selected: Which topics are packed; only their latched messages are.
+        options: How: salvaging, as a folder of images, or a slice with the latched messages of
+            the topics that are packed.
 
     Raises:
         SourceError: It cannot be read.
         OptionError: The options do not apply to it.
     """
-    reader = _open_whole(paths, salvage, images)
-    if asked:
+    reader = _open_whole(paths, options.images, salvage=options.salvage)
+    if options.slice:
         try:
-            take_slice(reader, asked, selected)
+            take_slice(reader, options.slice, options.selected)
         except BaseException:
             reader.close()
             raise
     return reader
 
 
-def _open_whole(paths: Sequence[Path], salvage: bool, images: ImageFolder | None) -> BagReader:
-    if salvage and any(map(dataset_at, paths)):
-        raise OptionError("`salvage` works with recordings, not with a dataset.")
+def _open_whole(paths: Sequence[Path], images: ImageFolder | None, *, salvage: bool) -> BagReader:
+    other = "a folder of images" if images else "a dataset" if any(map(dataset_at, paths)) else ""
+    if salvage and other:
+        raise OptionError(f"`salvage` works with recordings, not with {other}.")
     if images is None:
-        return open_sources(paths, salvage=salvage, opener=_open_one)
-    if salvage:
-        raise OptionError("`salvage` works with recordings, not with a folder of images.")
+        return open_sources(paths, salvage=salvage, opener=open_source)
     if len(paths) != 1:
         raise OptionError(
             f"Only one folder of images can be imported at a time, but {len(paths)} were given."
         )
     reader: BagReader = plugin("images")(paths[0], images)
     return reader
-
-
-def dataset_at(path: Path) -> Path | None:
-    """The folder of a dataset that is to be repacked; None for a recording."""
-    folder = path.parent if path.name == MANIFEST_NAME else path
-    if folder.suffix in RECORDING_SUFFIXES:  # saves a request for URLs
-        return None
-    try:
-        return folder if (folder / MANIFEST_NAME).is_file() else None
-    except OSError:
-        return None  # opening it will say why
-
-
-def _open_one(path: Path) -> BagReader:
-    folder = dataset_at(path)
-    if folder is None:
-        return open_reader(path)
-    with advising(COPY_AGAIN):
-        dataset = Dataset(folder, jpeg_quality=_BEST_JPEG)
-        dataset.verify_sidecars()
-    return DatasetReader(dataset, advice=COPY_AGAIN)
-
-
-# ---------------------------------------------------------------- resources
-
-
-def processes_for(plan: Plan) -> int:
-    """Processes that pack at a time: as requested, or as many as cores and memory serve."""
-    encoders = sum(
-        decision.key.width * decision.key.height * _bytes_a_pixel(track)
-        for decisions in plan.decisions.values()
-        for decision in decisions
-        for track in decision.plans[:1]
-    )
-    busy = available_cores() // max(1, plan.threads * plan.workers)
-    return plan.options.jobs or max(1, min(busy, _memory() // 2 // (encoders or 1)))
-
-
-def _bytes_a_pixel(plan: TrackPlan) -> int:
-    """About what an encoder takes; SVT-AV1 looks ahead with many pictures, x264 qp 0 with none."""
-    if plan.coding is None:
-        return 0
-    return 60 if plan.coding.recipe.lossless else 300
-
-
-def _memory() -> int:
-    """This machine's memory, or the container's limit if lower, bytes."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        with suppress(OSError, ValueError):
-            total = min(total, int(Path(name).read_text()))
-    return total
 
 
 # ---------------------------------------------------------------- cuts
@@ -377,7 +543,7 @@ def _pieces(
 ) -> list[Piece]:
     """The pieces of an indexed recording; fewer than two where it is packed at once."""
     cameras = [channel for channel in channels if is_camera(channel)]
-    free = _independent(reader, channels)
+    free = _independent(reader, options)
     if not free:
         return []
     window = options.window or GOPS_PER_WINDOW * options.group_frames
@@ -403,19 +569,21 @@ def _pieces(
     return pieces
 
 
-def _independent(reader: BagReader, channels: Sequence[Channel]) -> list[Channel]:
-    """The camera channels that can be cut anywhere."""
-    cameras = [channel for channel in channels if is_camera(channel)]
-    bound = set()
-    for channel in cameras:
-        first = reader.first(channel)
-        if first is not None and depends_on_others(channel, first):
-            bound.add(channel.topic)
-    return [channel for channel in cameras if channel.topic not in bound]
+def _independent(reader: BagReader, options: PackOptions) -> list[Channel]:
+    """The packed camera channels that can be cut anywhere."""
+    cameras = [one for one in reader.channels if options.selected(one.topic) and is_camera(one)]
+    firsts = [(camera, reader.first(camera)) for camera in cameras]
+    bound = {camera.topic for camera, one in firsts if one and depends_on_others(camera, one)}
+    return [camera for camera in cameras if camera.topic not in bound]
+
+
+# ---------------------------------------------------------------- what all pieces agree on
 
 
 def surveyed(plan: Plan, reader: BagReader, known: Collection[str] = ()) -> Plan:
-    """The plan with what all its pieces agree on.
+    """The plan with how images are stored in all its pieces.
+
+    The images with which pieces begin are looked at.
 
     Args:
         plan: Of several pieces.
@@ -425,13 +593,42 @@ def surveyed(plan: Plan, reader: BagReader, known: Collection[str] = ()) -> Plan
     """
     if not plan.is_divided:
         return plan
-    channels = [channel for channel in reader.channels if plan.options.selected(channel.topic)]
     starts = [piece.excerpt.start for piece in plan.pieces if not piece.is_solo]
-    decisions = {
-        channel.id: survey_channel(reader, channel, starts, plan.options, known)
-        for channel in _independent(reader, channels)
-    }
+    starts = starts[:: -(-len(starts) // _MAX_LOOKS) or 1]
+    decisions: dict[int, Sequence[Decision]] = {}
+    for channel in _independent(reader, plan.options):
+        inspector = MessageInspector(channel, transcode=plan.options.transcode)
+        stats = reader.stats().get(channel.id)
+        found: dict[StreamKey, Decision] = {}
+        for start in starts:
+            excerpt = Excerpt(start=start, topics=frozenset([channel.topic]), others=False)
+            samples = _samples(inspector, channel, reader.records(excerpt), plan.options)
+            if samples and samples[0].key not in found:
+                # one thread: on other cores, a pack that is resumed has to decide the same
+                rate = stats.rate if stats else None
+                decision = decide(samples, plan.options, 1, rate, known)
+                found[decision.key] = decision
+                if len(found) == MAX_STREAMS_PER_CHANNEL:
+                    break
+        decisions[channel.id] = list(found.values())
     return replace(plan, decisions=decisions)
+
+
+def _samples(
+    inspector: MessageInspector, channel: Channel, records: Iterator[object], options: PackOptions
+) -> list[CameraMessage]:
+    """The first images of one key, as many as needed to decide."""
+    samples: list[CameraMessage] = []
+    for record in islice(records, 4 * SAMPLES):
+        if isinstance(record, Message) and record.channel.id == channel.id:
+            with suppress(Refused):
+                seen = inspector.inspect(record)
+                if not samples or seen.key == samples[0].key:
+                    samples.append(seen)
+        enough = SAMPLES if samples and needs_trial(samples[0], options) else 1
+        if len(samples) == enough:
+            break
+    return samples
 
 
 # ---------------------------------------------------------------- plugins

@@ -7,9 +7,11 @@ decoded and scored, and encoded again with a lower crf until it is good enough.
 from __future__ import annotations
 
 import shutil
+import tempfile
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
@@ -25,6 +27,7 @@ from mp4ds.format.models import Quality as Measured
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage
+from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import (
     LEAST_CRF,
     LOSSLESS,
@@ -37,7 +40,7 @@ from mp4ds.video.codecs import (
 from mp4ds.video.encoder import Coding, VideoEncoder, coded_size
 from mp4ds.video.packets import PacketWriter, join_segments
 from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
-from mp4ds.video.scores import Ffmpeg, find_ffmpeg, scores_of
+from mp4ds.video.scores import SMALLEST, Ffmpeg, find_ffmpeg, largest_crf, scores_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +186,47 @@ class _CopiedTrack(Track):
 # ---------------------------------------------------------------- encoded
 
 
-class _EncodedTrack(Track):
+class _PictureTrack(Track):
+    """A track of pictures that are encoded here.
+
+    Attributes:
+        coding: How.
+        size: Columns and rows of the coded pictures.
+        options: Of the encoder.
+    """
+
+    coding: Coding
+    size: tuple[int, int]
+    options: Mapping[str, str]
+
+    def refuses(self, seen: CameraMessage) -> str | None:
+        if seen.pixels is None:
+            return "it has no pixels"
+        return self.coding.layout.refuses(seen.pixels)
+
+    def describe(self) -> dict[str, Any]:
+        layout, recipe = self.coding.layout, self.coding.recipe
+        values = layout.parameters.to_values()
+        color = Color(
+            primaries="bt709",
+            transfer="bt709",
+            matrix=recipe.matrix,
+            range="full" if recipe.full_range else "limited",
+        )
+        return {
+            "layout": layout.name,
+            "parameters": LayoutParameters.model_validate(values) if values else None,
+            "codec": recipe.codec,
+            "pixel_format": recipe.pixel_format,
+            "width": self.size[0],
+            "height": self.size[1],
+            "color": color if layout.is_shown else None,
+            "encoder": recipe.encoder,
+            "options": dict(self.options),
+        }
+
+
+class _EncodedTrack(_PictureTrack):
     def __init__(
         self,
         path: Path,
@@ -212,32 +255,23 @@ class _EncodedTrack(Track):
                 path.unlink(missing_ok=True)
                 refusals.append(str(error))
                 continue
-            self._coding = replace(coding, recipe=recipe)
+            self.coding = replace(coding, recipe=recipe)
+            self.size = self._encoder.width, self._encoder.height
+            self.options = self._encoder.options
             coded = f"coded as {recipe.codec}: {refusals[0]}" if refusals else ""
             self.note = "; ".join(filter(None, (note, coded)))
             return
         raise Refused(refusals[0])
 
-    def refuses(self, seen: CameraMessage) -> str | None:
-        return _refuses(self._coding, seen)
-
     def write(self, seen: CameraMessage, tick: int) -> None:
         if seen.pixels is not None:
-            self._encoder.write(self._coding.layout.to_picture(seen.pixels), tick)
+            self._encoder.write(self.coding.layout.to_picture(seen.pixels), tick)
 
     def close(self) -> None:
         self._encoder.close()
 
     def abandon(self) -> None:
         self._encoder.abandon()
-
-    def describe(self) -> dict[str, Any]:
-        encoder = self._encoder
-        return _facts(self._coding, (encoder.width, encoder.height), encoder.options)
-
-
-def _refuses(coding: Coding, seen: CameraMessage) -> str | None:
-    return "it has no pixels" if seen.pixels is None else coding.layout.refuses(seen.pixels)
 
 
 def _recipes(coding: Coding) -> Iterator[Recipe]:
@@ -247,35 +281,6 @@ def _recipes(coding: Coding) -> Iterator[Recipe]:
     for codec in lossless_codecs(pixel_format) if coding.recipe.lossless else ():
         if codec != coding.recipe.codec:
             yield recipe_for(pixel_format, lossless=True, codec=codec)
-
-
-def _facts(coding: Coding, size: tuple[int, int], options: Mapping[str, str]) -> dict[str, Any]:
-    """The fields of `mp4ds.format.models.Video`, except for the file.
-
-    Args:
-        coding: How its pictures are encoded.
-        size: Columns and rows of the coded pictures.
-        options: Of the encoder.
-    """
-    layout, recipe = coding.layout, coding.recipe
-    values = layout.parameters.to_values()
-    color = Color(
-        primaries="bt709",
-        transfer="bt709",
-        matrix=recipe.matrix,
-        range="full" if recipe.full_range else "limited",
-    )
-    return {
-        "layout": layout.name,
-        "parameters": LayoutParameters.model_validate(values) if values else None,
-        "codec": recipe.codec,
-        "pixel_format": recipe.pixel_format,
-        "width": size[0],
-        "height": size[1],
-        "color": color if layout.is_shown else None,
-        "encoder": recipe.encoder,
-        "options": dict(options),
-    }
 
 
 # ---------------------------------------------------------------- aimed at a score
@@ -387,6 +392,8 @@ class CrfControl:
 
 _FRAMES = 60  # of a window, or one group of pictures if that is longer
 _MOST_FRAMES = 240
+_MOST_SEARCHED = 5  # encodings of the first images
+_USUAL_RATE = 30.0
 
 
 def window_frames(gop: int) -> int:
@@ -477,6 +484,46 @@ class WindowCoder:
                 encoder.write(planes, tick - ticks[0])
         return self._scores(frames, decoded_planes(path))
 
+    def start_crf(self, samples: Sequence[CameraMessage]) -> int:
+        """The crf at which the first images of a stream reach the score.
+
+        Raises:
+            Refused: No crf reaches it.
+        """
+        target, codec = self.target, self.coding.recipe.codec
+        if min(self.coded_size) < SMALLEST:
+            raise Refused(f"images with less than {SMALLEST} rows or columns have no {target}")
+        step = round(TIMESCALE / (self.rate or _USUAL_RATE)) or 1
+        known: dict[int, float] = {}
+        with (
+            tempfile.TemporaryDirectory(prefix="mp4ds-") as name,
+            closing(self.spool(Path(name, "frames.yuv"))) as spool,
+        ):
+            for seen in samples:
+                self.keep(seen, spool)
+            due = self.reachable(spool)
+
+            def score(crf: int) -> float:
+                ticks = range(0, len(spool) * step, step)
+                known[crf] = self.mean(self.encode(spool, ticks, crf, Path(name, "sample.mp4")))
+                return known[crf]
+
+            least = LEAST_CRF[codec]
+            crf, reached = largest_crf(
+                score,
+                due,
+                guess=self.coding.crf,
+                largest=MAX_CRF[codec],
+                smallest=least,
+                fall=FALLS[target.metric],
+                most=_MOST_SEARCHED,
+            )
+        # a few frames have less VMAF than many, compared with their originals too: where they fall
+        # a little short, the first window tells
+        if not reached and crf == least and known[crf] < due - target.tolerance:
+            raise out_of_reach(target, due, f"crf {crf} gives {known[crf]:.2f}")
+        return crf
+
     def reachable(self, frames: PlaneSpool) -> float:
         """The score required of a window: the target, or less if it is out of reach.
 
@@ -511,13 +558,15 @@ def out_of_reach(target: QualityTarget, due: float, made: str) -> Refused:
     return Refused(f"{target} is out of reach: {made}{limit}")
 
 
-class _ScoredTrack(Track):
+class _ScoredTrack(_PictureTrack):
     """The videos of its windows are joined at the end."""
 
     def __init__(self, path: Path, coder: WindowCoder, note: str) -> None:
         self.note = note
         self._path = path
         self._coder = coder
+        self.coding, self.size = coder.coding, coder.coded_size
+        self.options = {**coder.coding.recipe.options, "g": str(coder.coding.gop)}
         self._most = window_frames(coder.coding.gop)
         codec, target = coder.coding.recipe.codec, coder.target
         self._control = CrfControl(
@@ -534,9 +583,6 @@ class _ScoredTrack(Track):
         self._segments: list[Path] = []
         self._scores: list[NDArray[np.int64]] = []
         self._reencoded = self._limited = 0
-
-    def refuses(self, seen: CameraMessage) -> str | None:
-        return _refuses(self._coder.coding, seen)
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         self._coder.keep(seen, self._spool)
@@ -594,16 +640,12 @@ class _ScoredTrack(Track):
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def describe(self) -> dict[str, Any]:
-        coder = self._coder
-        options = {**coder.coding.recipe.options, "g": str(coder.coding.gop)}
-        return {
-            **_facts(coder.coding, coder.coded_size, options),
-            "quality": Measured.from_scores(
-                coder.target,
-                np.concatenate(self._scores),
-                worst_window=min(map(coder.mean, self._scores)),
-                windows=len(self._scores),
-                reencoded=self._reencoded,
-                limited=self._limited,
-            ),
-        }
+        quality = Measured.from_scores(
+            self._coder.target,
+            np.concatenate(self._scores),
+            worst_window=min(map(self._coder.mean, self._scores)),
+            windows=len(self._scores),
+            reencoded=self._reencoded,
+            limited=self._limited,
+        )
+        return {**super().describe(), "quality": quality}

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.formats import open_reader
+from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
@@ -98,7 +99,8 @@ def info(path: Path | str, asked: Slice = WHOLE) -> Info:
         OptionError: The slice is empty.
     """
     if asked:
-        with open_recording([location(path)], asked=asked) as reader:
+        with open_recording([location(path)]) as reader:
+            take_slice(reader, asked)
             return _recording_info(reader)
     with open_any(path) as found:
         return _dataset_info(found) if isinstance(found, Dataset) else _recording_info(found)

@@ -18,7 +18,6 @@ from mp4ds.format.manifest import Source
 from mp4ds.format.models import ChannelModel, StreamSidecar, video_facts
 from mp4ds.format.sidecars import FileNames, dump_document, load_stream
 from mp4ds.packing.manifest import (
-    Origin,
     PartRecord,
     dataset_files,
     summarize,
@@ -82,7 +81,8 @@ def import_ros_mp4(
             for path in (source, described)
             for size, sha256 in [digest_file(path)]
         ]
-        write_manifest(part, Origin("bag", _PROFILE, sources=sources), old.profile)
+        origin = {"format": "bag", "recording_profile": _PROFILE, "sources": sources}
+        write_manifest(part, origin, old.profile)
         return summarize(part, target, sum(item.size for item in sources))
 
 
