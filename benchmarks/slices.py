@@ -38,7 +38,7 @@ _PROGRAM = """
 import json, pathlib, sys, time
 import mp4ds
 from mp4ds.packing.options import PackOptions
-from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 source, small, target, to, start, duration = sys.argv[1:]
 span = {"start": start, "duration": duration}
 def run(source, target, **options):

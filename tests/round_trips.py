@@ -9,7 +9,7 @@ from typing import Any
 
 import mp4ds
 from mp4ds.packing.options import PackOptions
-from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from scenes import Scene
 from sources import SOURCES, Source
 

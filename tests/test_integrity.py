@@ -16,7 +16,7 @@ from coded_scenes import CODED
 from compare import compare
 from edits import Document, agreed, changed, digest, flip
 from mp4ds import Mp4dsError, SourceError
-from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from scenes import Scene
 from sources import SOURCES, scene
 

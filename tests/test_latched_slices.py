@@ -18,7 +18,7 @@ from mp4ds.plugins.info import info
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.play import open_player
 from mp4ds.records import Message
-from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from player_scenes import (
     MS,
     START,

@@ -20,7 +20,7 @@ from rosbags.highlevel import AnyReader
 import mp4ds
 from coded_scenes import CODED
 from definitions import PICTURES
-from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from pictures import CAREFUL
 from round_trips import packed
 from sources import (

@@ -24,7 +24,7 @@ from mp4ds.format.models import Calibration, Roi
 from mp4ds.messages.encodings import ENCODINGS as KNOWN
 from mp4ds.plugins.demo import demo
 from mp4ds.times import StampIndex
-from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from mp4ds.video.images import Renderer
 from pictures import YUV, picture, pixels
 from republished import psnr

@@ -25,9 +25,9 @@ from mp4ds.format.fields import DecodedColumns
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
-from mp4ds.unpacking.options import UnpackOptions
-from mp4ds.unpacking.pictures import Reduction, at_most, times_of
+from mp4ds.unpacking.pictures import ReductionOptions, at_most, times_of
 from mp4ds.unpacking.republish import Republisher
+from mp4ds.unpacking.unpack import UnpackOptions
 from pictures import picture
 from republished import CAMERAS, Read, file_picture, image_of, psnr, read
 from scenes import Record, Scene, odd_scene, scene
@@ -341,7 +341,7 @@ def test_reduced_messages_from_a_time_on(packed: Callable[..., Packed], kind: st
             selected=lambda topic: True,
             converts_all=False,
             kind=kind,
-            reduction=Reduction(0.5, 2),
+            options=ReductionOptions(resize=0.5, every=2),
         )
         whole = messages_of(dataset, republisher, None)
         start = whole[len(whole) // 2][1]
@@ -446,7 +446,7 @@ def test_times_are_stamps_or_log_times(stamps: str) -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        *({"resize": value} for value in (0, -1.0, float("nan"), float("inf"), True, "0.5", 1e9)),
+        *({"resize": value} for value in (0, -1.0, float("nan"), float("inf"), True, 1e9)),
         *(
             {"resize": value}
             for value in ((0, 1), (1,), (1, 2, 3), (1.5, 2), (True, 2), (10**6, 1))
@@ -458,7 +458,7 @@ def test_times_are_stamps_or_log_times(stamps: str) -> None:
 )
 def test_not_a_reduction(options: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match=r"`(resize|every|max_rate)` .* use "):
-        Reduction(**options)
+        ReductionOptions(**options)
 
 
 def test_the_command_line(packed: Callable[..., Packed], tmp_path: Path) -> None:

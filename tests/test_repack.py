@@ -20,7 +20,7 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.planning import open_recording
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message
-from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from round_trips import Compare, journey, own_target, unpacked
 from sources import PERIOD, SOURCES, START, TRAITS, odd_scene, scene, write_bag
 

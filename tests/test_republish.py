@@ -29,9 +29,9 @@ from encoders import cv, nal_units
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
 from mp4ds.packing.options import PackOptions
-from mp4ds.unpacking.options import UnpackOptions, UnpackSummary
 from mp4ds.unpacking.pictures import KINDS
 from mp4ds.unpacking.republish import Republished, free_topic, republished_topic
+from mp4ds.unpacking.unpack import UnpackOptions, UnpackSummary
 from pictures import YUV, picture, sample_format
 from republished import (
     CAMERAS,

@@ -16,7 +16,7 @@ from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_each, pack_share
-from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from round_trips import TARGETS, Compare, output_of, own_target
 from sources import PERIOD, SOURCES, START, TRAITS, Scene, odd_scene, scene, write_bag
 

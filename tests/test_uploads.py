@@ -29,7 +29,7 @@ from mp4ds.files.uploads import local_path
 from mp4ds.files.urls import RemotePath
 from mp4ds.packing.options import PackOptions, PackProgress
 from mp4ds.packing.pack import pack_each, pack_share
-from mp4ds.unpacking.options import UnpackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
 from remote_servers import Request, Server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores
 from round_trips import TARGETS, Compare

@@ -76,8 +76,8 @@ if TYPE_CHECKING:
     from mp4ds.plugins.reporting.report import ReportSummary as ReportSummary
     from mp4ds.plugins.reporting.report import report as report
     from mp4ds.times import Sync as Sync
-    from mp4ds.unpacking.options import UnpackOptions as UnpackOptions
-    from mp4ds.unpacking.options import UnpackSummary as UnpackSummary
+    from mp4ds.unpacking.unpack import UnpackOptions as UnpackOptions
+    from mp4ds.unpacking.unpack import UnpackSummary as UnpackSummary
     from mp4ds.unpacking.unpack import unpack as unpack
 
 _HOMES = {
@@ -106,8 +106,7 @@ _HOMES = {
     "plugins.recording.record": "RecordSummary record",
     "plugins.reporting.report": "ReportOptions ReportSummary report",
     "times": "Sync",
-    "unpacking.options": "UnpackOptions UnpackSummary",
-    "unpacking.unpack": "unpack",
+    "unpacking.unpack": "UnpackOptions UnpackSummary unpack",
 }
 """Modules that are imported when one of their names is first used -> the names."""
 

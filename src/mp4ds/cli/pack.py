@@ -23,8 +23,7 @@ from mp4ds.errors import OptionError, counted, path_text, size_text
 from mp4ds.options import LONG, WHERE, seconds_text
 from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary
 from mp4ds.records import Loss, latched_text
-from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
-from mp4ds.unpacking.unpack import unpack, unpack_each
+from mp4ds.unpacking.unpack import UnpackOptions, UnpackProgress, UnpackSummary, unpack, unpack_each
 
 _LOSSES_SHOWN = 20
 _TEXTS = {"topic": "topic", "type": "type", "stored in": "text"}

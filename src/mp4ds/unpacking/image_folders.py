@@ -19,8 +19,7 @@ from mp4ds.dataset.views import View
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import csv_cell
 from mp4ds.format.fields import DecodedColumns, marked
-from mp4ds.unpacking.options import UnpackOptions
-from mp4ds.unpacking.pictures import files_of, resized_view
+from mp4ds.unpacking.pictures import ReductionOptions, files_of, resized_view
 from mp4ds.video.images import ImageFile
 
 _STAMPS_NAME = "stamps.csv"
@@ -78,7 +77,9 @@ class TopicImages:
 
     Args:
         frames: The topic, whose frames are reduced together.
-        options: How.
+        options: How to reduce them.
+        image_format: ``png`` or ``jpeg``; None: JPEG files as recorded, others as png.
+        jpeg_quality: Of new JPEG files, 1 to 100.
 
     Attributes:
         topic: The topic.
@@ -90,25 +91,26 @@ class TopicImages:
         FormatError: The dataset is damaged.
     """
 
-    def __init__(self, frames: Topic, options: UnpackOptions) -> None:
+    def __init__(
+        self, frames: Topic, options: ReductionOptions, image_format: str | None, jpeg_quality: int
+    ) -> None:
         self.topic = frames.topic
         self.thinned, self.refused = 0, Counter[str]()
         self._digits = len(str(len(frames) - 1))
         self._files: list[_Files] = []
-        reduction = options.reduction
-        is_kept = reduction.kept(DecodedColumns.of_frames(frames.stamps, frames.log_times))
+        is_kept = options.kept(DecodedColumns.of_frames(frames.stamps, frames.log_times))
         for place, part in enumerate(frames.parts):
             numbers = frames.numbers_of(place)
             kept = is_kept[numbers]
             self.thinned += part.count(~kept)
-            size = reduction.size_of(part)
-            keeps_files = size is None and part.are_jpeg_files and options.image_format != "png"
-            kind = "jpeg" if keeps_files else options.image_format or "png"
+            size = options.size_of(part)
+            keeps_files = size is None and part.are_jpeg_files and image_format != "png"
+            kind = "jpeg" if keeps_files else image_format or "png"
             view = resized_view(part, size)
             try:
                 file = None
                 if not keeps_files:
-                    file = ImageFile(view.encoding.name, kind, quality=options.jpeg_quality)
+                    file = ImageFile(view.encoding.name, kind, quality=jpeg_quality)
                 self._files.append(_Files(part, numbers, kept, kind, view, file))
             except OptionError as error:
                 self.refused[str(error).rstrip(".")] += part.count(kept)

@@ -129,24 +129,22 @@ def packet_format(kind: str, sidecar: StreamSidecar, pixel_format: str, *, ros1:
 # ---------------------------------------------------------------- fewer, and smaller
 
 
-@dataclass(frozen=True, slots=True)
-class Reduction:
-    """Smaller images, and fewer of them. Every stream is reduced separately.
+@dataclass(frozen=True, kw_only=True)
+class ReductionOptions(TopicOptions):
+    """Which topics, and how to reduce their images: each stream separately."""
 
-    Attributes:
-        resize: A factor, or width and height in pixels; None for as recorded.
-        every: Keep frames whose number in the stream is a multiple of this.
-        max_rate: Maximum frames per second on average; see `at_most`. None for all.
-
-    Raises:
-        OptionError: The size, number or rate is not valid.
-    """
-
-    resize: float | tuple[int, int] | None = None
-    every: int = 1
-    max_rate: float | None = None
+    every: int = option(
+        "Keep only every Nth frame, starting with the first.", 1, panel=WHAT, metavar="N"
+    )
+    max_rate: float | None = option("Maximum frames per second.", panel=WHAT, metavar="HZ")
+    resize: Parsed[float | tuple[int, int] | None] = option(
+        "Scale images down, and the calibrations with them.",
+        metavar="0.5|WxH",
+        parse=parse_resize,
+    )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.resize is not None:
             _check_size(self.resize)
         if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
@@ -160,6 +158,16 @@ class Reduction:
         ):
             raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
 
+    @property
+    def leaves_out(self) -> bool:
+        """Whether there may be fewer images."""
+        return self.every > 1 or self.max_rate is not None
+
+    @property
+    def reduces(self) -> bool:
+        """Whether there may be fewer images, or smaller ones."""
+        return self.leaves_out or self.resize is not None
+
     def size_of(self, frames: Images) -> tuple[int, int] | None:
         """New width and height for images of one size; None if unchanged.
 
@@ -171,43 +179,14 @@ class Reduction:
         size = size_after(frames.topic, frames.image_size, self.resize)
         return size if size != frames.image_size else None
 
-    @property
-    def leaves_out(self) -> bool:
-        """Whether there may be fewer images."""
-        return self.every > 1 or self.max_rate is not None
-
     def kept(self, columns: DecodedColumns) -> NDArray[np.bool_]:
-        """Which frames are kept, shape (frames,)."""
+        """Which frames are kept, shape (frames,); see `at_most` for a maximum rate."""
         is_kept = np.zeros(len(columns.stamp), np.bool_)
         is_kept[:: self.every] = True
         if self.max_rate is not None:
             chosen = np.flatnonzero(is_kept)
             is_kept[chosen] = at_most(self.max_rate, times_of(columns)[chosen])
         return is_kept
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReductionOptions(TopicOptions):
-    """Which topics, and how to reduce their images."""
-
-    every: int = option(
-        "Keep only every Nth frame, starting with the first.", 1, panel=WHAT, metavar="N", least=1
-    )
-    max_rate: float | None = option("Maximum frames per second.", panel=WHAT, metavar="HZ")
-    resize: Parsed[float | tuple[int, int] | None] = option(
-        "Scale images down, and the calibrations with them.",
-        metavar="0.5|WxH",
-        parse=parse_resize,
-    )
-
-    @property
-    def reduction(self) -> Reduction:
-        """How to reduce images.
-
-        Raises:
-            OptionError: The size, number or rate is not valid.
-        """
-        return Reduction(self.resize, self.every, self.max_rate)
 
 
 def _check_size(resize: Any) -> None:

@@ -28,7 +28,7 @@ from mp4ds.unpacking.pictures import (
     Frames,
     Given,
     ImageForm,
-    Reduction,
+    ReductionOptions,
     frames_of,
     holds_files,
     is_inverse_depth,
@@ -156,7 +156,7 @@ class Republisher:
         converts_all: Whether other channels are converted to it, too.
         kind: What to convert images to, one of `KINDS`; None for as recorded.
         jpeg_quality: Of new JPEG files, 1 to 100.
-        reduction: How to reduce images; None for as recorded.
+        options: How to reduce images.
         renamed: The name that a topic goes out by.
 
     Attributes:
@@ -181,10 +181,10 @@ class Republisher:
         converts_all: bool,
         kind: str | None = None,
         jpeg_quality: int = 95,
-        reduction: Reduction | None = None,
+        options: ReductionOptions | None = None,
         renamed: Callable[[str], str] = lambda topic: topic,
     ) -> None:
-        self._reduction = reduction or Reduction()
+        self._reduction = options or ReductionOptions()
         check_kind(kind, self._reduction)
         self._kind = kind
         self._world = world
@@ -213,7 +213,7 @@ class Republisher:
         for _, plans in planned:
             for plan in plans:
                 self._give_calibrations(plan, selected)
-        if kind or self._reduction != Reduction():
+        if kind or self._reduction.reduces:
             self._count_verbatim(dataset, selected)
 
     @property
@@ -423,14 +423,13 @@ class Republisher:
             raise FormatError("frame-count", stream.video_path, problem)
 
 
-def check_kind(kind: str | None, reduction: Reduction) -> None:
+def check_kind(kind: str | None, options: ReductionOptions) -> None:
     """Refuse to reduce copied video.
 
     Raises:
         OptionError: Says what to do.
     """
-    is_reduced = reduction.leaves_out or reduction.resize is not None
-    if kind and KINDS[kind].family == "video" and is_reduced:
+    if kind and KINDS[kind].family == "video" and options.reduces:
         raise OptionError(
             f"`resize`, `every` and `max_rate` cannot be combined with `images` {kind}, which "
             "copies the video. Use raw, jpeg or png."

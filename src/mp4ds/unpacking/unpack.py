@@ -7,7 +7,7 @@ import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -30,7 +30,7 @@ from mp4ds.files.outputs import Owned, staged
 from mp4ds.files.uploads import uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import MANIFEST_NAME, FileNames
-from mp4ds.options import Selection
+from mp4ds.options import WHAT, Selection, SliceOptions, force, jpeg_quality, latched, option
 from mp4ds.processes import each
 from mp4ds.records import (
     Attachment,
@@ -42,14 +42,85 @@ from mp4ds.records import (
     bounded,
 )
 from mp4ds.unpacking.image_folders import TopicImages, image_names
-from mp4ds.unpacking.options import UnpackOptions, UnpackProgress, UnpackSummary
-from mp4ds.unpacking.pictures import Reduction
-from mp4ds.unpacking.republish import Republisher, check_kind
+from mp4ds.unpacking.pictures import KINDS, ReductionOptions
+from mp4ds.unpacking.republish import Republished, Republisher, check_kind
 
 TARGETS = ("bag", "rosbag2", "mcap", "images")
 _SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
 _WORLDS = {"bag": "ros1", "rosbag2": "ros2"}
 _OURS = "mp4ds:"  # metadata records in which a dataset keeps the contents of a rosbag2 folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnpackOptions(SliceOptions, ReductionOptions):
+    """How to unpack."""
+
+    latched: bool = latched()
+    salvage: bool = option("Restore what can be read of a damaged dataset.", False, panel=WHAT)
+    storage: str | None = option(
+        "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap.",
+        choices=("sqlite3", "mcap"),
+    )
+    image_format: str | None = option(
+        "png (exact) or jpeg, for `to` images; default: JPEG files as recorded, others as png.",
+        choices=("png", "jpeg"),
+    )
+    images: str | None = option(
+        "Convert all cameras to raw, jpeg, png, compressed-video or ffmpeg messages; "
+        "default: as recorded.",
+        metavar="KIND",
+        choices=KINDS,
+    )
+    jpeg_quality: int = jpeg_quality()
+    skip_unconvertible: bool = option(
+        "Leave out, and count, what the output format cannot hold.", False
+    )
+    force: bool = force()
+
+
+@dataclass(frozen=True)
+class UnpackProgress:
+    """Progress of an unpack: messages written, and their total (0: unknown)."""
+
+    messages: int
+    messages_total: int
+
+
+@dataclass(frozen=True)
+class UnpackSummary:
+    """The result of an unpack.
+
+    Attributes:
+        output: The recording or folder made.
+        messages: Messages written, by topic.
+        converted: Types converted between ROS 1 and ROS 2, by topic.
+        omitted: What the target cannot hold and was left out: a phrase -> how many.
+        left_out: Topics left out on request.
+        republished: The results for topics whose images are converted.
+        as_recorded: If a conversion was requested, the camera topics with messages that stay as
+            recorded: reason -> how many.
+        unconvertible: Topics with messages left out because the target cannot hold them:
+            reason -> how many.
+        thinned: Topics with messages left out because fewer were requested -> how many.
+        latched: Latched messages from before the slice, by topic.
+        latched_left_out: Latched topics whose messages from before it are too large.
+        losses: What could not be read, if a damaged dataset is salvaged.
+        notes: Other deviations from the recording.
+    """
+
+    output: Path
+    messages: dict[str, int] = field(default_factory=dict)
+    converted: list[str] = field(default_factory=list)
+    omitted: dict[str, int] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+    republished: dict[str, Republished] = field(default_factory=dict)
+    as_recorded: dict[str, dict[str, int]] = field(default_factory=dict)
+    thinned: dict[str, int] = field(default_factory=dict)
+    unconvertible: dict[str, dict[str, int]] = field(default_factory=dict)
+    latched: dict[str, int] = field(default_factory=dict)
+    latched_left_out: list[str] = field(default_factory=list)
+    losses: list[Loss] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def unpack(
@@ -125,7 +196,7 @@ def _unpack_here(
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
             part = slice_of(whole, chosen.slice, chosen.selected)
-            if to == "images" or chosen.images or chosen.reduction != Reduction():
+            if to == "images" or chosen.images or chosen.reduces:
                 # whose frames are counted from the slice's first one
                 with sliced(whole, part, path.parent, chosen.selected) as opened:
                     if to == "images":
@@ -266,7 +337,7 @@ def _check(to: str, options: UnpackOptions) -> None:
         raise OptionError(f"`storage` works with `to` rosbag2, not with `to` {to}.")
     if options.images and to == "images":
         raise OptionError("`images` is for recordings; with `to` images, use `image_format`.")
-    check_kind(options.images, options.reduction)
+    check_kind(options.images, options)
     if options.salvage and options.slice:
         raise OptionError(
             "`salvage` restores a whole dataset: pack what it restores, and unpack a slice of that."
@@ -330,7 +401,7 @@ def _unpack_recording(
         converts_all=to in _WORLDS and to != source,
         kind=options.images,
         jpeg_quality=options.jpeg_quality,
-        reduction=options.reduction,
+        options=options,
     )
     reader.sources = republisher.sources
     storage = ""
@@ -505,7 +576,9 @@ def _unpack_images(
     for topic in filter(options.selected, dataset.camera_topics):
         without = dataset.verbatim(topic)[1]
         if topic in dataset:
-            images = TopicImages(dataset[topic], options)
+            images = TopicImages(
+                dataset[topic], options, options.image_format, options.jpeg_quality
+            )
             found.append(images)
             if images.refused:
                 refused[topic] = "; ".join(images.refused)

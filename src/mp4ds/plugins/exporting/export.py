@@ -148,7 +148,6 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
             "one by one."
         )
     options.check_for(to)
-    _ = options.reduction  # refuses invalid ones
 
 
 def _export_names(path: Path) -> set[str] | None:

@@ -454,7 +454,7 @@ class ExportJob:
             self.leave_out(stream.topic, _INVERSE, len(stream))
             return
         columns = stream.columns
-        kept = np.flatnonzero(self.options.reduction.kept(columns))
+        kept = np.flatnonzero(self.options.kept(columns))
         self.leave_out(stream.topic, _THINNED, len(stream) - len(kept))
         times = times_of(columns)
         if times is not columns.stamp:
@@ -472,7 +472,7 @@ class ExportJob:
         # depths and other measurements have no colours
         has_colours = encoding_as(known, "rgb") is not None
         colours = "rgb" if has_colours and (self._in_colour or is_converted) else "native"
-        return stream.view(colours, self.options.reduction.resize)
+        return stream.view(colours, self.options.size_of(stream))
 
     def _matched(self, cameras: list[ExportedCamera], tolerance_ns: int) -> list[ExportedCamera]:
         """The frames that every camera has, frame n of each taken at the same time."""

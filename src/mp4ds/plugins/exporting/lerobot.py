@@ -205,7 +205,7 @@ def _add_videos(
         _count(job, camera, used, episode.times, fps)
         size = _encode(job, camera.at(used), repeats.tolist(), path, fps)
         episode.features[feature] = _video_feature(path, size, job.options.codec, fps)
-        episode.statistics[feature] = _sampled(camera, job.options.reduction.resize)
+        episode.statistics[feature] = _sampled(camera, job.options.size_of(camera.stream))
         episode.videos.append(feature)
         job.places[f"videos/{feature}"] = camera.topic
 
@@ -277,14 +277,14 @@ def _video_feature(path: Path, size: tuple[int, int], codec: str, fps: int) -> d
     }
 
 
-def _sampled(camera: ExportedCamera, resize: float | tuple[int, int] | None) -> Statistics:
+def _sampled(camera: ExportedCamera, size: tuple[int, int] | None) -> Statistics:
     """The statistics of some frames' pixels, 0 to 1, by colour."""
     count = min(_SAMPLES, len(camera))
     chosen = np.unique(np.linspace(0, len(camera) - 1, count).astype(np.int64))
     found = []
     with closing(Topic([camera.stream])) as topic:
         for number in camera.numbers[chosen].tolist():
-            found.append(picture_statistics(topic.read([number], resize=resize)[0]))
+            found.append(picture_statistics(topic.read([number], resize=size)[0]))
     return merged(found)
 
 
