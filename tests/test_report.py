@@ -448,7 +448,7 @@ def assert_proxy_shows(dataset: Path, width: int) -> None:
             assert (shown.stamps // 1000).tolist() == ticks
             assert shown.image_size == size
             look = Look(opened[stream.topic], size)
-            for index, picture in stream.recorded_pictures():
+            for index, picture in stream.pictures(is_strict=False):
                 if picture is not None:
                     expected = blocks(look.picture(stream.recorded_pixels(picture)))
                     assert np.abs(blocks(shown[index].data) - expected).mean() < 8

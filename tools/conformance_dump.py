@@ -181,7 +181,7 @@ def _decoded(stream: Stream) -> Values:
 
 def _of_pictures(stream: Stream) -> Iterator[tuple[str, str]]:
     """SHA-256 of the pixels and of the payload of each frame."""
-    for index, picture in stream.pictures_at():
+    for index, picture in stream.pictures():
         pixels = stream.recorded_pixels(picture)
         little_endian = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
         payload = stream.rebuilder.payload(index, picture)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.views import Crop, Resize, View, view_of
 from mp4ds.errors import FormatError, Refused, VideoError
-from mp4ds.format.fields import DecodedColumns
+from mp4ds.format.fields import Choice, DecodedColumns, everything
 from mp4ds.format.models import Calibration
 from mp4ds.messages import depth, png
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, pixel_view
@@ -106,11 +106,15 @@ class Images(ABC):
     def open_reader(self) -> FrameReader:
         """A separate decoder for frames by number."""
 
-    def pictures(self, scale: Scale | None) -> Iterator[Picture]:
-        """All pictures in order, from a separate decoder; each is valid until the next one."""
+    def pictures(
+        self, choice: Choice = everything, scale: Scale | None = None
+    ) -> Iterator[tuple[int, Picture]]:
+        """The wanted pictures in order, each with its number, from a separate decoder.
+
+        Each is valid until the next one is requested.
+        """
         with self.open_reader() as reader:
-            for _, picture in reader.pictures_of(range(len(self)), scale):
-                yield picture
+            yield from reader.pictures_of(list(choice(self.columns)), scale)
 
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
         """Write the pixels of a picture, as recorded."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,10 +169,6 @@ class Stream(Images):
             lambda: self.open_video(sequential=False),
         )
 
-    def pictures(self, scale: Scale | None) -> Iterator[Picture]:
-        """All pictures in order, from a separate decoder that uses all cores."""
-        return (picture for _, picture in self.pictures_at(everything, scale))
-
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
         """Write the pixels of a picture, as recorded."""
         self.layout.to_pixels(picture, out)
@@ -194,14 +190,27 @@ class Stream(Images):
             )
         return prefix
 
-    def pictures_at(
+    @overload
+    def pictures(
         self, choice: Choice = everything, scale: Scale | None = None
-    ) -> Iterator[tuple[int, Picture]]:
+    ) -> Iterator[tuple[int, Picture]]: ...
+
+    @overload
+    def pictures(
+        self, choice: Choice = everything, scale: Scale | None = None, *, is_strict: bool
+    ) -> Iterator[tuple[int, Picture | None]]: ...
+
+    def pictures(
+        self, choice: Choice = everything, scale: Scale | None = None, *, is_strict: bool = True
+    ) -> Iterator[tuple[int, Picture | None]]:
         """The wanted pictures in order, each with its number, from a separate decoder.
 
         Args:
-            choice: Which are wanted. If all are, the video must end after them.
+            choice: Which are wanted; may be asked twice. If all are, the video must end after them.
             scale: See `PictureMaker.make`.
+            is_strict: Whether a picture that cannot be decoded is an error, and not None. What was
+                recorded as packets may have some without any damage to the video: they refer to
+                packets that were lost before they were recorded.
 
         Yields:
             Views that are valid until the next one is requested.
@@ -209,49 +218,31 @@ class Stream(Images):
         Raises:
             VideoError: See `VideoDecoder.pictures`.
         """
-        with self.open_video(sequential=True) as decoder, self.naming_frames():
-            if self.sound is not None:
-                wanted = self.sound_of(choice(self.columns))
-                for index, picture in decoder.decodable_pictures(wanted, scale):
-                    if picture is None:
-                        raise self._undecodable(index)
-                    yield index, picture
-            elif choice is everything:
-                yield from enumerate(decoder.pictures(scale))
-            else:
-                yield from decoder.pictures_at(choice(self.columns), scale)
-
-    def _undecodable(self, index: int) -> VideoError:
-        return VideoError("decode-failed", self.video_path, "cannot be decoded", frame=index)
-
-    def decodable_pictures(
-        self, choice: Choice = everything, scale: Scale | None = None
-    ) -> Iterator[tuple[int, Picture | None]]:
-        """Like `pictures_at`, but None for a picture that cannot be decoded.
-
-        Args:
-            choice: Which are wanted; asked twice.
-            scale: See `PictureMaker.make`.
-
-        Raises:
-            VideoError: None of them can be read.
-        """
         done = -1
         with self.naming_frames():
             if self.sound is None:
                 try:
                     with self.open_video(sequential=True) as decoder:
+                        if is_strict and choice is everything:
+                            yield from enumerate(decoder.pictures(scale))
+                            return
                         for index, picture in decoder.pictures_at(choice(self.columns), scale):
                             yield index, picture
                             done = index
                     return
                 except VideoError as error:
-                    if error.frame is None:
+                    if is_strict or error.frame is None:
                         raise
             # from there on on one core; see the decoder
             with self.open_video(sequential=False) as decoder:
                 rest = (index for index in self.sound_of(choice(self.columns)) if index > done)
-                yield from decoder.decodable_pictures(rest, scale)
+                for index, found in decoder.decodable_pictures(rest, scale):
+                    if found is None and is_strict:
+                        raise self._undecodable(index)
+                    yield index, found
+
+    def _undecodable(self, index: int) -> VideoError:
+        return VideoError("decode-failed", self.video_path, "cannot be decoded", frame=index)
 
     # ------------------------------------------------------------ messages
 
@@ -291,7 +282,7 @@ class Stream(Images):
                     yield index, rebuilder.packet_payload(index, reader.packet(index))
             return
         with self.naming_frames():
-            for index, picture in self.pictures_at(choice):
+            for index, picture in self.pictures(choice):
                 yield index, rebuilder.payload(index, picture)
 
     def _open_packets(self) -> PacketReader:
@@ -360,7 +351,7 @@ class Stream(Images):
                     reader = files.enter_context(self._open_packets())
                     frames = ((index, None) for index in range(len(self)))
                 else:
-                    frames = self.decodable_pictures()
+                    frames = self.pictures(is_strict=False)
                 for index, picture in frames:
                     report(index)
                     try:
@@ -374,17 +365,6 @@ class Stream(Images):
                         yield error
         except FormatError as error:
             yield error
-
-    def recorded_pictures(
-        self, choice: Choice = everything, scale: Scale | None = None
-    ) -> Iterator[tuple[int, Picture | None]]:
-        """Like `pictures_at`, but None for a packet that cannot be decoded.
-
-        Such packets refer to others that were lost before they were recorded.
-        """
-        if self.sidecar.body == "packet":
-            return self.decodable_pictures(choice, scale)
-        return self.pictures_at(choice, scale)
 
     def verify_video(self) -> None:
         """Check the video against its SHA-256, for when no message digest would reveal damage.

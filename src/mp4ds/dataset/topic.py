@@ -298,8 +298,7 @@ class Topic:
         parts: dict[int, Iterator[Frame]] = {}
         for owner, part in enumerate(self.parts):
             view = self._view(owner, "native", None, None)
-            pictures = enumerate(part.pictures(view.scale))
-            parts[owner] = self._one_by_one(owner, view, pictures)
+            parts[owner] = self._one_by_one(owner, view, part.pictures(scale=view.scale))
         return self._merged(np.arange(len(self)), parts)
 
     def get(

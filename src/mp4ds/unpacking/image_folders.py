@@ -56,7 +56,9 @@ class _Files:
             if file is None:
                 yield from files_of(part, marked(self.is_kept))
                 return
-            for index, picture in part.recorded_pictures(marked(self.is_kept), self.view.scale):
+            is_strict = part.sidecar.body != "packet"
+            choice, scale = marked(self.is_kept), self.view.scale
+            for index, picture in part.pictures(choice, scale, is_strict=is_strict):
                 made = None
                 if picture is not None:
                     made = file.encode(part.pixels(picture, self.view, index))

@@ -535,7 +535,8 @@ def _from_pictures(
     columns, scale = stream.columns, makers[0][0].scale
     with ExitStack() as files:
         packets = None
-        for index, picture in stream.recorded_pictures(choice, scale):
+        is_strict = stream.sidecar.body != "packet"
+        for index, picture in stream.pictures(choice, scale, is_strict=is_strict):
             if picture is not None:
                 view, make = makers[columns.variant[index]]
                 yield index, make(stream.pixels(picture, view, index))

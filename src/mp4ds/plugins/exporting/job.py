@@ -205,7 +205,8 @@ class ExportedCamera:
         self.stream.verify_pictures()
         place_of = np.full(len(self.stream), -1, np.int64)
         place_of[self.numbers] = np.arange(len(self))
-        for index, picture in self.stream.pictures_at(marked(place_of >= 0), self.view.scale):
+        # strictly: cameras are matched, and rows counted, before any picture is decoded
+        for index, picture in self.stream.pictures(marked(place_of >= 0), self.view.scale):
             yield int(place_of[index]), self.stream.pixels(picture, self.view, index)
 
 

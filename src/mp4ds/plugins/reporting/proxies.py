@@ -275,7 +275,7 @@ def make_proxy(
     picture: Bytes = np.zeros((size[1], size[0], 3), np.uint8)
     try:
         with encoder:
-            for number, found in stream.recorded_pictures():
+            for number, found in stream.pictures(is_strict=stream.sidecar.body != "packet"):
                 if found is not None:  # otherwise the previous one stays
                     picture = look.picture(stream.recorded_pixels(found))
                 encoder.write((picture,), int(times[number]))
