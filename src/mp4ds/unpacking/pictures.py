@@ -101,19 +101,18 @@ FAMILIES = {kind.type_name.rpartition("/")[2]: kind.family for kind in KINDS.val
 FAMILIES["RawImage"] = FAMILIES["Image"]  # Foxglove's
 
 
-def packet_format(kind: str, sidecar: StreamSidecar, pixel_format: str, *, ros1: bool) -> str:
+def packet_format(form: ImageForm, sidecar: StreamSidecar, pixel_format: str) -> str:
     """What messages say about the coding of their packets.
 
     Args:
-        kind: ``compressed-video`` or ``ffmpeg``.
+        form: Of the messages: ``compressed-video`` or ``ffmpeg``.
         sidecar: Of the video.
         pixel_format: Of the video as ffmpeg calls it.
-        ros1: Whether they are messages of ROS 1.
     """
-    if kind == "compressed-video":
+    if form.kind == "compressed-video":
         return sidecar.video.codec
     codec = CODECS[sidecar.video.codec].ffmpeg
-    if ros1:
+    if form.world == "ros1":
         return _ENCODERS.get(sidecar.video.codec, codec)
     encoding = sidecar.image.encoding
     known = ENCODINGS[encoding]
@@ -267,17 +266,18 @@ class ImageForm:
 
     Attributes:
         kind: One of `KINDS`.
-        ros1: Whether the messages are for ROS 1.
+        world: ``ros1`` or ``ros2``: what the messages are for.
         jpeg_quality: Of new JPEG files, 1 to 100.
         size: Width and height in pixels; None for as recorded.
-        keeps_format: Whether files keep their format field if they hold the same.
+        in_place: Whether the messages are of that kind already, and stay on their channel. Files
+            then keep their format field if they hold the same.
     """
 
     kind: str
-    ros1: bool
+    world: str
     jpeg_quality: int
-    size: tuple[int, int] | None = None
-    keeps_format: bool = False
+    size: tuple[int, int] | None
+    in_place: bool
 
 
 Make = Callable[[Pixels], Given]
@@ -306,7 +306,7 @@ def _maker(stream: Stream, header: Header, form: ImageForm) -> tuple[View, Make]
     except OptionError:
         raise Refused(f"{form.kind.upper()} files cannot hold {encoding} images") from None
     told = format_of(encoding, form, has_mosaic=form.kind == "png")
-    if form.keeps_format and encoding == recorded:
+    if form.in_place and encoding == recorded:
         told = header.format or ""
     return view, lambda pixels: Given(CodedFields(told), file.encode(pixels))
 
@@ -369,7 +369,7 @@ def format_of(encoding: str, form: ImageForm, *, has_mosaic: bool) -> str:
         inner = "bgr16" if encoding.endswith("16") else "bgr8"
     else:
         is_grey = known.channels == 1 and form.kind == "jpeg"
-        inner = "mono8" if is_grey and not form.ros1 else ""  # ROS 1 leaves it empty
+        inner = "mono8" if is_grey and form.world == "ros2" else ""  # ROS 1 leaves it empty
     return f"{encoding}; {form.kind} compressed {inner}"
 
 
@@ -388,35 +388,99 @@ def _raw(
 
 _VIDEO_CODECS = ("h264", "h265", "av1", "vp9")  # formats of Foxglove's CompressedVideo
 
-Frames = Callable[[Choice, bool], Iterator[tuple[int, Given | bytes | bytearray]]]
-"""Yields each wanted frame of a stream with its number, in order.
-
-One whose picture cannot be decoded is the message as recorded. Packets come with those they refer
-to, from a key frame on.
-
-Args:
-    choice: Which are wanted.
-    verify: Check the whole video first, for when no digest would reveal damage.
-
-Raises:
-    FormatError: The stream is damaged.
-"""
+Frames = Iterator[tuple[int, Given | bytes | bytearray]]
+"""Frames with their numbers; one whose picture cannot be decoded is the message as recorded."""
 
 
-def frames_of(stream: Stream, form: ImageForm) -> Frames:
-    """How to convert the images of a stream.
+class Conversion:
+    """How the images of a stream get another form.
+
+    Args:
+        stream: The stream.
+        form: The form.
 
     Raises:
         Refused: They cannot be converted; says why.
     """
-    if KINDS[form.kind].family == "video":
-        return _video(stream, form)
-    if form.size is None and holds_files(stream, form.kind):
-        return partial(_own_files, stream, _own_formats(stream.sidecar, form))
-    makers = [_maker(stream, header, form) for header in stream.sidecar.headers]
-    if stream.sidecar.body == "pixels" and makers[0][0].scale is None:
-        return partial(_from_pixels, stream, makers[0], form)
-    return partial(_from_pictures, stream, makers)
+
+    def __init__(self, stream: Stream, form: ImageForm) -> None:
+        self.stream, self.form = stream, form
+        self._frames: Callable[[Choice, bool], Frames]
+        headers = stream.sidecar.headers
+        if KINDS[form.kind].family == "video":
+            _check_video(stream, form)
+            self._frames = self._packets
+        elif form.size is None and holds_files(stream, form.kind):
+            encodings = [encoding_of(stream.sidecar, header) for header in headers]
+            self._formats = [format_of(one, form, has_mosaic=True) for one in encodings]
+            self._frames = self._files
+        else:
+            self._makers = [_maker(stream, header, form) for header in headers]
+            is_plain = stream.sidecar.body == "pixels" and self._makers[0][0].scale is None
+            self._frames = self._from_pixels if is_plain else self._from_pictures
+
+    def frames(self, choice: Choice, *, verify: bool) -> Frames:
+        """The wanted frames, in order; packets come with those they refer to, from a key frame on.
+
+        Args:
+            choice: Which are wanted.
+            verify: Check the whole video first, for when no digest would reveal damage.
+
+        Raises:
+            FormatError: The stream is damaged.
+        """
+        return self._frames(choice, verify)
+
+    def _packets(self, choice: Choice, verify: bool) -> Frames:
+        """The packets of the video, self-contained from each key frame on."""
+        stream = self.stream
+        if verify:
+            stream.verify_pictures()
+        with _packets(stream) as packets:
+            told = packet_format(self.form, stream.sidecar, packets.pixel_format)
+            fields = CodedFields(told, *stream.image_size)
+            wanted = unbroken(choice(stream.columns), packets.key_numbers, from_key=True)
+            for index in stream.sound_of(wanted):
+                is_key = bool(packets.keyframes[index])
+                yield index, Given(fields, packets.stand_alone(index), is_key=is_key)
+
+    def _files(self, choice: Choice, verify: bool) -> Frames:
+        variants = self.stream.columns.variant
+        for index, file in files_of(self.stream, choice, verify):
+            yield index, Given(CodedFields(self._formats[variants[index]]), file)
+
+    def _from_pixels(self, choice: Choice, verify: bool) -> Frames:
+        """From raw images, checked against their digests."""
+        form, image, (view, make) = self.form, self.stream.sidecar.image, self._makers[0]
+        size = {"width": image.width, "height": image.height, "step": image.step}
+        fields = ImageFields(image.encoding, is_bigendian=image.is_bigendian, **size)
+        for index, body in _bodies(self.stream, choice, verify):
+            if form.kind == "raw" and form.size is None:
+                yield index, Given(fields, body)
+                continue
+            is_bigendian = bool(image.is_bigendian)
+            pixels = pixel_view(body, ENCODINGS[image.encoding], **size, is_bigendian=is_bigendian)
+            if form.size is not None:
+                seen: Pixels = np.empty(view.shape, view.dtype)
+                view.give(np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("=")), seen)
+                pixels = seen
+            yield index, make(pixels)
+
+    def _from_pictures(self, choice: Choice, verify: bool) -> Frames:
+        """From the decoded pictures of files and packets."""
+        stream, scale = self.stream, self._makers[0][0].scale
+        if verify:
+            stream.verify_pictures()
+        with ExitStack() as files:
+            packets = None
+            is_strict = stream.sidecar.body != "packet"
+            for index, picture in stream.pictures(choice, scale, is_strict=is_strict):
+                if picture is not None:
+                    view, make = self._makers[stream.columns.variant[index]]
+                    yield index, make(stream.pixels(picture, view, index))
+                    continue
+                packets = packets or files.enter_context(_packets(stream))
+                yield index, stream.rebuilder.packet_payload(index, packets.packet(index))
 
 
 def holds_files(stream: Stream, kind: str) -> bool:
@@ -448,7 +512,7 @@ def files_of(
         yield index, body[start:]
 
 
-def _video(stream: Stream, form: ImageForm) -> Frames:
+def _check_video(stream: Stream, form: ImageForm) -> None:
     sidecar = stream.sidecar
     codec = sidecar.video.codec
     if codec not in _VIDEO_CODECS:
@@ -460,89 +524,16 @@ def _video(stream: Stream, form: ImageForm) -> Frames:
         )
     if stream.hidden_frames:
         raise Refused("the first packets of the slice depend on packets outside it")
-    return partial(_packets_of, stream, form)
-
-
-def _packets_of(
-    stream: Stream, form: ImageForm, choice: Choice, verify: bool
-) -> Iterator[tuple[int, Given]]:
-    """The packets of the video, self-contained from each key frame on."""
-    if verify:
-        stream.verify_pictures()
-    with _packets(stream) as packets:
-        told = packet_format(form.kind, stream.sidecar, packets.pixel_format, ros1=form.ros1)
-        fields = CodedFields(told, *stream.image_size)
-        wanted = choice(stream.columns)
-        for index in stream.sound_of(unbroken(wanted, packets.key_numbers, from_key=True)):
-            is_key = bool(packets.keyframes[index])
-            yield index, Given(fields, packets.stand_alone(index), is_key=is_key)
-
-
-def _own_formats(sidecar: StreamSidecar, form: ImageForm) -> list[str]:
-    encodings = [encoding_of(sidecar, header) for header in sidecar.headers]
-    return [format_of(encoding, form, has_mosaic=True) for encoding in encodings]
-
-
-def _own_files(
-    stream: Stream, formats: list[str], choice: Choice, verify: bool
-) -> Iterator[tuple[int, Given]]:
-    for index, file in files_of(stream, choice, verify):
-        variant = int(stream.columns.variant[index])
-        yield index, Given(CodedFields(formats[variant]), file)
-
-
-def _from_pixels(
-    stream: Stream, maker: tuple[View, Make], form: ImageForm, choice: Choice, verify: bool
-) -> Iterator[tuple[int, Given]]:
-    """From raw images, checked against their digests."""
-    image, (view, make) = stream.sidecar.image, maker
-    fields = ImageFields(image.encoding, image.width, image.height, image.step, image.is_bigendian)
-    for index, body in _bodies(stream, choice, verify):
-        if form.kind == "raw" and form.size is None:
-            yield index, Given(fields, body)
-            continue
-        pixels = pixel_view(
-            body,
-            ENCODINGS[image.encoding],
-            width=image.width,
-            height=image.height,
-            step=image.step,
-            is_bigendian=bool(image.is_bigendian),
-        )
-        if form.size is not None:
-            seen: Pixels = np.empty(view.shape, view.dtype)
-            view.give(np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("=")), seen)
-            pixels = seen
-        yield index, make(pixels)
 
 
 def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int, memoryview]]:
     """The bodies of the messages, each checked against its digest."""
     sidecar = stream.sidecar
-    form = form_for(sidecar.channel.to_record(0), sidecar.wire, str(stream.path))
+    form = form_for(stream.channel, sidecar.wire, str(stream.path))
     if sidecar.digests is None and verify:
         stream.verify_video()
     for index, payload in stream.payloads(choice):
         yield index, form.split(memoryview(payload)).body
-
-
-def _from_pictures(
-    stream: Stream, makers: list[tuple[View, Make]], choice: Choice, verify: bool
-) -> Iterator[tuple[int, Given | bytes | bytearray]]:
-    """From the decoded pictures of files and packets."""
-    if verify:
-        stream.verify_pictures()
-    columns, scale = stream.columns, makers[0][0].scale
-    with ExitStack() as files:
-        packets = None
-        is_strict = stream.sidecar.body != "packet"
-        for index, picture in stream.pictures(choice, scale, is_strict=is_strict):
-            if picture is not None:
-                view, make = makers[columns.variant[index]]
-                yield index, make(stream.pixels(picture, view, index))
-                continue
-            packets = packets or files.enter_context(_packets(stream))
-            yield index, stream.rebuilder.packet_payload(index, packets.packet(index))
 
 
 def _packets(stream: Stream) -> PacketReader:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,11 +25,10 @@ from mp4ds.records import HASH_KEY, Channel, Message, Schema
 from mp4ds.unpacking.pictures import (
     FAMILIES,
     KINDS,
-    Frames,
+    Conversion,
     Given,
     ImageForm,
     ReductionOptions,
-    frames_of,
     holds_files,
     is_inverse_depth,
 )
@@ -69,7 +68,7 @@ def free_topic(topic: str, kind: str, taken: Collection[str]) -> str:
 # ---------------------------------------------------------------- calibrations
 
 
-def resized(
+def _resized(
     infos: CalibrationMessages, stream: Stream, size: tuple[int, int]
 ) -> CalibrationMessages:
     """The calibration messages of a stream for another width and height of its images.
@@ -116,19 +115,19 @@ class _Plan:
 
     Attributes:
         stream: The stream.
-        kind: Of the new messages; empty for as recorded.
-        frames: Makes them; None for as recorded.
+        conversion: Of its images; None if they stay as recorded.
         is_kept: Which of them are kept; None for all.
-        size: Their new width and height; None for as recorded.
-        is_moved: Whether they go to a new channel.
     """
 
     stream: Stream
-    kind: str
-    frames: Frames | None
+    conversion: Conversion | None
     is_kept: NDArray[np.bool_] | None
-    size: tuple[int, int] | None
-    is_moved: bool
+
+    @property
+    def new_kind(self) -> str:
+        """Kind of the messages if they go to a new channel; else empty."""
+        form = self.conversion.form if self.conversion else None
+        return form.kind if form and not form.in_place else ""
 
     def chosen(self, choice: Choice) -> Choice:
         """Those of some frames that are kept."""
@@ -196,15 +195,15 @@ class Republisher:
         self._made: set[int] = set()
         self.sources: dict[Part, MessageSource] = {}
         self.republished: dict[str, Republished] = {}
-        self.as_recorded: dict[str, dict[str, int]] = {}
-        self.thinned: dict[str, int] = {}
+        self.as_recorded: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self.thinned = Counter[str]()
         chosen = [item for item in dataset.image_channels() if selected(item.channel.topic)]
         self._cameras = {item.channel.id for item in chosen}
         planned = [(item, self._plans(item)) for item in chosen]
         emptied = {
             item.channel.id
             for item, plans in planned
-            if sum(plan.is_moved for plan in plans) == len(item.streams)
+            if sum(bool(plan.new_kind) for plan in plans) == len(item.streams)
             and not item.recorded(dataset.messages_file.counts)
         }
         staying = [channel for channel in dataset.channels if channel.id not in emptied]
@@ -213,6 +212,7 @@ class Republisher:
         for _, plans in planned:
             for plan in plans:
                 self._give_calibrations(plan, selected)
+        self.thinned = +self.thinned  # without those of which all are kept
         if kind or self._reduction.reduces:
             self._count_verbatim(dataset, selected)
 
@@ -261,8 +261,8 @@ class Republisher:
         plans = [self._plan(stream) for stream in group.streams]
         for plan in plans:
             if plan.is_kept is not None:
-                self._leave_out(plan.stream.topic, plan.stream.count(~plan.is_kept))
-        return [plan for plan in plans if plan.frames or plan.is_kept is not None]
+                self.thinned[plan.stream.topic] += plan.stream.count(~plan.is_kept)
+        return [plan for plan in plans if plan.conversion or plan.is_kept is not None]
 
     def _plan(self, stream: Stream) -> _Plan:
         size = self._reduction.size_of(stream)
@@ -274,26 +274,19 @@ class Republisher:
             is_done = self._is_done(stream, kind)
             try:
                 if not is_done or size:
-                    form = self._form(stream, kind, size, is_done=is_done)
-                    return _Plan(stream, kind, frames_of(stream, form), is_kept, size, not is_done)
+                    world = self._world
+                    if is_done and stream.channel.message_encoding != ENCODINGS[world]:
+                        world = "ros2" if world == "ros1" else "ros1"
+                    form = ImageForm(kind, world, self._jpeg_quality, size, in_place=is_done)
+                    return _Plan(stream, Conversion(stream, form), is_kept)
                 if is_kept is None:
                     raise Refused(f"they are already {KINDS[kind].noun}")
             except Refused as reason:
-                self._keep(stream.topic, str(reason), stream.count(is_kept))
+                self.as_recorded[stream.topic][str(reason)] += stream.count(is_kept)
         if is_kept is not None and _refers(stream):
-            self._keep(stream.topic, _REFERS, stream.count())
+            self.as_recorded[stream.topic][_REFERS] += stream.count()
             is_kept = None
-        return _Plan(stream, "", None, is_kept, None, False)
-
-    def _leave_out(self, topic: str, count: int) -> None:
-        if count:
-            self.thinned[topic] = self.thinned.get(topic, 0) + count
-
-    def _form(
-        self, stream: Stream, kind: str, size: tuple[int, int] | None, *, is_done: bool
-    ) -> ImageForm:
-        encoding = stream.channel.message_encoding if is_done else ENCODINGS[self._world]
-        return ImageForm(kind, encoding == "ros1", self._jpeg_quality, size, keeps_format=is_done)
+        return _Plan(stream, None, is_kept)
 
     def _is_done(self, stream: Stream, kind: str) -> bool:
         """Whether the messages already have a kind, in either ROS."""
@@ -324,7 +317,7 @@ class Republisher:
         for item, plans in planned:
             recorded = item.channel
             made: dict[str, Channel] = {}
-            for kind in dict.fromkeys(plan.kind for plan in plans if plan.is_moved):
+            for kind in dict.fromkeys(plan.new_kind for plan in plans if plan.new_kind):
                 wanted = republished_topic(recorded.topic, recorded.type_name, kind)
                 if (recorded.topic, kind) not in topics:
                     topics[recorded.topic, kind] = free_topic(wanted, kind, taken)
@@ -338,16 +331,11 @@ class Republisher:
                 known = Republished(topic, made[kind].type_name, instead_of)
                 self.republished.setdefault(recorded.topic, known)
             for plan in plans:
-                if plan.frames is None:
-                    self.sources[plan.stream] = plan.fewer
-                    continue
-                is_ros1 = recorded.message_encoding == ENCODINGS["ros1"]
-                world = self._world if plan.is_moved else ("ros1" if is_ros1 else "ros2")
-                channel = made[plan.kind] if plan.is_moved else None
-                types = self._types_of(world, plan.kind)
-                self.sources[plan.stream] = partial(
-                    self._messages, plan, plan.frames, types, channel
-                )
+                self.sources[plan.stream] = plan.fewer
+                if conversion := plan.conversion:
+                    channel = made.get(plan.new_kind)
+                    source = partial(self._messages, plan, conversion, channel)
+                    self.sources[plan.stream] = source
 
     def _give_calibrations(self, plan: _Plan, selected: Callable[[str], bool]) -> None:
         """Adapt the calibrations of a stream whose images are reduced.
@@ -356,20 +344,21 @@ class Republisher:
         stamps no image has are kept.
         """
         stream, infos = plan.stream, plan.stream.infos
-        is_reduced = plan.size is not None or plan.is_kept is not None
+        size = plan.conversion.form.size if plan.conversion else None
+        is_reduced = size is not None or plan.is_kept is not None
         if infos is None or not is_reduced or not selected(infos.channel.topic):
             return
         given = infos
         is_wanted: NDArray[np.bool_] = np.ones(len(infos), np.bool_)
-        if plan.size is not None:
+        if size is not None:
             try:
-                given = resized(infos, stream, plan.size)
+                given = _resized(infos, stream, size)
             except Refused as reason:
-                self._keep(infos.channel.topic, str(reason), len(infos))
+                self.as_recorded[infos.channel.topic][str(reason)] += len(infos)
         if plan.is_kept is not None:
             stamps, frames = infos.columns.stamp, stream.stamps
             is_wanted = ~np.isin(stamps, frames) | np.isin(stamps, frames[plan.is_kept])
-            self._leave_out(infos.channel.topic, int((~is_wanted).sum()))
+            self.thinned[infos.channel.topic] += int((~is_wanted).sum())
 
         def messages(channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
             return given.messages(channel, marked(is_wanted, choice))
@@ -380,19 +369,14 @@ class Republisher:
         cameras = {channel.topic for channel in dataset.channels if is_camera(channel)}
         for entry in dataset.manifest.verbatim if dataset.manifest else []:
             if entry.topic in cameras and selected(entry.topic):
-                self._keep(entry.topic, f"stored verbatim: {entry.reason}", entry.messages)
-
-    def _keep(self, topic: str, reason: str, count: int) -> None:
-        reasons = self.as_recorded.setdefault(topic, {})
-        reasons[reason] = reasons.get(reason, 0) + count
+                self.as_recorded[entry.topic][f"stored verbatim: {entry.reason}"] += entry.messages
 
     # ------------------------------------------------------------ messages
 
     def _messages(
         self,
         plan: _Plan,
-        frames: Frames,
-        types: Types,
+        conversion: Conversion,
         made: Channel | None,
         recorded: Channel,
         choice: Choice,
@@ -400,12 +384,13 @@ class Republisher:
         """The messages of a stream, each with its ordinal in the recorded channel."""
         stream = plan.stream
         columns, headers = stream.columns, stream.sidecar.headers
+        types = self._types_of(conversion.form.world, conversion.form.kind)
         count = 0
-        for index, frame in frames(plan.chosen(choice), choice is everything):
+        for index, frame in conversion.frames(plan.chosen(choice), verify=choice is everything):
             count += 1
             ordinal = int(columns.ordinal[index])
             if not isinstance(frame, Given):
-                self._keep(recorded.topic, _NOT_DECODED, 1)
+                self.as_recorded[recorded.topic][_NOT_DECODED] += 1
                 yield ordinal, message_at(columns, index, recorded, frame)
                 continue
             frame_id = headers[int(columns.variant[index])].frame_id

@@ -439,7 +439,7 @@ def _unpack_recording(
             raise FormatError("message-count", dataset.path, problem)
     summary.omitted.update(Counter(writer.omitted) + Counter(republisher.omitted))
     summary.republished.update(republisher.republished)
-    summary.as_recorded.update(republisher.as_recorded)
+    summary.as_recorded.update({t: dict(why) for t, why in republisher.as_recorded.items()})
     summary.thinned.update(republisher.thinned)
 
 
