@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, as_completed
+from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
 
@@ -21,7 +22,7 @@ import cluster_tasks
 from clusters import WITH_NANNY, RealCluster
 from mp4ds.errors import Mp4dsError, OptionError, RemoteError
 from mp4ds.plugins import cluster as access
-from mp4ds.plugins.cluster import ClusterExecutor
+from mp4ds.plugins.cluster import cluster_executor
 from waiting import until
 
 
@@ -44,11 +45,14 @@ def numbered(count: int) -> list[str]:
 
 
 def errors(
-    executor: Executor, function: Callable[[str, str], None], folder: Path, *names: str
+    executor: AbstractContextManager[Executor],
+    function: Callable[[str, str], None],
+    folder: Path,
+    *names: str,
 ) -> dict[str, BaseException]:
     """Make a call for each name; by name, their errors."""
-    with executor:
-        calls = {name: executor.submit(function, str(folder), name) for name in names}
+    with executor as opened:
+        calls = {name: opened.submit(function, str(folder), name) for name in names}
         found = {name: call.exception() for name, call in calls.items()}
     return {name: error for name, error in found.items() if error is not None}
 
@@ -66,27 +70,16 @@ def started(folder: Path) -> list[Path]:
 
 def test_all_calls_are_made(cluster: RealCluster, tmp_path: Path) -> None:
     names = numbered(12)
-    executor = ClusterExecutor(cluster.address, 12)
+    executor = cluster_executor(cluster.address, 12)
     assert not errors(executor, cluster_tasks.write, tmp_path, *names)
     assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
     assert len({path.suffix for path in started(tmp_path)}) == 2  # processes: both worked
     assert len(started(tmp_path)) == len(names)  # once each
 
 
-def test_results_and_arguments(cluster: RealCluster) -> None:
-    with ClusterExecutor(cluster.address, 2) as executor:
-        calls = [executor.submit(int, "11", base=base) for base in range(2, 12)]
-        assert [call.result() for call in calls] == list(range(3, 13))
-
-
-def test_no_calls_need_no_cluster() -> None:
-    with ClusterExecutor("tcp://127.0.0.1:1", 1):
-        pass
-
-
 def test_errors_of_calls_are_told_and_not_tried_again(cluster: RealCluster, tmp_path: Path) -> None:
     names = ["source", "disk", "odd", "silent", "memory", "fine"]
-    executor = ClusterExecutor(cluster.address, 6)
+    executor = cluster_executor(cluster.address, 6)
     found = errors(executor, cluster_tasks.fail, tmp_path, *names)
     for name, sentence in [
         ("source", "drive.bag: is damaged. Copy it again."),
@@ -104,7 +97,9 @@ def test_errors_of_calls_are_told_and_not_tried_again(cluster: RealCluster, tmp_
 
 def test_a_function_that_the_cluster_lacks(tmp_path: Path) -> None:
     with RealCluster(tmp_path / "dask", workers=1, path=tmp_path) as cluster:
-        found = errors(ClusterExecutor(cluster.address, 2), cluster_tasks.write, tmp_path, "a", "b")
+        found = errors(
+            cluster_executor(cluster.address, 2), cluster_tasks.write, tmp_path, "a", "b"
+        )
     for error in found.values():
         assert "No module named 'cluster_tasks'" in str(error)
         assert "must have the same version of mp4ds" in str(error)
@@ -114,7 +109,7 @@ def test_a_function_that_the_cluster_lacks(tmp_path: Path) -> None:
 def test_an_error_of_the_caller_drops_what_waits_and_leaves_the_cluster(
     cluster: RealCluster, tmp_path: Path
 ) -> None:
-    with pytest.raises(KeyError), ClusterExecutor(cluster.address, 2) as executor:  # noqa: PT012
+    with pytest.raises(KeyError), cluster_executor(cluster.address, 2) as executor:  # noqa: PT012
         calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in numbered(50)]
         next(as_completed(calls)).result()
         raise KeyError
@@ -122,7 +117,7 @@ def test_an_error_of_the_caller_drops_what_waits_and_leaves_the_cluster(
     time.sleep(4 * cluster_tasks.SECONDS)
     assert len(started(tmp_path)) <= begun + 2  # those that workers had fetched
     (tmp_path / "next").mkdir()
-    executor = ClusterExecutor(cluster.address, 2)
+    executor = cluster_executor(cluster.address, 2)
     assert not errors(executor, cluster_tasks.write, tmp_path / "next", *numbered(4))
     assert cluster.scheduler.poll() is None
     assert all(worker.poll() is None for worker in cluster.workers)
@@ -132,7 +127,7 @@ def test_an_error_of_the_caller_drops_what_waits_and_leaves_the_cluster(
 
 
 def test_a_call_leaves_no_memory_behind(cluster: RealCluster, tmp_path: Path) -> None:
-    executor = ClusterExecutor(cluster.address, 4)
+    executor = cluster_executor(cluster.address, 4)
     assert not errors(executor, cluster_tasks.leave_large, tmp_path, *numbered(4))
     assert len(list(tmp_path.glob("*.freed"))) == 4
 
@@ -144,7 +139,7 @@ def test_calls_of_a_killed_worker_are_made_on_another(tmp_path: Path) -> None:
     names = numbered(8)
     with (
         RealCluster(tmp_path / "dask") as cluster,
-        ClusterExecutor(cluster.address, 8) as executor,
+        cluster_executor(cluster.address, 8) as executor,
     ):
         calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in names]
         next(as_completed(calls))
@@ -171,7 +166,7 @@ def test_a_call_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
     }
     # more workers than it kills: on a loaded machine a nanny may not bring one back
     with RealCluster(tmp_path / "dask", workers=4, arguments=WITH_NANNY, config=config) as cluster:
-        executor = ClusterExecutor(cluster.address, 7)
+        executor = cluster_executor(cluster.address, 7)
         found = errors(executor, cluster_tasks.die, tmp_path, "deadly", *numbered(6))
     assert set(found) == {"deadly"}
     assert re.search("2 different workers, but all those workers died", str(found["deadly"]))
@@ -182,7 +177,7 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
     names = numbered(8)
     with (
         RealCluster(tmp_path / "dask") as cluster,
-        ClusterExecutor(cluster.address, 8) as executor,
+        cluster_executor(cluster.address, 8) as executor,
     ):
         calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in names]
         next(as_completed(calls))
@@ -196,7 +191,7 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
     kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("0??")}
     assert 0 < len(kept) < len(names)
     with RealCluster(tmp_path / "dask-2", workers=1) as cluster:
-        executor = ClusterExecutor(cluster.address, 8)
+        executor = cluster_executor(cluster.address, 8)
         assert not errors(executor, cluster_tasks.write, tmp_path, *names)
     assert results(tmp_path).keys() >= set(names)
     assert all((tmp_path / name).stat().st_mtime_ns == kept[name] for name in kept)
@@ -210,7 +205,7 @@ def test_a_cluster_without_workers_is_given_up(
         RealCluster(tmp_path / "dask", workers=0) as cluster,
         dask.config.set({"mp4ds.worker-timeout": "1 s"}),
     ):
-        executor = ClusterExecutor(cluster.address, 1)
+        executor = cluster_executor(cluster.address, 1)
         found = errors(executor, cluster_tasks.write, tmp_path, "a")
         assert "has had no worker for 1 s. Start some, or find out" in str(found["a"])
 
@@ -218,7 +213,7 @@ def test_a_cluster_without_workers_is_given_up(
 def test_workers_may_come_late(tmp_path: Path) -> None:
     with (
         RealCluster(tmp_path / "dask", workers=0) as cluster,
-        ClusterExecutor(cluster.address, 1) as executor,
+        cluster_executor(cluster.address, 1) as executor,
     ):
         call = executor.submit(os.getpid)
         timer = threading.Timer(1, cluster.add_worker)
@@ -238,8 +233,11 @@ def test_workers_may_come_late(tmp_path: Path) -> None:
     ],
 )
 def test_other_addresses_are_refused(address: str) -> None:
-    with pytest.raises(OptionError, match=r"tcp://HOST:PORT .* slurm, pbs,"):
-        ClusterExecutor(address, 1)
+    with (
+        pytest.raises(OptionError, match=r"tcp://HOST:PORT .* slurm, pbs,"),
+        cluster_executor(address, 1),
+    ):
+        pass
 
 
 @pytest.mark.parametrize(
@@ -251,8 +249,11 @@ def test_a_missing_package_is_named(
     address: str, module: str, package: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(OptionError, match=rf"needs {package}.*pip install 'mp4ds\[cluster\]'"):
-        ClusterExecutor(address, 1)
+    with (
+        pytest.raises(OptionError, match=rf"needs {package}.*pip install 'mp4ds\[cluster\]'"),
+        cluster_executor(address, 1),
+    ):
+        pass
 
 
 @pytest.fixture
@@ -264,7 +265,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tcp://no-such-host.invalid:8786"])
 def test_nobody_at_the_address(address: str, tmp_path: Path) -> None:
     with pytest.raises(RemoteError, match="no Dask scheduler can be reached"):
-        errors(ClusterExecutor(address, 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor(address, 1), cluster_tasks.write, tmp_path, "a")
 
 
 @pytest.mark.usefixtures("impatient")
@@ -292,7 +293,7 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
         thread.start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(RemoteError, match=problem):
-            errors(ClusterExecutor(address, 1), cluster_tasks.write, tmp_path, "a")
+            errors(cluster_executor(address, 1), cluster_tasks.write, tmp_path, "a")
         thread.join()
     for connection in kept:
         connection.close()
@@ -300,7 +301,7 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
 
 def test_tls_needs_certificates(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="needs certificates"):
-        errors(ClusterExecutor("tls://127.0.0.1:1", 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor("tls://127.0.0.1:1", 1), cluster_tasks.write, tmp_path, "a")
 
 
 def is_alive(pid: int) -> bool:
@@ -362,17 +363,14 @@ def batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Batch]:
     until(lambda: not any(map(is_alive, system.numbers("jobs"))))
 
 
-def test_jobs_of_a_batch_system_make_the_calls(batch: Batch, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("calls", "jobs"), [(8, 2), pytest.param(1, 1, marks=pytest.mark.slow)])
+def test_jobs_of_a_batch_system_make_the_calls(
+    calls: int, jobs: int, batch: Batch, tmp_path: Path
+) -> None:
     with dask.config.set({"mp4ds.jobs": 2}):
-        executor = ClusterExecutor("slurm", 8)
-        assert not errors(executor, cluster_tasks.write, tmp_path, *numbered(8))
-    assert len(batch.numbers("jobs")) == 2
-
-
-@pytest.mark.slow
-def test_there_are_not_more_jobs_than_calls(batch: Batch, tmp_path: Path) -> None:
-    assert not errors(ClusterExecutor("slurm", 1), cluster_tasks.write, tmp_path, "a")
-    assert len(batch.numbers("jobs")) == 1
+        executor = cluster_executor("slurm", calls)
+        assert not errors(executor, cluster_tasks.write, tmp_path, *numbered(calls))
+    assert len(batch.numbers("jobs")) == jobs
 
 
 @pytest.mark.slow
@@ -380,7 +378,7 @@ def test_a_job_that_ended_is_submitted_again(
     batch: Batch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(access, "_LOOK_SECONDS", 0.5)
-    with dask.config.set({"mp4ds.jobs": 1}), ClusterExecutor("slurm", 6) as executor:
+    with dask.config.set({"mp4ds.jobs": 1}), cluster_executor("slurm", 6) as executor:
         calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in numbered(6)]
         next(as_completed(calls))
         os.killpg(batch.numbers("jobs")[0], signal.SIGKILL)
@@ -391,7 +389,7 @@ def test_a_job_that_ended_is_submitted_again(
 def test_what_the_batch_system_refuses_is_told(batch: Batch, tmp_path: Path) -> None:
     (batch.folder / "refuse").touch()
     with pytest.raises(RemoteError, match=r"could not be submitted.*invalid partition specified"):
-        errors(ClusterExecutor("slurm", 2), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor("slurm", 2), cluster_tasks.write, tmp_path, "a")
 
 
 @pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
@@ -405,13 +403,13 @@ def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
     }
     named = {f"jobqueue.{system}.{name}": value for name, value in settings.items()}
     with dask.config.set(named), pytest.raises(RemoteError, match="could not be submitted"):
-        errors(ClusterExecutor(system, 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor(system, 1), cluster_tasks.write, tmp_path, "a")
 
 
 @pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
 def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=rf"`cluster` {system}: .*jobqueue.yaml"):
-        errors(ClusterExecutor(system, 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor(system, 1), cluster_tasks.write, tmp_path, "a")
 
 
 @pytest.mark.parametrize(
@@ -423,4 +421,4 @@ def test_settings_are_checked(
     name: str, value: object, variable: str, batch: Batch, tmp_path: Path
 ) -> None:
     with dask.config.set({name: value}), pytest.raises(OptionError, match=variable):
-        errors(ClusterExecutor("slurm", 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor("slurm", 1), cluster_tasks.write, tmp_path, "a")

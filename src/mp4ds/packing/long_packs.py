@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -343,7 +343,7 @@ def _claimed(packs: Sequence[PartedPack], *, alone: bool) -> Iterator[None]:
 
 def pack_parts(
     packs: Sequence[PartedPack],
-    executor: Executor,
+    executor: AbstractContextManager[Executor],
     options: PackOptions,
     share: tuple[int, int] | None = None,
 ) -> Iterator[PackSummary]:
@@ -351,7 +351,7 @@ def pack_parts(
 
     Args:
         packs: The recordings.
-        executor: Packs the pieces; is shut down.
+        executor: Opens what packs the pieces.
         options: How.
         share: Which share of the pieces to pack, from 1, and the number of shares; None to pack
             all, and to make the datasets.
@@ -364,7 +364,7 @@ def pack_parts(
         RemoteError: The cluster was lost.
     """
     number, shares = share or (1, 1)
-    with _claimed(packs, alone=share is None), executor, ExitStack() as stack:
+    with _claimed(packs, alone=share is None), executor as workers, ExitStack() as stack:
         for pack in packs:
             pack.begin(anew=options.restart, alone=share is None)
             if options.join:
@@ -374,14 +374,14 @@ def pack_parts(
         for pack in packs:
             sources = pack.plan.hashed if share is None else []
             digests[pack.target] = {
-                source.path: executor.submit(digest_source, source) for source in sources
+                source.path: workers.submit(digest_source, source) for source in sources
             }
             calls.update((call, (pack, None)) for call in digests[pack.target].values())
             packer = stack.enter_context(closing(PartPacker(pack.plan, pack.folder.path)))
             missing = pack.missing
             for piece in pack.plan.pieces[number - 1 :: shares]:
                 if piece in missing:
-                    calls[executor.submit(packer, piece)] = pack, piece
+                    calls[workers.submit(packer, piece)] = pack, piece
             pack.tell(now=True)  # so that all work is known from the beginning
         left = Counter(pack.target for pack, _ in calls.values())
         ready = [pack for pack in packs if not left[pack.target]]

@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -556,11 +557,13 @@ def _bytes_a_pixel(plan: TrackPlan) -> int:
     return 60 if plan.coding.recipe.lossless else 300
 
 
-def _executor(packs: Sequence[PartedPack], options: PackOptions) -> Executor:
+def _executor(
+    packs: Sequence[PartedPack], options: PackOptions
+) -> AbstractContextManager[Executor]:
     """What packs the pieces."""
     if options.cluster:
         pieces = sum(len(pack.plan.pieces) for pack in packs)
-        executor: Executor = plugin("cluster")(options.cluster, pieces)
+        executor: AbstractContextManager[Executor] = plugin("cluster")(options.cluster, pieces)
         return executor
     return ProcessExecutor(min(_processes_for(pack.plan) for pack in packs))
 

@@ -635,7 +635,7 @@ def _samples(
 
 _PLUGINS = {
     "images": "importing.layouts:open_images",
-    "cluster": "cluster:ClusterExecutor",
+    "cluster": "cluster:cluster_executor",
 }
 """What the core asks for -> module of `mp4ds.plugins`, and its name there."""
 

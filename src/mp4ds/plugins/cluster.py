@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, InvalidStateError, ThreadPoolExecutor
-from concurrent.futures import wait as wait_for
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
@@ -48,17 +47,16 @@ _IS_IT_RUNNING = "Check whether it is still running."
 _GO_ON = "Finished work is kept: run the same command again to resume."
 
 
-class ClusterExecutor(Executor):
-    """Makes each call on a worker of a Dask cluster, which imports what is called by its name.
+@contextmanager
+def cluster_executor(address: str, calls: int) -> Iterator[Executor]:
+    """Connect to a Dask cluster; leaving with an exception drops the calls that wait.
 
-    It is connected at the first call and stays so: batch jobs, which may have had to queue, serve
-    all calls. A call whose worker dies is made on another one, as often as the scheduler's
+    Each call is made on a worker, which imports what is called by its name. A call whose worker
+    dies is made on another one, as often as the scheduler's
     ``distributed.scheduler.allowed-failures`` allows; one that raises is not. If the connection
-    breaks, or the cluster has no workers for long, all calls fail with a `RemoteError`.
-
-    A context manager: leaving it with an exception drops waiting calls; on a cluster that keeps
-    running, running calls finish, since a worker's thread cannot be stopped from outside. Whatever
-    was started for it ends with it.
+    breaks, or the cluster has no workers for long, all calls fail with a `RemoteError`. On a
+    cluster that keeps running, running calls finish: nothing can stop a thread of a worker from
+    outside. Whatever was started for the calls ends with them.
 
     Args:
         address: ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` of a scheduler, which is left as it
@@ -67,29 +65,62 @@ class ClusterExecutor(Executor):
         calls: Maximum number of parallel calls.
 
     Raises:
-        OptionError: The address has none of these forms, or a package is missing.
+        OptionError: The address has none of these forms, a package is missing, or the
+            configuration of Dask lacks something.
+        RemoteError: No scheduler responds within 15 s, or the batch system refuses the jobs.
+    """
+    _check_address(address)
+    from distributed import Client
+    from distributed.utils import silence_logging_cmgr
+
+    is_batch = address in BATCH_SYSTEMS
+    patience = _patience(_BATCH_WORKER_SECONDS if is_batch else _WORKER_SECONDS)
+    with ExitStack() as stack:
+        stack.enter_context(silence_logging_cmgr(logging.CRITICAL))  # what matters is raised
+        place: Any = address
+        jobs = 0
+        if is_batch:
+            jobs = min(calls, _most_jobs())
+            place = stack.enter_context(_batch_cluster(address, jobs))
+        else:
+            _check_scheduler(address)
+        try:
+            client = Client(place, timeout=_CONNECT_SECONDS, set_as_default=False)
+        except (OSError, ImportError) as error:
+            raise _unreachable(address, error) from None
+        # a scheduler drops the waiting calls of a client that leaves
+        executor = _ClientExecutor(stack.enter_context(client), address)
+
+        def refill() -> None:
+            if is_batch:
+                _submit_jobs(place, jobs)  # what is refused now may be accepted next time
+
+        watch = threading.Thread(target=executor.watch, args=(patience, refill), daemon=True)
+        watch.start()
+        stack.callback(watch.join)
+        stack.callback(executor.closed.set)
+        yield executor
+
+
+class _ClientExecutor(Executor):
+    """Makes calls by a client. Dask's own executor waits for ever when a connection breaks.
+
+    Attributes:
+        closed: Set when calls are no longer of interest.
     """
 
-    def __init__(self, address: str, calls: int) -> None:
-        _check_address(address)
-        self._address = address
-        self._most = calls
-        self._stack = ExitStack()
-        self._client: Client | None = None
+    def __init__(self, client: Client, address: str) -> None:
+        self._client, self._address = client, address
         self._calls: dict[Future[Any], Any] = {}  # -> Dask's; what nobody holds is not made
-        self._closed = threading.Event()
         self._lost: RemoteError | None = None
+        self.closed = threading.Event()
 
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Make a call on a worker.
 
         Raises:
-            RemoteError: No scheduler responds within 15 s, the batch system refuses the jobs, or
-                the cluster was lost.
-            OptionError: The configuration of Dask lacks something.
+            RemoteError: The cluster was lost.
         """
-        if self._client is None:
-            self._client = self._stack.enter_context(self._connected())
         if self._lost is not None:
             raise self._lost
         call: Future[_T] = Future()
@@ -99,62 +130,9 @@ class ClusterExecutor(Executor):
         theirs.add_done_callback(partial(self._hand_on, call))
         return call
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more calls.
-
-        Args:
-            wait: Wait for those that were taken.
-            cancel_futures: Drop them.
-        """
-        if cancel_futures:
-            for call in list(self._calls):
-                call.cancel()
-        elif wait:
-            wait_for(self._calls)
-        self._closed.set()
-        self._client = None
-        self._stack.close()  # a scheduler drops the waiting calls of a client that leaves
-
-    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
-        self.shutdown(cancel_futures=exc_type is not None)
-
-    @contextmanager
-    def _connected(self) -> Iterator[Client]:
-        from distributed import Client
-        from distributed.utils import silence_logging_cmgr
-
-        is_batch = self._address in BATCH_SYSTEMS
-        patience = _patience(_BATCH_WORKER_SECONDS if is_batch else _WORKER_SECONDS)
-        with ExitStack() as stack:
-            stack.enter_context(silence_logging_cmgr(logging.CRITICAL))  # what matters is raised
-            place: Any = self._address
-            jobs = 0
-            if is_batch:
-                jobs = min(self._most, _most_jobs())
-                place = stack.enter_context(_batch_cluster(self._address, jobs))
-            else:
-                _check_scheduler(place)
-            try:
-                client = Client(place, timeout=_CONNECT_SECONDS, set_as_default=False)
-            except (OSError, ImportError) as error:
-                raise _unreachable(self._address, error) from None
-            stack.enter_context(client)
-
-            def refill() -> None:
-                if is_batch:
-                    _submit_jobs(place, jobs)  # what is refused now may be accepted next time
-
-            watch = threading.Thread(
-                target=self._watch, args=(client, patience, refill), daemon=True
-            )
-            watch.start()
-            stack.callback(watch.join)
-            stack.callback(self._closed.set)
-            yield client
-
     def _hand_on(self, call: Future[Any], theirs: Any) -> None:
         """Give a call what Dask's future has; in a thread of the client."""
-        if self._closed.is_set() or call.cancelled():
+        if self.closed.is_set() or call.cancelled():
             return
         result, failure = None, None
         try:
@@ -186,26 +164,23 @@ class ClusterExecutor(Executor):
             with suppress(InvalidStateError):  # it is done
                 call.set_exception(self._lost)
 
-    def _watch(self, client: Client, patience: float, refill: Callable[[], None]) -> None:
+    def watch(self, patience: float, refill: Callable[[], None]) -> None:
         """Detect that calls will never be made; in a thread."""
         seen = time.monotonic()
-        while not self._closed.wait(_LOOK_SECONDS) and self._lost is None:
-            if client.status in ("closing", "closed"):
+        while not self.closed.wait(_LOOK_SECONDS) and self._lost is None:
+            if self._client.status in ("closing", "closed"):
                 self._fail(_DROPPED, _IS_IT_RUNNING)
-                return
-            if client.status != "running":
-                continue  # it reconnects, or gives up
-            is_waiting = any(not call.done() for call in list(self._calls))
-            if is_waiting:
-                refill()
-            has_workers = False
-            with suppress(OSError):  # unknown
-                has_workers = bool(client.nthreads())
-            if has_workers or not is_waiting:
-                seen = time.monotonic()
-            elif time.monotonic() - seen >= patience:
-                problem = f"has had no worker for {patience:g} s"
-                self._fail(problem, "Start some, or find out why they ended.")
+            elif self._client.status == "running":  # otherwise it reconnects, or gives up
+                if self._calls:
+                    refill()
+                has_workers = False
+                with suppress(OSError):  # unknown
+                    has_workers = bool(self._client.nthreads())
+                if has_workers or not self._calls:
+                    seen = time.monotonic()
+                elif time.monotonic() - seen >= patience:
+                    problem = f"has had no worker for {patience:g} s"
+                    self._fail(problem, "Start some, or find out why they ended.")
 
 
 def _attempt(call: Callable[[], _T]) -> _T:
