@@ -264,24 +264,24 @@ def test_every_kind_of_source(kind: str, tmp_path: Path) -> None:
         ("rgb8", 97, "h264", "ultrafast"),
         ("rgb8", 96, "av1", "12"),
         ("rgb8", 96, "h265", "ultrafast"),
+        ("jpeg-420", 96, "h264", "ultrafast"),
     ],
 )
 def test_the_videos_are_those_of_a_pack(
     encoding: str, width: int, codec: str, preset: str, tmp_path: Path
 ) -> None:
     """To the byte of their packets: a recommendation can be packed with."""
-    path = recording(tmp_path, encoding, width=width)
+    is_jpeg = encoding in CODED
+    path = tmp_path / "drive.bag"
+    write_bag(path, CODED[encoding]() if is_jpeg else camera_scene(encoding, width=width))
     options = replace(QUICK, codecs=[codec], presets=[preset])
     (camera,) = evaluate(path, options, output=tmp_path / "out").cameras
-    assert camera.clip.image_size == (width, 64)
-    packing = PackOptions(quality="crf=24", codec=codec, preset=preset, jobs=1)
+    assert is_jpeg or camera.clip.image_size == (width, 64)
+    assert any("--transcode" in note for note in camera.notes) == is_jpeg
+    packing = PackOptions(quality="crf=24", codec=codec, preset=preset, jobs=1, transcode=is_jpeg)
     mp4ds.pack(path, tmp_path / "drive", packing)
-    assert packet_bytes(tmp_path / "drive" / "cam_image_raw.mp4") == camera.cells[0].size
-
-
-def test_cameras_that_are_no_light_are_left_out(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=f"{TOPIC} has mono16 images"):
-        evaluate(recording(tmp_path, "mono16"), QUICK, output=tmp_path / "out")
+    (video,) = (tmp_path / "drive").glob("*.mp4")
+    assert packet_bytes(video) == camera.cells[0].size
 
 
 def test_a_setting_that_cannot_be_tried_is_told(tmp_path: Path) -> None:
@@ -293,20 +293,21 @@ def test_a_setting_that_cannot_be_tried_is_told(tmp_path: Path) -> None:
     assert any("h265 ultrafast crf 24" in note and "48x64" in note for note in camera.notes)
 
 
-def test_topics_are_chosen(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="matches no topic"):
-        evaluate(recording(tmp_path), replace(QUICK, topics=["/none"]), output=tmp_path / "out")
-    with pytest.raises(SourceError, match="no camera"):
-        evaluate(
-            tmp_path / "source" / "drive.bag",
-            replace(QUICK, exclude=["*"]),
-            output=tmp_path / "out",
-        )
-
-
-def test_nothing_to_evaluate(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="no such file"):
-        evaluate(tmp_path / "none.bag", QUICK, output=tmp_path / "out")
+@pytest.mark.parametrize(
+    ("encoding", "changed", "said"),
+    [
+        ("mono16", {}, f"{TOPIC} has mono16 images"),
+        ("rgb8", {"topics": ["/none"]}, "matches no topic"),
+        ("rgb8", {"exclude": ["*"]}, "no camera"),
+        ("", {}, "no such file"),
+    ],
+)
+def test_nothing_to_evaluate(
+    encoding: str, changed: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    source = recording(tmp_path, encoding) if encoding else tmp_path / "none.bag"
+    with pytest.raises((OptionError, SourceError), match=said):
+        evaluate(source, replace(QUICK, **changed), output=tmp_path / "out")
 
 
 def encoded(name: str) -> Scene:
@@ -349,19 +350,6 @@ def test_all_that_cameras_send_is_tried_or_told(
         assert all(f"has {name} images" in sentence for sentence in said)
     if name.startswith(("depth-", "video-")):
         assert said
-
-
-def test_jpeg_files_are_packed_anew(tmp_path: Path) -> None:
-    path = tmp_path / "drive.bag"
-    write_bag(path, CODED["jpeg-420"]())
-    (camera,) = evaluate(path, QUICK, output=tmp_path / "out").cameras
-    assert any("--transcode" in note for note in camera.notes)
-    options = PackOptions(
-        quality="crf=24", codec="h264", preset="ultrafast", jobs=1, transcode=True
-    )  # fmt: skip
-    mp4ds.pack(path, tmp_path / "drive", options)
-    (video,) = (tmp_path / "drive").glob("*.mp4")
-    assert packet_bytes(video) == camera.cells[0].size
 
 
 # ---------------------------------------------------------------- the demo, looked over
@@ -489,27 +477,23 @@ def test_the_same_again_tries_nothing(whole: Evaluation, bag: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_larger_grid_tries_what_is_new(tmp_path: Path) -> None:
+def test_what_is_new_or_damaged_is_tried(tmp_path: Path) -> None:
     path = recording(tmp_path)
-    first = evaluate(path, QUICK, output=tmp_path / "out")
-    assert (first.tried, first.known) == (1, 0)
-    more = evaluate(path, replace(QUICK, crf=["24", "30"]), output=tmp_path / "out")
-    assert (more.tried, more.known) == (1, 1)
-    assert more.cameras[0].cells[0] == first.cameras[0].cells[0]
-    other = evaluate(path, replace(QUICK, frames=8), output=tmp_path / "out")
-    assert (other.tried, other.known) == (1, 0)
 
+    def counts(**changed: Any) -> tuple[int, int]:
+        result = evaluate(path, replace(QUICK, **changed), output=tmp_path / "out")
+        sizes.append(result.cameras[0].cells[0].size)
+        return result.tried, result.known
 
-@pytest.mark.slow
-def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
-    path = recording(tmp_path)
-    first = evaluate(path, QUICK, output=tmp_path / "out")
-    (result,) = (tmp_path / "out" / "cells").iterdir()
-    for damaged in ("[1", json.dumps({**json.loads(result.read_text()), "size": "large"})):
-        result.write_text(damaged)
-        again = evaluate(path, QUICK, output=tmp_path / "out")
-        assert (again.tried, again.known) == (1, 0)
-        assert again.cameras[0].cells[0].size == first.cameras[0].cells[0].size
+    sizes: list[int] = []
+    assert counts() == (1, 0)
+    (known,) = (tmp_path / "out" / "cells").iterdir()
+    assert counts(crf=["24", "30"]) == (1, 1)
+    for damaged in ("[1", json.dumps({**json.loads(known.read_text()), "size": "large"})):
+        known.write_text(damaged)
+        assert counts() == (1, 0)
+    assert len(set(sizes)) == 1
+    assert counts(frames=8) == (1, 0)
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
@@ -627,31 +611,16 @@ def test_the_page_fits_the_window(width: int, whole: Evaluation, tmp_path: Path)
         assert tab.evaluate(f"{cut}.length") == 0
 
 
-def commands_in(name: str) -> list[str]:
-    text = (ROOT / "docs" / name).read_text()
-    blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
-    return [line for block in blocks for line in block.splitlines() if line.startswith("mp4ds ")]
-
-
 @pytest.mark.slow
 @needs_vmaf
 def test_the_commands_of_the_page(tmp_path: Path) -> None:
-    lines = commands_in("evaluate.md")
+    text = (ROOT / "docs" / "evaluate.md").read_text()
+    shells = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
+    lines = re.findall(r"^mp4ds .*", shells, re.MULTILINE)
     assert sum(line.startswith("mp4ds evaluate ") for line in lines) == 2
     for line in lines:
         done = typed(line, tmp_path)
         assert done.code == 0, done.err
-    text = (ROOT / "docs" / "evaluate.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     out = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, text=True)
     assert out.count("av1 12 crf 24") == 2
-
-
-@needs_vmaf
-def test_the_commands_of_the_paper_are_understood(tmp_path: Path) -> None:
-    lines = commands_in("paper.md")
-    assert len(lines) == 3
-    for line in lines:
-        done = typed(line, tmp_path)
-        assert done.code == 2
-        assert re.fullmatch(r"mp4ds: drive\S+: no such file or folder. Check the path.\n", done.err)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,11 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
-from mcap_protobuf.schema import build_file_descriptor_set
 
 import mp4ds
 from commands import call
@@ -91,23 +87,18 @@ def check_focused(camera: CameraCalibrations, made: Scene) -> None:
         assert (item.binning, item.roi, item.k_effective, item.p_effective) == (None,) * 4
 
 
-@pytest.mark.parametrize("source", SOME_SOURCES)
+@pytest.mark.parametrize("source", [*SOME_SOURCES, *FOXGLOVE_SOURCES])
 def test_recordings_of_every_kind(source: str, tmp_path: Path) -> None:
-    made = focused(scene("mono8"))
-    path = SOURCES[source](tmp_path, made)[0]
+    topics = "/cam/image_raw", "/cam/camera_info"
+    made, write = focused(scene("mono8")), {**SOURCES, **FOXGLOVE_SOURCES}[source]
+    if source in FOXGLOVE_SOURCES:
+        topics = "/camera/image", "/camera/calibration"
+        made = focused(foxglove_scene(partial(scene, "mono8"), frames=8, width=64, height=48))
+    camera = camera_of(intrinsics(write(tmp_path, made)[0]))
     if source == "bag-split":  # one part has the calibrations of its own messages
-        assert camera_of(intrinsics(path)).calibrations[0].message == 0
+        assert camera.calibrations[0].message == 0
         return
-    camera = camera_of(intrinsics(path))
-    assert (camera.topic, camera.info_topic) == ("/cam/image_raw", "/cam/camera_info")
-    check_focused(camera, made)
-
-
-@pytest.mark.parametrize("source", FOXGLOVE_SOURCES)
-def test_recordings_of_foxglove(source: str, tmp_path: Path) -> None:
-    made = focused(foxglove_scene(partial(scene, "mono8"), frames=8, width=64, height=48))
-    camera = camera_of(intrinsics(FOXGLOVE_SOURCES[source](tmp_path, made)[0]))
-    assert (camera.topic, camera.info_topic) == ("/camera/image", "/camera/calibration")
+    assert (camera.topic, camera.info_topic) == topics
     check_focused(camera, made)
 
 
@@ -194,30 +185,6 @@ def test_static_transforms_of_a_recording(source: str, tmp_path: Path) -> None:
     moving.mkdir()
     path = SOURCES[source](moving, Scene([transforms(LINKS, "/tf"), *made.messages]))[0]
     assert intrinsics(path).transforms == []
-
-
-def test_static_transforms_of_foxglove(tmp_path: Path) -> None:
-    message = FrameTransforms()
-    for parent, child, translation, rotation in LINKS:
-        item = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
-        for part, values in ((item.translation, translation), (item.rotation, rotation)):
-            for name, value in zip("xyzw", values, strict=False):
-                setattr(part, name, value)
-    write_mcap(tmp_path / "images.mcap", scene("mono8"), profile="ros2")
-    with (tmp_path / "drive.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        data = build_file_descriptor_set(FrameTransforms).SerializeToString()
-        schema = writer.register_schema("foxglove.FrameTransforms", "protobuf", data)
-        topic = writer.register_channel("/tf_static", "protobuf", schema)
-        writer.add_message(topic, START, message.SerializeToString(), START)
-        made = scene("mono8")
-        record = infos(made)[0]
-        schema = writer.register_schema("sensor_msgs/msg/CameraInfo", "ros2msg", b"")
-        topic = writer.register_channel("/cam/camera_info", "cdr", schema)
-        writer.add_message(topic, START, record.payload("cdr"), START)
-        writer.finish()  # type: ignore[no-untyped-call]
-    assert intrinsics(tmp_path / "drive.mcap").transforms == PATH
 
 
 # ---------------------------------------------------------------- effective K
@@ -326,18 +293,6 @@ def test_what_is_printed_is_python_for_opencv(packed: bool, tmp_path: Path) -> N
         names["K"], names["D"], names["R"], names["P"], (64, 48), cv2.CV_32FC1
     )
     assert maps[0].shape == (48, 64)
-
-
-def test_json(tmp_path: Path) -> None:
-    path = SOURCES["bag-none"](tmp_path, focused(scene("mono8")))[0]
-    result = json.loads(command(path, "--json")[0])
-    assert result["kind"] == "bag"
-    (camera,) = result["cameras"]
-    assert camera["topic"] == "/cam/image_raw"
-    assert camera["sizes"] == [[64, 48]]
-    listed = camera_of(intrinsics(path)).calibrations
-    assert [item["k"] for item in camera["calibrations"]] == [item.k for item in listed]
-    assert [item["message"] for item in camera["calibrations"]] == CHANGES
 
 
 def test_nothing_that_a_recording_says_becomes_code(tmp_path: Path) -> None:
