@@ -43,22 +43,6 @@ def two_cameras(*, second: str = "16UC1", names: tuple[str, str] = (COLOUR, DEPT
     return Scene(sorted([*first, *others], key=lambda message: message.log_time))
 
 
-def many_cameras(count: int, *, stampless: int) -> Scene:
-    """Small cameras with long names, of which one has no stamps."""
-    size: dict[str, Any] = {"frames": FRAMES, "width": 64, "height": 48, "noisy": False}
-    found = []
-    for number in range(count):
-        topic = f"/sensors/camera_array/camera_{number:02}/image_raw"
-        for message in scene("mono8", **size, with_info=False, seed=number).messages:
-            if message.topic != "/cam/image_raw":
-                continue
-            header = message.values["header"]
-            stamp = 0 if number == stampless else header["stamp"] + number * 700_000
-            values = {**message.values, "header": {**header, "stamp": stamp}}
-            found.append(replace(message, topic=topic, values=values))
-    return Scene(sorted(found, key=lambda message: message.log_time))
-
-
 def _moved(message: Record, topic: str, to: str) -> Record:
     return replace(message, topic=to) if message.topic == topic else message
 

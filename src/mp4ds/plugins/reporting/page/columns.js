@@ -9,32 +9,12 @@ var mp4dsColumns = (() => {
 
   /** A column as written by mp4ds.plugins.reporting.cameras.pack_column: a BigInt64Array of `count` values. */
   function decode(packed, count) {
-    const bytes = bytesOf(packed.values), out = new BigInt64Array(count);
-    const step = BigInt(packed.step);
-    let value = BigInt(packed.start), place = 0;
-    out[0] = value;
-    for (let i = 1; i < count; i++) {
-      let number = 0, scale = 1, groups = 0, byte = bytes[place++];
-      while (byte >= 128 && groups < 6) {  // up to 49 bits a number is exact
-        number += (byte - 128) * scale;
-        scale *= 128;
-        groups++;
-        byte = bytes[place++];
-      }
-      let residual;
-      if (byte < 128) {
-        number += byte * scale;
-        residual = BigInt(number % 2 ? -(number + 1) / 2 : number / 2);
-      } else {
-        let big = BigInt(number), shift = 42n;
-        for (; byte >= 128; byte = bytes[place++], shift += 7n) big += BigInt(byte - 128) << shift;
-        big += BigInt(byte) << shift;
-        residual = big & 1n ? -((big + 1n) >> 1n) : big >> 1n;
-      }
-      out[i] = value += step + residual;
-      if (value !== out[i]) value = out[i];  // modulo 2^64
-    }
-    if (place !== bytes.length) throw new Error("a column has the wrong length");
+    const Kind = {1: Int8Array, 2: Int16Array, 4: Int32Array, 8: BigInt64Array}[packed.size];
+    const residuals = new Kind(bytesOf(packed.values).buffer), step = BigInt(packed.step);
+    if (residuals.length !== count - 1) throw new Error("a column has the wrong length");
+    const out = new BigInt64Array(count);
+    out[0] = BigInt(packed.start);
+    for (let i = 1; i < count; i++) out[i] = out[i - 1] + step + BigInt(residuals[i - 1]);  // modulo 2^64
     return out;
   }
 
