@@ -16,6 +16,7 @@ from typing import Any
 import mcap.records as records
 import pytest
 import yaml
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
@@ -441,21 +442,22 @@ def test_pixels_of_big_endian_cdr_and_compressed_images() -> None:
 
 
 def test_pixels_of_protobuf_are_found_by_name() -> None:
-    def entry(number: int, raw: bytes) -> bytes:
-        return bytes([number << 3 | 2, len(raw)]) + raw
-
-    told = entry(1, b"data") + bytes([3 << 3, 9])
-    message = entry(1, b"RawImage") + entry(2, entry(1, b"width") + bytes([3 << 3, 2]))
-    file = entry(2, b"foxglove") + entry(4, message + entry(2, told))
-    channel = digests.Channel(
-        "/t", "foxglove.RawImage", "protobuf", ("protobuf", entry(1, file)), ()
-    )
+    files = FileDescriptorSet()
+    message = files.file.add(name="a.proto", package="foxglove").message_type.add(name="RawImage")
+    message.field.add(name="width", number=2, label=1, type=13)
+    message.field.add(name="data", number=9, label=1, type=12)
+    definition = "protobuf", files.SerializeToString()
+    channel = digests.Channel("/t", "foxglove.RawImage", "protobuf", definition, ())
     digester = digests.Digester(ignore=["/t"])
-    plain, pixels, width = (
-        digester.digest(channel, bytes([2 << 3, w]) + entry(9, data) + entry(7, b"cam"))
-        for w, data in ((4, b"abcd"), (4, b"xyz"), (5, b"abcd"))
+    plain, pixels, width, unknown = (
+        digester.digest(channel, bytes([2 << 3, w, 9 << 3 | 2, len(data)]) + data + rest)
+        for w, data, rest in (
+            *((4, b"abcd", b"\x38\1"), (4, b"xyz", b"\x38\1")),
+            *((5, b"abcd", b"\x38\1"), (4, b"abcd", b"\x38\2")),
+        )
     )
-    assert plain == pixels != width
+    assert plain == pixels
+    assert len({plain, width, unknown}) == 3
 
 
 def test_ignored_pixels_of_whole_recordings(tmp_path: Path) -> None:

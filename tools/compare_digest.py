@@ -12,6 +12,8 @@ from typing import Any, cast
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
@@ -44,29 +46,20 @@ class Digester:
     def digest(self, channel: Channel, payload: bytes) -> bytes:
         """Digest of what has to be equal."""
         pixels_ignored = any(fnmatch.fnmatchcase(channel.topic, glob) for glob in self.ignore)
-        parts: Iterable[bytes | memoryview] = (payload,)
+        parts: Iterable[bytes] = (payload,)
         if channel.topic in self.crossed:
-            parts = self._fields(channel, payload, skip_data=pixels_ignored)
-        elif pixels_ignored:
             try:
-                parts = list(without_pixels(channel, payload))
-            except (struct.error, IndexError):
-                parts = (payload,)  # a damaged image has no pixels to leave out
+                # a list: what goes wrong is to go wrong here
+                parts = list(field_bytes(decoded(channel, payload), skip_data=pixels_ignored))
+            except Exception:  # whatever the generated deserialiser trips over
+                self.undecodable.add(channel.topic)
+                parts = (channel.encoding.encode(), payload)
+        elif pixels_ignored:
+            parts = without_pixels(channel, payload)
         summary = hashlib.blake2b(digest_size=16)
         for part in parts:
             summary.update(part)
         return summary.digest()
-
-    def _fields(self, channel: Channel, payload: bytes, *, skip_data: bool) -> Iterator[bytes]:
-        name = ros2_name(channel.type)
-        try:
-            store = typestore(channel.type, channel.encoding, channel.definition)
-            decode = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
-            # a list: what goes wrong is to go wrong here
-            return iter(list(field_bytes(decode(payload, name), skip_data=skip_data)))
-        except Exception:  # whatever the generated deserialiser trips over
-            self.undecodable.add(channel.topic)
-            return iter((channel.encoding.encode(), payload))
 
 
 def ros2_name(name: str) -> str:
@@ -93,6 +86,13 @@ def typestore(of: str, encoding: str, definition: tuple[str, bytes] | None) -> A
     return store
 
 
+def decoded(channel: Channel, payload: bytes) -> Any:
+    """A message of ROS as an object."""
+    store = typestore(channel.type, channel.encoding, channel.definition)
+    decode = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
+    return decode(payload, ros2_name(channel.type))
+
+
 def field_bytes(value: Any, *, skip_data: bool = False) -> Iterator[bytes]:
     """The values of a deserialised message, the same for ROS 1 and ROS 2."""
     if hasattr(value, "__msgtype__"):
@@ -116,74 +116,26 @@ def field_bytes(value: Any, *, skip_data: bool = False) -> Iterator[bytes]:
         yield (value if isinstance(value, str) else str(int(value))).encode() + b";"
 
 
-def without_pixels(channel: Channel, payload: bytes) -> Iterator[bytes | memoryview]:
+def without_pixels(channel: Channel, payload: bytes) -> tuple[bytes, ...]:
     """An image message's bytes around its pixels; a compressed one's also without their length."""
-    view, short = memoryview(payload), channel.type.replace("/msg/", "/")
+    short = channel.type.replace("/msg/", "/")
     if channel.encoding == "protobuf" and channel.definition:
-        number = data_field_number(channel.definition[1], channel.type)
-        return (view[a:b] for n, _, a, b in protobuf_fields(payload) if n != number)
+        message = protobuf_type(channel.definition[1], channel.type).FromString(payload)
+        message.ClearField("data")
+        return (message.SerializeToString(deterministic=True),)
     if channel.encoding not in ("ros1", "cdr") or short not in IMAGES:
         raise ValueError(f"topic {channel.topic}: pixels of {channel.type} cannot be ignored")
-    base = 4 if channel.encoding == "cdr" else 0
-    order = ">" if base and payload[1] == 0 else "<"
-    at = base
-
-    def number32() -> int:
-        nonlocal at
-        at += (base - at) % 4 if base else 0
-        (value,) = struct.unpack_from(order + "I", payload, at)
-        at += 4
-        return int(value)
-
-    def skip_text() -> None:
-        nonlocal at
-        size = number32()
-        at += size
-
-    for _ in range(2 if base else 3):
-        number32()  # seq and stamp
-    skip_text()  # frame_id
-    if short == IMAGES[0]:
-        number32()  # height
-        number32()  # width
-    skip_text()  # encoding or format
-    if short == IMAGES[0]:
-        at += 1  # is_bigendian
-        number32()  # step
-    size = number32()
-    head = at if short == IMAGES[0] else at - 4
-    return iter((view[:head], view[at + size :]))
+    try:
+        head, _, tail = payload.rpartition(decoded(channel, payload).data.tobytes())
+    except Exception:  # a damaged image has no pixels to leave out
+        return (payload,)
+    return (head if short == IMAGES[0] else head[:-4], tail)
 
 
-def protobuf_fields(data: bytes) -> Iterator[tuple[int, int, int, int]]:
-    """Number, start of value, start and end of each field at the top level of a message."""
-    at = 0
-
-    def varint() -> int:
-        nonlocal at
-        value = shift = 0
-        while True:
-            byte = data[at]
-            value |= (byte & 0x7F) << shift
-            at, shift = at + 1, shift + 7
-            if byte < 0x80:
-                return value
-
-    while at < len(data):
-        start = at
-        tag = varint()
-        size = {1: 8, 5: 4}.get(tag & 7, 0)
-        if tag & 7 in (0, 2):
-            size = varint()
-        value = at
-        at += size if tag & 7 else 0
-        yield tag >> 3, value, start, at
-
-
-def data_field_number(descriptor_set: bytes, type_name: str) -> int:
-    """Number of the field ``data`` of a message, which a schema may choose freely."""
+@lru_cache
+def protobuf_type(descriptor_set: bytes, name: str) -> Any:
+    """The class of a message, as a recording defines it."""
+    pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(descriptor_set).file:
-        for message in file.message_type:
-            if f"{file.package}.{message.name}" == type_name:
-                return next(field.number for field in message.field if field.name == "data")
-    raise ValueError(f"{type_name} has no definition")
+        pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName(name))
