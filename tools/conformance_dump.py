@@ -33,16 +33,11 @@ from mp4ds.format.sidecars import MANIFEST_NAME, THE_TOP
 from mp4ds.records import Attachment, Message, MetadataRecord
 from mp4ds.video.packets import PacketReader
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / "conformance"))
+
+from images import planes_of
+
 Values = dict[str, Any]
-# places of green, blue, red and alpha in a pixel of packed formats
-_PACKED = {
-    "rgb24": (1, 2, 0),
-    "bgr24": (1, 0, 2),
-    "rgb0": (1, 2, 0),
-    "bgr0": (1, 0, 2),
-    "rgba": (1, 2, 0, 3),
-    "bgra": (1, 0, 2, 3),
-}
 
 
 def as_json(values: Values) -> str:
@@ -204,10 +199,11 @@ def _planes(stream: Stream) -> Values | None:
     if video.codec == "mjpeg":
         return None
     formats, hashes = set(), []
-    is_gray = (video.pixel_format or "").startswith("gray")
     try:
         for frame in decoded(stream.video_path):
-            name, planes = _as_the_standard_has_them(frame, is_gray=is_gray)
+            name, planes = planes_of(frame)
+            if (video.pixel_format or "").startswith("gray"):  # some decoders make up the chroma
+                name, planes = video.pixel_format, planes[:1]
             formats.add(name)
             hashes.append(_sha256(b"".join(plane.tobytes() for plane in planes)))
     except FFmpegError:
@@ -221,32 +217,6 @@ def decoded(path: Path) -> Iterator[av.VideoFrame]:
     """Every picture of a video, in order."""
     with av.open(str(path)) as container:
         yield from container.decode(video=0)
-
-
-def _as_the_standard_has_them(
-    frame: av.VideoFrame, *, is_gray: bool
-) -> tuple[str, list[NDArray[Any]]]:
-    """A planar format, and its planes, whatever form the decoder gave them."""
-    name = frame.format.name
-    if name in _PACKED:
-        places = _PACKED[name]
-        size = 3 if name.endswith("24") else 4
-        rows = _samples(frame, 0)[:, : frame.width * size]
-        pixels = rows.reshape(len(rows), frame.width, size)
-        return ("gbrap" if len(places) == 4 else "gbrp"), [pixels[..., at] for at in places]
-    name = name.replace("yuvj", "yuv")  # full range, told by name
-    if is_gray and name.startswith("yuv"):  # some decoders make up the chroma of a grey video
-        bits = name.partition("p")[2]
-        name = f"gray{bits}" if bits else "gray"
-    count = 1 if name.startswith("gray") else len(frame.planes)
-    return name, [_samples(frame, at)[:, : frame.planes[at].width] for at in range(count)]
-
-
-def _samples(frame: av.VideoFrame, index: int) -> NDArray[Any]:
-    """The rows of a plane as samples, padding included."""
-    plane: Any = frame.planes[index]  # a buffer, which its type does not tell
-    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height]
-    return rows.view("<u2") if frame.format.name.endswith(("le", "be")) else rows
 
 
 def _camera_info(stream: Stream) -> Values | None:
