@@ -6,13 +6,12 @@ import gc
 import os
 import re
 import signal
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
 
 import mp4ds
-from compare import compare as compare_recordings
 from mp4ds.packing.options import PackOptions
 from mp4ds.video.encoder import ordinary_scheduling
 from sources import SOURCES, scene
@@ -112,12 +111,6 @@ def unsynced() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("os.fsync", lambda _: None)
         yield
-
-
-@pytest.fixture
-def compare() -> Callable[..., list[str]]:
-    """The independent comparison of two recordings."""
-    return compare_recordings
 
 
 @pytest.fixture(scope="session")

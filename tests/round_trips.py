@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,6 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.unpack import UnpackOptions
 from scenes import Scene
 from sources import SOURCES, Source
-
-Compare = Callable[..., list[str]]
 
 TARGETS = {
     "bag": ("bag", None),

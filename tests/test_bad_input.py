@@ -34,12 +34,11 @@ from commands import (
     unchanged,
     without_progress,
 )
+from compare import compare
 from mp4ds.plugins import demo as demo_of
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
 from waiting import WATCHDOG_S, until
-
-Compare = Callable[..., list[str]]
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +200,7 @@ def test_a_pipe_is_no_recording(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- sources that are unusual
 
 
-def round_trip(source: Path, to: str, tmp_path: Path, compare: Compare) -> Result:
+def round_trip(source: Path, to: str, tmp_path: Path) -> Result:
     """Pack, validate, unpack and compare; returns what pack said."""
     before = tree(source) if source.is_dir() else source.read_bytes()
     packed = call("pack", source, "-o", tmp_path / "dataset")
@@ -226,11 +225,11 @@ NO_IMAGES = only(scene("mono8"), "/imu", "/tf", "/cam/camera_info")
 
 @pytest.mark.parametrize("kind", ["bag", "mcap", "rosbag2"])
 @pytest.mark.parametrize("content", ["no-messages", "no-channels", "no-images"])
-def test_nothing_for_a_video(content: str, kind: str, tmp_path: Path, compare: Compare) -> None:
+def test_nothing_for_a_video(content: str, kind: str, tmp_path: Path) -> None:
     made = {"no-messages": EMPTY, "no-channels": Scene([]), "no-images": NO_IMAGES}[content]
     name = {"bag": "bag-none", "mcap": "mcap-ros2-zstd", "rosbag2": "rosbag2-sqlite3-v9"}[kind]
     source = SOURCES[name](tmp_path, made)[0]
-    packed = round_trip(source, kind, tmp_path, compare)
+    packed = round_trip(source, kind, tmp_path)
     assert "no topic became a video" in packed.out
     assert not list(tmp_path.glob("dataset/*.mp4"))
 
@@ -250,12 +249,10 @@ def with_short_images() -> Scene:
 
 
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
-def test_an_image_with_less_data_than_its_header_says(
-    kind: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_an_image_with_less_data_than_its_header_says(kind: str, tmp_path: Path) -> None:
     name = {"bag": "bag-none", "mcap": "mcap-ros2-zstd"}[kind]
     source = SOURCES[name](tmp_path, with_short_images())[0]
-    packed = round_trip(source, kind, tmp_path, compare)
+    packed = round_trip(source, kind, tmp_path)
     said = [line for line in packed.out.splitlines() if "verbatim" in line]
     assert len(said) == 1
     assert said[0].startswith("/odd/image: 2 of 8 messages stored verbatim in messages.mcap: ")
@@ -277,11 +274,11 @@ def cameras(*topics: str) -> Scene:
 
 
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
-def test_topics_that_map_to_one_file_name(kind: str, tmp_path: Path, compare: Compare) -> None:
+def test_topics_that_map_to_one_file_name(kind: str, tmp_path: Path) -> None:
     topics = ("/a/b", "/a_b", "/A/b", "/a.b/", "/a_b-2")
     name = {"bag": "bag-none", "mcap": "mcap-ros2-zstd"}[kind]
     source = SOURCES[name](tmp_path, cameras(*topics))[0]
-    packed = round_trip(source, kind, tmp_path, compare)
+    packed = round_trip(source, kind, tmp_path)
     with mp4ds.open(tmp_path / "dataset") as dataset:
         files = {stream.topic: stream.sidecar.video.file for stream in dataset.streams}
     assert sorted(files) == sorted(topics)
@@ -297,9 +294,9 @@ def test_topics_that_map_to_one_file_name(kind: str, tmp_path: Path, compare: Co
     [("/../x", "/..", "..", "/."), ("", "/"), ("/dataset", "/messages", "/con"), ("/ä", "/相机"),
      ("/a\nb", "/\x1b[31mred", "/[bold]", "/a[/b]"), ("/" + "x" * 300, "/" + "x" * 299 + "y")],
 )  # fmt: skip
-def test_topics_with_odd_names(topics: tuple[str, ...], tmp_path: Path, compare: Compare) -> None:
+def test_topics_with_odd_names(topics: tuple[str, ...], tmp_path: Path) -> None:
     write_mcap(tmp_path / "drive.mcap", cameras(*topics))
-    packed = round_trip(tmp_path / "drive.mcap", "mcap", tmp_path, compare)
+    packed = round_trip(tmp_path / "drive.mcap", "mcap", tmp_path)
     names = {path.name for path in (tmp_path / "dataset").iterdir()}
     assert all(re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}", name) for name in names)
     assert len(names) == 2 + 2 * len(topics)

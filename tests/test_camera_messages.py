@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED, ODD, VERBATIM
+from compare import compare
 from definitions import PICTURES
 from encoders import pillow
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from pictures import BAYER, CONTENTS, ENCODINGS, picture
 from republished import Read, image_of, psnr, read
-from round_trips import Compare, Journey, journey, own_target
+from round_trips import Journey, journey, own_target
 from scenes import Scene
 from sources import SOURCES, scene
 
@@ -72,9 +73,7 @@ EVEN |= {("full", "32FC1")}
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize(("content", "encoding", "source", "shape"), share(RAW, 6))
-def test_raw_images(
-    content: str, encoding: str, source: str, shape: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_raw_images(content: str, encoding: str, source: str, shape: str, tmp_path: Path) -> None:
     recorded = scene(encoding, frames=FRAMES, content=content, **SHAPES[shape])
     done = journey(tmp_path, SOURCES[source], recorded, own_target(source))
     assert compare(done.sources, done.output) == []
@@ -111,7 +110,7 @@ LATER = {
 @pytest.mark.parametrize("name", LATER)
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-lz4"])
 def test_images_that_do_not_fit_what_the_first_were_like(
-    name: str, source: str, tmp_path: Path, compare: Compare
+    name: str, source: str, tmp_path: Path
 ) -> None:
     """A second stream takes them, message by message, and both merge again."""
     encoding, first, then = LATER[name]
@@ -165,7 +164,7 @@ STREAMS = {"jpeg-mixed-sizes": 2, "video-h264-resized": 2}
 @pytest.mark.parametrize(
     ("name", "source"), share([(name, s) for name in CODED for s in CODED_SOURCES], 6)
 )
-def test_coded_pictures(name: str, source: str, tmp_path: Path, compare: Compare) -> None:
+def test_coded_pictures(name: str, source: str, tmp_path: Path) -> None:
     recorded = CODED[name]()
     topic = image_topic(recorded)
     done = journey(tmp_path, SOURCES[source], recorded, own_target(source))
@@ -232,7 +231,7 @@ FOXGLOVE_CASES = [(name, source) for name in FOXGLOVE for source in FOXGLOVE_SOU
 
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize(("name", "source"), share(FOXGLOVE_CASES, len(FOXGLOVE_SOURCES)))
-def test_foxglove_messages(name: str, source: str, tmp_path: Path, compare: Compare) -> None:
+def test_foxglove_messages(name: str, source: str, tmp_path: Path) -> None:
     done = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE[name](), "mcap")
     assert compare(done.sources, done.output) == []
     messages, frames = FOXGLOVE_EXPECTED[name]
@@ -286,9 +285,7 @@ QUALITIES: dict[str, dict[str, Any]] = {
     ("quality", "encoding"),
     share([(quality, name) for name in ENCODINGS for quality in QUALITIES], len(QUALITIES)),
 )
-def test_raw_images_in_a_lossy_profile(
-    quality: str, encoding: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_raw_images_in_a_lossy_profile(quality: str, encoding: str, tmp_path: Path) -> None:
     """All but the pixels is exact, and the pixels are where loss would harm their meaning."""
     is_lossy = encoding in LOSSY
     recorded = scene(encoding, frames=6, width=94, height=62, pad=2, noisy=not is_lossy)
@@ -311,7 +308,7 @@ def test_raw_images_in_a_lossy_profile(
 @pytest.mark.parametrize("quality", QUALITIES)
 @pytest.mark.parametrize("size", [(16, 16), (34, 18), (48, 32), (48, 200), (62, 62), (64, 16)])
 def test_narrow_images_in_a_lossy_profile(
-    size: tuple[int, int], quality: str, tmp_path: Path, compare: Compare
+    size: tuple[int, int], quality: str, tmp_path: Path
 ) -> None:
     """x265 damages pictures, or the memory, where there are up to 48 columns: it is not asked."""
     recorded = scene("mono8", frames=12, width=size[0], height=size[1], noisy=False)
@@ -327,9 +324,7 @@ def test_narrow_images_in_a_lossy_profile(
     assert 37 < least_psnr(done, TOPIC) < 90  # 37.3 of 10 bits by the SVT-AV1 of PyAV 19
 
 
-def test_narrow_images_in_a_lossless_h265_video_become_another(
-    tmp_path: Path, compare: Compare
-) -> None:
+def test_narrow_images_in_a_lossless_h265_video_become_another(tmp_path: Path) -> None:
     """Its lossless pictures of 16 columns are wrong, too."""
     recorded = scene("mono16", frames=6, width=16, height=64, content="12-bit")
     done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", codec="h265")
@@ -358,9 +353,7 @@ LEAST = {
     ("name", "quality"),
     share([(name, quality) for name in TRANSCODED for quality in QUALITIES], len(QUALITIES)),
 )
-def test_jpeg_files_that_are_transcoded(
-    name: str, quality: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_jpeg_files_that_are_transcoded(name: str, quality: str, tmp_path: Path) -> None:
     recorded = CODED[name](frames=8, width=96, height=64)
     topic = image_topic(recorded)
     options = QUALITIES[quality] | {"transcode": True}
@@ -379,7 +372,7 @@ def test_jpeg_files_that_are_transcoded(
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
-def test_jpeg_packets_that_are_transcoded(quality: str, tmp_path: Path, compare: Compare) -> None:
+def test_jpeg_packets_that_are_transcoded(quality: str, tmp_path: Path) -> None:
     recorded = CODED["ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"](width=96, height=64)
     topic = image_topic(recorded)
     options = QUALITIES[quality] | {"transcode": True}
@@ -409,7 +402,7 @@ OTHERS = [
     share([(name, quality) for name in OTHERS for quality in QUALITIES], 2 * len(QUALITIES)),
 )
 def test_what_else_is_coded_stays_exact_in_every_profile(
-    name: str, quality: str, tmp_path: Path, compare: Compare
+    name: str, quality: str, tmp_path: Path
 ) -> None:
     """Depth and packets: there is nothing to transcode."""
     recorded = CODED[name]()
@@ -420,7 +413,7 @@ def test_what_else_is_coded_stays_exact_in_every_profile(
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
-def test_jpeg_files_are_kept_unless_asked(quality: str, tmp_path: Path, compare: Compare) -> None:
+def test_jpeg_files_are_kept_unless_asked(quality: str, tmp_path: Path) -> None:
     recorded = CODED["jpeg-rgb"]()
     done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **QUALITIES[quality])
     assert compare(done.sources, done.output) == []
@@ -454,7 +447,7 @@ def test_transcoding_without_loss_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("source", ["bag-bz2", "rosbag2-mcap-v9", "mcap-ros2-zstd"])
-def test_a_robot_with_many_cameras(source: str, tmp_path: Path, compare: Compare) -> None:
+def test_a_robot_with_many_cameras(source: str, tmp_path: Path) -> None:
     """Several topics and kinds in one recording, in several threads."""
     names = ["jpeg-rgb", "png-gray-cv2", "depth-16UC1-rvl", "video-h264", "ffmpeg-libx265"]
     scenes = [CODED[name](seed=n) for n, name in enumerate(names)]
@@ -479,9 +472,7 @@ def test_a_robot_with_many_cameras(source: str, tmp_path: Path, compare: Compare
 
 
 @pytest.mark.parametrize(("frames", "are_files"), [(1, True), (6, False)])
-def test_a_few_small_files_stay_files(
-    frames: int, are_files: bool, tmp_path: Path, compare: Compare
-) -> None:
+def test_a_few_small_files_stay_files(frames: int, are_files: bool, tmp_path: Path) -> None:
     """109 bytes of PNG would become a video and a sidecar of 4 kB."""
     recorded = CODED["png-gray-cv2"](frames=frames, width=16, height=12)
     done = journey(tmp_path, SOURCES["mcap-ros2-zstd"], recorded, "mcap")

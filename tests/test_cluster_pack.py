@@ -15,10 +15,11 @@ import pytest
 
 import mp4ds
 from clusters import OTHER_VERSION, RealCluster
+from compare import compare
 from in_parts import facts, leftovers
 from mp4ds.errors import PartsFailedError
 from mp4ds.packing.options import PackOptions
-from round_trips import Compare, unpacked
+from round_trips import unpacked
 from sources import SOURCES, scene
 from waiting import WATCHDOG_S, until
 
@@ -71,7 +72,7 @@ def finished(folder: Path) -> dict[str, int]:
 
 
 def test_it_is_the_same_dataset(
-    cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path, compare: Compare
+    cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
     seen = []
     mp4ds.pack(source, tmp_path / "dataset", on(cluster), progress=seen.append)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from compare import compare
 from edits import flip
 from mp4ds.bags.protocols import RecordingSlice
 from mp4ds.dataset.checks import validate
@@ -22,7 +23,6 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack
 from mp4ds.records import Excerpt
 from mp4ds.unpacking.unpack import unpack
-from round_trips import Compare
 from sources import scene, write_bag
 
 
@@ -76,9 +76,7 @@ def test_files_of_all_parts_are_not_open_at_once(whole: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("count", [2, 5])
-def test_parts_are_the_whole_again(
-    count: int, whole: Path, tmp_path: Path, compare: Compare
-) -> None:
+def test_parts_are_the_whole_again(count: int, whole: Path, tmp_path: Path) -> None:
     joined = join(cut(whole, tmp_path / "parts", count), tmp_path / "joined")
     assert validate(joined, deep=True) == []
     for dataset in (whole, joined):

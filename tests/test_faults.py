@@ -25,6 +25,7 @@ import pytest
 
 import mp4ds
 from commands import NEEDS_ROOT, run, start, tree
+from compare import compare
 from in_parts import WORK, InlineExecutor, Pack, facts, leftovers
 from mp4ds.errors import Mp4dsError, PartsFailedError, SourceError, TargetError, WriteError
 from mp4ds.packing.options import PackOptions
@@ -32,7 +33,7 @@ from mp4ds.packing.parts import PartPacker
 from mp4ds.packing.planning import Piece
 from mp4ds.plugins.demo import demo
 from mp4ds.processes import ProcessExecutor
-from round_trips import Compare, unpacked
+from round_trips import unpacked
 from waiting import WATCHDOG_S, until
 
 PARTS = ["00000", "00001"]
@@ -134,7 +135,7 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> set[tuple[str, str]]:
 
 @pytest.mark.parametrize("limit", REACHED)
 def test_a_disk_that_is_full_at_any_moment(
-    limit: str, pack: Pack, tmp_path: Path, reached: set[tuple[str, str]], compare: Compare
+    limit: str, pack: Pack, tmp_path: Path, reached: set[tuple[str, str]]
 ) -> None:
     before = tree(pack.source.parent)
     refusals = 0
@@ -198,7 +199,7 @@ def failing_open(
 
 
 @pytest.mark.parametrize("size", [pytest.param("300k", marks=pytest.mark.slow), "1400k"])
-def test_the_real_command_on_a_full_disk(size: str, tmp_path: Path, compare: Compare) -> None:
+def test_the_real_command_on_a_full_disk(size: str, tmp_path: Path) -> None:
     (tmp_path / "source").mkdir()
     bag = tmp_path / "source" / "drive.bag"
     demo(bag, seconds=1)
@@ -252,9 +253,7 @@ class _BadSector(io.FileIO):
 @pytest.mark.parametrize(
     "pack", ["bag-none", "bag-bz2", "mcap-ros2-zstd", "mcap-ros2-none"], indirect=True
 )
-def test_a_bad_sector(
-    pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
-) -> None:
+def test_a_bad_sector(pack: Pack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     middle = pack.source.stat().st_size // 2
     real = io.open
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import mp4ds
 from coded_scenes import CODED
 from commands import call, refused
+from compare import compare
 from definitions import IMAGE
 from in_parts import InlineExecutor, leftovers, use
 from mp4ds import yamlio
@@ -250,9 +251,7 @@ def test_in_parts_too_and_each_time_alike(tmp_path: Path, executor: InlineExecut
 # ---------------------------------------------------------------- out of reach
 
 
-def test_one_of_two_equal_channels_cannot_have_the_score(
-    tmp_path: Path, compare: Callable[..., list[str]]
-) -> None:
+def test_one_of_two_equal_channels_cannot_have_the_score(tmp_path: Path) -> None:
     """The channel of the first image is not that of the images that cannot have it."""
     (whole,) = recording(tmp_path, [0.0, 0.0, 30.0])
     excerpt = Excerpt(topics=frozenset([TOPIC]), others=False)
@@ -277,9 +276,7 @@ def test_one_of_two_equal_channels_cannot_have_the_score(
     assert compare([path], unpacked(tmp_path, "mcap"), ignore_pixels=[TOPIC]) == []
 
 
-def test_what_cannot_have_the_score_is_lossless(
-    tmp_path: Path, compare: Callable[..., list[str]]
-) -> None:
+def test_what_cannot_have_the_score_is_lossless(tmp_path: Path) -> None:
     paths = recording(tmp_path, [20.0])
     options = PackOptions(quality="psnr=59.9", **{**QUICK, "codec": "av1", "preset": "12"})
     summary = mp4ds.pack(paths, tmp_path / "dataset", options)
@@ -295,7 +292,6 @@ def test_what_cannot_have_the_score_is_lossless(
 def test_what_cannot_have_it_later_on_is_lossless(
     window: int | None,
     tmp_path: Path,
-    compare: Callable[..., list[str]],
 ) -> None:
     """The first images have it, later ones do not: with parts, only theirs are lossless."""
     noises = [0.0, 0.0, 30.0, 0.0, 0.0, 0.0]
@@ -321,9 +317,7 @@ def test_small_images_are_lossless(tmp_path: Path) -> None:
     assert any("less than 16 rows" in str(text) for text in (*topic.notes, *topic.verbatim))
 
 
-def test_jpeg_files_that_cannot_have_it_stay(
-    tmp_path: Path, compare: Callable[..., list[str]]
-) -> None:
+def test_jpeg_files_that_cannot_have_it_stay(tmp_path: Path) -> None:
     paths = SOURCES["mcap-ros2-none"](tmp_path / "source", CODED["jpeg-rgb"]())
     options = {"transcode": True, **QUICK}
     mp4ds.pack(paths, tmp_path / "small", PackOptions(quality="ssim=0.9", **options))

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -20,6 +20,7 @@ import pytest
 import mp4ds
 from coded_scenes import CODED
 from commands import call, tree
+from compare import compare
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.salvage.mcap import McapSalvage
@@ -40,7 +41,6 @@ from scenes import Scene, scene
 from sources import SOURCES
 from waiting import WATCHDOG_S, until
 
-Compare = Callable[..., list[str]]
 SALVAGE = PackOptions(salvage=True)
 HERE = Path(__file__).parent
 
@@ -76,7 +76,7 @@ def again(dataset: Path, folder: Path, to: str | None = None) -> Path:
         ("rosbag2-mcap-v5", "yuv422_yuy2"),
     ],
 )
-def test_what_comes_is_there(source: str, encoding: str, tmp_path: Path, compare: Compare) -> None:
+def test_what_comes_is_there(source: str, encoding: str, tmp_path: Path) -> None:
     paths = write(tmp_path, source, scene(encoding, frames=20))
     summary = recorded(PlayedNode(paths), tmp_path / "live")
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
@@ -93,7 +93,7 @@ def test_what_comes_is_there(source: str, encoding: str, tmp_path: Path, compare
 
 
 @pytest.mark.parametrize("kind", ["video-h265", "video-h264-headers-once"])
-def test_packets_on_both_sides_of_a_cut(kind: str, tmp_path: Path, compare: Compare) -> None:
+def test_packets_on_both_sides_of_a_cut(kind: str, tmp_path: Path) -> None:
     """Pieces are cut at key frames of the video, whatever else is cut in between."""
     paths = write(tmp_path, "rosbag2-mcap-v5", CODED[kind](frames=40))
     (made,) = recorded(PlayedNode(paths), tmp_path / "live").datasets
@@ -132,7 +132,7 @@ def test_times_that_are_not_in_order(case: str, tmp_path: Path) -> None:
     assert times == sorted(times)
 
 
-def test_quality(tmp_path: Path, compare: Compare) -> None:
+def test_quality(tmp_path: Path) -> None:
     paths = write(tmp_path)
     recorded(PlayedNode(paths), tmp_path / "live", quality="visual")
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
@@ -289,9 +289,7 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("most", [{"max_duration": 0.5}, {"max_size": 200_000}])
-def test_datasets_of_a_length_or_size(
-    most: dict[str, Any], tmp_path: Path, compare: Compare
-) -> None:
+def test_datasets_of_a_length_or_size(most: dict[str, Any], tmp_path: Path) -> None:
     paths = write(tmp_path, of=scene("mono8", frames=40, width=160, height=120))
     summary = recorded(PlayedNode(paths), tmp_path / "live", **most)
     made = [item.dataset for item in summary.datasets]
@@ -326,9 +324,7 @@ def test_pauses_and_splits_on_demand(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- too much
 
 
-def test_packing_that_is_too_slow(
-    tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_packing_that_is_too_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The spool keeps what is not packed yet, beyond what the buffer holds; nothing is dropped."""
     monkeypatch.setattr(spool, "WINDOW_NS", 2_000_000_000)
     paths = write(tmp_path, of=scene("bayer_rggb8", frames=60, width=320, height=240))
@@ -356,9 +352,7 @@ def test_packing_that_is_too_slow(
     assert compare(paths, again(tmp_path / "live", tmp_path)) == []
 
 
-def test_packing_that_fails(
-    tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_packing_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The recording goes on, what was recorded stays, and the command that packs it is named."""
     paths = write(tmp_path)
     fail_to_pack(1, "the encoder is out of order", monkeypatch)
@@ -372,9 +366,7 @@ def test_packing_that_fails(
     assert compare(paths, again(tmp_path / "live", tmp_path)) == []
 
 
-def test_a_packing_process_that_dies(
-    tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_packing_process_that_dies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths = write(tmp_path)
     python = tmp_path / "python"
     python.write_text("#!/bin/sh\nexit 7\n")
@@ -438,9 +430,7 @@ def messages(paths: list[Path]) -> Iterator[Message]:
                 yield record
 
 
-def test_a_disk_that_is_full(
-    tmp_path: Path, compare: Compare, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What was written before is kept."""
     paths = write(tmp_path)
     due = next(iter(messages(paths)))

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 import mp4ds
 from commands import call, program, refused
+from compare import compare
 from in_parts import InlineExecutor, leftovers, use
 from mp4ds.bags.formats import open_sources
 from mp4ds.errors import OptionError, PartsFailedError, RemoteError, SourceError
@@ -28,7 +29,7 @@ from mp4ds.plugins.intrinsics import intrinsics
 from mp4ds.records import Excerpt, Message
 from remote_servers import Request, Server, web_server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores, web
-from round_trips import Compare, own_target, unpacked
+from round_trips import own_target, unpacked
 from sources import SOURCES, Scene, scene, write_bag, write_mcap
 
 __all__ = ["folder_url", "put", "s3", "s3_running", "stores", "web"]
@@ -192,9 +193,7 @@ def test_of_a_file_that_is_read_little_is_kept() -> None:
 # ---------------------------------------------------------------- recordings
 
 
-def round_trip(
-    paths: Sequence[Path], urls: Sequence[str], folder: Path, source: str, compare: Compare
-) -> None:
+def round_trip(paths: Sequence[Path], urls: Sequence[str], folder: Path, source: str) -> None:
     mp4ds.pack(urls, folder / "dataset", PackOptions(window=3))
     assert mp4ds.validate(folder / "dataset", deep=True) == []
     assert compare(paths, unpacked(folder, own_target(source))) == []
@@ -208,23 +207,23 @@ def some(first: int) -> list[Any]:
 
 @pytest.mark.parametrize("source", some(0))
 def test_every_source_in_a_store(
-    source: str, tmp_path: Path, put: Put, compare: Compare, executor: InlineExecutor
+    source: str, tmp_path: Path, put: Put, executor: InlineExecutor
 ) -> None:
     paths = SOURCES[source](tmp_path / "source", scene("bayer_rggb8", frames=7))
-    round_trip(paths, [put(path) for path in paths], tmp_path, source, compare)
+    round_trip(paths, [put(path) for path in paths], tmp_path, source)
 
 
 @pytest.mark.parametrize("source", some(1))
 def test_every_source_on_a_web_server(
-    source: str, tmp_path: Path, web: Server, compare: Compare, executor: InlineExecutor
+    source: str, tmp_path: Path, web: Server, executor: InlineExecutor
 ) -> None:
     paths = SOURCES[source](tmp_path / "web", scene("bayer_rggb8", frames=7))
     urls = [f"{web.url}/{path.name}" for path in paths]
-    round_trip(paths, urls, tmp_path, source, compare)
+    round_trip(paths, urls, tmp_path, source)
 
 
 @pytest.mark.slow
-def test_windows_are_packed_by_other_processes(tmp_path: Path, put: Put, compare: Compare) -> None:
+def test_windows_are_packed_by_other_processes(tmp_path: Path, put: Put) -> None:
     write_bag(tmp_path / "drive.bag", scene("mono8", frames=6))
     mp4ds.pack(put(tmp_path / "drive.bag"), tmp_path / "dataset", PackOptions(window=3, jobs=1))
     assert compare([tmp_path / "drive.bag"], unpacked(tmp_path, "bag")) == []
@@ -281,9 +280,7 @@ def test_an_excerpt_reads_its_chunks(name: str, large: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "dataset"])
-def test_a_slice_fetches_what_is_in_it(
-    name: str, large: Path, tmp_path: Path, compare: Compare
-) -> None:
+def test_a_slice_fetches_what_is_in_it(name: str, large: Path, tmp_path: Path) -> None:
     """Of a dataset whole groups of pictures; it is given as the recording's own slice."""
     if name == "dataset":
         (tmp_path / "there").mkdir()
@@ -347,7 +344,7 @@ def dataset_url(
 
 
 def test_a_dataset_is_used_there_as_here(
-    dataset_url: tuple[str, Path, Server], tmp_path: Path, compare: Compare
+    dataset_url: tuple[str, Path, Server], tmp_path: Path
 ) -> None:
     url, here, _ = dataset_url
     with mp4ds.open(url) as there, mp4ds.open(here) as local:

@@ -13,6 +13,7 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
+from compare import compare
 from mp4ds.errors import OptionError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
@@ -21,7 +22,7 @@ from mp4ds.packing.planning import open_recording
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message
 from mp4ds.unpacking.unpack import UnpackOptions
-from round_trips import Compare, journey, own_target, unpacked
+from round_trips import journey, own_target, unpacked
 from sources import PERIOD, SOURCES, START, TRAITS, odd_scene, scene, write_bag
 
 
@@ -47,7 +48,7 @@ def images(dataset: Path) -> list[str]:
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("source", SOURCES)
-def test_what_was_exact_stays_so(source: str, tmp_path: Path, compare: Compare) -> None:
+def test_what_was_exact_stays_so(source: str, tmp_path: Path) -> None:
     first = tmp_path / "first"
     first.mkdir()
     before = journey(first, SOURCES[source], scene("mono16"), own_target(source))
@@ -67,7 +68,7 @@ def test_what_was_exact_stays_so(source: str, tmp_path: Path, compare: Compare) 
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("trait", TRAITS)
-def test_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None:
+def test_odd_recordings(trait: str, tmp_path: Path) -> None:
     first = tmp_path / "first"
     first.mkdir()
     before = journey(first, SOURCES["bag-lz4"], odd_scene(trait), "bag")
@@ -77,7 +78,7 @@ def test_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None:
 
 @pytest.mark.one_in(6)
 @pytest.mark.parametrize("kind", CODED)
-def test_coded_images(kind: str, tmp_path: Path, compare: Compare) -> None:
+def test_coded_images(kind: str, tmp_path: Path) -> None:
     first = tmp_path / "first"
     first.mkdir()
     before = journey(first, SOURCES["mcap-ros2-zstd"], CODED[kind](frames=6), "mcap")
@@ -85,14 +86,14 @@ def test_coded_images(kind: str, tmp_path: Path, compare: Compare) -> None:
     assert compare(before.sources, unpacked(tmp_path, "mcap")) == []
 
 
-def test_in_parts(recording: Path, tmp_path: Path, compare: Compare) -> None:
+def test_in_parts(recording: Path, tmp_path: Path) -> None:
     mp4ds.pack(recording, tmp_path / "whole")
     mp4ds.pack(tmp_path / "whole", tmp_path / "dataset", PackOptions(window=4))
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     assert compare([recording], unpacked(tmp_path, "bag")) == []
 
 
-def test_log_times_that_do_not_tell_the_order(tmp_path: Path, compare: Compare) -> None:
+def test_log_times_that_do_not_tell_the_order(tmp_path: Path) -> None:
     """Messages of equal times in different files: such a dataset is read as a whole."""
     made = odd_scene("encoding-change")
     equal = [

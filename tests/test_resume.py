@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 import mp4ds
+from compare import compare
 from in_parts import IN_PARTS, WORK, InlineExecutor, Pack, facts, leftovers, use
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.errors import (
@@ -32,7 +33,7 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_each, pack_share
 from mp4ds.plugins.demo import demo
 from mp4ds.records import ChannelStats
-from round_trips import Compare, unpacked
+from round_trips import unpacked
 from sources import SOURCES, scene
 from waiting import until
 
@@ -58,7 +59,7 @@ def stopped(pack: Pack) -> Callable[[int], Path]:
 
 
 def test_it_goes_on_from_the_last_finished_part(
-    pack: Pack, stopped: Callable[[int], Path], tmp_path: Path, compare: Compare
+    pack: Pack, stopped: Callable[[int], Path], tmp_path: Path
 ) -> None:
     stopped(0)  # where nothing was finished, nothing is left
     stopped(2)
@@ -251,9 +252,7 @@ def test_shares_of_several_machines_are_joined(pack: Pack, monkeypatch: pytest.M
 # ---------------------------------------------------------------- many recordings
 
 
-def test_many_recordings_are_one_job(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
-) -> None:
+def test_many_recordings_are_one_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Long ones, short ones, and one that is there already."""
     (tmp_path / "source").mkdir()
     paths = []
@@ -328,7 +327,7 @@ def long_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("kills", [1, 20], ids=["once", "storm"])
 def test_killed_at_random_moments_it_ends_as_if_it_had_not_been(
-    kills: int, tmp_path: Path, long_bag: Path, compare: Compare
+    kills: int, tmp_path: Path, long_bag: Path
 ) -> None:
     mp4ds.pack(long_bag, tmp_path / "whole", PackOptions(codec="h264"))
     command = [

@@ -15,13 +15,13 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
+from compare import compare
 from conftest import DATA, real
 from definitions import PICTURES
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds.records import Message
 from round_trips import (
     TARGETS,
-    Compare,
     journey,
     output_of,
     own_target,
@@ -39,9 +39,7 @@ def has_streams(folder: Path) -> bool:
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("encoding", ["bayer_gbrg8", "mono16"])
-def test_every_source_returns_to_its_own_format(
-    source: str, encoding: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_every_source_returns_to_its_own_format(source: str, encoding: str, tmp_path: Path) -> None:
     sources = SOURCES[source](tmp_path / "source", scene(encoding))
     output = round_trip(sources, tmp_path, own_target(source))
     assert has_streams(tmp_path / "dataset")
@@ -71,9 +69,7 @@ CROSSED = [
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize(("camera", "source", "target"), CROSSED)
-def test_from_any_ros_to_any_other(
-    camera: str, source: str, target: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_from_any_ros_to_any_other(camera: str, source: str, target: str, tmp_path: Path) -> None:
     recorded = CAMERAS[camera]()
     done = journey(tmp_path, SOURCES[source], recorded, target)
     assert compare(done.sources, done.output) == []
@@ -86,9 +82,7 @@ FOXGLOVE_CAMERAS = ["raw-bgr8", "jpeg-rgb", "video-h264"]
 
 @pytest.mark.parametrize("camera", FOXGLOVE_CAMERAS)
 @pytest.mark.parametrize("target", [*TARGETS][:4])
-def test_foxglove_messages_of_ros_go_to_any_other(
-    camera: str, target: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_foxglove_messages_of_ros_go_to_any_other(camera: str, target: str, tmp_path: Path) -> None:
     write = FOXGLOVE_SOURCES["mcap-foxglove-ros2"]
     done = journey(tmp_path, write, FOXGLOVE[camera](), target)
     assert compare(done.sources, done.output) == []
@@ -98,9 +92,7 @@ def test_foxglove_messages_of_ros_go_to_any_other(
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("camera", [*FOXGLOVE_CAMERAS, "webp"])
 @pytest.mark.parametrize("target", [*TARGETS][:3])
-def test_what_no_ros_can_hold_is_refused(
-    target: str, camera: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_what_no_ros_can_hold_is_refused(target: str, camera: str, tmp_path: Path) -> None:
     done = journey(tmp_path, FOXGLOVE_SOURCES["mcap-protobuf"], FOXGLOVE[camera](), "mcap")
     assert compare(done.sources, done.output) == []
     done.output.unlink()
@@ -135,7 +127,7 @@ FOXGLOVE_TOPICS = {"/camera/image", "/camera/calibration", "/tf", "/pose", "/log
 
 
 @pytest.mark.parametrize("target", [*TARGETS][:3])
-def test_what_ros_can_hold_of_the_rest(target: str, tmp_path: Path, compare: Compare) -> None:
+def test_what_ros_can_hold_of_the_rest(target: str, tmp_path: Path) -> None:
     """The remedy that the refusal names."""
     recorded = scene("rgb8")
     sources = SOURCES["mcap-none-profile"](tmp_path / "source", recorded)
@@ -152,7 +144,7 @@ def test_what_ros_can_hold_of_the_rest(target: str, tmp_path: Path, compare: Com
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("trait", TRAITS)
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-none"])
-def test_odd_messages_return(trait: str, source: str, tmp_path: Path, compare: Compare) -> None:
+def test_odd_messages_return(trait: str, source: str, tmp_path: Path) -> None:
     sources = SOURCES[source](tmp_path / "source", odd_scene(trait))
     output = round_trip(sources, tmp_path, own_target(source))
     assert compare(sources, output) == []
@@ -177,7 +169,7 @@ REAL_FOLDERS = sorted(
 
 @pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", [*REAL, *REAL_FOLDERS] or ["bags"])
-def test_real_recordings_return(name: str, tmp_path: Path, compare: Compare) -> None:
+def test_real_recordings_return(name: str, tmp_path: Path) -> None:
     path = real(name)
     target = "rosbag2" if path.is_dir() or path.suffix == ".db3" else path.suffix[1:]
     output = round_trip([path], tmp_path, target)

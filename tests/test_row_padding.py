@@ -14,12 +14,13 @@ import pytest
 from numpy.typing import NDArray
 
 import mp4ds
+from compare import compare
 from in_parts import InlineExecutor, use
 from mp4ds import yamlio
 from mp4ds.bags.formats import open_reader
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
-from round_trips import Compare, unpacked
+from round_trips import unpacked
 from sources import SOURCES, odd_scene
 from test_structure import ROOT
 
@@ -42,9 +43,7 @@ def recording(folder: Path, trait: str, source: str = "mcap-ros2-none", **option
     "trait", ["row-padding-garbage", "row-padding-varied", "row-padding-not-last"]
 )
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-none"])
-def test_padded_images_are_a_video(
-    trait: str, quality: str, source: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_padded_images_are_a_video(trait: str, quality: str, source: str, tmp_path: Path) -> None:
     paths = recording(tmp_path, trait, source)
     options = PackOptions(quality=quality, codec=None if quality == "lossless" else "h264")
     summary = mp4ds.pack(paths, tmp_path / "dataset", options)
@@ -86,7 +85,7 @@ def bodies_size(payload: bytes) -> int:
 
 @pytest.mark.parametrize("window", [None, 4])
 def test_padding_beyond_a_bound_is_verbatim(
-    window: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Compare
+    window: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of parts, those with too much of it together become two streams."""
     monkeypatch.setattr("mp4ds.format.fields.MAX_PADDING", 150)

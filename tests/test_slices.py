@@ -11,13 +11,14 @@ import pytest
 
 import mp4ds
 from coded_scenes import CODED
+from compare import compare
 from mp4ds.errors import FormatError, OptionError, SourceError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.pack import pack_each, pack_share
 from mp4ds.unpacking.unpack import UnpackOptions
-from round_trips import TARGETS, Compare, output_of, own_target
+from round_trips import TARGETS, output_of, own_target
 from sources import PERIOD, SOURCES, START, TRAITS, Scene, odd_scene, scene, write_bag
 
 FRAMES = 40
@@ -50,7 +51,7 @@ def hidden(dataset: Path) -> list[int]:
 @pytest.mark.one_in(10)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("way", ["one-pass", "parts", "dataset", "dataset-anew", "unpack"])
-def test_what_is_taken(source: str, way: str, tmp_path: Path, compare: Compare) -> None:
+def test_what_is_taken(source: str, way: str, tmp_path: Path) -> None:
     """Of a recording in one pass and in parts, and of a dataset of it, copied and anew."""
     paths = SOURCES[source](tmp_path, scene("rgb8", frames=FRAMES))
     dataset, whole = tmp_path / "dataset", tmp_path / "whole"
@@ -80,7 +81,7 @@ def test_what_is_taken(source: str, way: str, tmp_path: Path, compare: Compare) 
 
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("trait", TRAITS)
-def test_of_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None:
+def test_of_odd_recordings(trait: str, tmp_path: Path) -> None:
     """Also where log times do not tell the order of messages, and so nothing can be copied."""
     paths = SOURCES["mcap-ros1-zstd"](tmp_path, odd_scene(trait, frames=12))
     start, end = START + 3 * PERIOD, START + 8 * PERIOD
@@ -95,7 +96,7 @@ def test_of_odd_recordings(trait: str, tmp_path: Path, compare: Compare) -> None
     assert compare(paths, output, start=start, end=end) == []
 
 
-def test_equal_times_in_different_files(tmp_path: Path, compare: Compare) -> None:
+def test_equal_times_in_different_files(tmp_path: Path) -> None:
     """Unpacking a slice leaves out what packing it leaves out; what converts says what to do."""
     made = odd_scene("encoding-change")
     equal = [
@@ -117,7 +118,7 @@ def test_equal_times_in_different_files(tmp_path: Path, compare: Compare) -> Non
 @pytest.mark.parametrize(
     "kind", ["video-h264", "video-h265", "video-av1", "ffmpeg-libx264", "jpeg-rgb", "png-rgb-cv2"]
 )
-def test_of_coded_messages(kind: str, tmp_path: Path, compare: Compare) -> None:
+def test_of_coded_messages(kind: str, tmp_path: Path) -> None:
     paths = SOURCES["mcap-ros2-zstd"](tmp_path, CODED[kind](frames=12))
     start, end = START + 5 * PERIOD, START + 9 * PERIOD
     span = {"start": str(start), "end": str(end)}
@@ -198,9 +199,7 @@ def test_topics_and_facts_without_a_slice(visual: Path, tmp_path: Path) -> None:
     assert videos.items() <= {item.name: item.sha256 for item in new.files}.items()
 
 
-def test_images_without_their_calibrations(
-    recording: Path, tmp_path: Path, compare: Compare
-) -> None:
+def test_images_without_their_calibrations(recording: Path, tmp_path: Path) -> None:
     mp4ds.pack(recording, tmp_path / "whole")
     with mp4ds.open(tmp_path / "whole") as opened:
         info = opened.streams[0].sidecar.camera_info
@@ -230,7 +229,7 @@ def test_a_damaged_group_is_not_copied(recording: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "part").exists()
 
 
-def test_a_span_without_frames_keeps_the_rest(tmp_path: Path, compare: Compare) -> None:
+def test_a_span_without_frames_keeps_the_rest(tmp_path: Path) -> None:
     """Calibrations whose images are outside are kept as they are."""
     recorded = scene("rgb8", frames=FRAMES)
     kept = [

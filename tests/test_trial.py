@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mp4ds
+from compare import compare
 from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE
 from mp4ds.messages.layouts import fit
@@ -225,7 +226,6 @@ def test_the_next_codec_where_one_refuses(
     codec: str | None,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    compare: Callable[..., list[str]],
 ) -> None:
     """The encoder may refuse, by its size, what it took of the middle of an image."""
     asked: list[str] = []
@@ -288,9 +288,7 @@ def test_an_archive_has_the_smallest() -> None:
 
 @pytest.mark.one_in(12)
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_fast_forms_are_exact(
-    encoding: str, tmp_path: Path, compare: Callable[..., list[str]]
-) -> None:
+def test_fast_forms_are_exact(encoding: str, tmp_path: Path) -> None:
     paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene(encoding, frames=7))
     options = PackOptions(purpose="training=900", window=3)
     mp4ds.pack(paths, tmp_path / "dataset", options)
@@ -325,9 +323,7 @@ def test_lossy_videos_for_a_purpose(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("encoding", "codec"), [("bayer_rggb8", "h264"), ("rgb8", "h264"), ("16UC1", "ffv1")]
 )
-def test_packing_at_speed(
-    encoding: str, codec: str, tmp_path: Path, compare: Callable[..., list[str]]
-) -> None:
+def test_packing_at_speed(encoding: str, codec: str, tmp_path: Path) -> None:
     """Nothing is tried: parts of any length and rate get the same videos, which are exact."""
     found = []
     for number, made in enumerate((source_scene(encoding, frames=9), source_scene(encoding))):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import pytest
 
 import mp4ds
 from commands import Result, call, tree
+from compare import compare
 from mp4ds.errors import WriteError
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.plugins.recording import spool
@@ -21,7 +21,6 @@ from record_scenes import PlayedNode, fail_to_pack, recorded
 from scenes import scene
 from sources import SOURCES
 
-Compare = Callable[..., list[str]]
 FRAMES = 12
 PIECE, PART = "000002.mcap", "000001"
 
@@ -96,7 +95,7 @@ def test_a_recorder_leaves_files_of_the_user(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- damage
 
 
-def test_everything_is_recovered(unfinished: Path, compare: Compare) -> None:
+def test_everything_is_recovered(unfinished: Path) -> None:
     result = salvaged(unfinished)
     assert result.code == 0, result
     assert "lost" not in result.out

@@ -16,6 +16,7 @@ from PIL import Image
 
 import mp4ds
 from commands import call
+from compare import compare
 from in_parts import InlineExecutor, facts, use
 from mp4ds.errors import (
     OptionError,
@@ -32,7 +33,7 @@ from mp4ds.packing.pack import pack_each, pack_share
 from mp4ds.unpacking.unpack import UnpackOptions
 from remote_servers import Request, Server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores
-from round_trips import TARGETS, Compare
+from round_trips import TARGETS
 from sources import scene, write_bag
 
 __all__ = ["folder_url", "put", "s3", "s3_running", "stores"]
@@ -116,7 +117,6 @@ def test_a_pack_is_uploaded_the_manifest_last(
     source: Path,
     store: Store,
     tmp_path: Path,
-    compare: Compare,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     executor = use(monkeypatch, InlineExecutor())
@@ -189,7 +189,7 @@ def test_force_replaces_the_manifest_first(source: Path, store: Store) -> None:
 @pytest.mark.parametrize("name", ["cam_image_raw.mp4", "messages.mcap", "dataset.yaml"])
 @pytest.mark.parametrize("replaced", [False, True])
 def test_a_failed_upload_keeps_what_was_made(
-    name: str, replaced: bool, source: Path, store: Store, compare: Compare
+    name: str, replaced: bool, source: Path, store: Store
 ) -> None:
     options = replace(FAST, force=replaced)
     if replaced:
@@ -252,7 +252,7 @@ def test_a_source_that_cannot_be_read_leaves_nothing(tmp_path: Path, store: Stor
 
 
 def test_a_divided_pack_goes_on(
-    source: Path, store: Store, compare: Compare, monkeypatch: pytest.MonkeyPatch
+    source: Path, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = replace(FAST, window=3)
     use(monkeypatch, InlineExecutor(lambda task: task == "00001"))
@@ -268,7 +268,7 @@ def test_a_divided_pack_goes_on(
 
 
 def test_shares_meet_in_the_temporary_folder(
-    source: Path, store: Store, compare: Compare, monkeypatch: pytest.MonkeyPatch
+    source: Path, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = replace(FAST, window=3)
     use(monkeypatch, InlineExecutor())
@@ -314,9 +314,7 @@ def test_the_temporary_folder_is_ones_own(source: Path, store: Store, tmp_path: 
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_an_unpack_is_uploaded(
-    target: str, packed_bag: Path, store: Store, tmp_path: Path, compare: Compare
-) -> None:
+def test_an_unpack_is_uploaded(target: str, packed_bag: Path, store: Store, tmp_path: Path) -> None:
     to, storage = TARGETS[target]
     name = "again" + {"bag": ".bag", "mcap": ".mcap"}.get(to, "")
     url, options = f"{store.folder}/{name}", UnpackOptions(storage=storage)
@@ -364,9 +362,7 @@ def test_images_are_uploaded(packed_bag: Path, store: Store, tmp_path: Path) -> 
     assert not any(name.endswith(".png") for name in store.names())
 
 
-def test_from_a_url_to_a_url(
-    packed_bag: Path, put: Put, store: Store, tmp_path: Path, compare: Compare
-) -> None:
+def test_from_a_url_to_a_url(packed_bag: Path, put: Put, store: Store, tmp_path: Path) -> None:
     mp4ds.unpack(put(packed_bag), "bag", f"{store.folder}/again.bag")
     store.files.get(f"{store.folder}/again.bag", str(tmp_path / "again.bag"))
     mp4ds.unpack(packed_bag, "bag", tmp_path / "here.bag")

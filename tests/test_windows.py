@@ -14,11 +14,12 @@ from mcap.writer import Writer
 
 import mp4ds
 from coded_scenes import CODED
+from compare import compare
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from in_parts import InlineExecutor, facts, leftovers, use
 from mp4ds.packing.options import PackOptions
 from pictures import ENCODINGS, picture
-from round_trips import Compare, own_target, unpacked
+from round_trips import own_target, unpacked
 from scenes import Scene
 from sources import SOURCES, TRAITS, odd_scene, scene
 
@@ -40,7 +41,6 @@ def compare_packs(
     folder: Path,
     source: str,
     recorded: Scene,
-    compare: Compare,
     executor: InlineExecutor,
     **options: Any,
 ) -> None:
@@ -61,12 +61,10 @@ def compare_packs(
 
 @pytest.mark.one_in(12)
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_every_encoding(
-    encoding: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
-) -> None:
+def test_every_encoding(encoding: str, tmp_path: Path, executor: InlineExecutor) -> None:
     source = INDEXED[ENCODINGS.index(encoding) % 3]
     recorded = scene(encoding, frames=10, width=66, height=46)
-    compare_packs(tmp_path, source, recorded, compare, executor)
+    compare_packs(tmp_path, source, recorded, executor)
 
 
 OTHERS: dict[str, tuple[Callable[[], Scene], str]] = {
@@ -87,9 +85,7 @@ OTHERS: dict[str, tuple[Callable[[], Scene], str]] = {
 
 @pytest.mark.one_in(12)
 @pytest.mark.parametrize("name", OTHERS)
-def test_every_source_and_message(
-    name: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
-) -> None:
+def test_every_source_and_message(name: str, tmp_path: Path, executor: InlineExecutor) -> None:
     recorded, source = OTHERS[name]
     paths = (SOURCES | FOXGLOVE_SOURCES)[source](tmp_path / "source", recorded())
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(window=3))
@@ -101,9 +97,7 @@ def test_every_source_and_message(
 
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("codec", ["av1", "av1-10bit", "h264", "h265"])
-def test_a_lossy_profile(
-    codec: str, tmp_path: Path, compare: Compare, executor: InlineExecutor
-) -> None:
+def test_a_lossy_profile(codec: str, tmp_path: Path, executor: InlineExecutor) -> None:
     """The parts are decoded alike; each begins with a key frame, and nothing else differs."""
     options = {"quality": "crf=12", "codec": codec}
     recorded = scene("rgb8", frames=10, width=96, height=64, noisy=False)
@@ -123,9 +117,7 @@ def test_a_lossy_profile(
     assert max(error) < 12
 
 
-def test_channels_that_cannot_be_told_apart(
-    tmp_path: Path, compare: Compare, executor: InlineExecutor
-) -> None:
+def test_channels_that_cannot_be_told_apart(tmp_path: Path, executor: InlineExecutor) -> None:
     """Two of the same topic, type and metadata are one: its messages are counted together."""
     (source,) = SOURCES["mcap-ros2-zstd"](tmp_path / "source", scene("mono8", frames=11))
     path = tmp_path / "source" / "twice.mcap"

@@ -16,6 +16,7 @@ from mcap.writer import Writer
 
 import mp4ds
 from coded_tools import mutations
+from compare import compare
 from foxglove_wire import SERIALIZATIONS, message_class
 from mp4ds.messages.protobuf import ProtobufForm
 from mp4ds.messages.wire import (
@@ -30,7 +31,6 @@ from mp4ds.messages.wire import (
     WireError,
     prove,
 )
-from round_trips import Compare
 from scenes import Record
 from waiting import lines_run
 
@@ -528,9 +528,7 @@ def test_a_large_message_takes_no_copy() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["json", "flatbuffer", "cbor"])
-def test_other_serializations_are_kept_as_they_are(
-    encoding: str, tmp_path: Path, compare: Compare
-) -> None:
+def test_other_serializations_are_kept_as_they_are(encoding: str, tmp_path: Path) -> None:
     """Whatever they hold: nobody looks."""
     path = tmp_path / "drive.mcap"
     with path.open("wb") as stream:
