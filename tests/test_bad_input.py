@@ -816,8 +816,7 @@ def test_json_of_success(
     }
     result = call(*arguments[command], "--json")
     assert result.code == 0
-    events = [json.loads(line)["event"] for line in result.err.splitlines()]
-    assert set(events) == ({"start", "progress", "end"} if command == "pack" else set())
+    assert result.err == ""
     keys = {
         "pack": "topics",
         "unpack": "messages",

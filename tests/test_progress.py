@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import json
 import os
 import pty
 import re
@@ -18,22 +17,20 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import click
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from commands import Result, program
-from mp4ds.cli.output import be_json
 from mp4ds.cli.progress import (
-    Events,
     Log,
     duration_text,
     pack_progress,
     rows_of,
     share_of,
 )
-from mp4ds.packing.options import PackProgress
+from mp4ds.packing.options import PackOptions, PackProgress
+from mp4ds.packing.pack import pack_each
 from mp4ds.plugins.demo import demo
 from test_terminal import Screen
 from waiting import WATCHDOG_S, until
@@ -98,18 +95,6 @@ def logged(reports: Iterable[Report], outcome: str = "done") -> list[str]:
     return stream.getvalue().splitlines()
 
 
-def events_of(reports: Iterable[Report], outcome: str = "done") -> list[dict[str, Any]]:
-    """The events of packs, each as the schema has it."""
-    clock, stream = Clock(), io.StringIO()
-    events = Events(stream, clock=clock, now=clock.now)
-    for seconds, states in reports:
-        clock.seconds = 1000.0 + seconds
-        for state in states:
-            events.take(state)
-    events.end(outcome)
-    return parsed(stream.getvalue())
-
-
 # ---------------------------------------------------------------- where it stands
 
 
@@ -128,16 +113,13 @@ def test_datasets_count_by_their_size() -> None:
 
 @pytest.mark.parametrize("before", [0.0, 0.8])
 def test_the_time_left_is_by_what_this_run_did(before: float) -> None:
-    reports = ((n, [told(before + n * (1 - before) / 1000)]) for n in range(401))
-    left = [event["seconds_left"] for event in events_of(reports)[1:-1]]
-    assert left[:3] == [None] * 3
-    assert left[-1] == pytest.approx(600, abs=5)
+    lines = logged((n, [told(before + n * (1 - before) / 1000)]) for n in range(401))
+    assert lines[-2].endswith(" | 10 min left")
 
 
 @pytest.mark.parametrize("share", [None, 0.0, 0.5])
 def test_no_time_left_is_told_that_is_not_known(share: float | None) -> None:
-    found = events_of((n, [told(share, parts=0)]) for n in range(9))
-    assert {event["seconds_left"] for event in found[1:-1]} == {None}
+    assert "left" not in " ".join(logged((n, [told(share, parts=0)]) for n in range(19)))
 
 
 # ---------------------------------------------------------------- anything at all
@@ -172,25 +154,21 @@ def jobs(draw: st.DrawFn) -> list[tuple[float, PackProgress]]:
 def test_contradictory_progress_is_shown_sensibly(
     reports: list[tuple[float, PackProgress]], width: int, height: int
 ) -> None:
-    clock, lines, events = Clock(0.0), io.StringIO(), io.StringIO()
+    clock, lines = Clock(0.0), io.StringIO()
     log = Log(lines, clock=clock, now=clock.now)
-    stream = Events(events, clock=clock, now=clock.now)
     states: dict[Path, PackProgress] = {}
     size = {"COLUMNS": str(width), "LINES": str(height), "TERM": "xterm"}
     with mock.patch.dict(os.environ, size), shown_on(Screen()) as screen, pack_progress() as take:
         for now, state in reports:
             clock.seconds = now
             take(state)
-            stream.take(state)
             states[state.dataset] = state
             log.show(rows_of(states))
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue())
     assert all(letter.isprintable() or letter in "\n\r" for letter in text)
     log.end("done")
-    stream.end("done")
     for line in lines.getvalue().splitlines():
         assert re.fullmatch(r"\d\d:\d\d:\d\d packing [ -~]+", line)
-    parsed(events.getvalue())
 
 
 # ---------------------------------------------------------------- log files
@@ -246,7 +224,6 @@ def test_a_pack_does_not_fail_for_want_of_a_log(mode: str) -> None:
         log = Log(stream, clock=Clock())
         log.show(rows_of({Path("/data/drive"): told(0.5)}))
         log.end("done")
-        Events(stream).take(told(0.5))
 
 
 @pytest.mark.parametrize(
@@ -267,96 +244,6 @@ def test_durations(seconds: float, text: str) -> None:
     assert duration_text(seconds) == text
 
 
-# ---------------------------------------------------------------- --json
-
-KEYS: dict[str, dict[str, Any]] = {
-    "start": {"dataset": str},
-    "progress": {
-        "dataset": str,
-        "phase": str,
-        "note": str,
-        "done": (float, type(None)),
-        "job_done": (float, type(None)),
-        "tasks_done": int,
-        "tasks_total": int,
-        "tasks_before": int,
-        "failed": int,
-        "bytes_read": int,
-        "bytes_total": int,
-        "bytes_written": int,
-        "topics": dict,
-        "seconds_left": (int, type(None)),
-    },
-    "end": {"outcome": str, "seconds": float},
-}
-
-
-def parsed(text: str) -> list[dict[str, Any]]:
-    """Events, each as the schema has it."""
-
-    def refuse(word: str) -> None:
-        raise ValueError(f"{word} is no JSON")
-
-    assert text.isascii()
-    found = [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
-    for event in found:
-        keys = KEYS[event["event"]]
-        assert set(event) == {"event", "time", *keys}
-        assert all(isinstance(event[key], kind) for key, kind in keys.items()), event
-        assert datetime.fromisoformat(event["time"]).utcoffset() == timedelta(0)
-        for topic in event.get("topics", {}).values():
-            assert set(topic) == {"done", "total"}
-    kinds = [event["event"] for event in found]
-    if found:
-        assert kinds[0] == "start"
-        assert kinds[-1] == "end"
-        assert set(kinds[1:-1]) == {"progress"}
-    return found
-
-
-def test_the_events_of_a_pack() -> None:
-    found = events_of((n / 10, [told(n / 1000, note=HOSTILE)]) for n in range(1001))
-    assert len(found) == 1 + 101 + 1
-    assert found[51] == {
-        "event": "progress",
-        "time": "2024-05-01T12:00:50.000+00:00",
-        "dataset": "/data/drive",
-        "phase": "packing",
-        "note": HOSTILE,
-        "done": 0.5,
-        "job_done": 0.5,
-        "tasks_done": 120,
-        "tasks_total": 240,
-        "tasks_before": 0,
-        "failed": 0,
-        "bytes_read": 25_000_000_000,
-        "bytes_total": 50_000_000_000,
-        "bytes_written": 2_500_000_000,
-        "topics": {f"/cam{n}": {"done": 18_000, "total": 36_000} for n in range(2)},
-        "seconds_left": 50,
-    }
-    assert found[-2]["done"] == 1.0
-    assert found[-1]["seconds"] == 100.0
-
-
-def test_the_last_event_is_not_lost_and_none_is_told_twice() -> None:
-    found = events_of((n / 10, [told(n / 4)]) for n in range(5))
-    assert [event.get("done") for event in found] == [None, 0.0, 1.0, None]
-
-
-def test_each_dataset_is_told_of_once_a_second() -> None:
-    both = ((n / 8, [told(n / 80, dataset=name) for name in ("a", "b")]) for n in range(81))
-    found = events_of(both, "interrupted")[1:-1]
-    for name in ("a", "b"):
-        own = [event for event in found if event["dataset"].endswith(name)]
-        assert len(own) == 11
-        assert own[-1]["done"] == 1.0
-
-
-def test_a_pack_that_does_not_begin_has_no_events() -> None:
-    assert events_of([], "failed") == []
-
-
 # ---------------------------------------------------------------- while a command runs
 
 
@@ -371,15 +258,17 @@ def test_a_pack_that_does_not_begin_has_no_events() -> None:
     ],
 )
 def test_the_end_is_told_however_it_comes(
-    error: type[BaseException] | None, outcome: str, capsys: pytest.CaptureFixture[str]
+    error: type[BaseException] | None,
+    outcome: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with click.Context(click.Command("pack")), suppress(error or ValueError):
-        be_json()
-        with pack_progress() as take:
-            take(told(0.5))
-            if error is not None:
-                raise error
-    assert parsed(capsys.readouterr().err)[-1]["outcome"] == outcome
+    monkeypatch.setattr("mp4ds.cli.progress._LEAST_PAUSE", 0.0)
+    with suppress(error or ValueError), pack_progress() as take:
+        take(told(0.5))
+        if error is not None:
+            raise error
+    assert f" packing drive: {outcome} after 0 s | parts 120/240" in capsys.readouterr().err
 
 
 def test_a_short_pack_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
@@ -469,31 +358,25 @@ def command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "mp4ds", "pack", *map(str, arguments), *quick, "--gop", "4"]
 
 
-def test_events_of_the_command(drives: list[Path], tmp_path: Path) -> None:
-    done = program(*command(*drives, "--output", f"{tmp_path}/", "--window", "4", "--json"))
-    assert [Path(made["dataset"]).name for made in json.loads(done.out)] == ["day", "night"]
-    found = parsed(done.err)
-    assert found[-1]["outcome"] == "done"
-    reports = found[1:-1]
-    shares = [event["job_done"] for event in reports]
-    assert shares == sorted(shares)
+def test_the_command_reports_all_its_datasets(
+    drives: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: list[PackProgress] = []
+    options = PackOptions(quality="crf=40", codec="h264", preset="ultrafast", gop=4, window=4)
+    pack_each(drives, f"{tmp_path}/", options, progress=seen.append)
+    states: dict[Path, PackProgress] = {}
+    shares = []
+    for state in seen:
+        states[state.dataset] = state
+        shares.append(share_of(states))
+    assert shares == sorted(shares)  # type: ignore[type-var]
     assert (shares[0], shares[-1]) == (0.0, 1.0)
     # both are known from the beginning, so that the share is of both
-    assert {event["dataset"] for event in reports[:2]} == {
-        str(tmp_path / "day"),
-        str(tmp_path / "night"),
-    }
+    assert {state.dataset.name for state in seen[:2]} == {"day", "night"}
     for name, frames in (("day", 15), ("night", 9)):
-        last = [event for event in reports if Path(event["dataset"]).name == name][-1]
-        assert last["tasks_done"] == last["tasks_total"] > 1
-        counts = [(topic["done"], topic["total"]) for topic in last["topics"].values()]
-        assert counts == [(frames, frames)] * 2
-
-
-def test_events_of_a_pack_in_one_go(drives: list[Path], tmp_path: Path) -> None:
-    found = parsed(program(*command(drives[0], "--output", tmp_path / "x", "--json")).err)
-    assert found[-2]["done"] == found[-2]["job_done"] == 1.0
-    assert found[-2]["tasks_total"] == 0
+        last = [state for state in seen if state.dataset.name == name][-1]
+        assert last.tasks_done == last.tasks_total > 1
+        assert list(last.topics.values()) == [(frames, frames)] * 2
 
 
 @pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])

@@ -1,8 +1,7 @@
-"""Progress of commands, always on stderr: live, as lines, or as events for packs."""
+"""Progress of commands, always on stderr: live, or as lines."""
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -10,13 +9,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import TextIO
 
 from mp4ds.cli.output import is_json, is_quiet, shown
 from mp4ds.errors import size_text
 from mp4ds.packing.options import PackProgress
 
-_LinesT = TypeVar("_LinesT", bound="_Lines")
 _NAME_WIDTH = 60
 _ROUNDING = 1e-6
 _DIGITS = 9  # digits of a share: with a float's full precision, the time left may overflow
@@ -85,8 +83,15 @@ def display(*, timed: bool = True) -> Iterator[Show]:
         with _bars(timed=timed) as show:
             yield show
     else:
-        with Log(sys.stderr, timed=timed) as log:
+        log, outcome = Log(sys.stderr, timed=timed), "done"
+        try:
             yield log.show
+        except BaseException as error:
+            stopped = isinstance(error, (KeyboardInterrupt, SystemExit))
+            outcome = "interrupted" if stopped else "failed"
+            raise
+        finally:
+            log.end(outcome)
 
 
 @contextmanager
@@ -125,8 +130,8 @@ def _bars(*, timed: bool) -> Iterator[Show]:
         yield show
 
 
-class _Lines:
-    """What a stream is told of a command, as long as anyone reads it, and how the command ends.
+class Log:
+    """Reports by lines: after 10 s, and whenever a twentieth of the time has passed again.
 
     Args:
         stream: Where to.
@@ -146,50 +151,14 @@ class _Lines:
         self._stream, self._timed, self._clock, self._now = stream, timed, clock, now
         self._began = clock()
         self._known: tuple[float, float] | None = None  # when a share was known first, and which
-
-    def end(self, outcome: str) -> None:
-        """Tell how it ended."""
-        raise NotImplementedError
-
-    def __enter__(self: _LinesT) -> _LinesT:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        stopped = kind is not None and issubclass(kind, (KeyboardInterrupt, SystemExit))
-        self.end("interrupted" if stopped else "failed" if kind else "done")
-
-    @property
-    def _seconds(self) -> float:
-        return self._clock() - self._began
-
-    def _left(self, share: float | None) -> int | None:
-        """Seconds until all is done, by what was done since a share was known; None if unknown."""
-        if not share or not self._timed:
-            return None
-        now = self._clock()
-        self._known = self._known or (now, share)
-        began, before = self._known
-        if share <= before or now - began < _SURE_SECONDS:
-            return None
-        return int((now - began) * (1 - share) / (share - before))
-
-    def _write(self, line: str) -> None:
-        with suppress(OSError, ValueError):  # ValueError: it was closed
-            self._stream.write(line + "\n")
-            self._stream.flush()
-
-
-class Log(_Lines):
-    """Reports by lines: after 10 s, and whenever a twentieth of the time has passed again."""
-
-    _last: Sequence[Row] = ()
-    _next = _LEAST_PAUSE
+        self._last: Sequence[Row] = ()
+        self._next = _LEAST_PAUSE
 
     def show(self, rows: Sequence[Row]) -> None:
         """Take what is done, and write a line if one is due."""
         self._last = rows
         whole, *parts = rows
-        left, seconds = self._left(whole.share), self._seconds
+        left, seconds = self._left(whole.share), self._clock() - self._began
         if seconds < self._next:
             return
         self._next = seconds + min(max(_LEAST_PAUSE, _GROWTH * seconds), _MOST_PAUSE)
@@ -200,14 +169,27 @@ class Log(_Lines):
 
     def end(self, outcome: str) -> None:
         """Write how it ended, if there were lines before."""
-        if self._last and self._seconds >= _LEAST_PAUSE:
-            text = plain(self._last[0].text)
-            self._tell(f"{outcome} after {duration_text(self._seconds)}", text)
+        seconds = self._clock() - self._began
+        if self._last and seconds >= _LEAST_PAUSE:
+            self._tell(f"{outcome} after {duration_text(seconds)}", plain(self._last[0].text))
+
+    def _left(self, share: float | None) -> float | None:
+        """Seconds until all is done, by what was done since a share was known; None if unknown."""
+        if not share or not self._timed:
+            return None
+        now = self._clock()
+        self._known = self._known or (now, share)
+        began, before = self._known
+        if share <= before or now - began < _SURE_SECONDS:
+            return None
+        return (now - began) * (1 - share) / (share - before)
 
     def _tell(self, *texts: str) -> None:
         name = plain(self._last[0].name)
         line = " | ".join(filter(None, texts))
-        self._write(f"{self._now().astimezone():%H:%M:%S} {name}: {line}")
+        with suppress(OSError, ValueError):  # nobody reads it; ValueError: it was closed
+            self._stream.write(f"{self._now().astimezone():%H:%M:%S} {name}: {line}\n")
+            self._stream.flush()
 
 
 @contextmanager
@@ -231,9 +213,6 @@ def progress_of(doing: str) -> Iterator[Callable[..., None]]:
 
 
 # ---------------------------------------------------------------- packs
-
-_EVENT_SECONDS = 1.0
-
 
 States = dict[Path, PackProgress]
 """Last reported state of each dataset, in the order in which they began."""
@@ -298,66 +277,6 @@ def _amounts(*states: PackProgress) -> str:
     return "  ".join(filter(None, texts))
 
 
-class Events(_Lines):
-    """Reports packs as JSON events: the first, the last, and one a second of each dataset."""
-
-    def __init__(self, stream: TextIO, **more: Any) -> None:
-        super().__init__(stream, **more)
-        self._states: States = {}
-        self._written: dict[Path, tuple[float, PackProgress]] = {}
-
-    def take(self, state: PackProgress) -> None:
-        """Take a state, and write the event if one is due."""
-        if not self._states:
-            self._event("start", dataset=str(state.dataset))
-        self._states[state.dataset] = state
-        before = self._written.get(state.dataset)
-        if before is None or self._clock() - before[0] >= _EVENT_SECONDS:
-            self._report(state)
-
-    def end(self, outcome: str) -> None:
-        """Write what was not due yet, and how it ended."""
-        for dataset, state in self._states.items():
-            if self._written[dataset][1] is not state:
-                self._report(state)
-        if self._states:
-            self._event("end", outcome=outcome, seconds=round(self._seconds, 3))
-
-    def _report(self, state: PackProgress) -> None:
-        self._written[state.dataset] = self._clock(), state
-        done = packed_share(state) if state.phase == "packing" else state.done
-        share = share_of(self._states)
-        self._event(
-            "progress",
-            dataset=str(state.dataset),
-            phase=state.phase,
-            note=state.note,
-            # while joining does not report progress, the share stays that of packing
-            done=None if done == 1 and state.phase != "packing" else _rounded(done),
-            job_done=_rounded(share),
-            tasks_done=state.tasks_done,
-            tasks_total=state.tasks_total,
-            tasks_before=state.tasks_before,
-            failed=state.failed,
-            bytes_read=state.bytes_read,
-            bytes_total=state.bytes_total,
-            bytes_written=state.bytes_written,
-            topics={
-                topic: {"done": done, "total": total}
-                for topic, (done, total) in state.topics.items()
-            },
-            seconds_left=self._left(share),
-        )
-
-    def _event(self, event: str, **values: Any) -> None:
-        now = self._now().isoformat(timespec="milliseconds")
-        self._write(json.dumps({"event": event, "time": now, **values}))
-
-
-def _rounded(share: float | None) -> float | None:
-    return None if share is None else round(share, 6)
-
-
 @contextmanager
 def pack_progress(*, whole: bool = True) -> Iterator[Callable[[PackProgress], None]]:
     """Show the progress of packs while the context lasts.
@@ -368,10 +287,6 @@ def pack_progress(*, whole: bool = True) -> Iterator[Callable[[PackProgress], No
     Yields:
         What takes the progress, several times a second.
     """
-    if is_json():
-        with Events(sys.stderr, timed=whole) as events:
-            yield events.take
-        return
     states: States = {}
     with display(timed=whole) as show:
 
