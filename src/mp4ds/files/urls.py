@@ -12,7 +12,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path, PurePosixPath
 from reprlib import repr as shortened
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
@@ -163,9 +163,7 @@ class RemotePath(_Path):
         try:
             found = url_to_fs(self.url, **options)[0]
             if self._on_web:
-                from mp4ds.files.web import RangeFileSystem
-
-                found = RangeFileSystem(**found.storage_options)
+                found = _range_file_system()(**found.storage_options)
         except ImportError as error:
             is_of_extra = self.scheme in (*_S3, *_HTTP)
             remedy = _INSTALL if is_of_extra else _text(error)
@@ -373,6 +371,42 @@ class RemotePath(_Path):
         """
         with suppress(FileNotFoundError), _sentences(self, "removed"):
             self._files.rm_file(self._key)
+
+
+@cache
+def _range_file_system() -> Any:
+    """The class of fsspec for web servers, which reads whatever these send, limited to ranges."""
+    from fsspec.implementations.http import HTTPFileSystem
+
+    class RangeFileSystem(HTTPFileSystem):  # type: ignore[misc]
+        """Reads no more than was asked for."""
+
+        async def _cat_file(self, url: str, start: int = 0, end: int = 0, **kwargs: Any) -> bytes:
+            """A range; one byte more if the server sends more.
+
+            Raises:
+                Refused: The server does not support ranges.
+            """
+            options = {**self.kwargs, **kwargs}
+            headers = {
+                **options.pop("headers", {}),
+                "Range": f"bytes={start}-{end - 1}",
+                "Accept-Encoding": "identity",
+            }
+            session = await self.set_session()
+            async with session.get(self.encode_url(url), headers=headers, **options) as response:
+                self._raise_not_found_for_status(response, url)
+                if response.status != 206 and start > 0:
+                    raise Refused("the web server does not support range requests")
+                data = bytearray()
+                while missing := end - start + 1 - len(data):
+                    piece = await response.content.read(missing)
+                    if not piece:
+                        break
+                    data += piece
+                return bytes(data)
+
+    return RangeFileSystem
 
 
 # ---------------------------------------------------------------- locations
