@@ -252,13 +252,6 @@ def test_the_terminal_is_as_it_was_after_a_signal(
     assert terminal.attributes[3] == before[3]
 
 
-def test_ctrl_c_is_typed(terminal: Terminal, session: Session) -> None:
-    session.expect("entered")
-    terminal.type(b"\x03")
-    session.expect(f"ended {-signal.SIGINT}")
-    assert not terminal.gives_keys
-
-
 def test_ctrl_z_gives_the_terminal_back_and_fg_takes_it(
     terminal: Terminal, session: Session
 ) -> None:

@@ -322,7 +322,7 @@ def test_a_terminal_shows_each_dataset(monkeypatch: pytest.MonkeyPatch) -> None:
     assert re.search(r"  b .* 50 % +parts 120/240  25\.0 GB -> 2\.5 GB", text)
 
 
-def test_a_terminal_shows_hostile_names_harmlessly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_names_steer_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     topics = {HOSTILE: (1, None), "[red]/[/red]": (2, 3), "{task.id}": (3, 4)}
     state = told(0.5, topics=topics, phase="joining", note=HOSTILE)
     text = on_screen(state, monkeypatch=monkeypatch)
@@ -369,7 +369,6 @@ def test_the_command_reports_all_its_datasets(
     for state in seen:
         states[state.dataset] = state
         shares.append(share_of(states))
-    assert shares == sorted(shares)  # type: ignore[type-var]
     assert (shares[0], shares[-1]) == (0.0, 1.0)
     # both are known from the beginning, so that the share is of both
     assert {state.dataset.name for state in seen[:2]} == {"day", "night"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import dataclasses
 import inspect
 import re
@@ -47,50 +48,25 @@ def test_other_names_are_attribute_errors() -> None:
     assert not hasattr(mp4ds, "__wrapped__")
 
 
-def test_every_error_is_public() -> None:
-    tree = {
+TREE = re.findall(r"(\w+Error)(?: \((\w+)\))?(?: +(?:exit code )?(\d))?", str(errors.__doc__))
+"""Each error as it is drawn: its name, the builtin one that it is too, and its exit code."""
+
+
+@pytest.mark.parametrize(("name", "builtin", "code"), TREE)
+def test_errors_are_what_is_drawn(name: str, builtin: str, code: str) -> None:
+    error = getattr(mp4ds, name)
+    assert issubclass(error, getattr(builtins, builtin or "Exception"))
+    assert not code or error.exit_code == int(code)
+
+
+def test_every_error_is_public_and_drawn() -> None:
+    found = {
         name
         for name, value in vars(errors).items()
-        if isinstance(value, type) and issubclass(value, mp4ds.Mp4dsError) and name[0] != "_"
+        if isinstance(value, type) and issubclass(value, mp4ds.Mp4dsError)
     }
-    assert tree <= set(NAMES)
-    for name in tree:
-        assert issubclass(getattr(mp4ds, name), mp4ds.Mp4dsError)
-        assert name in str(errors.__doc__)  # the tree is drawn there
-
-
-BUILTIN: dict[type[Exception], str] = {
-    ValueError: "SourceError OptionError FormatError VersionError VideoError ConversionError",
-    OSError: "TargetError WriteError",
-    FileNotFoundError: "SourceNotFoundError",
-    FileExistsError: "TargetExistsError",
-    LookupError: "FrameNotFoundError",
-    RuntimeError: "SampleError",
-    Exception: "PathError RemoteError PartsFailedError ScoringError EncoderRefusedError",
-}
-WRONG_INPUT = [
-    "SourceError", "SourceNotFoundError", "TargetError", "TargetExistsError", "OptionError",
-    "FrameNotFoundError",
-]  # fmt: skip
-"""What ends a command with the code 2; all others end it with 1."""
-
-
-@pytest.mark.parametrize(
-    ("name", "builtin"), [(name, kind) for kind, names in BUILTIN.items() for name in names.split()]
-)
-def test_errors_are_also_builtin_ones(name: str, builtin: type) -> None:
-    error = getattr(mp4ds, name)
-    assert issubclass(error, builtin)
-    assert error.exit_code == (2 if name in WRONG_INPUT else 1)
-    assert re.search(rf"{name}\b.* {error.exit_code}\b", str(errors.__doc__)) or name in (
-        "SourceNotFoundError",
-        "TargetExistsError",
-    )
-
-
-def test_every_error_has_its_builtin_one() -> None:
-    listed = {name for names in BUILTIN.values() for name in names.split()}
-    assert {"Mp4dsError", *listed} == {name for name in NAMES if name.endswith("Error")}
+    assert found == {name for name, _, _ in TREE}
+    assert found == {name for name in NAMES if name.endswith("Error")}
 
 
 def test_the_errors_sentences() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import re
@@ -15,7 +14,6 @@ import pytest
 import commands
 import mp4ds
 from commands import Result, program
-from mp4ds.cli.progress import progress_of
 from scenes import Scene
 from sources import scene, write_mcap
 
@@ -97,24 +95,6 @@ def test_topics_steer_no_terminal(
     assert "\x9b" not in shown
     assert "\u202e" not in shown
     assert "http://x" not in re.sub(r"\\x1b]8;;http://x|\[link=http://x\]", "", shown)
-
-
-def test_progress_is_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    err = Screen()
-    with contextlib.redirect_stderr(err), progress_of("reading") as told:
-        told("/x[/foo][link=http://x]\x1b]0;title\x07")
-    assert "/x[/foo][link=http://x]\\x1b]0;title\\x07" in err.getvalue()
-
-
-def test_a_bar_shows_per_cent_and_what_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    err = Screen()
-    with contextlib.redirect_stderr(err), progress_of("validating") as tell:
-        tell("decoding left.mp4", 0.42)
-    assert "validating" in err.getvalue()
-    assert "42 %" in err.getvalue()
-    assert "decoding left.mp4" in err.getvalue()
 
 
 # ---------------------------------------------------------------- standard streams

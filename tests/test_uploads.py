@@ -19,7 +19,6 @@ from commands import call
 from compare import compare
 from in_parts import InlineExecutor, facts, use
 from mp4ds.errors import (
-    OptionError,
     PartsFailedError,
     RemoteError,
     SourceError,
@@ -278,12 +277,6 @@ def test_shares_meet_in_the_temporary_folder(
     assert compare([source], store.unpacked()) == []
 
 
-def test_nothing_to_join(source: Path, store: Store) -> None:
-    with pytest.raises(OptionError, match=r"nothing to join"):
-        mp4ds.pack(source, store.url, replace(FAST, join=True))
-    assert store.kept() == []
-
-
 def test_one_dataset_each(source: Path, store: Store, put: Put, tmp_path: Path) -> None:
     write_bag(tmp_path / "other.bag", scene("mono8", frames=3))
     urls, folder = [put(source), put(tmp_path / "other.bag")], f"{store.folder}/all"
@@ -360,13 +353,6 @@ def test_images_are_uploaded(packed_bag: Path, store: Store, tmp_path: Path) -> 
         mp4ds.unpack(packed_bag, "images", url)
     mp4ds.unpack(packed_bag, "images", url, UnpackOptions(force=True, image_format="jpeg"))
     assert not any(name.endswith(".png") for name in store.names())
-
-
-def test_from_a_url_to_a_url(packed_bag: Path, put: Put, store: Store, tmp_path: Path) -> None:
-    mp4ds.unpack(put(packed_bag), "bag", f"{store.folder}/again.bag")
-    store.files.get(f"{store.folder}/again.bag", str(tmp_path / "again.bag"))
-    mp4ds.unpack(packed_bag, "bag", tmp_path / "here.bag")
-    assert compare([tmp_path / "here.bag"], tmp_path / "again.bag") == []
 
 
 # ---------------------------------------------------------------- the command line
