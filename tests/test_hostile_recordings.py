@@ -221,7 +221,7 @@ sqlite_open._LEAST_STEPS = 10**15
 path = Path(sys.argv[1])
 signal.signal(signal.SIGVTALRM, stop)
 try:
-    with sqlite_open.open_tables(path, path) as tables:
+    with sqlite_open.open_tables(path) as tables:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.05)
         tables.select(sys.argv[2]).fetchone()
 except Stop:

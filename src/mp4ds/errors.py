@@ -121,6 +121,7 @@ class PathError(Mp4dsError):
     def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
         self.path = path
         self.problem = problem
+        self.remedy = remedy
         super().__init__(f"{path_text(path)}: {problem}." + (f" {remedy}" if remedy else ""))
 
 

@@ -62,33 +62,28 @@ def unreadable(path: Path, place: str, error: Exception, remedy: str) -> SourceE
     return SourceError(path, f"is damaged{place}: {error}", remedy)
 
 
-def open_source(path: Path, shown: Path | None = None) -> BinaryIO:
+def open_source(path: Path) -> BinaryIO:
     """Open a file of a recording, refusing anything else.
-
-    Args:
-        path: The file.
-        shown: Its name in errors, if it is a decompressed copy.
 
     Raises:
         SourceError: It is missing, unreadable, not a regular file, empty, or a git-lfs pointer.
     """
-    shown = shown or path
     try:
         if not path.is_file() and not path.is_dir() and path.exists():
-            raise SourceError(shown, "is not a regular file")  # opening a pipe could block forever
+            raise SourceError(path, "is not a regular file")  # opening a pipe could block forever
         stream = path.open("rb")
     except FileNotFoundError:
-        raise SourceNotFoundError(shown) from None
+        raise SourceNotFoundError(path) from None
     except OSError as error:
-        raise SourceError(shown, f"cannot be read: {error.strerror}") from None
+        raise SourceError(path, f"cannot be read: {error.strerror}") from None
     head = stream.read(len(_LFS_POINTER))
     stream.seek(0)
     if head and head != _LFS_POINTER:
         return stream
     stream.close()
     if not head:
-        raise SourceError(shown, "is empty")
-    raise SourceError(shown, "is a git-lfs pointer, not the recording", "Run `git lfs pull`.")
+        raise SourceError(path, "is empty")
+    raise SourceError(path, "is a git-lfs pointer, not the recording", "Run `git lfs pull`.")
 
 
 def other_begin(path: Path, kind: str, magic: bytes, start: bytes) -> SourceError:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
@@ -23,9 +22,7 @@ from mp4ds.bags import protocols
 from mp4ds.bags.files import (
     SALVAGE_REMEDY,
     DamageError,
-    most_held,
     most_unpacked,
-    open_source,
 )
 from mp4ds.bags.mcap_index import ChunkEntry, McapSummary, read_summary
 from mp4ds.bags.mcap_records import (
@@ -60,7 +57,7 @@ class McapReader(BagReader):
 
     Args:
         path: The file.
-        shown: Its name in errors, where it is a decompressed copy.
+        most: Bytes that a record may have.
 
     Raises:
         SourceError: The file is missing, not an MCAP file, or cut short.
@@ -68,10 +65,10 @@ class McapReader(BagReader):
 
     format = "mcap"
 
-    def __init__(self, path: Path, *, shown: Path | None = None) -> None:
+    def __init__(self, path: Path, *, most: int = MAX_RECORD_BYTES) -> None:
         self.path = path
-        self._shown = shown or path
-        self.files = [self._shown]
+        self.files = [path]
+        self._most = most
         self._declared = declared = Declared()
         self._channels = declared.channels
         self._schemas = declared.schemas.values()
@@ -97,12 +94,7 @@ class McapReader(BagReader):
             self._declared.add_summary(self._summary.schemas, self._summary.channels)
 
     def _start_pass(self) -> RecordStream:
-        file = open_source(self.path, self._shown)
-        size = file.seek(0, os.SEEK_END)
-        file.seek(0)
-        # a small compressed file may hold what claims to be large
-        most = MAX_RECORD_BYTES if self._shown == self.path else most_held()
-        stream = RecordStream(file, self._shown, size, most)
+        stream = RecordStream(self.path, self._most)
         try:
             stream.read_magic()
         except BaseException:
@@ -123,9 +115,7 @@ class McapReader(BagReader):
     @property
     def position(self) -> int:
         """Bytes of the file that `records` has consumed."""
-        if self._pass is None or self._shown == self.path:
-            return self._pass.tell() if self._pass else self._position
-        return self._pass.tell() * self._shown.stat().st_size // max(1, self._pass.size)
+        return self._pass.tell() if self._pass else self._position
 
     @property
     def is_indexed(self) -> bool:
@@ -158,7 +148,7 @@ class McapReader(BagReader):
         self._declared.skipped.clear()
         try:
             yield from read(stream)
-            self._position = self._shown.stat().st_size
+            self._position = self.path.stat().st_size
         finally:
             self._pass = None
             stream.close()
@@ -224,7 +214,7 @@ class McapReader(BagReader):
             yield self._other_at(stream, place)
         if excerpt == EVERYTHING and not summary.covers(count):
             raise SourceError(
-                self._shown,
+                self.path,
                 f"is damaged: its chunks hold {count} messages, which its statistics contradict",
                 SALVAGE_REMEDY,
             )

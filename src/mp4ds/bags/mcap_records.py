@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
@@ -20,6 +21,7 @@ from mp4ds.bags.files import (
     SALVAGE_REMEDY,
     DamageError,
     OversizeError,
+    open_source,
     other_begin,
     unpack,
     unreadable,
@@ -57,19 +59,19 @@ class RecordStream:
     """One pass over the records of an MCAP file.
 
     Args:
-        stream: A binary stream at the start of the file.
-        path: The file's name, for errors.
-        size: Bytes in the stream.
+        path: The file.
         most: Bytes that a record may have.
 
     Attributes:
+        size: Bytes of the file.
         start: Byte offset of the record that was read last.
     """
 
-    def __init__(self, stream: BinaryIO, path: Path, size: int, most: int) -> None:
-        self._stream = stream
+    def __init__(self, path: Path, most: int) -> None:
+        self._stream = open_source(path)
         self.path = path
-        self.size = size
+        self.size = self._stream.seek(0, os.SEEK_END)
+        self._stream.seek(0)
         self._most = most
         self._offset = 0
         self.start = 0

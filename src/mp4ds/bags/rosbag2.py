@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +18,7 @@ from mp4ds.bags.files import (
     DamageError,
     copy_file,
     decompress_file,
+    most_held,
     open_source,
     unreadable,
     unzstd,
@@ -118,35 +119,44 @@ class Rosbag2Reader(CombinedReader):
         start = _start(file)
         if start.startswith(ZSTD_MAGIC) or (remote(file) and not self._is_mcap(file, start)):
             return None
-        return self._file_reader(file, file)
+        return self._file_reader(file)
 
-    def _is_mcap(self, shown: Path, start: bytes) -> bool:
+    def _is_mcap(self, file: Path, start: bytes) -> bool:
         """Whether a storage file, which begins so, is or should be an MCAP file."""
-        is_named = shown.name.removesuffix(".zstd").endswith(".mcap")
+        is_named = file.name.removesuffix(".zstd").endswith(".mcap")
         is_listed = self._info is not None and self._info.storage == "mcap"
         return start == MCAP_MAGIC or is_named or is_listed
 
-    def _file_reader(self, file: Path, shown: Path) -> BagReader:
-        """The reader of a file, or of its decompressed copy."""
-        is_mcap = self._is_mcap(shown, _start(file))
-        return (self._mcap_reader if is_mcap else self._sqlite_reader)(file, shown=shown)
+    def _file_reader(self, file: Path, **limit: int) -> BagReader:
+        """The reader of a file, or of its copy of the same name."""
+        is_mcap = self._is_mcap(file, _start(file))
+        return (self._mcap_reader if is_mcap else self._sqlite_reader)(file, **limit)
 
     def _holds_zstd(self, reader: BagReader) -> bool:
         """Whether the messages of a file without metadata.yaml are individually compressed."""
         texts = [text for key, text in reader.tables.items() if ":metadata:" in key]
         return bool(texts) and parse_bag_info(texts[-1], reader.path).compression == "message"
 
-    def _opened(self, number: int) -> AbstractContextManager[BagReader]:
-        reader = self._readers[number]
-        return nullcontext(reader) if reader else self._unpacked(number)
+    @contextmanager
+    def _opened(self, number: int) -> Iterator[BagReader]:
+        reader, file = self._readers[number], self._storage_files[number]
+        try:
+            with nullcontext(reader) if reader else self._unpacked(file) as part:
+                yield part
+        except SourceError as error:
+            if not self._is_packed[number] or error.path == file:
+                raise
+            raise SourceError(file, error.problem, error.remedy) from None  # not of its copy
 
     @contextmanager
-    def _unpacked(self, number: int) -> Iterator[BagReader]:
-        file = self._storage_files[number]
+    def _unpacked(self, file: Path) -> Iterator[BagReader]:
+        """The reader of a copy, which has the name of the file: losses and tables tell it."""
         with tempfile.TemporaryDirectory(prefix="mp4ds-") as folder:
-            copy = Path(folder) / "storage"
+            copy = Path(folder) / file.name
             self._unpack(file, copy)
-            with self._file_reader(copy, file) as reader:
+            # a small compressed file may hold what claims to be large
+            with self._file_reader(copy, most=most_held()) as reader:
+                reader.files = [file]
                 yield reader
 
     def _unpack(self, file: Path, target: Path) -> None:
@@ -154,7 +164,7 @@ class Rosbag2Reader(CombinedReader):
 
     def _unpack_first(self) -> None:
         """Open the first file, whose channels are needed before anything is read, until then."""
-        self._readers[0] = self._first_copy.enter_context(self._unpacked(0))
+        self._readers[0] = self._first_copy.enter_context(self._opened(0))
 
     def _drop_first(self) -> None:
         if any(self._is_packed[:1]):
@@ -195,10 +205,18 @@ class Rosbag2Reader(CombinedReader):
     def spans(self) -> Sequence[tuple[int, int]]:
         """Of each file, bounds of its log times, nanoseconds."""
         starts: list[int] = []
-        for reader in reversed(self._readers):
-            span = reader.span if reader else None
+        for number in reversed(range(len(self._readers))):
+            span = None
+            if self._readers[number]:
+                with self._opened(number) as part:
+                    span = part.span
             starts.append(span[0] if span else min(starts, default=_NEVER))
         return [(start, _NEVER) for start in reversed(starts)]
+
+    @property
+    def position(self) -> int:
+        """Bytes read of the files; of one that was decompressed, the share read of its copy."""
+        return self._done + sum(map(_position, self._active))
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """The metadata record, then the records of all files, merged."""
@@ -250,6 +268,13 @@ class Rosbag2Reader(CombinedReader):
         """Close the files, and remove those that were decompressed."""
         super().close()
         self._drop_first()
+
+
+def _position(part: BagReader) -> int:
+    (file,) = part.files
+    if part.path == file:
+        return part.position
+    return part.position * file.stat().st_size // part.path.stat().st_size
 
 
 def _start(file: Path) -> bytes:

@@ -22,7 +22,6 @@ from mp4ds.bags.files import (
     SALVAGE,
     SALVAGE_REMEDY,
     OversizeError,
-    most_held,
     open_source,
     unreadable,
 )
@@ -57,13 +56,13 @@ class Tables:
     Args:
         connection: To the file.
         size: Its size in bytes, including the files beside it.
-        shown: Its name in errors.
+        path: The file, for errors.
     """
 
-    def __init__(self, connection: sqlite3.Connection, size: int, shown: Path) -> None:
+    def __init__(self, connection: sqlite3.Connection, size: int, path: Path) -> None:
         self._connection = connection
         self._size, self._left = size, 2 * size  # names are read twice, UTF-16 becomes longer
-        self._shown = shown
+        self._path = path
         self.raised: BaseException | None = None
         looks = self._looks()
         next(looks)
@@ -88,7 +87,7 @@ class Tables:
             if not isinstance(sql, bytes) or not _PLAIN.match(sql):
                 shown = bytes(name).decode(errors="replace") if isinstance(name, bytes) else name
                 raise SourceError(
-                    self._shown,
+                    self._path,
                     f"has a view or virtual table {shown!r}, which recordings never have",
                     f"Drop it with the sqlite3 tool, or {SALVAGE}",
                 )
@@ -117,16 +116,15 @@ class Tables:
     def too_much(self) -> SourceError:
         """The error for tables that hold more than the file."""
         problem = "is damaged: its tables list more data than a file of its size can hold"
-        return SourceError(self._shown, problem, SALVAGE_REMEDY)
+        return SourceError(self._path, problem, SALVAGE_REMEDY)
 
 
 @contextmanager
-def open_tables(path: Path, shown: Path, *, damaged: bool = False) -> Iterator[Tables]:
+def open_tables(path: Path, *, damaged: bool = False) -> Iterator[Tables]:
     """Open a file for reading only.
 
     Args:
         path: The database.
-        shown: Its name in errors, where it is a decompressed copy.
         damaged: Read a file that was cut short, too, up to where it ends.
 
     Raises:
@@ -143,7 +141,7 @@ def open_tables(path: Path, shown: Path, *, damaged: bool = False) -> Iterator[T
         connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
         connection.text_factory = bytes  # verbatim, whether it is UTF-8 or not
         size = path.stat().st_size + beside
-        tables = Tables(connection, size, shown)
+        tables = Tables(connection, size, path)
         connection.execute("PRAGMA trusted_schema = OFF")
         if damaged:  # otherwise sqlite3 opens no file of fewer pages than its header says
             connection.execute("PRAGMA writable_schema = ON")
@@ -161,7 +159,7 @@ def open_tables(path: Path, shown: Path, *, damaged: bool = False) -> Iterator[T
             else "If it was cut short, try `.recover` of the sqlite3 tool, or "
         )
         problem = f"cannot be read as sqlite3: {error}"
-        raise SourceError(shown, problem, remedy + SALVAGE) from None
+        raise SourceError(path, problem, remedy + SALVAGE) from None
     finally:
         if connection:
             connection.set_progress_handler(None, 0)
@@ -191,7 +189,7 @@ class SqliteReader(BagReader):
 
     Args:
         path: The database.
-        shown: Its name in errors and tables, where it is a decompressed copy.
+        most: Bytes that a message may have; None for no limit but the file's size.
         damaged: Read a file that was cut short, too.
 
     Attributes:
@@ -208,21 +206,15 @@ class SqliteReader(BagReader):
     is_indexed = False
     has_all_channels = True
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        shown: Path | None = None,
-        damaged: bool = False,
-    ) -> None:
+    def __init__(self, path: Path, *, most: int | None = None, damaged: bool = False) -> None:
         self.path = path
+        self.files = [path]
+        self._most = most
         self._damaged = damaged
-        self._shown = shown or path
-        self.files = [self._shown]
         self._definitions: list[tuple[Schema, str]] = []
-        with closing(open_source(path, self._shown)) as stream:
+        with closing(open_source(path)) as stream:
             if stream.read(len(_MAGIC)) != _MAGIC:
-                raise SourceError(self._shown, "is not an sqlite3 database")
+                raise SourceError(self.path, "is not an sqlite3 database")
         with self._opened() as tables:
             self._check_columns(tables)
             self._definitions = list(self._read_definitions(tables))
@@ -233,13 +225,13 @@ class SqliteReader(BagReader):
 
     def _opened(self) -> AbstractContextManager[Tables]:
         """Its tables, for one pass."""
-        return open_tables(self.path, self._shown, damaged=self._damaged)
+        return open_tables(self.path, damaged=self._damaged)
 
     def _columns(self, tables: Tables, table: str) -> list[str]:
         columns = tables.columns(table)
         if any(is_computed for _, is_computed in columns):
             problem = f"has a computed column in its table {table}, which recordings never have"
-            raise SourceError(self._shown, problem, SALVAGE_REMEDY)
+            raise SourceError(self.path, problem, SALVAGE_REMEDY)
         return [self._text(name, table) for name, _ in columns]
 
     def _text(self, value: Any, table: str) -> str:
@@ -248,7 +240,7 @@ class SqliteReader(BagReader):
                 return value.decode()
             except UnicodeDecodeError:
                 raise SourceError(
-                    self._shown, f"has text in its table {table} that is not UTF-8"
+                    self.path, f"has text in its table {table} that is not UTF-8"
                 ) from None
         return "" if value is None else str(value)
 
@@ -258,11 +250,11 @@ class SqliteReader(BagReader):
             self._columns(tables, "messages"),
         )
         if not {*topics}.issuperset(_TOPIC_COLUMNS) or not {*messages} >= _MESSAGE_COLUMNS:
-            raise SourceError(self._shown, "is an sqlite3 database, but not of rosbag2")
+            raise SourceError(self.path, "is an sqlite3 database, but not of rosbag2")
         unknown = [name for name in messages if name not in _MESSAGE_COLUMNS]
         if unknown:
             raise SourceError(
-                self._shown,
+                self.path,
                 f"has an unknown column {unknown[0]!r} in its table of messages",
                 "Install a newer mp4ds.",
             )
@@ -302,7 +294,7 @@ class SqliteReader(BagReader):
         return Schema(type_name, "", b"")
 
     def _read_tables(self, tables: Tables) -> Iterator[tuple[str, str]]:
-        prefix = f"db3:{self._shown.name}"
+        prefix = f"db3:{self.path.name}"
         for column in self._columns(tables, "schema"):
             quoted = column.replace('"', '""')
             row = next(tables.rows(f'SELECT "{quoted}" FROM schema LIMIT 1'), None)
@@ -339,7 +331,7 @@ class SqliteReader(BagReader):
             yield from self._excerpt_records(excerpt)
 
     def _all_records(self) -> Iterator[Message]:
-        size = self._shown.stat().st_size
+        size = self.path.stat().st_size
         with self._opened() as tables:
             # Counted without the index, which may lack messages where it is damaged.
             # COUNT(*) would continue without a look at signals.
@@ -374,13 +366,13 @@ class SqliteReader(BagReader):
 
     def _bad_index(self) -> SourceError:
         return SourceError(
-            self._shown,
+            self.path,
             "is damaged: its index of times does not list its messages",
             f"Rebuild it with `REINDEX` in the sqlite3 tool, or {SALVAGE}",
         )
 
     def _message(self, tables: Tables, row_id: int, place: str) -> Message:
-        if self.path != self._shown:
+        if self._most is not None:
             self._check_size(tables, row_id, place)
         query = "SELECT topic_id, timestamp, data, typeof(data) FROM messages WHERE id = ?"
         row = next(tables.rows(query, (row_id,)), None)
@@ -390,17 +382,17 @@ class SqliteReader(BagReader):
         channel = self._channels.get(topic_id)
         if channel is None:
             raise SourceError(
-                self._shown,
+                self.path,
                 f"{place} has topic id {topic_id}, which is not in its table of topics",
                 f"`ros2 bag convert` leaves such messages out, or {SALVAGE}",
             )
         place = f"{place}, topic {channel.topic}"
         if not isinstance(timestamp, int) or timestamp < 0:
             problem = f"{place}: {timestamp!r} is not a valid time"
-            raise SourceError(self._shown, problem, SALVAGE_REMEDY)
+            raise SourceError(self.path, problem, SALVAGE_REMEDY)
         if kind != b"blob":
             problem = f"{place}: the payload is {kind.decode()}, not a blob"
-            raise SourceError(self._shown, problem, SALVAGE_REMEDY)
+            raise SourceError(self.path, problem, SALVAGE_REMEDY)
         return Message(channel, timestamp, timestamp, 0, data)
 
     def _check_size(self, tables: Tables, row_id: int, place: str) -> None:
@@ -408,10 +400,10 @@ class SqliteReader(BagReader):
         found = tables.select(
             "SELECT length(data) FROM messages WHERE id = ?", (row_id,)
         ).fetchone()
-        size, most = found[0] if found else None, most_held()
-        if isinstance(size, int) and size > most:
-            error = OversizeError(f"it has {size} bytes", most)
-            raise unreadable(self._shown, f": {place}", error, SALVAGE_REMEDY)
+        size = found[0] if found else None
+        if self._most is not None and isinstance(size, int) and size > self._most:
+            error = OversizeError(f"it has {size} bytes", self._most)
+            raise unreadable(self.path, f": {place}", error, SALVAGE_REMEDY)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans by channel id."""

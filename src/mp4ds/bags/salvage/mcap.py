@@ -14,7 +14,7 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from mp4ds.bags.files import DamageError, most_held, open_source, recover
+from mp4ds.bags.files import DamageError, recover
 from mp4ds.bags.mcap_index import ChunkTable, McapSummary
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
@@ -332,7 +332,7 @@ class McapSalvage(FileSalvage):
 
     Args:
         path: The file.
-        shown: Its name in losses, if it is a decompressed copy, to which their offsets refer.
+        most: Bytes that a record may have.
         is_alone: Whether it is an error, not just a loss, if nothing can be read.
 
     Raises:
@@ -343,15 +343,8 @@ class McapSalvage(FileSalvage):
     magic = MAGIC
     kind = "an MCAP file"
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        shown: Path | None = None,
-        is_alone: bool = True,
-    ) -> None:
-        super().__init__(path, shown=shown, is_alone=is_alone)
-        open_source(path, shown).close()
+    def __init__(self, path: Path, *, most: int = _MAX_LENGTH, is_alone: bool = True) -> None:
+        super().__init__(path, is_alone=is_alone)
         self._declared = declared = Declared()
         self._channels = declared.channels
         self._schemas = declared.schemas.values()
@@ -359,9 +352,7 @@ class McapSalvage(FileSalvage):
         self._summary = read_summary(path)
         self._index_offset = self._summary.offset or None
         self._is_timed = self._summary.chunks.has_messages
-        # a small compressed file may hold what claims to be large
-        longest = _MAX_LENGTH if path == self._shown else most_held()
-        self._framing = McapFraming(declared.channels, longest)
+        self._framing = McapFraming(declared.channels, most)
         self._read_profile()
         if self._summary.is_verified:
             self._declared.add_summary(self._summary.schemas, self._summary.channels)

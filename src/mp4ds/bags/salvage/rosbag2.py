@@ -18,7 +18,6 @@ from mp4ds.bags.files import (
     DamageError,
     OversizeError,
     decompress_file,
-    most_held,
     unzstd,
 )
 from mp4ds.bags.protocols import BagReader
@@ -47,7 +46,7 @@ class SqliteSalvage(SqliteReader):
 
     Args:
         path: The database.
-        shown: Its name in errors and tables, where it is a decompressed copy.
+        most: Bytes that a message may have; None for no limit but the file's size.
 
     Attributes:
         expected: Expected number of messages, if known from elsewhere.
@@ -61,13 +60,13 @@ class SqliteSalvage(SqliteReader):
     _times = BagReader._times
     _stats = BagReader._stats
 
-    def __init__(self, path: Path, *, shown: Path | None = None) -> None:
+    def __init__(self, path: Path, *, most: int | None = None) -> None:
         self.expected: int | None = None
         try:
-            super().__init__(path, shown=shown, damaged=True)
+            super().__init__(path, most=most, damaged=True)
         except SourceError as error:
             remedy = _UNFINISHED if Path(f"{path}-journal").exists() else _RECOVER
-            raise SourceError(shown or path, error.problem, remedy) from None
+            raise SourceError(path, error.problem, remedy) from None
         self.is_indexed = False
 
     @property
@@ -81,16 +80,15 @@ class SqliteSalvage(SqliteReader):
     def _records(self, excerpt: Excerpt) -> Iterator[Message]:
         """Everything readable, of which all but the excerpt is dropped."""
         self.losses = []
-        log = LossLog(self._shown.name)
+        log = LossLog(self.path.name)
         yield from filter(excerpt.has, self._found(log))
         self.losses = log.finish()
 
     def _found(self, log: LossLog) -> Iterator[Message]:
         given = lost = 0
-        size = self._shown.stat().st_size
+        size = self.path.stat().st_size
         with self._opened() as tables:
-            most_rows = self.path.stat().st_size // _LEAST_ROW
-            keys, times, problem = _index(tables, most_rows, self.expected)
+            keys, times, problem = _index(tables, size // _LEAST_ROW, self.expected)
             for read, row in enumerate(np.lexsort((keys, times)).tolist(), 1):
                 message = self._salvaged(tables, int(keys[row]), log)
                 if message is None:
@@ -120,8 +118,9 @@ class SqliteSalvage(SqliteReader):
             if not isinstance(time, int) or time < 0:
                 raise Refused(f"messages of {channel.topic} with a time before 1970")
             (size,) = _first(tables, "length(data)", key)
-            if self.path != self._shown and isinstance(size, int) and size > (most := most_held()):
-                raise Refused(f"messages of {channel.topic} {lost_by(OversizeError('', most))}")
+            if self._most is not None and isinstance(size, int) and size > self._most:
+                error = OversizeError("", self._most)
+                raise Refused(f"messages of {channel.topic} {lost_by(error)}")
             (data,) = _first(tables, "data", key)
             if not isinstance(data, bytes):
                 raise Refused(f"messages of {channel.topic} without a payload")
@@ -280,10 +279,10 @@ class Rosbag2Salvage(Rosbag2Reader):
                 self._storage_files.remove(file)
         return readers
 
-    def _file_reader(self, file: Path, shown: Path) -> BagReader:
-        reader = super()._file_reader(file, shown)
+    def _file_reader(self, file: Path, **limit: int) -> BagReader:
+        reader = super()._file_reader(file, **limit)
         if isinstance(reader, SqliteSalvage):
-            reader.expected = self._expected(shown)
+            reader.expected = self._expected(file)
         return reader
 
     def _holds_zstd(self, reader: BagReader) -> bool:

@@ -297,7 +297,6 @@ class FileSalvage(BagReader):
 
     Args:
         path: The file.
-        shown: Its name in losses, if it is a decompressed copy.
         is_alone: Whether it is an error, not just a loss, if nothing can be read.
 
     Attributes:
@@ -314,10 +313,9 @@ class FileSalvage(BagReader):
     _index_offset: int | None = None  # where the final index begins: no message is lost from there
     _is_timed = False  # whether the file's index tells how long messages must wait for earlier ones
 
-    def __init__(self, path: Path, *, shown: Path | None = None, is_alone: bool = True) -> None:
+    def __init__(self, path: Path, *, is_alone: bool = True) -> None:
         self.path = path
-        self._shown = shown or path
-        self.files = [self._shown]
+        self.files = [path]
         self._is_alone = is_alone
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
@@ -327,7 +325,7 @@ class FileSalvage(BagReader):
             RuntimeError: `records` was called again before this one was exhausted.
         """
         self.losses = []
-        self._log = log = LossLog(self._shown.name)
+        self._log = log = LossLog(self.path.name)
         self._tally = Tally(log, self._topic_of)
         self._found = 0  # valid records
         self._count: int | None = None  # messages that the file states
@@ -338,7 +336,7 @@ class FileSalvage(BagReader):
             self._window = window
             self._scan = Scan(window, self._framing, self._lose)
             for record in self._scanned():
-                self.position = self._place(window)
+                self.position = window.offset
                 given += isinstance(record, Message)
                 if record is None:
                     if self._is_timed:
@@ -350,7 +348,7 @@ class FileSalvage(BagReader):
                 if self._log is not log:
                     raise RuntimeError(f"{self.path} is salvaged once at a time")
             yield from filter(excerpt.has, held.release(None))
-            self.position = self._place(window)
+            self.position = window.offset
         if self._is_alone and not self._found and not self.channels:
             raise SourceError(self.path, f"holds no records of {self.kind}")
         self.losses = log.finish(None if self._count is None else max(0, self._count - given))
@@ -358,12 +356,6 @@ class FileSalvage(BagReader):
     @abstractmethod
     def _scanned(self) -> Iterator[Record | None]:
         """All records in the order of the file; None where `_earliest` may be later than before."""
-
-    def _place(self, window: Window) -> int:
-        """Bytes of the file, compressed as it may be, that were read."""
-        if self._shown == self.path:
-            return window.offset
-        return window.offset * self._shown.stat().st_size // max(1, window.size)
 
     def _topic_of(self, channel_id: int) -> str | None:
         channel = self._channels.get(channel_id)
