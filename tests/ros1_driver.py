@@ -2,7 +2,7 @@
 
     ros1_driver.py RECORDING [OPTIONS]
 
-OPTIONS are those of `NodeOptions` in JSON. Each line of the input is a call of a method of
+OPTIONS are those of `PlayOptions` in JSON. Each line of the input is a call of a method of
 `Driver`, or of its node, with its arguments, each line of the output what it returns.
 """
 
@@ -18,7 +18,8 @@ from typing import Any
 
 from mp4ds.bags.formats import open_reader
 from mp4ds.errors import Mp4dsError
-from mp4ds.plugins.ros.node import NodeOptions, Service, action, open_node
+from mp4ds.plugins.playing.options import PlayOptions
+from mp4ds.plugins.ros.node import Service, action, open_node
 from mp4ds.records import Channel, Message
 
 
@@ -43,7 +44,7 @@ class Driver:
             if not any(message.channel is channel for channel in self.channels):
                 self.channels.append(message.channel)
         self.is_paused = False
-        self.publisher = open_node("ros1", NodeOptions(**{"node": "mp4ds_play", **options}))
+        self.publisher = open_node("ros1", PlayOptions(**options), "mp4ds_play")
         self.waited = 0
         ros1: Any = sys.modules["mp4ds.plugins.ros.ros1"]  # since the node is open
         wait = ros1.Sender._wait_for_room

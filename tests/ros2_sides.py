@@ -7,7 +7,7 @@ import gc
 import os
 import random
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,9 @@ from rosbags.convert.converter import default_message
 from rosbags.typesys import Stores, get_typestore
 
 import fake_rclpy
-from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
+from mp4ds.plugins.playing.options import PlayOptions
+from mp4ds.plugins.ros.node import Node, open_node
+from mp4ds.plugins.ros.qos import Qos
 from mp4ds.records import Channel, Schema
 from roscore import Process
 from waiting import WATCHDOG_S, until
@@ -165,8 +167,12 @@ class Side:
     def __init__(self, peer: Any) -> None:
         self.peer = peer
 
-    def open(self, **options: Any) -> Node:
-        return open_node("ros2", NodeOptions(**{"node": "rosbag2_player", **options}))
+    def open(
+        self, name: str = "rosbag2_player", overrides: Mapping[str, Qos] = {}, **options: Any
+    ) -> Node:
+        chosen = PlayOptions(**options)
+        vars(chosen)["overrides"] = overrides  # as read from a file
+        return open_node("ros2", chosen, name)
 
     @contextmanager
     def stopped(self, publisher: Any, recorded: Channel) -> Iterator[None]:

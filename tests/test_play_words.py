@@ -12,7 +12,7 @@ import pytest
 from commands import call
 from mp4ds.cli.play import play_command
 from mp4ds.errors import OptionError
-from mp4ds.plugins.ros.names import PLAIN, NodeNames, node_arguments
+from mp4ds.plugins.ros.node import PLAIN, NodeNames, node_arguments
 from roscore import PLAY
 from test_examples import ROOT
 

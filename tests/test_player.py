@@ -16,7 +16,7 @@ from mp4ds.errors import OptionError
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import FollowedClock, Pace
 from mp4ds.plugins.playing.play import open_player
-from mp4ds.plugins.ros.names import NodeNames
+from mp4ds.plugins.ros.node import NodeNames
 from player_scenes import (
     MS,
     START,

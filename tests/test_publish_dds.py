@@ -38,7 +38,7 @@ def custom(definition: str, encoding: str = "ros2msg", name: str = "pkg/msg/Own"
 
 
 def test_others_are_told_type_hash_and_qos(side: Side) -> None:
-    qos = Qos(reliability="best_effort", durability="transient_local", deadline_ns=10**9)
+    qos = Qos(reliability="best_effort", durability="transient_local", deadline=10**9)
     with side.open(overrides={"/b": qos}) as publisher:
         for topic in ("/a", "/b"):
             publisher.advertise(channel(topic, STRING))
@@ -266,7 +266,7 @@ def test_a_topic_may_have_two_types(side: Side) -> None:
 
 
 def test_a_quality_of_service_that_makes_no_sense_is_told(side: Side) -> None:
-    nonsense = Qos(deadline_ns=-5)
+    nonsense = Qos(deadline=-5)
     with (
         side.open(overrides={"/a": nonsense}) as publisher,
         pytest.raises(ConversionError, match="or its QoS"),
@@ -278,7 +278,7 @@ def test_a_quality_of_service_that_makes_no_sense_is_told(side: Side) -> None:
 def test_a_bad_ros_domain_id_is_told(monkeypatch: pytest.MonkeyPatch, told: str) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", told)
     with pytest.raises(OptionError, match="ROS_DOMAIN_ID"):
-        open_node("ros2", NodeOptions("player"))
+        open_node("ros2", NodeOptions(), "player")
 
 
 @pytest.mark.parametrize(
@@ -298,14 +298,14 @@ def test_discovery_may_be_kept_to_this_machine(
 def test_a_configuration_that_makes_no_sense_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", "<Nonsense/>")
     with pytest.raises(RemoteError, match="CYCLONEDDS_URI"):
-        open_node("ros2", NodeOptions("player"))
+        open_node("ros2", NodeOptions(), "player")
 
 
 def test_the_library_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "mp4ds.plugins.ros.dds_node", raising=False)
     monkeypatch.setitem(sys.modules, "cyclonedds.builtin", None)
     with pytest.raises(RemoteError, match=r"pip install 'mp4ds\[dds\]'"):
-        open_node("ros2", NodeOptions("player"))
+        open_node("ros2", NodeOptions(), "player")
 
 
 @pytest.mark.parametrize("topic", ["", "/", "/a b", "/a//b", "/1a", "/ä", "/a__b", "/a/", "~/a"])

@@ -322,7 +322,7 @@ def test_slow_subscriber_holds_up_nobody(roscore: Core, tmp_path: Path) -> None:
 def test_short_queue_drops_the_oldest(roscore: Core, tmp_path: Path) -> None:
     messages = [("/a", f"{i:03}" + "x" * 1_000_000, "/n", 0) for i in range(30)]
     bag = write_strings(tmp_path / "many.bag", messages)
-    published, receiver = connected(roscore, bag, ["/a"], queue_size=3)
+    published, receiver = connected(roscore, bag, ["/a"], queue=3)
     receiver.stop()
     published.ask("publish")
     dropped = published.ask("dropped")
@@ -337,7 +337,7 @@ def test_short_queue_drops_the_oldest(roscore: Core, tmp_path: Path) -> None:
 def test_player_that_waits_does_not_wait_for_ever(roscore: Core, tmp_path: Path) -> None:
     messages = [("/a", "x" * 1_000_000, "/n", 0)] * 40
     bag = write_strings(tmp_path / "many.bag", messages)
-    published, receiver = connected(roscore, bag, ["/a"], queue_size=2, wait_s=1.0)
+    published, receiver = connected(roscore, bag, ["/a"], queue=2, immediate=True)
     receiver.stop()
     assert published.ask("publish") == 1  # and no other one waited
     receiver.resume()
@@ -425,7 +425,7 @@ def test_no_rospy() -> None:
         "import sys; sys.modules['rospy'] = None\n"
         "from mp4ds.plugins.ros.node import NodeOptions, open_node\n"
         "from mp4ds.errors import RemoteError\n"
-        "try: open_node('ros1', NodeOptions('player'))\n"
+        "try: open_node('ros1', NodeOptions(), 'player')\n"
         "except RemoteError as error: print(error)\n"
     )
     told = program("-c", code).out
@@ -446,9 +446,9 @@ def test_leaves_the_process_alone(roscore: Core) -> None:
         "            signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))\n"
         "before = state()\n"
         "from mp4ds.plugins.ros.node import NodeOptions, open_node\n"
-        "with open_node('ros1', NodeOptions('player')) as publisher:\n"
+        "with open_node('ros1', NodeOptions(), 'player') as publisher:\n"
         "    during = state()\n"
-        "    try: open_node('ros1', NodeOptions('player'))\n"
+        "    try: open_node('ros1', NodeOptions(), 'player')\n"
         "    except OSError as error: print(error)\n"
         "print(before == during == state())\n"
     )

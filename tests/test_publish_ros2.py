@@ -18,8 +18,7 @@ import fake_rclpy
 from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.errors import ConversionError, OptionError, Refused, RemoteError
 from mp4ds.plugins.playing.player import player_services
-from mp4ds.plugins.ros.names import NodeNames
-from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
+from mp4ds.plugins.ros.node import NodeNames
 from mp4ds.plugins.ros.qos import Qos, load_overrides, offered_qos, recorded_qos
 from mp4ds.records import Channel, Schema
 from ros2_sides import KINDS, SIDES, STORE, Controls, Side, channel, connect, message, padded
@@ -218,10 +217,10 @@ def test_ros_names_the_node_and_its_clock(side: Side) -> None:
         assert side.peer.connected("/sim", 1) == 1
 
 
-@pytest.mark.parametrize("seconds", [WATCHDOG_S, float("inf")])
-def test_subscribers_have_as_long_as_they_are_given(side: Side, seconds: float) -> None:
+@pytest.mark.parametrize("milliseconds", [int(WATCHDOG_S * 1000), 0])
+def test_subscribers_have_as_long_as_they_are_given(side: Side, milliseconds: int) -> None:
     recorded = channel("/robot/topic", STRING)
-    with side.open(parting_s=seconds) as publisher:
+    with side.open(wait_for_all_acked=milliseconds) as publisher:
         connect(side, publisher, recorded)
         publisher.publish(recorded, message(STRING, 1), 0)
     assert len(side.peer.received("/robot/topic", 1)) == 1
@@ -230,7 +229,7 @@ def test_subscribers_have_as_long_as_they_are_given(side: Side, seconds: float) 
 def test_subscribers_that_do_not_acknowledge(side: Side) -> None:
     """The topics are named, others are not."""
     heard, plain = channel("/robot/topic", STRING), channel("/robot/other", STRING)
-    publisher = side.open(parting_s=0.5)
+    publisher = side.open(wait_for_all_acked=500)
     with side.stopped(publisher, heard):
         publisher.advertise(plain)
         publisher.publish(heard, message(STRING, 1), 0)
@@ -274,13 +273,9 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> fake_rclpy.Bus:
     return fake_rclpy.install(monkeypatch)
 
 
-def rclpy_node(**options: Any) -> Node:
-    return open_node("ros2", NodeOptions("player", **options))
-
-
 def test_rclpy_has_to_have_the_whole_type(bus: fake_rclpy.Bus) -> None:
     bus.halves.add("sensor_msgs/msg/Imu")
-    with rclpy_node() as publisher:
+    with Side(None).open() as publisher:
         for kind, says in (("JointState", "not installed"), ("Imu", "typesupport_c")):
             with pytest.raises(Refused, match=says):
                 publisher.advertise(channel("/x", f"sensor_msgs/msg/{kind}"))
@@ -302,7 +297,7 @@ def test_an_installed_type_that_is_not_the_recorded_one_is_told(
     ):
         hashes = [{"type_name": STRING, "hash_string": installed}]
         described.write_text(json.dumps({"type_hashes": hashes}))
-        with rclpy_node() as publisher, warnings.catch_warnings(record=True) as said:
+        with Side(None).open() as publisher, warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             publisher.advertise(one)
             publisher.advertise(channel("/y", STRING))  # it is told once
@@ -316,7 +311,7 @@ def test_rclpy_tells_of_a_topic_whose_type_it_has_not(bus: fake_rclpy.Bus) -> No
     bus.kinds["own/msg/Own"] = SimpleNamespace(type_name="own/msg/Own")
     peer.advertise("/own", "own/msg/Own")
     del bus.kinds["own/msg/Own"]
-    with rclpy_node() as publisher:
+    with Side(None).open() as publisher:
         publisher.listen("/own", lambda _: None)
         until(lambda: bus.errors)
     assert "'own/msg/Own' is not installed" in bus.errors[0]
@@ -325,7 +320,7 @@ def test_rclpy_tells_of_a_topic_whose_type_it_has_not(bus: fake_rclpy.Bus) -> No
 def test_rclpy_reads_a_big_endian_clock(bus: fake_rclpy.Bus) -> None:
     heard: list[int] = []
     payload = b"\0\0\0\0" + (5).to_bytes(4, "big") + (6).to_bytes(4, "big")
-    with rclpy_node() as publisher:
+    with Side(None).open() as publisher:
         publisher.follow_clock(heard.append)
         fake_rclpy.FakePeer(bus).publish("/clock", "rosgraph_msgs/msg/Clock", payload)
         until(lambda: heard)
@@ -338,13 +333,13 @@ def test_rclpy_gets_the_whole_quality_of_service(bus: fake_rclpy.Bus) -> None:
         depth=4,
         reliability="best_effort",
         durability="transient_local",
-        deadline_ns=1,
-        lifespan_ns=2,
+        deadline=1,
+        lifespan=2,
         liveliness="manual_by_topic",
-        lease_ns=3,
+        liveliness_lease_duration=3,
         avoid_ros_namespace_conventions=True,
     )
-    with rclpy_node(overrides={"/x": qos}) as publisher:
+    with Side(None).open(overrides={"/x": qos}) as publisher:
         publisher.advertise(channel("/x", STRING))
         got = bus.publishers[0].qos
     assert (got.history.name, got.depth) == ("KEEP_ALL", 4)
@@ -359,7 +354,7 @@ def test_rclpy_passes_messages_on_as_they_are(bus: fake_rclpy.Bus) -> None:
     recorded = channel("/x", STRING)
     payload = message(STRING, 1, little_endian=False)[:-1]
     peer = fake_rclpy.FakePeer(bus)
-    with rclpy_node() as publisher:
+    with Side(None).open() as publisher:
         publisher.advertise(recorded)
         peer.subscribe("/x", STRING)
         publisher.publish(recorded, payload, 0)
@@ -367,7 +362,7 @@ def test_rclpy_passes_messages_on_as_they_are(bus: fake_rclpy.Bus) -> None:
 
 
 def test_rclpy_may_be_shut_down_from_outside(bus: fake_rclpy.Bus) -> None:
-    with rclpy_node() as publisher:
+    with Side(None).open() as publisher:
         publisher.advertise(channel("/x", STRING))
         bus.publishers[0].node.context.try_shutdown()
         assert not publisher.is_alive
@@ -377,7 +372,7 @@ def test_services_may_be_missing_in_a_ros(
     bus: fake_rclpy.Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rosbag2_interfaces.srv", None)
-    with rclpy_node() as publisher:
+    with Side(None).open() as publisher:
         publisher.serve(player_services(Controls()))
     assert not bus.services
 
@@ -385,7 +380,7 @@ def test_services_may_be_missing_in_a_ros(
 def test_without_a_ros_that_is_told(bus: fake_rclpy.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rclpy.context", None)
     with pytest.raises(RemoteError, match="source ROS 2"):
-        rclpy_node()
+        Side(None).open()
 
 
 INFINITE = (
@@ -437,10 +432,10 @@ def test_policies_with_a_limit_are_read() -> None:
     assert recorded_qos(text) == (
         Qos(
             reliability="best_effort",
-            deadline_ns=1_000_000_005,
-            lifespan_ns=7,
+            deadline=1_000_000_005,
+            lifespan=7,
             liveliness="manual_by_topic",
-            lease_ns=3_000_000_000,
+            liveliness_lease_duration=3_000_000_000,
             avoid_ros_namespace_conventions=True,
         ),
     )
@@ -507,7 +502,7 @@ def test_overrides_are_read(tmp_path: Path) -> None:
             history="keep_all",
             depth=1,
             durability="transient_local",
-            lifespan_ns=1_000_000_005,
+            lifespan=1_000_000_005,
             liveliness="manual_by_topic",
             avoid_ros_namespace_conventions=True,
         ),

@@ -31,9 +31,8 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.spool import SpoolFolder
 from mp4ds.plugins.recording import spool
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.recording.receiving import MessageBuffer
-from mp4ds.plugins.recording.record import RecordProgress
-from mp4ds.plugins.ros.names import NodeNames
+from mp4ds.plugins.recording.record import MessageBuffer, RecordProgress
+from mp4ds.plugins.ros.node import NodeNames
 from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message, Schema
 from record_scenes import PlayedNode, fail_to_pack, played, recorded

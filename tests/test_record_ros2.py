@@ -20,10 +20,8 @@ from mp4ds.bags.formats import open_reader
 from mp4ds.bags.rosbag2_metadata import read_bag_info
 from mp4ds.errors import OptionError
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.recording.receiving import Source
-from mp4ds.plugins.recording.record import open_recorder, recorder_services
-from mp4ds.plugins.ros.names import NodeNames
-from mp4ds.plugins.ros.node import Node, NodeOptions, open_node
+from mp4ds.plugins.recording.record import Source, open_recorder, recorder_services
+from mp4ds.plugins.ros.node import Node, NodeNames, open_node
 from mp4ds.plugins.ros.qos import Qos, asked_qos, qos_text, recorded_qos
 from mp4ds.plugins.ros.ros2 import installed_definition, is_hidden, standard_definition
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
@@ -52,8 +50,8 @@ def receiving(
 ) -> Source:
     """A recorder's source, which is not started; without topics, of all there are."""
     chosen = RecordOptions(all=not topics, **options)
-    named = NodeOptions("rosbag2_recorder", chosen.names, unpublished=chosen.unpublished)
-    return Source(node or open_node("ros2", named), chosen, Wanted(topics, chosen), take)
+    node = node or open_node("ros2", chosen, "rosbag2_recorder")
+    return Source(node, chosen, Wanted(topics, chosen), take)
 
 
 class Heard:
@@ -173,7 +171,7 @@ def test_ros_renames_topics(side: Side) -> None:
     with side.open(names=names) as publisher:
         publisher.advertise(found)
         publisher.clock(clock)
-        node = side.open(node="rosbag2_recorder", names=names)
+        node = side.open("rosbag2_recorder", names=names)
         node.serve(recorder_services(Controls()))
         source = receiving(heard.take, "name", node=node, use_sim_time=True, names=names)
         source.start()
@@ -237,7 +235,7 @@ def test_the_clock_is_recorded_by_itself(side: Side) -> None:
 def test_services(side: Side) -> None:
     """Those of rosbag2's recorder."""
     controls = Controls()
-    with side.open(node="rosbag2_recorder") as node:
+    with side.open("rosbag2_recorder") as node:
         node.serve(recorder_services(controls))
 
         def call(name: str) -> dict[str, Any]:
@@ -317,7 +315,7 @@ def test_topics_that_nobody_publishes_yet(monkeypatch: pytest.MonkeyPatch) -> No
         source.close()
     assert [*map(padded, heard.payloads["/robot/name"])] == [padded(message(STRING, 1))]
     with pytest.raises(OptionError, match="source a ROS 2"):
-        DdsNode(NodeOptions("recorder", unpublished=True))
+        DdsNode(RecordOptions(unpublished=True), "recorder")
 
 
 def test_a_type_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -414,7 +412,7 @@ def test_a_definition_that_a_node_describes(
 
 
 def test_qos_as_rosbag2_writes_it() -> None:
-    profiles = [Qos(depth=3, durability="transient_local", deadline_ns=1_500_000_000), Qos()]
+    profiles = [Qos(depth=3, durability="transient_local", deadline=1_500_000_000), Qos()]
     assert [*recorded_qos(qos_text(profiles))] == profiles
     text = qos_text(profiles)
     assert "sec: 9223372036\n    nsec: 854775807" in text

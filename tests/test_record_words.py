@@ -15,7 +15,7 @@ from commands import call, refused
 from mp4ds.cli.record import record_command
 from mp4ds.errors import OptionError
 from mp4ds.plugins.recording.options import RecordOptions
-from mp4ds.plugins.ros.names import NodeNames
+from mp4ds.plugins.ros.node import NodeNames
 from roscore import RECORD
 
 ROOT = Path(__file__).parents[1]

@@ -24,7 +24,7 @@ from mp4ds.cli.progress import Row, display
 from mp4ds.errors import OptionError
 from mp4ds.options import WHERE, Options
 from mp4ds.options import option as field_option
-from mp4ds.plugins.ros.names import LOG_LEVELS, PLAIN, NodeNames, node_arguments
+from mp4ds.plugins.ros.node import LOG_LEVELS, PLAIN, NodeNames, node_arguments
 
 try:
     import termios

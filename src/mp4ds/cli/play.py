@@ -23,7 +23,7 @@ from mp4ds.cli.progress import Row
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.play import open_player
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary
-from mp4ds.plugins.ros.names import SERVICE_EVENTS
+from mp4ds.plugins.ros.node import SERVICE_EVENTS
 
 _FASTER = 1.1
 _NS = 1_000_000_000

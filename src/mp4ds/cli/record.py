@@ -25,7 +25,7 @@ from mp4ds.files.sources import salvage_command
 from mp4ds.options import WHERE, parse_pattern
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.record import RecordProgress, RecordSummary, open_recorder
-from mp4ds.plugins.ros.names import SERVICE_EVENTS
+from mp4ds.plugins.ros.node import SERVICE_EVENTS
 
 _SHOWN = 20  # topics
 _UNTIMED = "their log time is negative or too large"

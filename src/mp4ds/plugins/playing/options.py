@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 from mp4ds.errors import OptionError
 from mp4ds.options import (
@@ -15,19 +14,19 @@ from mp4ds.options import (
     WHERE,
     Parsed,
     Selection,
-    argument,
     jpeg_quality,
     option,
     parse_number,
     pattern,
     seconds,
 )
-from mp4ds.plugins.ros.names import PLAIN, NodeNames
-from mp4ds.plugins.ros.node import CLOCK
+from mp4ds.plugins.ros.node import CLOCK, NodeOptions
 from mp4ds.unpacking.pictures import ReductionOptions
 
 KINDS = {"raw": "raw", "compressed": "jpeg", "ffmpeg": "ffmpeg"}
 """Transport that cameras are published as -> kind of image in `mp4ds.unpacking`."""
+
+_IMMEDIATE_WAIT_S = 2.0
 
 
 def _parse_rate(value: str | float) -> float:
@@ -43,7 +42,7 @@ def rooted(topic: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayOptions(ReductionOptions):
+class PlayOptions(ReductionOptions, NodeOptions):
     """How to play datasets back."""
 
     exclude: Sequence[str] = option(
@@ -53,7 +52,6 @@ class PlayOptions(ReductionOptions):
         panel=WHAT,
         metavar="GLOB",
     )
-    to: str | None = argument("ros1 or ros2; default: the ROS that is sourced.")
     rate: Parsed[float] = option(
         "Playback rate; 2 is twice as fast.",
         1.0,
@@ -149,13 +147,6 @@ class PlayOptions(ReductionOptions):
         least=0,
         only=("ros1",),
     )
-    qos_overrides: Path | None = option(
-        "QoS profiles by topic (ROS 2).",
-        None,
-        "--qos-profile-overrides-path",
-        metavar="YAML",
-        only=("ros2",),
-    )
     publish_as: str | None = option(
         "Publish cameras as raw, compressed (JPEG) or ffmpeg (video packets); "
         "default: as recorded.",
@@ -177,7 +168,6 @@ class PlayOptions(ReductionOptions):
     lock_step: str = option(
         "Publish the next frame only after a message on this topic.", "", metavar="TOPIC"
     )
-    names: NodeNames = argument("Name, namespace and remappings of the ROS node.", PLAIN)
 
     def __post_init__(self) -> None:
         """Refuse options that are invalid or contradict each other."""
@@ -201,6 +191,17 @@ class PlayOptions(ReductionOptions):
             raise OptionError(
                 f"`{given[0]}` contradicts `follow_clock`: another player's clock sets the pace."
             )
+
+    @property
+    def parting_s(self) -> float | None:
+        """How long to wait at the end for acknowledgements; 0 was given for ever."""
+        patience = self.wait_for_all_acked
+        return None if patience is None else patience / 1000 or math.inf
+
+    @property
+    def wait_s(self) -> float:
+        """How long to wait for a subscriber with a full queue."""
+        return _IMMEDIATE_WAIT_S if self.immediate else 0.0
 
     @property
     def leads(self) -> bool:

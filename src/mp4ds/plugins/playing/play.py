@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -14,10 +13,8 @@ from mp4ds.errors import advising
 from mp4ds.plugins.playing.options import PlayOptions, Wanted
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary
 from mp4ds.plugins.playing.timeline import Timeline
-from mp4ds.plugins.ros.node import Node, NodeOptions, World, chosen_world, open_node
-from mp4ds.plugins.ros.qos import load_overrides
+from mp4ds.plugins.ros.node import Node, chosen_world, open_node
 
-_IMMEDIATE_WAIT_S = 2.0
 _NODES = {"ros1": "mp4ds_play", "ros2": "rosbag2_player"}
 
 
@@ -75,23 +72,9 @@ def open_player(
             for place in datasets_in(datasets)
         ]
         timeline = Timeline(opened, chosen, wanted, world)
-        node = node or stack.enter_context(_opened(world, chosen))
+        node = node or stack.enter_context(open_node(world, chosen, _NODES[world]))
         follow = chosen.follow_clock
         if follow is None:
             follow = not (chosen.leads or chosen.immediate) and node.wants_clock
         chosen = replace(chosen, follow_clock=follow)
         yield Player(timeline, node, chosen, progress=progress)
-
-
-def _opened(world: World, chosen: PlayOptions) -> Node:
-    chosen.check_for(world)
-    patience = chosen.wait_for_all_acked
-    options = NodeOptions(
-        _NODES[world],
-        chosen.names,
-        overrides=load_overrides(chosen.qos_overrides),
-        parting_s=None if patience is None else patience / 1000 or math.inf,
-        queue_size=chosen.queue,
-        wait_s=_IMMEDIATE_WAIT_S if chosen.immediate else 0.0,
-    )
-    return open_node(world, options)

@@ -117,13 +117,12 @@ class Player:
         self._pause_topics = timeline.named("pause_topics", options.pause_topics)
         self._changed = threading.Condition(threading.RLock())
         self._playback: ReadAhead[Message] | None = None
-        self._read_ns: int | None = None  # where the playback starts, until it is used
         self._is_paused = self._options.paused
         self._is_stopped = False
         self._is_over = False
         self._is_resting = False  # at the end, kept alive
         self._burst: _Burst | None = None
-        self._target: int | None = self._start  # where to continue
+        self._target: int | None = None  # where to continue
         self._has_looped = False
         self._was_awaited = False  # whether the next message was not ready in time
         self._followed = FollowedClock(steady=steady)
@@ -136,8 +135,7 @@ class Player:
         self._reached = self._start  # log time of the last message published
         self._ticks = Ticks(self._options.clock)
         self._next_report = 0.0
-        self._advertised: dict[int, Channel] = {}  # by id()
-        self._missing: dict[int, Channel] = {}  # those whose type is not installed
+        self._installed: dict[int, tuple[Channel, bool]] = {}  # whether its type is, by id()
         self._done = PlaySummary()
         self._restamper = Restamper(self._pace.wall_of) if options.restamp else None
 
@@ -307,28 +305,29 @@ class Player:
             self._node.clock(self._start)  # advertised before the first message
         self._read_from(self._start)  # decode ahead while waiting
         self._wait(max(_SETTLE_S, self._options.delay), "waiting")
-        channels = [one for one in self._timeline.channels if id(one) not in self._missing]
+        channels = [one for one in self._timeline.channels if self._is_installed(one)]
         while self._options.wait_for_subscribers and not self._is_stopped:
             if all(self._node.subscribers(item) > 0 for item in channels):
                 break
             self._wait(0.1, "waiting for subscribers")
+        if self._target is None and self._node.is_alive and not self._is_stopped:
+            self._begin_at(self._start)
 
     def _advertise(self, channels: Sequence[Channel]) -> None:
         missing: list[Channel] = []
         for channel in channels:
-            self._advertised[id(channel)] = channel
+            counts = self._done.messages
             try:
                 self._node.advertise(channel)
             except Refused:  # the message type is not installed
                 missing.append(channel)
-                self._done.not_installed.setdefault(channel.topic, 0)
-            else:
-                self._done.messages.setdefault(channel.topic, 0)
+                counts = self._done.not_installed
+            counts.setdefault(channel.topic, 0)
+            self._installed[id(channel)] = channel, counts is self._done.messages
         if not missing:
             return
-        self._missing |= {id(channel): channel for channel in missing}
         named = ", ".join(sorted({f"{one.topic} ({one.type_name})" for one in missing}))
-        if len(self._missing) == len(self._advertised):
+        if not any(is_installed for _, is_installed in self._installed.values()):
             problem = f"no message type of the recording is installed: {named}"
             raise RemoteError(self._node.address, problem)
         warnings.warn(
@@ -337,11 +336,11 @@ class Player:
             stacklevel=2,
         )
 
-    def _is_missing(self, message: Message) -> bool:
-        """Whether the type of a message is not installed."""
-        if id(message.channel) not in self._advertised:  # of an image that could not be converted
-            self._advertise([message.channel])
-        return id(message.channel) in self._missing
+    def _is_installed(self, channel: Channel) -> bool:
+        """Whether the type of a channel is installed."""
+        if id(channel) not in self._installed:  # of an image that could not be converted
+            self._advertise([channel])
+        return self._installed[id(channel)][1]
 
     def _wait(self, seconds: float, state: str) -> None:
         end = time.monotonic() + seconds
@@ -359,7 +358,8 @@ class Player:
         with self._changed:
             target, self._target = self._target, None
         if target is not None:
-            self._jump(target)
+            self._read_from(target)
+            self._begin_at(target)
         self._tick()
         with self._changed:  # held until `wait`, so that no notification is missed
             try:
@@ -391,7 +391,7 @@ class Player:
 
     def _seconds_until(self, due: Message | None) -> tuple[float, str]:
         """How long to wait, and the state meanwhile; 0: publish the message now."""
-        if due is not None and self._is_missing(due):
+        if due is not None and not self._is_installed(due.channel):
             return 0.0, "playing"
         self._pause_before(due)
         if self._is_paused:
@@ -462,11 +462,8 @@ class Player:
 
     # ------------------------------------------------------------ publishing
 
-    def _jump(self, time_ns: int) -> None:
-        """Continue at a recording time."""
-        if self._read_ns != time_ns:
-            self._read_from(time_ns)
-        self._read_ns = None
+    def _begin_at(self, time_ns: int) -> None:
+        """Continue at the recording time that is read from."""
         with self._changed:
             self._replies, self._last_frame, self._reached = 1, None, time_ns
             self._controlled = time_ns
@@ -485,7 +482,6 @@ class Player:
         self._playback = self._timeline.play(
             time_ns, is_late=self._is_late, on_ready=self._on_ready
         )
-        self._read_ns = time_ns
 
     def _at_end(self) -> bool:
         """Start over, or wait for a control that does; returns whether to continue. Locked."""
@@ -516,7 +512,7 @@ class Player:
                 return
         if self._playback is not None:
             next(self._playback)
-        if self._is_missing(due):
+        if not self._is_installed(due.channel):
             self._done.not_installed[due.channel.topic] += 1
         elif not (self._timeline.is_frame(due) and self._is_late(due.log_time)):
             if self._has_clock(due):
@@ -548,7 +544,7 @@ class Player:
                 self._last_frame = due.log_time
 
     def _send(self, due: Message, time_ns: int) -> None:
-        if self._is_missing(due):
+        if not self._is_installed(due.channel):
             return
         payload = due.data if self._restamper is None else self._restamper.restamped(due)
         self._node.publish(due.channel, payload, time_ns)

@@ -5,22 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from mp4ds.errors import OptionError
 from mp4ds.options import (
     WHAT,
-    Options,
     Parsed,
     Selection,
     about,
-    argument,
     force,
     option,
     parse_size,
     pattern,
 )
-from mp4ds.plugins.ros.names import PLAIN, SERVICE_EVENTS, NodeNames
+from mp4ds.plugins.ros.node import SERVICE_EVENTS, NodeOptions
 from mp4ds.video.codecs import LOSSLESS, MAX_GOP, QualitySetting, parse_quality
 
 
@@ -38,10 +35,9 @@ def _parse_duration(value: str | float) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordOptions(Options):
+class RecordOptions(NodeOptions):
     """How to record."""
 
-    to: str | None = argument("ros1 or ros2; default: the one that is sourced.")
     all: bool = option(
         "Record all topics, including new ones, and all service events (ROS 2).",
         False,
@@ -130,12 +126,6 @@ class RecordOptions(Options):
     ignore_leaf: bool = option(
         "Leave out topics without a subscriber (ROS 2).", False, "--ignore-leaf-topics", panel=WHAT
     )
-    qos_overrides: Path | None = option(
-        "QoS profiles to subscribe with, by topic (ROS 2).",
-        None,
-        "--qos-profile-overrides-path",
-        metavar="YAML",
-    )
     custom_data: Sequence[str] = option(
         "Entry for custom_data of the rosbag2 metadata (ROS 2); repeatable.",
         (),
@@ -143,7 +133,6 @@ class RecordOptions(Options):
     )
     about: str | None = about()
     force: bool = force()
-    names: NodeNames = argument("Name, namespace and remappings of the node.", PLAIN)
 
 
 class Wanted:

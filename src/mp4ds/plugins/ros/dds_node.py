@@ -128,7 +128,7 @@ def _dds_qos(qos: Qos, user_data: str, *, is_reader: bool = False) -> Any:
     kept = Policy.History.KeepAll
     if qos.history == "keep_last":
         kept = Policy.History.KeepLast(qos.depth)
-    lease = _FOREVER if qos.lease_ns is None else qos.lease_ns
+    lease = _FOREVER if qos.liveliness_lease_duration is None else qos.liveliness_lease_duration
     liveliness = {
         "automatic": Policy.Liveliness.Automatic,
         "manual_by_node": Policy.Liveliness.ManualByParticipant,
@@ -149,10 +149,10 @@ def _dds_qos(qos: Qos, user_data: str, *, is_reader: bool = False) -> Any:
             Policy.Durability.TransientLocal,
             Policy.DurabilityService(0, kept, *unlimited),
         ]
-    if qos.deadline_ns is not None:
-        policies.append(Policy.Deadline(qos.deadline_ns))
-    if qos.lifespan_ns is not None:
-        policies.append(Policy.Lifespan(qos.lifespan_ns))
+    if qos.deadline is not None:
+        policies.append(Policy.Deadline(qos.deadline))
+    if qos.lifespan is not None:
+        policies.append(Policy.Lifespan(qos.lifespan))
     if user_data:
         policies.append(Policy.Userdata(user_data.encode()))
     if is_reader:
@@ -167,8 +167,8 @@ def _offered_by(qos: Any) -> Qos:
     return Qos(
         reliability="best_effort" if is_best_effort else "reliable",
         durability="transient_local" if is_latched else "volatile",
-        deadline_ns=finite(qos[Policy.Deadline].deadline) if Policy.Deadline in qos else None,
-        lifespan_ns=finite(qos[Policy.Lifespan].lifespan) if Policy.Lifespan in qos else None,
+        deadline=finite(qos[Policy.Deadline].deadline) if Policy.Deadline in qos else None,
+        lifespan=finite(qos[Policy.Lifespan].lifespan) if Policy.Lifespan in qos else None,
     )
 
 
@@ -302,7 +302,8 @@ class DdsNode(Ros2Node):
     wait for the GIL while it is held by a write that waits for the very thread they run on.
 
     Args:
-        options: How it takes part; the node's name is used for its services only.
+        options: How it takes part.
+        name: Its name, if the options have none; used for its services only.
 
     Raises:
         OptionError: There is no such domain, or an option needs rclpy.
@@ -311,11 +312,11 @@ class DdsNode(Ros2Node):
 
     discovery_s = 2 * _SETTLE_S
 
-    def __init__(self, options: NodeOptions) -> None:
+    def __init__(self, options: NodeOptions, name: str) -> None:
         if options.unpublished:
             raise OptionError("`unpublished` works with rclpy only: source a ROS 2.")
         super().__init__(options)
-        self._name = options.names.of_node(options.node)
+        self._name = options.names.of_node(name)
         self._domain = _domain()
         self._participant = _open_participant(self._domain)
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)

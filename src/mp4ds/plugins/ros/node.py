@@ -1,27 +1,269 @@
-"""A node of ROS: publishes, subscribes, offers services; there is a class for each library."""
+"""A node of ROS: publishes, subscribes, offers services. Its names and options; opening it."""
 
 from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args
 
 from mp4ds.errors import OptionError, RemoteError
-from mp4ds.plugins.ros.names import PLAIN, NodeNames
-from mp4ds.plugins.ros.qos import Qos
+from mp4ds.options import WHERE, Options, argument, option
+from mp4ds.plugins.ros.qos import Qos, load_map, load_overrides
 from mp4ds.records import Channel
 
 World = Literal["ros1", "ros2"]
 CLOCK = "/clock"
 _Node = TypeVar("_Node", bound="Node")
+
+
+# ---------------------------------------------------------------- names
+
+SERVICE_EVENTS = "/_service_event"
+"""What follows the name of a service in that of the topic of its events, in ROS 2."""
+
+_NODE = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_NAMESPACE = re.compile(r"/?(?:[A-Za-z_]\w*/?)*", re.ASCII)
+_RULE = re.compile(r"(?:[A-Za-z_]\w*:(?!=))?([^:=\s]+):=(\S+)")
+_OTHER = re.compile(r"_(?!_(?:node|name|ns):=).*:=.*", re.DOTALL)
+"""Handled by ROS itself, such as ``__log:=``, or a private parameter."""
+
+_BARE = re.compile(r"[~/A-Za-z_][\w/~]*:=.*", re.ASCII)
+_VALUED = {
+    "-r": "remap",
+    "--remap": "remap",
+    "--log-level": "log_level",
+    "-p": "parameter",
+    "--param": "parameter",
+    "--params-file": "file",
+    "--log-config-file": "",
+    "-e": "",
+    "--enclave": "",
+}
+"""ROS 2 arguments that take a value -> what it is; empty for those that are ignored."""
+
+_SIM_TIME = "use_sim_time"
+_FLAG = re.compile(r"--(?:enable|disable)-[\w-]+-logs")
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
+
+
+@dataclass(frozen=True)
+class NodeNames:
+    """The ROS arguments of a node.
+
+    Attributes:
+        node: Its name; empty for the default.
+        namespace: Its namespace, such as ``/robot``; empty for the root.
+        rules: Remappings of topics: old name, new name.
+        log_level: The log level, as in ROS 2; empty if not given.
+        use_sim_time: The parameter of this name; None if not given.
+    """
+
+    node: str = ""
+    namespace: str = ""
+    rules: tuple[tuple[str, str], ...] = ()
+    log_level: str = ""
+    use_sim_time: bool | None = None
+
+    def in_world(self, world: str | None) -> NodeNames:
+        """The same for a ROS version: in ROS 1 the environment may set the namespace."""
+        namespace = os.environ.get("ROS_NAMESPACE", "") if world == "ros1" else ""
+        return replace(self, namespace=namespace) if namespace and not self.namespace else self
+
+    def of_node(self, node: str) -> str:
+        """The node's name with its namespace, such as ``robot/player``; `node` is the default."""
+        return "/".join(filter(None, (self.namespace.strip("/"), self.node or node)))
+
+    def renamed(self, topic: str) -> str:
+        """The name of a topic after remapping; unchanged if no rule applies."""
+        found = {self.resolved(old): new for old, new in self.rules}.get(self.resolved(topic))
+        return topic if found is None else self.resolved(found)
+
+    def resolved(self, name: str) -> str:
+        """The absolute name, such as ``/robot/imu``."""
+        root = "/" + self.namespace.strip("/")
+        if name.startswith("/"):
+            return name
+        if name.startswith("~"):
+            name = f"{self.node}/{name[1:].lstrip('/')}"
+        return f"{root.rstrip('/')}/{name}"
+
+
+PLAIN = NodeNames()
+"""No ROS arguments."""
+
+
+def node_arguments(
+    words: Sequence[str], *, rules_of: Sequence[str] = ("--remap", "-m")
+) -> tuple[list[str], NodeNames]:
+    """Separate the ROS arguments from the others of a command line.
+
+    ROS 2 arguments are between ``--ros-args`` and ``--`` or the end, ROS 1 arguments anywhere:
+    ``__name:=x``, ``__ns:=/y``, ``_parameter:=1``, ``/topic:=/other``. Parameters other than
+    ``use_sim_time`` are ignored.
+
+    Args:
+        words: The command line.
+        rules_of: Options of the command itself that take remappings.
+
+    Returns:
+        The other arguments, and the ROS arguments.
+
+    Raises:
+        OptionError: A ROS argument is not valid.
+    """
+    rest: list[str] = []
+    names = NodeNames()
+    parameters: list[tuple[str, str]] = []
+    left = iter(words)
+    is_own = False
+    for word in left:
+        if word == "--ros-args":
+            names = _ros2(left, names, parameters)
+        elif word == "--":
+            rest += [word, *left]
+        elif _BARE.fullmatch(word) and not is_own:
+            names = _with_rule(names, word)
+        else:
+            is_own = word in rules_of or (is_own and ":=" in word)
+            rest.append(word)
+    for kind, value in parameters:  # last, as files have sections for node names
+        names = _with_file(names, Path(value)) if kind == "file" else _with(names, value)
+    return rest, names
+
+
+def _ros2(words: Iterator[str], names: NodeNames, parameters: list[tuple[str, str]]) -> NodeNames:
+    for word in words:
+        name, has_value, value = word.partition("=")
+        if word == "--":
+            break
+        if _FLAG.fullmatch(word):
+            continue
+        if name not in _VALUED:
+            known = ", ".join(_VALUED)
+            raise OptionError(f"--ros-args {word} is not known. Use {known}; end them with --.")
+        if not (has_value and name.startswith("--")):
+            value = next(words, "")
+        if _VALUED[name] == "remap":
+            names = _with_rule(names, value)
+        elif _VALUED[name] == "log_level":
+            names = replace(names, log_level=value if value in LOG_LEVELS else "")
+        elif _VALUED[name]:
+            parameters.append((_VALUED[name], value))
+    return names
+
+
+def _with(names: NodeNames, parameter: str) -> NodeNames:
+    """Add a parameter given as ``name:=value``."""
+    name, is_given, value = parameter.partition(":=")
+    if not is_given:
+        raise OptionError(f"{parameter!r} is not a ROS parameter; write it as name:=value.")
+    if name.rpartition(":")[2] != _SIM_TIME:
+        return names
+    return replace(names, use_sim_time=_truth(value, "--ros-args"))
+
+
+def _with_file(names: NodeNames, path: Path) -> NodeNames:
+    """Add the parameters that a file has for this node."""
+    own = names.of_node("")
+    for node, parameters in _nodes(load_map(path, "nodes to parameters"), ""):
+        if node in ("**", own) and _SIM_TIME in parameters:
+            names = replace(names, use_sim_time=_truth(parameters[_SIM_TIME], str(path)))
+    return names
+
+
+def _nodes(found: Mapping[Any, Any], place: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:
+    for key, value in found.items():
+        if isinstance(value, dict) and key == "ros__parameters":
+            yield place, value
+        elif isinstance(value, dict):
+            yield from _nodes(value, f"{place}/{key}".replace("//", "/").strip("/"))
+
+
+def _truth(value: Any, place: str) -> bool:
+    known = {"true": True, "false": False}
+    if str(value).lower() in known:
+        return known[str(value).lower()]
+    raise OptionError(f"{place}: {_SIM_TIME} must be true or false, not {value!r}.")
+
+
+def _with_rule(names: NodeNames, rule: str) -> NodeNames:
+    if _OTHER.fullmatch(rule):
+        return names
+    match = _RULE.fullmatch(rule)
+    if not match:
+        raise OptionError(f"{rule!r} is not a remapping; write it as /old/topic:=/new/topic.")
+    old, new = match.groups()
+    if old in ("__node", "__name"):
+        if not _NODE.fullmatch(new):
+            raise OptionError(f"{rule!r}: {new!r} is not a valid node name.")
+        return replace(names, node=new)
+    if old == "__ns":
+        if not _NAMESPACE.fullmatch(new):
+            raise OptionError(f"{rule!r}: {new!r} is not a valid namespace, such as /robot.")
+        return replace(names, namespace=new)
+    return replace(names, rules=(*names.rules, (old, new)))
+
+
+# ---------------------------------------------------------------- the node
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeOptions(Options):
+    """How a node takes part; the options of a player and of a recorder are such options."""
+
+    to: str | None = argument("ros1 or ros2; default: the ROS that is sourced.")
+    qos_overrides: Path | None = option(
+        "QoS profiles by topic (ROS 2).",
+        None,
+        "--qos-profile-overrides-path",
+        metavar="YAML",
+        panel=WHERE,
+        only=("ros2",),
+    )
+    names: NodeNames = argument("Name, namespace and remappings of the ROS node.", PLAIN)
+
+    # for those without the option
+    queue = 0
+    unpublished = False
+
+    @cached_property
+    def overrides(self) -> Mapping[str, Qos]:
+        """QoS profiles to use instead of the usual ones, by topic.
+
+        Raises:
+            OptionError: Their file cannot be read or is not valid.
+        """
+        return load_overrides(self.qos_overrides)
+
+    @property
+    def parting_s(self) -> float | None:
+        """How long to wait at the end for acknowledgements (ROS 2), may be infinite.
+
+        Topics that are not acknowledged by then are named in a warning. None: 3 s, without one.
+        """
+        return None
+
+    @property
+    def wait_s(self) -> float:
+        """How long to wait for a subscriber that receives nothing and has a full queue (ROS 1).
+
+        Then its oldest message is dropped. Above 0, publishing without pacing is as fast as the
+        subscribers, which lose nothing. After a timeout, a subscriber is not waited for again until
+        it has caught up.
+        """
+        return 0.0
+
 
 Receive = Callable[[Channel, bytes, int], None]
 """Called with the channel of a message, the message, and when it was sent, 0 if that is not known.
@@ -60,34 +302,6 @@ def action(name: str, act: Callable[[], object]) -> Service:
         return {}
 
     return Service(name, "", "", answer)
-
-
-@dataclass(frozen=True)
-class NodeOptions:
-    """How a node takes part.
-
-    Attributes:
-        node: Its name, if `names` has none.
-        names: Name, namespace and remappings.
-        overrides: QoS profiles to use instead of the usual ones, by topic (ROS 2).
-        parting_s: How long to wait at the end for acknowledgements (ROS 2), may be infinite; topics
-            that are not acknowledged by then are named in a warning. None: 3 s, without a warning.
-        queue_size: Messages that may wait for each subscriber of a topic, as with ``rosbag play
-            --queue`` (ROS 1); 0 for any number. There is a limit of bytes in any case.
-        wait_s: How many seconds to wait for a subscriber that receives nothing and has a full
-            queue, before its oldest message is dropped (ROS 1). Above 0, publishing without pacing
-            is as fast as the subscribers, which lose nothing. After a timeout, a subscriber is not
-            waited for again until it has caught up.
-        unpublished: Whether `Node.topics` has those without a publisher, too (rclpy).
-    """
-
-    node: str
-    names: NodeNames = PLAIN
-    overrides: Mapping[str, Qos] = field(default_factory=dict)
-    parting_s: float | None = None
-    queue_size: int = 0
-    wait_s: float = 0.0
-    unpublished: bool = False
 
 
 class Node(ABC):
@@ -275,27 +489,30 @@ def chosen_world(command: str, asked: str | None) -> World:
     )
 
 
-def open_node(world: World, options: NodeOptions) -> Node:
+def open_node(world: World, options: NodeOptions, name: str) -> Node:
     """Open a node.
 
     Args:
         world: For ROS 2, rclpy is used if it is installed, else Cyclone DDS.
         options: How it takes part.
+        name: Its name, if the options have none.
 
     Raises:
-        OptionError: An option is not valid.
+        OptionError: An option is not valid, or does not work with this ROS.
         RemoteError: Something is missing: a library, a network or a master.
     """
+    options.check_for(world)
     kind = world if world == "ros1" else "rclpy" if find_spec("rclpy") is not None else "dds"
-    module, name, remedy = _NODES[kind]
+    module, class_name, remedy = _NODES[kind]
     before = logging.getLoggerClass()
     try:
-        node: type[Node] = getattr(import_module(f"mp4ds.plugins.ros.{module}"), name)
+        found = import_module(f"mp4ds.plugins.ros.{module}")
     except ImportError as error:
         raise RemoteError(kind, f"{error}; {remedy}") from None
     finally:
         logging.setLoggerClass(before)  # rosgraph sets its own for the whole process
-    return node(options)
+    node: Node = getattr(found, class_name)(options, name)
+    return node
 
 
 # ---------------------------------------------------------------- threads

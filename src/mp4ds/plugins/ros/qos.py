@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from mp4ds.bags.latched import PLAYER_DEPTH, latched_depth
 from mp4ds.bags.rosbag2_metadata import dump_yaml, native_qos
 from mp4ds.errors import OptionError
-from mp4ds.plugins.ros.names import load_map
 from mp4ds.records import QOS_KEY, Channel
 
 _NS = 10**9
 _MAX_DEPTH = 2**31 - 1
 _RECEIVED = 100  # depth of a subscription: messages are taken out at once
+_MAX_BYTES = 2**20
+_Loader: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _INFINITE_SECONDS = 2**31 - 1  # the smallest of the values that middlewares use for infinity
 _INFINITE = {"sec": 2**63 // _NS, "nsec": 2**63 % _NS - 1}
 _NAMES = {
@@ -25,28 +28,26 @@ _NAMES = {
     "durability": ("volatile", "transient_local"),
     "liveliness": ("automatic", "manual_by_node", "manual_by_topic"),
 }
-_DURATIONS = {
-    "deadline": "deadline_ns",
-    "lifespan": "lifespan_ns",
-    "liveliness_lease_duration": "lease_ns",
-}
-_BARE = "avoid_ros_namespace_conventions"
-_KNOWN = (*_NAMES, "depth", *_DURATIONS, _BARE)
+DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
+"""The policies of `Qos` that are durations."""
 
 
 @dataclass(frozen=True, slots=True)
 class Qos:
     """The QoS profile that a publisher offers; the defaults are those of `ros2 bag play`.
 
+    Its fields are the policies, with the names and in the order that rosbag2 and rclpy have.
+
     Attributes:
         history: ``keep_last`` or ``keep_all``.
         depth: How many messages ``keep_last`` keeps, at least 1.
         reliability: ``reliable`` or ``best_effort``.
         durability: ``volatile`` or ``transient_local``.
-        deadline_ns: Maximum nanoseconds between two messages; None for no limit.
-        lifespan_ns: Nanoseconds after which a message expires; None for never.
+        deadline: Maximum nanoseconds between two messages; None for no limit.
+        lifespan: Nanoseconds after which a message expires; None for never.
         liveliness: ``automatic``, ``manual_by_node`` or ``manual_by_topic``.
-        lease_ns: Nanoseconds after which a silent publisher is considered dead; None for never.
+        liveliness_lease_duration: Nanoseconds after which a silent publisher is considered dead;
+            None for never.
         avoid_ros_namespace_conventions: Whether the topic's DDS name has no ``rt/`` prefix.
     """
 
@@ -54,10 +55,10 @@ class Qos:
     depth: int = PLAYER_DEPTH
     reliability: str = "reliable"
     durability: str = "volatile"
-    deadline_ns: int | None = None
-    lifespan_ns: int | None = None
+    deadline: int | None = None
+    lifespan: int | None = None
     liveliness: str = "automatic"
-    lease_ns: int | None = None
+    liveliness_lease_duration: int | None = None
     avoid_ros_namespace_conventions: bool = False
 
     @property
@@ -70,6 +71,8 @@ class Qos:
         """Whether late subscribers get earlier messages."""
         return self.durability == "transient_local"
 
+
+_POLICIES = tuple(policy.name for policy in fields(Qos))
 
 CLOCK_QOS = Qos(depth=1, reliability="best_effort")
 """The profile of /clock, rclcpp's ClockQoS."""
@@ -100,7 +103,7 @@ def _as_subscribers_see(qos: Qos) -> Qos:
         qos,
         history="keep_last",
         depth=PLAYER_DEPTH,
-        lifespan_ns=None,
+        lifespan=None,
         avoid_ros_namespace_conventions=False,
     )
 
@@ -128,28 +131,14 @@ def asked_qos(profiles: Sequence[Qos]) -> Qos:
 
 def qos_text(profiles: Sequence[Qos]) -> str:
     """QoS profiles as rosbag2 writes them from metadata version 9 on."""
-    return dump_yaml(
-        [
-            {
-                "history": profile.history,
-                "depth": profile.depth,
-                "reliability": profile.reliability,
-                "durability": profile.durability,
-                "deadline": _written(profile.deadline_ns),
-                "lifespan": _written(profile.lifespan_ns),
-                "liveliness": profile.liveliness,
-                "liveliness_lease_duration": _written(profile.lease_ns),
-                _BARE: profile.avoid_ros_namespace_conventions,
-            }
-            for profile in profiles
-        ]
-    )
+    return dump_yaml([{key: _written(profile, key) for key in _POLICIES} for profile in profiles])
 
 
-def _written(nanoseconds: int | None) -> dict[str, int]:
-    if nanoseconds is None:
-        return dict(_INFINITE)
-    return {"sec": nanoseconds // _NS, "nsec": nanoseconds % _NS}
+def _written(profile: Qos, key: str) -> Any:
+    value = getattr(profile, key)
+    if key not in DURATIONS:
+        return value
+    return dict(_INFINITE) if value is None else {"sec": value // _NS, "nsec": value % _NS}
 
 
 def recorded_qos(text: str) -> tuple[Qos, ...]:
@@ -167,10 +156,10 @@ def recorded_qos(text: str) -> tuple[Qos, ...]:
 def _recorded(profile: Mapping[str, Any]) -> Qos:
     found: dict[str, Any] = {}
     has_depth = profile.get("history") == "keep_last" and profile.get("depth") != 0
-    for key in _KNOWN if has_depth else (key for key in _KNOWN if key != "depth"):
-        with suppress(ValueError, KeyError):
-            name, value = _policy(key, profile[key])
-            found[name] = value
+    for key in _POLICIES:
+        if key in profile and (key != "depth" or has_depth):
+            with suppress(ValueError):
+                found[key] = _policy(key, profile[key])
     return Qos(**found)
 
 
@@ -192,6 +181,34 @@ def load_overrides(path: Path | None) -> dict[str, Qos]:
     return {topic: _override(path, topic, value) for topic, value in document.items()}
 
 
+def load_map(path: Path, of: str) -> dict[Any, Any]:
+    """Read a small YAML file of the user's.
+
+    Args:
+        path: The file; an empty one is an empty map.
+        of: What it maps, for errors.
+
+    Raises:
+        OptionError: It cannot be read, or is not a map.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read: {error.strerror}.") from None
+    if len(data) > _MAX_BYTES:
+        raise OptionError(f"{path}: is larger than {_MAX_BYTES} bytes, too large to map {of}.")
+    try:
+        document = yaml.load(data.decode(), Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise OptionError(f"{path}: is not valid YAML: {reason}.") from None
+    if document is None:
+        return {}
+    if not isinstance(document, dict):
+        raise OptionError(f"{path}: does not map {of}.")
+    return document
+
+
 def _override(path: Path, topic: Any, profile: Any) -> Qos:
     if not isinstance(topic, str):
         raise OptionError(f"{path}: {topic!r} is not a topic name; put it in quotes.")
@@ -200,15 +217,14 @@ def _override(path: Path, topic: Any, profile: Any) -> Qos:
     found: dict[str, Any] = {}
     for key, value in profile.items():
         try:
-            name, found_value = _policy(key, value)
+            found[key] = _policy(key, value)
         except ValueError as reason:
             raise OptionError(f"{path}: {topic}: {key}: {reason}.") from None
-        found[name] = found_value
     return Qos(**found)
 
 
-def _policy(key: str, value: Any) -> tuple[str, Any]:
-    """Attribute of `Qos` and value of a policy.
+def _policy(key: str, value: Any) -> Any:
+    """The value of a policy of `Qos`.
 
     Raises:
         ValueError: It is none; says why.
@@ -218,18 +234,18 @@ def _policy(key: str, value: Any) -> tuple[str, Any]:
         name = value.lower() if isinstance(value, str) else value
         if name != "system_default" and name not in names:
             raise ValueError(f"{value!r} is not known. Use {', '.join(names)}")
-        return key, names[0] if name == "system_default" else name
-    if key in _DURATIONS:
-        return _DURATIONS[key], _duration(value)
+        return names[0] if name == "system_default" else name
+    if key in DURATIONS:
+        return _duration(value)
     if key == "depth":
         if type(value) is not int or not 0 <= value <= _MAX_DEPTH:
             raise ValueError(f"{value!r} is not an integer from 0 to {_MAX_DEPTH}")
-        return key, max(1, value)
-    if key == _BARE:
-        if not isinstance(value, bool):
-            raise ValueError(f"{value!r} is neither true nor false")
-        return key, value
-    raise ValueError(f"is not a QoS policy. Use {', '.join(_KNOWN)}")
+        return max(1, value)
+    if key not in _POLICIES:
+        raise ValueError(f"is not a QoS policy. Use {', '.join(_POLICIES)}")
+    if not isinstance(value, bool):
+        raise ValueError(f"{value!r} is neither true nor false")
+    return value
 
 
 def _duration(value: Any) -> int | None:

@@ -7,6 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from rosidl_runtime_py.utilities import get_message, get_service
 
 from mp4ds.errors import ConversionError, Refused, RemoteError
 from mp4ds.plugins.ros.node import NodeOptions, Service
-from mp4ds.plugins.ros.qos import Qos
+from mp4ds.plugins.ros.qos import DURATIONS, Qos
 from mp4ds.plugins.ros.ros2 import (
     Ros2Node,
     finite,
@@ -68,15 +69,16 @@ class RclpyNode(Ros2Node):
 
     Args:
         options: How it takes part.
+        name: Its name, if the options have none.
     """
 
-    def __init__(self, options: NodeOptions) -> None:
+    def __init__(self, options: NodeOptions, name: str) -> None:
         super().__init__(options)
         self._context = Context()
         rclpy.init(args=[], context=self._context)
         names = options.names
         self._node = rclpy.create_node(
-            names.node or options.node, context=self._context, namespace=names.namespace or None
+            names.node or name, context=self._context, namespace=names.namespace or None
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -250,35 +252,31 @@ def _hash_text(type_hash: Any) -> str:
 # ---------------------------------------------------------------- QoS
 
 
-def _profile(qos: Qos) -> Any:
-    def duration(nanoseconds: int | None) -> Any:
-        return Duration(nanoseconds=nanoseconds or 0)  # 0 means no limit
+_NAMED = {
+    "history": HistoryPolicy,
+    "reliability": ReliabilityPolicy,
+    "durability": DurabilityPolicy,
+    "liveliness": LivelinessPolicy,
+}
 
-    # manual_by_node was removed from ROS 2
-    liveliness = "AUTOMATIC" if qos.liveliness != "manual_by_topic" else "MANUAL_BY_TOPIC"
-    return QoSProfile(
-        history=HistoryPolicy[qos.history.upper()],
-        depth=qos.depth,
-        reliability=ReliabilityPolicy[qos.reliability.upper()],
-        durability=DurabilityPolicy[qos.durability.upper()],
-        deadline=duration(qos.deadline_ns),
-        lifespan=duration(qos.lifespan_ns),
-        liveliness=LivelinessPolicy[liveliness],
-        liveliness_lease_duration=duration(qos.lease_ns),
-        avoid_ros_namespace_conventions=qos.avoid_ros_namespace_conventions,
-    )
+
+def _profile(qos: Qos) -> Any:
+    if qos.liveliness == "manual_by_node":  # it was removed from ROS 2
+        qos = replace(qos, liveliness="automatic")
+    policies = asdict(qos)
+    for key in DURATIONS:
+        policies[key] = Duration(nanoseconds=policies[key] or 0)  # 0 means no limit
+    for key, kind in _NAMED.items():
+        policies[key] = kind[policies[key].upper()]
+    return QoSProfile(**policies)
 
 
 def _offered_by(profile: Any) -> Qos:
-    history = profile.history.name.lower()
-    liveliness = profile.liveliness.name.lower()
-    return Qos(
-        history=history if history in ("keep_last", "keep_all") else "keep_last",
-        depth=max(1, profile.depth),
-        reliability=profile.reliability.name.lower(),
-        durability=profile.durability.name.lower(),
-        deadline_ns=finite(profile.deadline.nanoseconds),
-        lifespan_ns=finite(profile.lifespan.nanoseconds),
-        liveliness=liveliness if liveliness.startswith("manual") else "automatic",
-        lease_ns=finite(profile.liveliness_lease_duration.nanoseconds),
-    )
+    found: dict[str, Any] = {key: getattr(profile, key).name.lower() for key in _NAMED}
+    if found["history"] not in ("keep_last", "keep_all"):  # discovery does not tell
+        found["history"] = "keep_last"
+    if not found["liveliness"].startswith("manual"):
+        found["liveliness"] = "automatic"
+    for key in DURATIONS:
+        found[key] = finite(getattr(profile, key).nanoseconds)
+    return Qos(depth=max(1, profile.depth), **found)

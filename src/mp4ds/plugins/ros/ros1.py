@@ -33,8 +33,7 @@ from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import is_ros1
 from mp4ds.bags.ros1 import make_channel
 from mp4ds.errors import ConversionError, OptionError, RemoteError
-from mp4ds.plugins.ros.names import NodeNames
-from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions, Receive, Service
+from mp4ds.plugins.ros.node import CLOCK, Node, NodeNames, NodeOptions, Receive, Service
 from mp4ds.records import Channel
 
 MAX_BYTES = 128 << 20
@@ -379,6 +378,7 @@ class Ros1Node(Node):
 
     Args:
         options: How it takes part.
+        name: Its name, to which a number is appended, unless the options have one.
 
     Raises:
         OptionError: The address of the master is not valid.
@@ -388,9 +388,9 @@ class Ros1Node(Node):
     world = "ros1"
     poll_s = 0.5  # the master is asked over the network
 
-    def __init__(self, options: NodeOptions) -> None:
+    def __init__(self, options: NodeOptions, name: str) -> None:
         super().__init__(options)
-        self._master = _start_node(options.node, options.names)
+        self._master = _start_node(name, options.names)
         self._clock_topic = options.names.renamed(CLOCK)
         self._topics: dict[str, AdvertisedTopic] = {}
         self._channels: dict[int, tuple[Channel, AdvertisedTopic, str | None]] = {}  # by id()
@@ -410,7 +410,7 @@ class Ros1Node(Node):
     def advertise(self, channel: Channel) -> None:
         """Announce a channel."""
         self._check_alive()
-        topic = self._topic(channel.topic, self._kind(channel), self._options.queue_size)
+        topic = self._topic(channel.topic, self._kind(channel), self._options.queue)
         caller = None
         if is_ros1(channel):
             caller = channel.metadata.get("callerid", "")

@@ -23,8 +23,7 @@ from mp4ds.bags.types import (
     types_of,
 )
 from mp4ds.errors import ConversionError, OptionError, Refused
-from mp4ds.plugins.ros.names import SERVICE_EVENTS
-from mp4ds.plugins.ros.node import CLOCK, Node, NodeOptions, Receive
+from mp4ds.plugins.ros.node import CLOCK, SERVICE_EVENTS, Node, NodeOptions, Receive
 from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, asked_qos, offered_qos, qos_text
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
@@ -69,6 +68,7 @@ class Ros2Node(Node):
 
     def __init__(self, options: NodeOptions) -> None:
         super().__init__(options)
+        self._overrides = options.overrides
         self._clock_topic = options.names.renamed(CLOCK)
         self._clock: Writer | None = None
         self._channels: dict[int, tuple[Channel, Writer]] = {}  # by id()
@@ -130,7 +130,7 @@ class Ros2Node(Node):
         if channel.message_encoding != "cdr":
             encoding = channel.message_encoding or "unknown"
             raise ConversionError(channel.topic, f"its message encoding is {encoding}, not cdr")
-        qos = offered_qos(channel, self._options.overrides)
+        qos = offered_qos(channel, self._overrides)
         key = (channel.topic, channel.schema, qos)
         writer = None if qos.is_latched else self._shared.get(key)
         if writer is None:
@@ -206,7 +206,7 @@ class Ros2Node(Node):
         schema = Schema(kind, _ENCODING if definition else "", definition.encode())
         metadata = {QOS_KEY: qos_text(offered), **({HASH_KEY: type_hash} if type_hash else {})}
         channel = Channel(len(self._received), name, "cdr", schema, metadata)
-        qos = self._options.overrides.get(topic) or asked_qos(offered)
+        qos = self._overrides.get(topic) or asked_qos(offered)
         try:
             self._received[topic] = self._read(topic, kind, qos, partial(receive, channel))
         except ConversionError as error:
