@@ -134,22 +134,24 @@ class ProcessExecutor(Executor):
     def __init__(self, processes: int, *, nice: int = 0) -> None:
         self._most, self._nice = processes, nice
         self._is_closed = self._is_ended = False
+        self._taking = threading.Lock()  # no thread is joined that has not been started
         self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()  # None ends a thread
         self._threads: list[threading.Thread] = []
         self._processes: set[_Process] = set()
 
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Make a call in a process, of a function that can be pickled."""
-        if self._is_closed:
-            raise RuntimeError("no more calls after shutdown")
         call = _Call(Future(), pickle.dumps(fn), pickle.dumps((args, kwargs)))
-        self._calls.put(call)
-        if len(self._threads) < self._most:
-            # a daemon, unlike those of a ThreadPoolExecutor: a process that is interrupted again
-            # while it ends its calls waits for none of them
-            thread = threading.Thread(target=self._work, daemon=True)
-            self._threads.append(thread)
-            thread.start()
+        with self._taking:
+            if self._is_closed:
+                raise RuntimeError("no more calls after shutdown")
+            self._calls.put(call)
+            if len(self._threads) < self._most:
+                # a daemon, unlike those of a ThreadPoolExecutor: a process that is interrupted
+                # again while it ends its calls waits for none of them
+                thread = threading.Thread(target=self._work, daemon=True)
+                self._threads.append(thread)
+                thread.start()
         return call.future
 
     def _work(self) -> None:
@@ -190,7 +192,8 @@ class ProcessExecutor(Executor):
             wait: Wait for those that were taken.
             cancel_futures: Drop those that are waiting, and end those that are running.
         """
-        self._is_closed = True
+        with self._taking:
+            self._is_closed = True
         if cancel_futures:
             self._is_ended = True
             with suppress(queue.Empty):
