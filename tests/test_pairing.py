@@ -105,14 +105,6 @@ def test_calibrations_belong_to_the_image_beside_them(
     assert pair_camera_infos(channels(*topics)[::-1]) == pairs
 
 
-@pytest.mark.parametrize("info", INFO)
-@pytest.mark.parametrize("image", [*RAW, *CODED])
-def test_every_type_of_images_and_calibrations(image: str, info: str) -> None:
-    transport = "/compressed" if image in CODED else ""
-    pair = [channel(7, "/cam/image_raw" + transport, image), channel(3, "/cam/camera_info", info)]
-    assert pair_camera_infos(pair) == {3: 7}
-
-
 def test_only_the_types_count() -> None:
     image, info = channels("/cam/image_raw", "/cam/camera_info")
     words = Channel(2, "/cam/image_raw", "ros1", Schema("std_msgs/String", "", b""))

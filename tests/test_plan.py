@@ -16,7 +16,7 @@ from mp4ds.errors import OptionError
 from mp4ds.format.fields import FileName
 from mp4ds.format.sidecars import FileNames
 from mp4ds.options import Selection
-from mp4ds.packing.planning import cut_times, spans_of
+from mp4ds.packing.planning import cut_times
 from mp4ds.video.codecs import QualitySetting, QualityTarget, parse_quality, visual_setting
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -169,9 +169,6 @@ def test_spans_hold_every_time_once_and_few_frames(lists: list[list[int]], frame
     columns = [np.sort(np.array(times, np.int64)) for times in lists]
     cuts = cut_times(columns, frames)
     assert cuts == sorted(set(cuts))
-    spans = spans_of(cuts)
-    assert (spans[0][0], spans[-1][1]) == (None, None)
-    assert [end for _, end in spans[:-1]] == [start for start, _ in spans[1:]] == cuts
     assert all(cut > min(map(min, lists)) for cut in cuts)
     for column in columns:
         if len(np.unique(column)) == len(column):

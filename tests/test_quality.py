@@ -16,20 +16,18 @@ from numpy.typing import NDArray
 
 import mp4ds
 from coded_scenes import CODED
-from commands import call, refused
 from compare import compare
 from definitions import IMAGE
 from in_parts import InlineExecutor, leftovers, use
 from mp4ds import yamlio
 from mp4ds.bags.formats import open_reader
-from mp4ds.errors import OptionError, ScoringError
+from mp4ds.errors import ScoringError
 from mp4ds.format.models import Quality
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.tracks import CrfControl, window_frames
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message
-from mp4ds.video.codecs import QualityTarget, parse_quality
 from mp4ds.video.scores import find_ffmpeg, largest_crf, scores_of
 from round_trips import unpacked
 from scenes import Record, instant, scene, together
@@ -123,18 +121,6 @@ def check_psnr(dataset: Path, noises: list[float], target: float) -> Quality:
     assert own.mean() >= target - 0.005
     assert windows.min() >= target - 0.505
     return found
-
-
-# ---------------------------------------------------------------- what is asked for
-
-
-def test_scores_that_may_be_asked_for() -> None:
-    assert parse_quality("vmaf=99.5").target == QualityTarget("vmaf", 99.5)
-    assert str(parse_quality("psnr=42.00")) == "psnr=42"
-    assert not parse_quality("ssim=0.98").lossless
-    for text in ("vmaf", "vmaf=", "vmaf=0", "vmaf=100", "psnr=60", "ssim=1", "ssim=nan", "x=3"):
-        with pytest.raises(OptionError, match="score to reach"):
-            parse_quality(text)
 
 
 def test_windows_are_whole_groups_of_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -379,19 +365,6 @@ def test_without_libvmaf_it_is_said_how_to_get_it(
     with pytest.raises(ScoringError, match=r"pip install 'mp4ds\[vmaf\]'"):
         mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="vmaf=95"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
-
-
-# ---------------------------------------------------------------- the command
-
-
-def test_the_command_tells_what_it_came_to(tmp_path: Path) -> None:
-    (path,) = recording(tmp_path, [0.0])
-    command = ("pack", path, "-o", tmp_path / "d", "--codec", "h264", "--preset", "ultrafast")
-    done = call(*command, "--quality", "psnr=40")
-    assert done.code == 0, done.err
-    assert f"{TOPIC}: psnr " in done.out
-    assert "(target: 40)" in done.out
-    refused(call(*command, "--quality", "psnr=99"), 2, "--quality 'psnr=99' is not known")
 
 
 @needs_vmaf

@@ -19,6 +19,7 @@ from compare import compare
 from conftest import DATA, real
 from definitions import PICTURES
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
+from mp4ds.bags.formats import open_reader
 from mp4ds.records import Message
 from round_trips import (
     TARGETS,
@@ -174,3 +175,7 @@ def test_real_recordings_return(name: str, tmp_path: Path) -> None:
     target = "rosbag2" if path.is_dir() or path.suffix == ".db3" else path.suffix[1:]
     output = round_trip([path], tmp_path, target)
     assert compare(path, output) == []
+    with open_reader(path) as before, open_reader(output) as after:
+        # it does not compare them; an index may list a schema, but not the channel that uses it
+        used = {channel.schema for channel in after.channels}
+        assert set(before.unused_schemas) <= {*after.unused_schemas, *used}

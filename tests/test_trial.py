@@ -91,14 +91,6 @@ def test_key_frames_are_weighed_by_their_number(codec: str) -> None:
         assert others < first / 20
 
 
-def test_an_encoder_that_refuses() -> None:
-    recipe = recipe_for("gray12le", lossless=True, codec="h265")
-    with pytest.raises(EncoderRefusedError, match="libx265 does not take pictures of 2x2"):
-        encode_on_trial(
-            [(np.zeros((2, 2), np.uint16),)], recipe, picture_format="gray12le", threads=1
-        )
-
-
 # ---------------------------------------------------------------- choices
 
 
@@ -248,14 +240,6 @@ def test_the_next_codec_where_one_refuses(
     assert codec in (None, first)
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
-
-
-def test_a_codec_that_refuses_the_size_is_not_insisted_on(tmp_path: Path) -> None:
-    """x265 takes no narrow pictures."""
-    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("mono8", width=40, height=30))
-    summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(codec="h265"))
-    (topic,) = (topic for topic in summary.topics if topic.topic == "/cam/image_raw")
-    assert topic.notes[0].startswith("coded as ")
 
 
 # ---------------------------------------------------------------- purposes

@@ -19,7 +19,6 @@ import mp4ds
 from coded_scenes import CODED
 from definitions import COMPRESSED, IMAGE
 from mp4ds import ConversionError, UnpackOptions
-from mp4ds.dataset.dataset import Dataset
 from mp4ds.messages.depth import encode_rvl
 from scenes import Record, Scene
 from sources import SOURCES, scene
@@ -188,27 +187,23 @@ def test_all_frames_are_there_in_their_place(tmp_path: Path) -> None:
     made = mixed()
     expected = pictures(made)
     with mp4ds.open(packed(tmp_path, made)) as dataset:
-        check_frames(dataset, made, expected)
-
-
-def check_frames(dataset: Dataset, made: Scene, expected: list[NDArray[np.uint8]]) -> None:
-    frames = dataset[TOPIC]
-    assert len(frames) == FRAMES
-    for number, frame in enumerate(frames):
-        assert np.array_equal(frame.data, expected[number])
-        assert (frame.index, frame.encoding, frame.frame_id) == (number, "mono8", "cam")
-    stamps = [item.values["header"]["stamp"] for item in made.messages if item.topic == TOPIC]
-    assert frames.stamps.tolist() == stamps
-    assert [item.index for item in frames.get([11, 0, 4, 4])] == [11, 0, 4, 4]
-    assert np.array_equal(frames.read([5, 1], format="gray"), np.array(expected)[[5, 1]])
-    assert np.array_equal(frames.at(stamps[4]).data, expected[4])
-    found = frames.between(stamps[3], stamps[6])
-    assert [np.array_equal(f.data, expected[n]) for n, f in enumerate(found, 3)] == [True] * 3
-    assert frames[0].intrinsics == frames[1].intrinsics is not None
-    # the stream alone, by its file name, has those of its video
-    assert len(dataset["cam_image_raw"]) == FRAMES - 4
-    assert dataset.topics == [TOPIC]
-    assert TOPIC in dataset
+        frames = dataset[TOPIC]
+        assert len(frames) == FRAMES
+        for number, frame in enumerate(frames):
+            assert np.array_equal(frame.data, expected[number])
+            assert (frame.index, frame.encoding, frame.frame_id) == (number, "mono8", "cam")
+        stamps = [item.values["header"]["stamp"] for item in made.messages if item.topic == TOPIC]
+        assert frames.stamps.tolist() == stamps
+        assert [item.index for item in frames.get([11, 0, 4, 4])] == [11, 0, 4, 4]
+        assert np.array_equal(frames.read([5, 1], format="gray"), np.array(expected)[[5, 1]])
+        assert np.array_equal(frames.at(stamps[4]).data, expected[4])
+        found = frames.between(stamps[3], stamps[6])
+        assert [np.array_equal(f.data, expected[n]) for n, f in enumerate(found, 3)] == [True] * 3
+        assert frames[0].intrinsics == frames[1].intrinsics is not None
+        # the stream alone, by its file name, has those of its video
+        assert len(dataset["cam_image_raw"]) == FRAMES - 4
+        assert dataset.topics == [TOPIC]
+        assert TOPIC in dataset
 
 
 def test_a_topic_without_a_video(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from array import array
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -134,7 +133,7 @@ class MessageInspector:
         if isinstance(fields, ImageFields):
             return _raw_image(message, form, parts, fields)
         if isinstance(fields, CodedFields):
-            return self._kind_of(parts.body, fields)(message, form, parts)
+            return self._coded(message, form, parts, fields)
         raise Refused("it holds no image")
 
     def leave_out(self, seen: CameraMessage) -> None:
@@ -142,20 +141,20 @@ class MessageInspector:
         if seen.key.codec in self._parsers:
             self._parsers[seen.key.codec].leave_out()
 
-    def _kind_of(
-        self, body: memoryview, fields: CodedFields
-    ) -> Callable[[Message, Form, Parts], CameraMessage]:
+    def _coded(
+        self, message: Message, form: Form, parts: Parts, fields: CodedFields
+    ) -> CameraMessage:
         if self._is_packets:
             codec = packet_codec(fields.format)
             if codec != "mjpeg":
-                return partial(self._packet, codec)
-        elif bytes(body[: len(png.SIGNATURE)]) == png.SIGNATURE:
-            return self._png_image
+                return self._packet(message, form, parts, codec)
+        elif bytes(parts.body[: len(png.SIGNATURE)]) == png.SIGNATURE:
+            return self._png_image(message, form, parts)
         elif "compressedDepth" in fields.format:
-            return self._depth_image
-        return self._jpeg_image
+            return self._depth_image(message, form, parts)
+        return self._jpeg_image(message, form, parts)
 
-    def _packet(self, codec: str, message: Message, form: Form, parts: Parts) -> CameraMessage:
+    def _packet(self, message: Message, form: Form, parts: Parts, codec: str) -> CameraMessage:
         if codec not in self._parsers:
             self._parsers[codec] = CODECS[codec].parser()
         parser = self._parsers[codec]

@@ -170,8 +170,8 @@ class PartedPack:
                 messages[topic] += count
                 size += length
         frames = self.plan.frames
-        packed = sum(min(messages[topic], count) for topic, count in frames.items())
-        total = sum(frames.values())
+        packed = sum(min(messages[topic], count or 0) for topic, count in frames.items())
+        total = sum(count or 0 for count in frames.values())
         self.report(
             PackProgress(
                 dataset=self.target,

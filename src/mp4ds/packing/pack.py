@@ -41,9 +41,7 @@ from mp4ds.files.sources import (
 from mp4ds.files.uploads import local_path, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest, load_stream
-from mp4ds.messages.serializations import is_camera
 from mp4ds.options import ENCODING
-from mp4ds.packing.calibrations import by_topic
 from mp4ds.packing.long_packs import PartedPack, Report, pack_parts
 from mp4ds.packing.manifest import (
     PartRecord,
@@ -66,12 +64,8 @@ from mp4ds.packing.spool import recover
 from mp4ds.packing.tracks import TrackPlan
 from mp4ds.processes import ProcessExecutor, available_cores, memory_bytes
 from mp4ds.video.codecs import (
-    DEFAULT_LOSSY,
     LOSSLESS,
-    Purpose,
-    QualitySetting,
     check_codec,
-    fastest_preset,
     parse_quality,
 )
 from mp4ds.video.scores import find_ffmpeg
@@ -104,16 +98,7 @@ def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> 
     plan, report = parted.plan, parted.report
     is_slice = bool(plan.options.slice)
     total = sum(map(source_size, reader.files))
-    stats = reader.stats()
-    due = sum(item.count for item in stats.values())
-    cameras = [channel for channel in reader.channels if is_camera(channel)]
-    counts: dict[str, int | None] = {
-        topic: None
-        if any(channel.id not in stats for channel in own)
-        else sum(stats[channel.id].count for channel in own)
-        for topic, own in by_topic(cameras).items()
-    }
-
+    due = sum(item.count for item in reader.stats().values())
     next_report = 0.0
 
     def progress(part: PartRecord, *, done: bool = False) -> None:
@@ -134,9 +119,9 @@ def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> 
                 bytes_total=total,
                 bytes_written=folder_size(folder),
                 topics={
-                    name: (topic.messages, counts[name])
-                    for name, topic in part.topics.items()
-                    if name in counts
+                    name: (part.topics[name].messages, count)
+                    for name, count in plan.frames.items()
+                    if name in part.topics
                 },
             )
             report(state)
@@ -438,32 +423,19 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
             "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
             "any lossless video of its pixels."
         )
-    codec = checked_codec(quality, options.codec, options.preset, options.purpose)
+    codec = check_codec(
+        options.codec,
+        options.preset,
+        lossless=quality.lossless,
+        crf=quality.crf,
+        fast=options.is_fast,
+    )
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         find_ffmpeg()  # fails before anything is read, saying how to get one
     transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))
     chosen = replace(options, quality=quality, codec=codec, transcode=transcode, images=images)
     chosen.group_frames  # noqa: B018 - refuses a contradiction
     return chosen
-
-
-def checked_codec(
-    quality: QualitySetting, codec: str | None, preset: str | None, purpose: Purpose | None
-) -> str | None:
-    """The codec by its usual name; None for the default.
-
-    Args:
-        quality: What it has to do.
-        codec: As given by the user.
-        preset: The encoder's preset.
-        purpose: What the dataset is for.
-
-    Raises:
-        OptionError: It cannot do that, or has no such preset.
-    """
-    if purpose is not None and purpose.is_speed and quality.crf is not None:
-        preset = preset or fastest_preset(codec or DEFAULT_LOSSY)
-    return check_codec(codec, preset, lossless=quality.lossless, crf=quality.crf)
 
 
 def _quality_of(paths: Sequence[Path]) -> str:

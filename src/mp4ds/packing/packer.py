@@ -28,7 +28,7 @@ from mp4ds.format.models import (
     video_facts,
 )
 from mp4ds.format.sidecars import FileNames, dump_document
-from mp4ds.messages.png import PngRecipe, zlib_fingerprint
+from mp4ds.messages.png import zlib_fingerprint
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
 from mp4ds.messages.wire import CodedFields
@@ -50,7 +50,7 @@ from mp4ds.packing.planning import (
     needs_trial,
 )
 from mp4ds.packing.tracks import TrackPlan, open_track
-from mp4ds.records import Attachment, Channel, Message
+from mp4ds.records import EVERYTHING, Attachment, Channel, Message
 from mp4ds.times import PresentationClock
 
 Exact = Mapping[tuple[Identity, StreamKey], str]
@@ -268,23 +268,23 @@ class StreamWriter:
         padding = None if wrap.padding is None else base64.b64encode(wrap.padding).decode()
         if exceeds_padding((padding, *(head.padding for head in self._table.headers))):
             raise Refused("too much padding between rows, different in each image")
+        png = None
+        if wrap.png is not None:
+            recipe = {**asdict(wrap.png), "deflate": zlib_fingerprint()}
+            png = PngFile.model_validate(recipe)
         return Header(
             frame_id=seen.parts.frame_id,
             format=fields.format if isinstance(fields, CodedFields) else None,
             template=template,
             framing=wrap.framing,
             prefix=wrap.prefix.hex(),
-            png=_png_file(wrap.png) if wrap.png else None,
+            png=png,
             padding=padding,
         )
 
     def abandon(self) -> None:
         """Stop writing; the caller removes the files."""
         self._track.abandon()
-
-
-def _png_file(recipe: PngRecipe) -> PngFile:
-    return PngFile.model_validate({**asdict(recipe), "deflate": zlib_fingerprint()})
 
 
 # ---------------------------------------------------------------- cameras
@@ -470,12 +470,12 @@ class Packer:
         progress: Callable[[PartRecord], None],
     ) -> None:
         self.reader, self.plan, self.exact = reader, plan, exact
-        self.decisions = {} if piece.decides_itself else plan.decisions
+        self.decisions = {} if piece.is_solo else plan.decisions
         self.part = PartRecord(folder)
         self._excerpt = piece.excerpt
         self._selected = plan.options.selected
         # that of a part is read once more, as parts are put together
-        self._compression = "zstd" if piece.is_all else "lz4"
+        self._compression = "zstd" if piece.excerpt == EVERYTHING else "lz4"
         self._progress = progress
         self._transforms = TransformCollector()
         channels = [channel for channel in reader.channels if self._selected(channel.topic)]

@@ -6,7 +6,6 @@ begin.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -295,16 +294,6 @@ class Piece:
     excerpt: Excerpt
     is_solo: bool = False
 
-    @property
-    def is_all(self) -> bool:
-        """Whether it is the whole recording."""
-        return self.excerpt == EVERYTHING
-
-    @property
-    def decides_itself(self) -> bool:
-        """Whether how its images are stored concerns no other piece."""
-        return self.is_all or self.is_solo
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -317,7 +306,7 @@ class Plan:
         about: The description of the recording, if there is one.
         pieces: In the order of their time; a single one for a short recording, or without an index.
         pairs: Calibration channels and those of their images, by id.
-        frames: Messages of each topic of images, if there are several pieces.
+        frames: Messages of each topic of images; None where that is unknown.
         threads: Of each encoder.
         workers: Streams that a process encodes in parallel.
         tools: Versions of what packs: parts made by different ones may not fit together.
@@ -331,7 +320,7 @@ class Plan:
     about: About | None
     pieces: Sequence[Piece]
     pairs: Mapping[int, int]
-    frames: Mapping[str, int]
+    frames: Mapping[str, int | None]
     threads: int
     workers: int
     tools: Mapping[str, str]
@@ -340,7 +329,7 @@ class Plan:
     @property
     def is_divided(self) -> bool:
         """Whether there are several pieces."""
-        return not self.pieces[0].is_all
+        return len(self.pieces) > 1
 
     @property
     def texts(self) -> list[list[str]]:
@@ -476,12 +465,6 @@ def _without_short_end(
     return cuts[:-1] if rest < frames // 2 else cuts
 
 
-def spans_of(cuts: Sequence[int]) -> list[tuple[int | None, int | None]]:
-    """Half-open spans of log time, ns, between the cuts; None is open."""
-    edges = [None, *cuts, None]
-    return list(pairwise(edges))
-
-
 # ---------------------------------------------------------------- pieces
 
 
@@ -509,15 +492,18 @@ def divide(
     pairs = find_pairs(reader, options.camera_info, channels)
     pieces = _pieces(reader, channels, pairs, options) if reader.is_indexed else []
     cores = max(1, available_cores() // recordings)
-    frames = Counter[str]()
+    stats = reader.stats()
+    frames: dict[str, int | None] = {}
+    for channel in packed:
+        unknown = 0 if reader.is_indexed else None
+        count = stats[channel.id].count if channel.id in stats else unknown
+        before = frames.get(channel.topic, 0)
+        frames[channel.topic] = None if before is None or count is None else before + count
     if len(pieces) > 1:
         # where there are more cores than pieces, each has several: for streams, then for encoders
         spare = max(1, cores // len(pieces))
         workers = min(spare, len(packed))
         threads = max(1, spare // workers)
-        stats = reader.stats()
-        for channel in packed:
-            frames[channel.topic] += stats[channel.id].count if channel.id in stats else 0
     else:
         pieces = [Piece("all", EVERYTHING)]
         if recordings == 1:
@@ -531,7 +517,7 @@ def divide(
         about=None if options.about is None else load_about(options.about),
         pieces=pieces,
         pairs=pairs,
-        frames=dict(frames),
+        frames=frames,
         threads=threads,
         workers=workers,
         tools=tools(),
@@ -551,8 +537,8 @@ def _pieces(
         window = max(window, LEAST_WINDOW)
     times = reader.times()
     columns = [times[channel.id] for channel in free if len(times.get(channel.id, ()))]
-    spans = spans_of(cut_times(columns, window))
-    if len(spans) == 1:
+    cuts = cut_times(columns, window)
+    if not cuts:
         return []
     topics = {channel.topic for channel in free}
     by_id = {channel.id: channel.topic for channel in channels}
@@ -563,7 +549,7 @@ def _pieces(
         excerpt = Excerpt(topics=frozenset(own), others=False)
         pieces.append(Piece(f"whole-{len(pieces)}", excerpt, is_solo=True))
         without |= own
-    for number, (start, end) in enumerate(spans):
+    for number, (start, end) in enumerate(pairwise([None, *cuts, None])):
         excerpt = Excerpt(start, end, without=frozenset(without), others=number == 0)
         pieces.append(Piece(f"{number:05}", excerpt))
     return pieces

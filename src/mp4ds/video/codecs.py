@@ -272,6 +272,7 @@ def check_codec(
     *,
     lossless: bool,
     crf: int | None = None,
+    fast: bool = False,
 ) -> str | None:
     """Refuse a codec that cannot encode any stream of a profile, or options it does not have.
 
@@ -280,6 +281,7 @@ def check_codec(
         preset: The encoder's preset, or None for the default.
         lossless: Whether every sample must be restored exactly.
         crf: Constant rate factor, where there is one.
+        fast: Whether the preset is the fastest by default.
 
     Returns:
         The codec by its `codec_name`.
@@ -303,7 +305,7 @@ def check_codec(
             + (f"Use one of {known}." if known else "It has no presets.")
         )
     if crf is not None:
-        _check_crf(name, preset, crf)
+        _check_crf(name, preset or (fastest_preset(name) if fast else None), crf)
     return codec
 
 

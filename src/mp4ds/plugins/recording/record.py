@@ -19,7 +19,6 @@ from mp4ds.files.outputs import sync
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.packing.options import PackSummary
-from mp4ds.packing.pack import checked_codec
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.spool import Split
 from mp4ds.plugins.ros.node import (
@@ -35,7 +34,7 @@ from mp4ds.plugins.ros.ros2 import is_hidden
 from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message, MetadataRecord
 from mp4ds.times import INT64_MAX
-from mp4ds.video.codecs import SPEED, Purpose
+from mp4ds.video.codecs import check_codec
 
 _NS = 1_000_000_000
 _REPORT_S = 0.2
@@ -195,7 +194,9 @@ def _check(options: RecordOptions) -> None:
         )
     if options.about is not None:
         load_about(options.about)
-    checked_codec(quality, options.codec, options.preset, Purpose(SPEED))
+    check_codec(
+        options.codec, options.preset, lossless=quality.lossless, crf=quality.crf, fast=True
+    )
 
 
 def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:
