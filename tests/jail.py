@@ -13,8 +13,10 @@ import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import wraps
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import mp4ds
 from mp4ds.bags.convert import Converter
@@ -25,6 +27,9 @@ from waiting import WATCHDOG_S
 
 MEMORY = 2 * 2**30
 """Bytes of address space that a reading may take."""
+
+MAX_MEMORY = 1000 * 2**20
+"""Bytes of memory that one must get along with."""
 
 SECONDS = 10
 """Seconds of computing after which a reading is ended."""
@@ -57,43 +62,21 @@ class Outcome:
     peak: int = 0
 
 
-class Jail:
-    """Where to read; all arguments and results are pickled."""
+_CONTEXT = multiprocessing.get_context("forkserver")
+_STORES = [f"rosbags.typesys.stores.ros{name}" for name in ("1_noetic", "2_humble")]
+_CONTEXT.set_forkserver_preload([__name__, "jsonschema", "mp4ds.dataset.checks", *_STORES])
 
-    def __init__(self) -> None:
-        self._context = multiprocessing.get_context("forkserver")
-        stores = [f"rosbags.typesys.stores.ros{name}" for name in ("1_noetic", "2_humble")]
-        self._context.set_forkserver_preload(
-            [__name__, "jsonschema", "mp4ds.dataset.checks", *stores]
-        )
 
-    def validate(self, path: Path, *, deep: bool = True) -> Outcome:
-        """All problems of a sidecar or dataset."""
-        return self._run(_validate, path, deep)
+def confined(work: Callable[..., None]) -> Callable[..., Outcome]:
+    """Have a reading, which notes its outcome, done in a process of its own.
 
-    def read(self, path: Path) -> Outcome:
-        """Open a sidecar or dataset, read a frame, all frames, and all messages."""
-        return self._run(_read, path)
+    It must end with a result or an error that mp4ds raises on purpose, in little memory.
+    """
 
-    def records(self, path: Path, *, salvage: bool = False) -> Outcome:
-        """Read all messages of a recording, or what is there of a damaged one."""
-        return self._run(_records, path, salvage)
-
-    def converted(self, path: Path, to: str) -> Outcome:
-        """Convert all messages of a recording to ``ros1`` or ``ros2``."""
-        return self._run(_converted, path, to)
-
-    def decoded(self, path: Path) -> Outcome:
-        """Decode all messages of a recording."""
-        return self._run(_decoded, path)
-
-    def unpacked(self, path: Path, to: str) -> Outcome:
-        """Pack a recording and unpack it to a format; both are made beside it."""
-        return self._run(_unpacked, path, to)
-
-    def _run(self, work: Callable[..., None], *arguments: object) -> Outcome:
-        receiver, sender = self._context.Pipe(duplex=False)
-        child = self._context.Process(target=_confined, args=(sender, work, *arguments))
+    @wraps(work)
+    def run(*arguments: object, **options: object) -> Outcome:
+        receiver, sender = _CONTEXT.Pipe(duplex=False)
+        child = _CONTEXT.Process(target=_run, args=(sender, run, arguments, options))
         child.start()
         sender.close()
         try:
@@ -102,10 +85,14 @@ class Jail:
             child.join(WATCHDOG_S)
             outcome = Outcome(error="Killed", text=f"ended with status {child.exitcode}")
         child.join(WATCHDOG_S)
+        assert outcome.ours or not outcome.error, outcome.text
+        assert outcome.peak < MAX_MEMORY
         return outcome
 
+    return run
 
-def _confined(sender: Connection, work: Callable[..., None], *arguments: object) -> None:
+
+def _run(sender: Connection, work: Any, arguments: Any, options: Any) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     signal.alarm(30 * SECONDS)  # for one that waits: on a busy machine, too
@@ -113,7 +100,7 @@ def _confined(sender: Connection, work: Callable[..., None], *arguments: object)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         try:
-            work(found, *arguments)
+            work.__wrapped__(found, *arguments, **options)
         except BaseException as error:
             found.error, found.ours = type(error).__name__, isinstance(error, mp4ds.Mp4dsError)
             found.text = str(error) if found.ours else traceback.format_exc()
@@ -122,7 +109,9 @@ def _confined(sender: Connection, work: Callable[..., None], *arguments: object)
     sender.send(found)
 
 
-def _read(found: Outcome, path: Path) -> None:
+@confined
+def read(found: Outcome, path: Path) -> None:
+    """Open a sidecar or dataset, read a frame, all frames, and all messages."""
     with mp4ds.open(path) as dataset:
         for topic in dataset:
             _ = topic[-1]
@@ -132,13 +121,17 @@ def _read(found: Outcome, path: Path) -> None:
             found.messages += 1
 
 
-def _validate(found: Outcome, path: Path, deep: bool) -> None:
+@confined
+def validate(found: Outcome, path: Path, *, deep: bool = True) -> None:
+    """Find all problems of a sidecar or dataset."""
     problems = mp4ds.validate(path, deep=deep)
     found.codes = sorted({problem.code for problem in problems})
     found.problems = [str(problem) for problem in problems]
 
 
-def _records(found: Outcome, path: Path, salvage: bool) -> None:
+@confined
+def records(found: Outcome, path: Path, *, salvage: bool = False) -> None:
+    """Read all messages of a recording, or what is there of a damaged one."""
     with open_sources([path], salvage=salvage) as reader:  # type: ignore[call-overload]
         for record in reader.records():
             found.messages += isinstance(record, Message)
@@ -146,7 +139,9 @@ def _records(found: Outcome, path: Path, salvage: bool) -> None:
             found.problems = [loss.problem for loss in reader.losses]
 
 
-def _converted(found: Outcome, path: Path, to: str) -> None:
+@confined
+def converted(found: Outcome, path: Path, to: str) -> None:
+    """Convert all messages of a recording to ``ros1`` or ``ros2``."""
     converter = Converter(to)
     with open_sources([path]) as reader:
         for record in reader.records():
@@ -156,13 +151,17 @@ def _converted(found: Outcome, path: Path, to: str) -> None:
                 found.messages += 1
 
 
-def _decoded(_: Outcome, path: Path) -> None:
+@confined
+def decoded(_: Outcome, path: Path) -> None:
+    """Decode all messages of a recording."""
     with open_sources([path]) as reader:
         messages = (record for record in reader.records() if isinstance(record, Message))
         for message in as_recorded(messages, path):
             _ = message.decoded
 
 
-def _unpacked(_: Outcome, path: Path, to: str) -> None:
+@confined
+def unpacked(_: Outcome, path: Path, to: str) -> None:
+    """Pack a recording and unpack it to a format; both are made beside it."""
     mp4ds.pack(path, f"{path}.packed")
     mp4ds.unpack(f"{path}.packed", to, f"{path}.unpacked.{to}")

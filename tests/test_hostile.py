@@ -23,11 +23,11 @@ from typing import Any
 import av
 import pytest
 
+import jail
 import mp4ds
 from coded_scenes import CODED
 from edits import Change, Document, agreed, changed, load
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
-from jail import Jail, Outcome
 from mp4ds import Mp4dsError, VersionError, yamlio
 from mp4ds.format.fields import FORMAT_VERSION, MAX_CAMERA_INFOS, MAX_FRAMES
 from scenes import Scene
@@ -35,14 +35,8 @@ from sources import SOURCES, scene
 
 STEM = "cam_image_raw"
 WIDTH, HEIGHT, FRAMES = 64, 48, 8
-MAX_MEMORY = 1000 * 2**20
 BAD_DOCUMENT = {"schema-invalid", "model-invalid"}
 COLUMNS = ("log_time", "stamp", "seq")
-
-
-@pytest.fixture(scope="module")
-def jail() -> Jail:
-    return Jail()
 
 
 @pytest.fixture
@@ -111,19 +105,10 @@ UNSEALED = both(drop("video", "size"), drop("video", "sha256"))
 LOSSY = both(UNSEALED, drop("digests"), put("profile", value="visual"))
 
 
-def bounded(outcome: Outcome) -> None:
-    assert outcome.error in ("", *MP4DS_ERRORS), outcome.text
-    assert outcome.peak < MAX_MEMORY
-
-
-MP4DS_ERRORS = [name for name in mp4ds.__all__ if name.endswith("Error")]
-
-
-def refused(jail: Jail, path: Path, *codes: str, by_reading: bool = True) -> str:
+def refused(path: Path, *codes: str, by_reading: bool = True) -> str:
     """Both ways of reading refuse, one with a problem of these codes, one with an error.
 
     Args:
-        jail: Where to read.
         path: What to read.
         codes: Codes of which one must be found, and all others may not.
         by_reading: Whether opening or reading must fail, too.
@@ -132,55 +117,51 @@ def refused(jail: Jail, path: Path, *codes: str, by_reading: bool = True) -> str
         All problems as text.
     """
     validated = jail.validate(path)
-    bounded(validated)
     assert not validated.error, validated.text
     assert validated.codes, "no problem was found"
     assert set(validated.codes) <= set(codes), validated.problems
     read = jail.read(path)
-    bounded(read)
     if by_reading:
         assert read.ours, read.text or "it could be read"
         assert any(f"[{code}]" in read.text for code in codes), read.text
     return "\n".join(validated.problems)
 
 
-def accepted(jail: Jail, path: Path) -> None:
+def accepted(path: Path) -> None:
     for outcome in (jail.validate(path), jail.read(path)):
-        bounded(outcome)
         assert not outcome.error, outcome.text
         assert outcome.problems == []
 
 
-def test_the_good_ones_are_accepted(pair: Path, dataset: Path, jail: Jail) -> None:
-    accepted(jail, pair)
-    accepted(jail, dataset)
+def test_the_good_ones_are_accepted(pair: Path, dataset: Path) -> None:
+    accepted(pair)
+    accepted(dataset)
     assert jail.read(pair).frames == FRAMES
 
 
 # ---------------------------------------------------------------- names of files
 
 
-def test_no_file_outside_is_touched(dataset: Path, tmp_path: Path, jail: Jail) -> None:
+def test_no_file_outside_is_touched(dataset: Path, tmp_path: Path) -> None:
     outside = shutil.copy(dataset / f"{STEM}.mp4", tmp_path / "x.mp4")
     os.utime(outside, (1, 1))
     changed(dataset / f"{STEM}.yaml", put("video", "file", value="../x.mp4"))
     agreed(dataset)
-    refused(jail, dataset, *BAD_DOCUMENT)
+    refused(dataset, *BAD_DOCUMENT)
     assert Path(outside).stat().st_atime == 1
 
 
 @pytest.mark.parametrize("name", ["dataset.yaml", f"{STEM}.yaml", "messages.mcap"])
-def test_a_video_that_is_another_file_of_the_dataset(name: str, dataset: Path, jail: Jail) -> None:
+def test_a_video_that_is_another_file_of_the_dataset(name: str, dataset: Path) -> None:
     changed(dataset / f"{STEM}.yaml", both(LOSSY, put("video", "file", value=name)))
     agreed(dataset)
-    refused(jail, dataset, "video-unreadable", "manifest-inconsistent")
+    refused(dataset, "video-unreadable", "manifest-inconsistent")
 
 
 @pytest.mark.parametrize("name", ["dataset.yaml", "messages.mcap", "none.yaml"])
-def test_a_sidecar_that_is_another_file(name: str, dataset: Path, jail: Jail) -> None:
+def test_a_sidecar_that_is_another_file(name: str, dataset: Path) -> None:
     changed(dataset / "dataset.yaml", put("streams", 0, "sidecar", value=name))
     refused(
-        jail,
         dataset,
         *("kind-unknown", "yaml-invalid", "file-missing", "manifest-inconsistent", "model-invalid"),
     )
@@ -191,32 +172,29 @@ def test_a_sidecar_that_is_another_file(name: str, dataset: Path, jail: Jail) ->
 
 @pytest.mark.parametrize("inside", [True, False], ids=["inside", "outside"])
 @pytest.mark.parametrize("suffix", [".mp4", ".yaml"])
-def test_links_are_followed(
-    suffix: str, inside: bool, dataset: Path, tmp_path: Path, jail: Jail
-) -> None:
+def test_links_are_followed(suffix: str, inside: bool, dataset: Path, tmp_path: Path) -> None:
     # git-annex, DVC and the caches of data hubs hold every file as a link to a store
     path = dataset / f"{STEM}{suffix}"
     path.rename((dataset if inside else tmp_path) / "blob")
     path.symlink_to("blob" if inside else "../blob")
-    accepted(jail, dataset)
+    accepted(dataset)
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".yaml"])
-def test_links_in_a_circle(suffix: str, pair: Path, jail: Jail) -> None:
+def test_links_in_a_circle(suffix: str, pair: Path) -> None:
     path = pair.with_suffix(suffix)
     path.unlink()
     path.symlink_to(path.name)
     if suffix == ".yaml":
         for outcome in (jail.validate(pair), jail.read(pair)):
-            bounded(outcome)
             assert outcome.ours or outcome.codes == ["file-missing"], outcome.text
     else:
-        refused(jail, pair, "file-missing")
+        refused(pair, "file-missing")
 
 
 @pytest.mark.parametrize("kind", ["zero", "fifo", "folder"])
 @pytest.mark.parametrize("name", [f"{STEM}.yaml", f"{STEM}.mp4", "messages.mcap", "dataset.yaml"])
-def test_not_a_regular_file(name: str, kind: str, dataset: Path, jail: Jail) -> None:
+def test_not_a_regular_file(name: str, kind: str, dataset: Path) -> None:
     path = dataset / name
     path.unlink()
     if kind == "zero":
@@ -226,7 +204,6 @@ def test_not_a_regular_file(name: str, kind: str, dataset: Path, jail: Jail) -> 
     else:
         path.mkdir()
     for outcome in (jail.validate(dataset), jail.read(dataset)):
-        bounded(outcome)
         assert outcome.ours or outcome.codes, outcome.text
 
 
@@ -253,27 +230,27 @@ TEXTS: dict[str, bytes] = {
 
 @pytest.mark.parametrize("name", TEXTS)
 @pytest.mark.parametrize("to", ["sidecar", "manifest"])
-def test_yaml_beyond_the_subset(to: str, name: str, dataset: Path, jail: Jail) -> None:
+def test_yaml_beyond_the_subset(to: str, name: str, dataset: Path) -> None:
     path = dataset / (f"{STEM}.yaml" if to == "sidecar" else "dataset.yaml")
     head = b'mp4ds: "1.1"\nkind: stream\n' if TEXTS[name].startswith(b"a:") else b""
     path.write_bytes(head + TEXTS[name])
-    refused(jail, path if to == "sidecar" else dataset, "yaml-invalid")
+    refused(path if to == "sidecar" else dataset, "yaml-invalid")
     assert not list(dataset.glob("pwned"))
 
 
-def test_a_sidecar_larger_than_any(pair: Path, jail: Jail) -> None:
+def test_a_sidecar_larger_than_any(pair: Path) -> None:
     os.truncate(pair, 8 * 2**30)  # takes no room on the disk
-    refused(jail, pair, "yaml-invalid")
+    refused(pair, "yaml-invalid")
 
 
-def test_a_text_that_looks_like_a_column_cut_out(pair: Path, jail: Jail) -> None:
+def test_a_text_that_looks_like_a_column_cut_out(pair: Path) -> None:
     changed(pair, put("columns", "stamp", "values", value="mp4ds column 0"))
-    refused(jail, pair, "column-invalid")
+    refused(pair, "column-invalid")
 
 
-def test_many_unknown_keys(pair: Path, jail: Jail) -> None:
+def test_many_unknown_keys(pair: Path) -> None:
     edited(pair, b"frames: 8", b"frames: 8" + b"".join(b"\nk%d: 1" % n for n in range(20_000)))
-    text = refused(jail, pair, *BAD_DOCUMENT)
+    text = refused(pair, *BAD_DOCUMENT)
     assert len(text) < 10_000
 
 
@@ -281,9 +258,9 @@ def test_many_unknown_keys(pair: Path, jail: Jail) -> None:
 
 
 @pytest.mark.parametrize("version", ["2.0", "2.7", "10.0", "99999999999.0"])
-def test_a_newer_major_version_is_refused(version: str, pair: Path, jail: Jail) -> None:
+def test_a_newer_major_version_is_refused(version: str, pair: Path) -> None:
     changed(pair, put("mp4ds", value=version))
-    text = refused(jail, pair, "version-unsupported")
+    text = refused(pair, "version-unsupported")
     assert version in text
     assert FORMAT_VERSION in text
     with pytest.raises(VersionError, match=version):
@@ -295,16 +272,15 @@ def test_a_newer_major_version_is_refused(version: str, pair: Path, jail: Jail) 
     [b"1", b"1.0", b'"1"', b'"1.0.0"', b'"01.0"', b'"0.9"', b'"1.0 "', b'"-1.0"', b'"1.\xd9\xa1"',
      b"null", b"[1]", b"{}", b"true", b'"' + b"9" * 5000 + b'.0"'],
 )  # fmt: skip
-def test_not_a_version(version: bytes, pair: Path, jail: Jail) -> None:
+def test_not_a_version(version: bytes, pair: Path) -> None:
     edited(pair, b'mp4ds: "1.1"', b"mp4ds: " + version)
-    refused(jail, pair, "version-unsupported")
+    refused(pair, "version-unsupported")
 
 
-def test_a_newer_minor_version_with_many_keys(pair: Path, jail: Jail) -> None:
+def test_a_newer_minor_version_with_many_keys(pair: Path) -> None:
     keys = b"".join(b"\nk%d: 1" % n for n in range(20_000))
     edited(pair, b'mp4ds: "1.1"', b'mp4ds: "1.7"' + keys)
     outcome = jail.validate(pair)
-    bounded(outcome)
     assert not outcome.error, outcome.text
     assert sum(map(len, outcome.warned)) < 10_000
 
@@ -331,10 +307,10 @@ img_timestamp: [1.5, 2.5]
         ("D: [0.1]", "D: [[1]]"),
     ],
 )
-def test_a_hostile_version_0(old: str, new: str, pair: Path, jail: Jail) -> None:
+def test_a_hostile_version_0(old: str, new: str, pair: Path) -> None:
     assert old in VERSION_0
     pair.write_text(VERSION_0.replace(old, new))
-    refused(jail, pair, "migration-failed", "yaml-invalid", *BAD_DOCUMENT)
+    refused(pair, "migration-failed", "yaml-invalid", *BAD_DOCUMENT)
 
 
 # ---------------------------------------------------------------- numbers that ask for memory
@@ -361,19 +337,19 @@ GEOMETRY: dict[str, tuple[Change, set[str]]] = {
 
 
 @pytest.mark.parametrize("name", GEOMETRY)
-def test_sizes_that_ask_for_memory(name: str, pair: Path, jail: Jail) -> None:
+def test_sizes_that_ask_for_memory(name: str, pair: Path) -> None:
     change, codes = GEOMETRY[name]
     changed(pair, change)
-    refused(jail, pair, *codes)
+    refused(pair, *codes)
 
 
-def test_as_many_frames_as_a_hollow_video_has_bytes(pair: Path, jail: Jail) -> None:
+def test_as_many_frames_as_a_hollow_video_has_bytes(pair: Path) -> None:
     os.truncate(pair.with_suffix(".mp4"), MAX_FRAMES)  # takes no room on the disk
     changed(pair, both(LOSSY, claiming(MAX_FRAMES)))
-    refused(jail, pair, "frame-count")
+    refused(pair, "frame-count")
 
 
-def test_millions_of_camera_infos_in_a_few_bytes(pair: Path, jail: Jail) -> None:
+def test_millions_of_camera_infos_in_a_few_bytes(pair: Path) -> None:
     runs = column(0, 0, f"0*{MAX_CAMERA_INFOS - 1}")
     changed(
         pair,
@@ -382,7 +358,7 @@ def test_millions_of_camera_infos_in_a_few_bytes(pair: Path, jail: Jail) -> None
             *(put("camera_info", "columns", name, value=runs) for name in COLUMNS),
         ),
     )
-    bounded(jail.validate(pair))
+    jail.validate(pair)
 
 
 # ---------------------------------------------------------------- columns
@@ -397,9 +373,9 @@ RESIDUALS: dict[str, str] = {
 
 
 @pytest.mark.parametrize("name", RESIDUALS)
-def test_columns_that_do_not_decode(name: str, pair: Path, jail: Jail) -> None:
+def test_columns_that_do_not_decode(name: str, pair: Path) -> None:
     changed(pair, put("columns", "stamp", "values", value=RESIDUALS[name]))
-    text = refused(jail, pair, "column-invalid", "yaml-invalid")
+    text = refused(pair, "column-invalid", "yaml-invalid")
     assert "columns.stamp" in text or "yaml-invalid" in text
 
 
@@ -448,19 +424,17 @@ COLUMN_CHANGES: dict[str, tuple[Change, set[str]]] = {
 
 
 @pytest.mark.parametrize("name", COLUMN_CHANGES)
-def test_a_sidecar_that_contradicts_itself_or_its_video(name: str, pair: Path, jail: Jail) -> None:
+def test_a_sidecar_that_contradicts_itself_or_its_video(name: str, pair: Path) -> None:
     change, codes = COLUMN_CHANGES[name]
     changed(pair, change)
-    refused(jail, pair, *codes)
+    refused(pair, *codes)
 
 
 @pytest.mark.parametrize(("start", "step"), [(3, 1), (0, 2), (2**62, 1)])
-def test_places_of_messages_that_are_nowhere(
-    start: int, step: int, dataset: Path, jail: Jail
-) -> None:
+def test_places_of_messages_that_are_nowhere(start: int, step: int, dataset: Path) -> None:
     changed(dataset / f"{STEM}.yaml", put("columns", "ordinal", value=column(start, step, WHOLE)))
     agreed(dataset)
-    refused(jail, dataset, "messages-missing")
+    refused(dataset, "messages-missing")
 
 
 # ---------------------------------------------------------------- videos
@@ -546,27 +520,25 @@ OTHER_VIDEOS: dict[str, tuple[Callable[[Path], object], set[str]]] = {
 
 
 @pytest.mark.parametrize("name", OTHER_VIDEOS)
-def test_another_video(name: str, pair: Path, jail: Jail) -> None:
+def test_another_video(name: str, pair: Path) -> None:
     make, codes = OTHER_VIDEOS[name]
     path = pair.with_suffix(".mp4")
     if name not in ("half", "missing"):
         path.unlink()
     make(path)
     changed(pair, LOSSY)
-    refused(jail, pair, *codes)
+    refused(pair, *codes)
 
 
 @pytest.mark.parametrize("size", [(32, 48), (128, 48), (64, 96), (4096, 4096)])
-def test_a_video_that_changes_its_size_half_way(
-    size: tuple[int, int], pair: Path, jail: Jail
-) -> None:
+def test_a_video_that_changes_its_size_half_way(size: tuple[int, int], pair: Path) -> None:
     start = h264((WIDTH, HEIGHT), FRAMES // 2)
     video_that_changes(pair.with_suffix(".mp4"), start, h264(size, FRAMES // 2))
     changed(pair, LOSSY)
-    refused(jail, pair, "geometry-mismatch", "decode-failed")
+    refused(pair, "geometry-mismatch", "decode-failed")
 
 
-def test_a_file_header_of_another_size(pair: Path, jail: Jail) -> None:
+def test_a_file_header_of_another_size(pair: Path) -> None:
     # what counts is the size in the coded stream: no other is allocated
     path = pair.with_suffix(".mp4")
     data = bytearray(path.read_bytes())
@@ -575,32 +547,30 @@ def test_a_file_header_of_another_size(pair: Path, jail: Jail) -> None:
     path.write_bytes(data)
     changed(pair, UNSEALED)
     for outcome in (jail.validate(pair), jail.read(pair)):
-        bounded(outcome)
         assert not outcome.error or outcome.ours
 
 
 @pytest.mark.parametrize("name", [b"Lavf", b"VideoHandler"])
-def test_a_video_with_a_text_that_is_not_utf8(name: bytes, pair: Path, jail: Jail) -> None:
+def test_a_video_with_a_text_that_is_not_utf8(name: bytes, pair: Path) -> None:
     path = pair.with_suffix(".mp4")
     data = bytearray(path.read_bytes())
     data[data.index(name)] |= 0x80
     path.write_bytes(data)
     changed(pair, UNSEALED)
     for outcome in (jail.validate(pair), jail.read(pair)):
-        bounded(outcome)
         assert not outcome.error or outcome.ours
 
 
-def test_a_playlist_of_other_files(pair: Path, jail: Jail) -> None:
+def test_a_playlist_of_other_files(pair: Path) -> None:
     path = pair.with_suffix(".mp4")
     path.rename(pair.with_name("other.mp4"))
     path.write_text("ffconcat version 1.0\nfile other.mp4\n")
     changed(pair, LOSSY)
-    refused(jail, pair, "video-unreadable")
+    refused(pair, "video-unreadable")
 
 
 @pytest.mark.parametrize("form", ["hls", "sdp", "concat", "dash"])
-def test_nothing_is_fetched_from_a_network(form: str, pair: Path, jail: Jail) -> None:
+def test_nothing_is_fetched_from_a_network(form: str, pair: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(0.05)
         url = f"http://127.0.0.1:{server.getsockname()[1]}/x.mp4"
@@ -614,7 +584,7 @@ def test_nothing_is_fetched_from_a_network(form: str, pair: Path, jail: Jail) ->
         }[form]
         pair.with_suffix(".mp4").write_text(text)
         changed(pair, LOSSY)
-        refused(jail, pair, "video-unreadable")
+        refused(pair, "video-unreadable")
         with pytest.raises(TimeoutError):
             server.accept()
 
@@ -679,10 +649,10 @@ def copied(sidecar: Path, folder: Path) -> Path:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_good_ones_of_every_kind_are_accepted(
-    kind: str, pairs: Callable[[str], Path], tmp_path: Path, jail: Jail
+    kind: str, pairs: Callable[[str], Path], tmp_path: Path
 ) -> None:
     pair = copied(pairs(kind), tmp_path)
-    accepted(jail, pair)
+    accepted(pair)
     assert jail.read(pair).frames == 6
 
 
@@ -944,12 +914,12 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
 @pytest.mark.one_in(6)
 @pytest.mark.parametrize("name", FORGED)
 def test_a_forged_sidecar_of_coded_pictures(
-    name: str, pairs: Callable[[str], Path], tmp_path: Path, jail: Jail
+    name: str, pairs: Callable[[str], Path], tmp_path: Path
 ) -> None:
     kind, change, codes = FORGED[name]
     pair = copied(pairs(kind), tmp_path)
     changed(pair, change)
-    refused(jail, pair, *codes)
+    refused(pair, *codes)
 
 
 # ---------------------------------------------------------------- manifests
@@ -960,14 +930,12 @@ def test_a_forged_sidecar_of_coded_pictures(
     [b"", b"x" * 4096, b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"],
     ids=["empty", "junk", "git-lfs"],
 )
-def test_messages_that_are_no_mcap(content: bytes, dataset: Path, jail: Jail) -> None:
+def test_messages_that_are_no_mcap(content: bytes, dataset: Path) -> None:
     (dataset / "messages.mcap").write_bytes(content)
     agreed(dataset)
     outcome = jail.validate(dataset)
-    bounded(outcome)
     assert outcome.codes == ["messages-unreadable"]
     outcome = jail.read(dataset)
-    bounded(outcome)
     assert outcome.ours, outcome.text
 
 
