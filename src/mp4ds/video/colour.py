@@ -25,12 +25,19 @@ _TAPS = (0, 28), (1, 8), (-1, -3), (2, -1)  # distance from the nearest sample, 
 _BAND = 64  # rows that numpy converts at a time: what is between fits the processor's cache
 
 
-def samples(frame: av.VideoFrame, index: int) -> NDArray[Any]:
-    """A plane as a view of shape (rows, columns), uint8 or uint16."""
+def samples(frame: av.VideoFrame, index: int = 0) -> NDArray[Any]:
+    """A plane as a view, uint8 or uint16.
+
+    Returns:
+        Shape (rows, columns), or (rows, columns, channels) if the plane has several.
+    """
     plane: Any = frame.planes[index]  # a buffer, which its type does not tell
-    dtype = np.uint8 if frame.format.components[0].bits == 8 else np.dtype("<u2")
+    components = frame.format.components
+    dtype = np.uint8 if components[0].bits == 8 else np.dtype("<u2")
+    channels = sum(component.plane == index for component in components)
     rows: NDArray[Any] = np.frombuffer(plane, dtype).reshape(plane.height, -1)
-    return rows[:, : plane.width]
+    pixels = rows[:, : channels * plane.width]
+    return pixels if channels == 1 else pixels.reshape(plane.height, plane.width, channels)
 
 
 class Factors(NamedTuple):

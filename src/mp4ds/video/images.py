@@ -22,6 +22,7 @@ from mp4ds.errors import OptionError, Refused, SourceError
 from mp4ds.messages import png
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels, check_size
 from mp4ds.messages.layouts import CHROMA_SHIFTS, Layout, bind
+from mp4ds.video.colour import samples
 from mp4ds.video.pixels import PictureConverter, plain_frame, scaling
 
 STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp")
@@ -305,22 +306,10 @@ class ImageFile:
             frame = self._converter.convert(frame, "rgb24")
         if frame.format.name != self._pixel_format:
             frame = self._converter.convert(frame, self._pixel_format)
-        return self._jpeg_file(frame) if self._jpeg else _png_file(frame)
-
-    def _jpeg_file(self, frame: av.VideoFrame) -> bytes:
-        from PIL import Image
-
-        channels = 1 if self._pixel_format == "gray" else 3
-        plane: Any = frame.planes[0]
-        rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-        packed = np.ascontiguousarray(rows[: frame.height, : channels * frame.width])
-        mode, size = ("L" if channels == 1 else "RGB"), (frame.width, frame.height)
-        file = io.BytesIO()
-        # full chroma: what is published as colour was often demosaiced, and is sharp in it
-        Image.frombuffer(mode, size, packed, "raw", mode, 0, 1).save(
-            file, "JPEG", quality=self._quality, subsampling=0
-        )
-        return file.getvalue()
+        if self._jpeg:
+            # full chroma: what is published as colour was often demosaiced, and is sharp in it
+            return _file(samples(frame), "JPEG", quality=self._quality, subsampling=0)
+        return _png_file(frame)
 
 
 def _png_file(frame: av.VideoFrame) -> bytes:
@@ -443,18 +432,18 @@ class Renderer:
             interpolation=scaling((width, height), self._size),
             threads=1,  # a pool inherited over fork would never end
         )
-        np.copyto(out, _array(frame))
+        np.copyto(out, samples(frame))
 
     def _packed(self, pixels: Pixels) -> tuple[NDArray[Any], str]:
         """The image in one array, and ffmpeg's name of its format; YUV and mosaics as RGB."""
         if self._layout is not None:
             frame = plain_frame(self._layout.to_picture(pixels), self._source)
-            return _array(self._camera.convert(frame, "rgb24")), "rgb24"
+            return samples(self._camera.convert(frame, "rgb24")), "rgb24"
         if self._encoding.mosaic:
             height, width = pixels.shape
             frame = plain_frame((_even_mosaic(pixels),), self._source)
             made = "rgb24" if self._encoding.bytes_per_sample == 1 else "rgb48le"
-            return _array(self._colours.convert(frame, made))[:height, :width], made
+            return samples(self._colours.convert(frame, made))[:height, :width], made
         return pixels, self._source
 
 
@@ -470,19 +459,8 @@ def _frame(array: NDArray[Any], pixel_format: str) -> av.VideoFrame:
     if array.dtype == np.uint8 or array.ndim == 2:
         return plain_frame((array,), pixel_format)
     frame = av.VideoFrame(array.shape[1], array.shape[0], pixel_format)
-    _array(frame)[...] = array
+    samples(frame)[...] = array
     return frame
-
-
-def _array(frame: av.VideoFrame) -> NDArray[Any]:
-    """The pixels of a packed frame as a view of shape (H, W) or (H, W, C)."""
-    channels = len(frame.format.components)
-    samples = np.dtype("u1" if frame.format.components[0].bits == 8 else "<u2")
-    plane: Any = frame.planes[0]  # a buffer, which its type does not tell
-    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-    row_bytes = frame.width * channels * samples.itemsize
-    pixels = rows[: frame.height, :row_bytes].view(samples)
-    return pixels if channels == 1 else pixels.reshape(frame.height, frame.width, channels)
 
 
 # ---------------------------------------------------------------- pages

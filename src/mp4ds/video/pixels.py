@@ -107,10 +107,10 @@ _CARE = _FULL_CHROMA | _ACCURATE | _BITEXACT
 _INTERPOLATION = _BICUBIC | _CARE
 _MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
 
-_CHANNELS = {"rgb24": 3, "bgr24": 3, "rgba": 4, "bgra": 4}
+_PACKED = ("rgb24", "bgr24", "rgba", "bgra")
 _VIA_PLANES = ("rgb24", "bgr24")
 _ROUNDED = ("yuv420p", TEN_BITS)
-_VIEWED = ("gray", "gray16le", *_CHANNELS)  # PyAV makes frames of their arrays without a copy
+_VIEWED = ("gray", "gray16le", *_PACKED)  # PyAV makes frames of their arrays without a copy
 # x264 codes grey with neutral chroma; full range has a name of its own in some decoders
 _DECODED_AS = {
     "gray": ("gray", "yuv420p", "yuvj420p"),
@@ -137,7 +137,7 @@ def shows_colours(
     picture_format: str, picture_size: tuple[int, int], coded_size: tuple[int, int]
 ) -> bool:
     """Whether pictures are what the video shows: 8-bit colours, no mosaic, same size."""
-    return picture_format in _CHANNELS and picture_size == coded_size
+    return picture_format in _PACKED and picture_size == coded_size
 
 
 def scaling(size: tuple[int, int], made: tuple[int, int]) -> int:
@@ -202,7 +202,7 @@ class PictureConverter:
             return np.stack([samples(made, index) for index in order], axis=-1, out=out)
         if self._is_defined(frame):
             return self._rgb(frame, scale.pixel_format, out)
-        pixels = _packed(frame, scale.pixel_format, self)
+        pixels = samples(self.convert(frame, scale.pixel_format))
         if out is None and frame.format.name != scale.pixel_format and pixels.flags.c_contiguous:
             return pixels  # new already; a copy would cost as much again in page faults
         out = np.empty(pixels.shape, np.uint8) if out is None else out
@@ -301,8 +301,7 @@ def plain_frame(picture: Picture, picture_format: str) -> av.VideoFrame:
     height, width = picture[0].shape
     frame = av.VideoFrame(width, height, picture_format)
     for index, plane in enumerate(picture):
-        rows = _rows(frame, index).view(plane.dtype)
-        rows[: plane.shape[0], : plane.shape[1]] = plane
+        samples(frame, index)[: plane.shape[0], : plane.shape[1]] = plane
     return frame
 
 
@@ -319,24 +318,10 @@ def _gray_to_yuv(picture: NDArray[Any], pixel_format: str) -> av.VideoFrame:
     picture = _pad_to_even(picture)
     height, width = picture.shape
     frame = av.VideoFrame(width, height, pixel_format)
-    _rows(frame, 0)[:height, :width] = picture
+    samples(frame)[...] = picture
     for index in (1, 2):
-        _rows(frame, index)[...] = 128
+        samples(frame, index)[...] = 128
     return frame
-
-
-def _rows(frame: av.VideoFrame, index: int) -> NDArray[np.uint8]:
-    """A plane as a view of shape (rows, bytes of a row), padding included."""
-    plane: Any = frame.planes[index]  # a buffer, which its type does not tell
-    return np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-
-
-def _packed(
-    frame: av.VideoFrame, pixel_format: str, converter: PictureConverter
-) -> NDArray[np.uint8]:
-    channels = _CHANNELS[pixel_format]
-    rows = _rows(converter.convert(frame, pixel_format), 0)
-    return rows[: frame.height, : channels * frame.width].reshape(frame.height, -1, channels)
 
 
 # ---------------------------------------------------------------- pictures
@@ -403,10 +388,11 @@ class PictureMaker:
         if scale is not None:
             return (self._converter.scale(frame, scale, out),)
         if self._picture_format.startswith("bayer_"):
-            return (self._mosaic(_packed(frame, "rgb24", self._converter)),)
-        if self._picture_format in _CHANNELS:
+            return (self._mosaic(samples(self._converter.convert(frame, "rgb24"))),)
+        if self._picture_format in _PACKED:
             width, height = self._picture_size
-            return (_packed(frame, self._picture_format, self._converter)[:height, :width],)
+            colours = samples(self._converter.convert(frame, self._picture_format))
+            return (colours[:height, :width],)
         return self._planes(frame)
 
     def _planes(self, frame: av.VideoFrame) -> Picture:
@@ -422,10 +408,8 @@ class PictureMaker:
             across, down = CHROMA_SHIFTS.get(wanted, (0, 0))
             chroma = (-(-height >> down), -(-width >> across))
             sizes += [chroma] * (len(frame.planes) - 1)
-        sample = "<u2" if wanted.endswith("le") else "u1"
         return tuple(
-            _rows(frame, index).view(sample)[:rows, :columns]
-            for index, (rows, columns) in enumerate(sizes)
+            samples(frame, index)[:rows, :columns] for index, (rows, columns) in enumerate(sizes)
         )
 
     def _mosaic(self, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
