@@ -319,6 +319,6 @@ def test_sources_are_read_by_threads(trait: str, start: int | None, tmp_path: Pa
         wanted = rows(dataset.records(start=start))
         assert rows(dataset.records(start=start, ahead=ahead)) == wanted
         parts = sum(len(group.parts) for group in dataset._groups)
-        assert len(ahead.threads) == parts + 1 + (len(dataset._groups) if start is None else 0)
+        assert len(ahead.threads) == parts + 1 + len(dataset._groups)
         for thread in ahead.threads:
             thread.join()

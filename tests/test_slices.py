@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 import mp4ds
 from coded_scenes import CODED
@@ -94,6 +95,24 @@ def test_of_odd_recordings(trait: str, tmp_path: Path) -> None:
         assert compare(paths, output, start=start, end=end) == []
     output = unpacked(tmp_path / "whole", "mcap", **span)
     assert compare(paths, output, start=start, end=end) == []
+
+
+def test_messages_of_equal_times_come_as_in_the_whole(tmp_path: Path) -> None:
+    """Whichever topic they are of, and whatever attachments stand among them."""
+    made = odd_scene("plain", frames=12)
+    equal = [replace(one, log_time=one.log_time // PERIOD * PERIOD) for one in made.messages]
+    paths = SOURCES["mcap-ros1-zstd"](tmp_path, replace(made, messages=equal))
+    mp4ds.pack(paths, tmp_path / "whole")
+    orders, start = [], START + 3 * PERIOD
+    for name, span in (("all", {}), ("part", {"start": str(start)})):
+        output = tmp_path / f"{name}.mcap"
+        mp4ds.unpack(tmp_path / "whole", "mcap", output, UnpackOptions(**span))
+        with output.open("rb") as file:
+            found = make_reader(file).iter_messages(log_time_order=False)
+            rows = [(channel.topic, message.log_time) for _, channel, message in found]
+        orders.append([row for row in rows if row[1] >= start])
+    assert orders[0] == orders[1] == sorted(orders[0], key=lambda row: row[1])
+    assert len(set(orders[0])) > len({time for _, time in orders[0]})
 
 
 def test_equal_times_in_different_files(tmp_path: Path) -> None:

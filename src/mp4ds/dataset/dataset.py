@@ -404,10 +404,11 @@ class Dataset:
     ) -> Iterator[Record]:
         """Everything recorded, merged by log time; each channel in its own order.
 
-        For a time span, a channel's messages in messages.mcap are merged with those of its videos
-        by log time. Only messages are yielded then, and nothing before the key frame of a video's
-        first message is decoded. If some messages are left out, videos are not checked against
-        their SHA-256, but messages still are against their digests.
+        Messages of equal times come channel by channel, in the same order whether all are read or
+        a span. For a span, a channel's messages in messages.mcap are merged with those of its
+        videos by log time. Only messages are yielded then, and nothing before the key frame of a
+        video's first message is decoded. If some messages are left out, videos are not checked
+        against their SHA-256, but messages still are against their digests.
 
         Args:
             sources: Replacement sources for the messages of a video or its calibrations; all others
@@ -428,16 +429,17 @@ class Dataset:
         span = Excerpt(start, end, None if topics is None else frozenset(topics))
         choice = within(span, choose) if is_span else choose
 
-        def own(group: ChannelGroup) -> list[Iterator[tuple[int, Message]]]:
-            return [*map(ahead, group.sources(choice, sources or {}))]
+        def messages(group: ChannelGroup) -> Iterator[Message]:
+            own = [*map(ahead, group.sources(choice, sources or {}))]
+            if not is_span:
+                return self._group_messages(group, own, ahead)
+            part = replace(span, topics=frozenset([group.channel.topic]))
+            recorded = ahead(group.found_in(self.messages_file.in_time(part)))
+            return by_time(recorded, *((item for _, item in source) for source in own))
 
-        groups = [item for item in self._groups if topics is None or item.channel.topic in topics]
-        if is_span:
-            recorded = ahead(self.recorded_messages(span))
-            parts = [(message for _, message in part) for group in groups for part in own(group)]
-            return by_time(recorded, *parts)
-        channels = (self._group_messages(group, own(group), ahead) for group in groups)
-        return by_time(ahead(self._verbatim_records(topics)), *channels)
+        groups = (item for item in self._groups if topics is None or item.channel.topic in topics)
+        found = self.messages_file.in_time(span) if is_span else self.messages_file.in_file_order()
+        return by_time(ahead(self._verbatim_records(found, topics)), *map(messages, groups))
 
     def times(self, topics: Collection[str] | None = None) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame.
@@ -504,10 +506,12 @@ class Dataset:
             if gap:
                 yield group.channel.topic, gap
 
-    def _verbatim_records(self, topics: Collection[str] | None) -> Iterator[Record]:
+    def _verbatim_records(
+        self, records: Iterator[Record], topics: Collection[str] | None
+    ) -> Iterator[Record]:
         channels = self._verbatim_channels
         wanted = {item.id for item in channels if topics is None or item.topic in topics}
-        for record in self.messages_file.in_file_order():
+        for record in records:
             if not isinstance(record, Message) or record.channel.id in wanted:
                 yield record
 

@@ -274,8 +274,11 @@ MessageSource = Callable[[Channel, Choice], Iterator[tuple[int, Message]]]
 
 
 def by_time(*records: Iterator[_RecordT]) -> Iterator[_RecordT]:
-    """Merge records that are in the order of their log times; what has none comes first."""
-    return _in_order(records, lambda record: getattr(record, "log_time", 0))
+    """Merge messages that are in the order of their log times; other records come at once.
+
+    An attachment has a log time, too, but stands anywhere: waiting for it would hold up messages.
+    """
+    return _in_order(records, lambda one: one.log_time if isinstance(one, Message) else 0)
 
 
 def _in_order(parts: Sequence[Iterator[_Item]], key: Callable[[_Item], int]) -> Iterator[_Item]:

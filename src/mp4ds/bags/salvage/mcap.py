@@ -306,9 +306,7 @@ class _Chunk:
         if crc and zlib.crc32(unpacked.content) == crc:
             problem = ""
         elif crc and not problem:
-            problem = (
-                "a chunk does not match its checksum: its messages were kept, but some are altered"
-            )
+            problem = "a chunk does not match its checksum: what could be read of it may be altered"
         used = records + 8 + unpacked.used if unpacked.used else 0
         is_doubtful = bool(problem) and (not unpacked.is_sound or not unpacked.problem)
         return cls(
