@@ -81,7 +81,7 @@ def test_parts_are_the_whole_again(count: int, whole: Path, tmp_path: Path) -> N
     assert validate(joined, deep=True) == []
     for dataset in (whole, joined):
         unpack(dataset, "bag", tmp_path / f"{dataset.name}.bag")
-    compare(tmp_path / "drive.bag", tmp_path / "joined.bag")
+    assert compare([tmp_path / "drive.bag"], tmp_path / "joined.bag") == []
     with Dataset(whole) as before, Dataset(joined) as after:
         assert before.manifest is not None
         assert after.manifest is not None

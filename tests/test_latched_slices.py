@@ -46,13 +46,12 @@ def made(kind: str, folder: Path) -> Path:
     return make_drive(path) if kind == "bag" else make_ros2(path)
 
 
-def due(path: Path, *, latched: bool = True) -> list[Recorded]:
+def due(path: Path) -> list[Recorded]:
     """What a slice has to hold: all latched messages of these recordings are sent at the start."""
     return [
         (topic, data, time)
         for topic, data, time in recorded(path)
-        if FIRST <= time < START + 15 * STEP
-        or (latched and time < FIRST and topic in ("/tf_static", "/map"))
+        if FIRST <= time < START + 15 * STEP or (time < FIRST and topic in ("/tf_static", "/map"))
     ]
 
 
@@ -92,14 +91,6 @@ def test_it_begins_with_them(way: str, kind: str, tmp_path: Path) -> None:
     total = sum(TOPICS[kind].values())
     words = f"{total} latched messages from before the start: "
     assert [note for note in info(dataset).notes if words in note]
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_without_them(way: str, tmp_path: Path) -> None:
-    source = made("bag", tmp_path)
-    summary, output = sliced(way, source, tmp_path, latched=False)
-    assert recorded(output) == due(source, latched=False)
-    assert summary.latched == {}
 
 
 def test_a_slice_of_a_slice_and_its_beginning(tmp_path: Path) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import queue
 import shutil
-import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -17,6 +15,7 @@ from coded_scenes import CODED
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, VideoError
 from mp4ds.format.fields import DecodedColumns, everything
+from mp4ds.plugins.playing.timeline import ReadAhead
 from mp4ds.records import Message, Record
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.mp4 import read_sample_table
@@ -290,35 +289,19 @@ def test_messages_that_are_in_no_file(choose: Any, long: Path) -> None:
 # ---------------------------------------------------------------- ahead
 
 
-class Threads:
-    """Reads each source by a thread of its own."""
-
-    def __init__(self) -> None:
-        self.threads: list[threading.Thread] = []
-
-    def __call__(self, items: Iterator[T], /) -> Iterator[T]:
-        made: queue.Queue[Any] = queue.Queue(4)
-        end = object()
-
-        def run() -> None:
-            for item in items:
-                made.put(item)
-            made.put(end)
-
-        thread = threading.Thread(target=run, daemon=True)
-        self.threads.append(thread)
-        thread.start()
-        return iter(made.get, end)
-
-
 @pytest.mark.parametrize("start", [None, 0])
 @pytest.mark.parametrize("trait", ["size-change", "plain"])
 def test_sources_are_read_by_threads(trait: str, start: int | None, tmp_path: Path) -> None:
     with Dataset(packed(tmp_path, odd_scene(trait))) as dataset:
-        ahead = Threads()
+        threads: list[ReadAhead[Any]] = []
+
+        def ahead(items: Iterator[T]) -> Iterator[T]:
+            threads.append(ReadAhead(items, 4))
+            return threads[-1]
+
         wanted = rows(dataset.records(start=start))
         assert rows(dataset.records(start=start, ahead=ahead)) == wanted
         parts = sum(len(group.parts) for group in dataset._groups)
-        assert len(ahead.threads) == parts + 1 + len(dataset._groups)
-        for thread in ahead.threads:
-            thread.join()
+        assert len(threads) == parts + 1 + len(dataset._groups)
+        for thread in threads:
+            thread.close()

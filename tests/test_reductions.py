@@ -197,15 +197,6 @@ def test_calibrations_are_made_to_match(packed: Callable[..., Packed], name: str
         assert (value.binning_x, value.binning_y, value.roi.width) == (0, 0, 0)
 
 
-def test_other_topics_stay(packed: Callable[..., Packed]) -> None:
-    made = packed("raw-mono8")
-    options: dict[str, Any] = {"resize": 0.5, "every": 3, "max_rate": 9.0}
-    plain, less = (made.unpack("mcap", None, **how)[1] for how in ({}, options))
-    others = [[m for m in found if not m.topic.startswith("/cam")] for found in (plain, less)]
-    assert rows(others[0]) == rows(others[1])
-    assert len(less) < len(plain)
-
-
 def test_what_no_video_holds_is_told(tmp_path: Path) -> None:
     made = Packed(tmp_path, odd_scene("data-empty"), "mcap-ros2-zstd")
     summary, messages = made.unpack("mcap", None, resize=0.5, every=2)
