@@ -18,7 +18,7 @@ from pathlib import Path
 import dask
 import pytest
 
-import cluster_tasks
+import clusters
 from clusters import WITH_NANNY, RealCluster
 from mp4ds.errors import Mp4dsError, OptionError, RemoteError
 from mp4ds.plugins import cluster as access
@@ -71,8 +71,8 @@ def started(folder: Path) -> list[Path]:
 def test_all_calls_are_made(cluster: RealCluster, tmp_path: Path) -> None:
     names = numbered(12)
     executor = cluster_executor(cluster.address, 12)
-    assert not errors(executor, cluster_tasks.write, tmp_path, *names)
-    assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
+    assert not errors(executor, clusters.write, tmp_path, *names)
+    assert results(tmp_path) == {name: clusters.result(name) for name in names}
     assert len({path.suffix for path in started(tmp_path)}) == 2  # processes: both worked
     assert len(started(tmp_path)) == len(names)  # once each
 
@@ -80,7 +80,7 @@ def test_all_calls_are_made(cluster: RealCluster, tmp_path: Path) -> None:
 def test_errors_of_calls_are_told_and_not_tried_again(cluster: RealCluster, tmp_path: Path) -> None:
     names = ["source", "disk", "odd", "silent", "memory", "fine"]
     executor = cluster_executor(cluster.address, 6)
-    found = errors(executor, cluster_tasks.fail, tmp_path, *names)
+    found = errors(executor, clusters.fail, tmp_path, *names)
     for name, sentence in [
         ("source", "drive.bag: is damaged. Copy it again."),
         ("disk", "a file: No space left on device"),
@@ -97,11 +97,9 @@ def test_errors_of_calls_are_told_and_not_tried_again(cluster: RealCluster, tmp_
 
 def test_a_function_that_the_cluster_lacks(tmp_path: Path) -> None:
     with RealCluster(tmp_path / "dask", workers=1, path=tmp_path) as cluster:
-        found = errors(
-            cluster_executor(cluster.address, 2), cluster_tasks.write, tmp_path, "a", "b"
-        )
+        found = errors(cluster_executor(cluster.address, 2), clusters.write, tmp_path, "a", "b")
     for error in found.values():
-        assert "No module named 'cluster_tasks'" in str(error)
+        assert "No module named 'clusters'" in str(error)
         assert "must have the same version of mp4ds" in str(error)
     assert len(found) == 2
 
@@ -110,15 +108,15 @@ def test_an_error_of_the_caller_drops_what_waits_and_leaves_the_cluster(
     cluster: RealCluster, tmp_path: Path
 ) -> None:
     with pytest.raises(KeyError), cluster_executor(cluster.address, 2) as executor:  # noqa: PT012
-        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in numbered(50)]
+        calls = [executor.submit(clusters.write, str(tmp_path), name) for name in numbered(50)]
         next(as_completed(calls)).result()
         raise KeyError
     begun = len(started(tmp_path))
-    time.sleep(4 * cluster_tasks.SECONDS)
+    time.sleep(4 * clusters.SECONDS)
     assert len(started(tmp_path)) <= begun + 2  # those that workers had fetched
     (tmp_path / "next").mkdir()
     executor = cluster_executor(cluster.address, 2)
-    assert not errors(executor, cluster_tasks.write, tmp_path / "next", *numbered(4))
+    assert not errors(executor, clusters.write, tmp_path / "next", *numbered(4))
     assert cluster.scheduler.poll() is None
     assert all(worker.poll() is None for worker in cluster.workers)
 
@@ -128,7 +126,7 @@ def test_an_error_of_the_caller_drops_what_waits_and_leaves_the_cluster(
 
 def test_a_call_leaves_no_memory_behind(cluster: RealCluster, tmp_path: Path) -> None:
     executor = cluster_executor(cluster.address, 4)
-    assert not errors(executor, cluster_tasks.leave_large, tmp_path, *numbered(4))
+    assert not errors(executor, clusters.leave_large, tmp_path, *numbered(4))
     assert len(list(tmp_path.glob("*.freed"))) == 4
 
 
@@ -141,7 +139,7 @@ def test_calls_of_a_killed_worker_are_made_on_another(tmp_path: Path) -> None:
         RealCluster(tmp_path / "dask") as cluster,
         cluster_executor(cluster.address, 8) as executor,
     ):
-        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in names]
+        calls = [executor.submit(clusters.write, str(tmp_path), name) for name in names]
         next(as_completed(calls))
         victim = cluster.workers[0]
         mine = f"*.by-{victim.pid}"
@@ -154,7 +152,7 @@ def test_calls_of_a_killed_worker_are_made_on_another(tmp_path: Path) -> None:
         unfinished = [p.stem for p in tmp_path.glob(mine) if not p.with_suffix("").exists()]
         assert unfinished
         assert [call.exception() for call in calls] == [None] * 8
-    assert results(tmp_path) == {name: cluster_tasks.result(name) for name in names}
+    assert results(tmp_path) == {name: clusters.result(name) for name in names}
     for name in unfinished:
         assert len(list(tmp_path.glob(f"{name}.by-*"))) == 2
 
@@ -167,7 +165,7 @@ def test_a_call_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
     # more workers than it kills: on a loaded machine a nanny may not bring one back
     with RealCluster(tmp_path / "dask", workers=4, arguments=WITH_NANNY, config=config) as cluster:
         executor = cluster_executor(cluster.address, 7)
-        found = errors(executor, cluster_tasks.die, tmp_path, "deadly", *numbered(6))
+        found = errors(executor, clusters.die, tmp_path, "deadly", *numbered(6))
     assert set(found) == {"deadly"}
     assert re.search("2 different workers, but all those workers died", str(found["deadly"]))
 
@@ -179,7 +177,7 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
         RealCluster(tmp_path / "dask") as cluster,
         cluster_executor(cluster.address, 8) as executor,
     ):
-        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in names]
+        calls = [executor.submit(clusters.write, str(tmp_path), name) for name in names]
         next(as_completed(calls))
         cluster.scheduler.kill()
         found = [error for call in calls if (error := call.exception())]
@@ -192,7 +190,7 @@ def test_a_lost_scheduler_is_an_error_and_the_next_one_goes_on(tmp_path: Path) -
     assert 0 < len(kept) < len(names)
     with RealCluster(tmp_path / "dask-2", workers=1) as cluster:
         executor = cluster_executor(cluster.address, 8)
-        assert not errors(executor, cluster_tasks.write, tmp_path, *names)
+        assert not errors(executor, clusters.write, tmp_path, *names)
     assert results(tmp_path).keys() >= set(names)
     assert all((tmp_path / name).stat().st_mtime_ns == kept[name] for name in kept)
 
@@ -206,7 +204,7 @@ def test_a_cluster_without_workers_is_given_up(
         dask.config.set({"mp4ds.worker-timeout": "1 s"}),
     ):
         executor = cluster_executor(cluster.address, 1)
-        found = errors(executor, cluster_tasks.write, tmp_path, "a")
+        found = errors(executor, clusters.write, tmp_path, "a")
         assert "has had no worker for 1 s. Start some, or find out" in str(found["a"])
 
 
@@ -265,7 +263,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tcp://no-such-host.invalid:8786"])
 def test_nobody_at_the_address(address: str, tmp_path: Path) -> None:
     with pytest.raises(RemoteError, match="no Dask scheduler can be reached"):
-        errors(cluster_executor(address, 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor(address, 1), clusters.write, tmp_path, "a")
 
 
 @pytest.mark.usefixtures("impatient")
@@ -293,7 +291,7 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
         thread.start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(RemoteError, match=problem):
-            errors(cluster_executor(address, 1), cluster_tasks.write, tmp_path, "a")
+            errors(cluster_executor(address, 1), clusters.write, tmp_path, "a")
         thread.join()
     for connection in kept:
         connection.close()
@@ -301,7 +299,7 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
 
 def test_tls_needs_certificates(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="needs certificates"):
-        errors(cluster_executor("tls://127.0.0.1:1", 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor("tls://127.0.0.1:1", 1), clusters.write, tmp_path, "a")
 
 
 def is_alive(pid: int) -> bool:
@@ -369,7 +367,7 @@ def test_jobs_of_a_batch_system_make_the_calls(
 ) -> None:
     with dask.config.set({"mp4ds.jobs": 2}):
         executor = cluster_executor("slurm", calls)
-        assert not errors(executor, cluster_tasks.write, tmp_path, *numbered(calls))
+        assert not errors(executor, clusters.write, tmp_path, *numbered(calls))
     assert len(batch.numbers("jobs")) == jobs
 
 
@@ -379,7 +377,7 @@ def test_a_job_that_ended_is_submitted_again(
 ) -> None:
     monkeypatch.setattr(access, "_LOOK_SECONDS", 0.5)
     with dask.config.set({"mp4ds.jobs": 1}), cluster_executor("slurm", 6) as executor:
-        calls = [executor.submit(cluster_tasks.write, str(tmp_path), name) for name in numbered(6)]
+        calls = [executor.submit(clusters.write, str(tmp_path), name) for name in numbered(6)]
         next(as_completed(calls))
         os.killpg(batch.numbers("jobs")[0], signal.SIGKILL)
         assert [call.exception() for call in calls] == [None] * 6
@@ -389,7 +387,7 @@ def test_a_job_that_ended_is_submitted_again(
 def test_what_the_batch_system_refuses_is_told(batch: Batch, tmp_path: Path) -> None:
     (batch.folder / "refuse").touch()
     with pytest.raises(RemoteError, match=r"could not be submitted.*invalid partition specified"):
-        errors(cluster_executor("slurm", 2), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor("slurm", 2), clusters.write, tmp_path, "a")
 
 
 @pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
@@ -403,13 +401,13 @@ def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
     }
     named = {f"jobqueue.{system}.{name}": value for name, value in settings.items()}
     with dask.config.set(named), pytest.raises(RemoteError, match="could not be submitted"):
-        errors(cluster_executor(system, 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor(system, 1), clusters.write, tmp_path, "a")
 
 
 @pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
 def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=rf"`cluster` {system}: .*jobqueue.yaml"):
-        errors(cluster_executor(system, 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor(system, 1), clusters.write, tmp_path, "a")
 
 
 @pytest.mark.parametrize(
@@ -421,4 +419,4 @@ def test_settings_are_checked(
     name: str, value: object, variable: str, batch: Batch, tmp_path: Path
 ) -> None:
     with dask.config.set({name: value}), pytest.raises(OptionError, match=variable):
-        errors(cluster_executor("slurm", 1), cluster_tasks.write, tmp_path, "a")
+        errors(cluster_executor("slurm", 1), clusters.write, tmp_path, "a")

@@ -501,28 +501,25 @@ def ask(
 
 
 @pytest.mark.parametrize(
-    ("asked", "start", "end"),
+    ("asked", "part"),
     [
-        ("bytes=0-", 0, 1024),
-        ("bytes=10-19", 10, 20),
-        ("bytes=1000-5000", 1000, 1024),
-        ("bytes=-24", 1000, 1024),
-        ("bytes=-9999", 0, 1024),
+        ("bytes=0-", (0, 1024)),
+        ("bytes=10-19", (10, 20)),
+        ("bytes=1000-5000", (1000, 1024)),
+        ("bytes=-24", (1000, 1024)),
+        ("bytes=-9999", (0, 1024)),
+        *((text, None) for text in ("bytes=1024-", "bytes=5-2", "bytes=-0")),
     ],
 )
-def test_byte_ranges(server: ReportServer, asked: str, start: int, end: int) -> None:
+def test_byte_ranges(server: ReportServer, asked: str, part: tuple[int, int] | None) -> None:
     status, headers, body = ask(server, "/d/a%20b.mp4", Range=asked)
-    assert status == 206
+    if part is None:
+        assert (status, headers["Content-Range"], body) == (416, "bytes */1024", b"")
+        return
+    start, end = part
+    assert (status, headers["Content-Type"]) == (206, "video/mp4")
     assert headers["Content-Range"] == f"bytes {start}-{end - 1}/1024"
-    assert headers["Content-Type"] == "video/mp4"
     assert body == (bytes(range(256)) * 4)[start:end]
-
-
-@pytest.mark.parametrize("asked", ["bytes=1024-", "bytes=5-2", "bytes=-0"])
-def test_ranges_that_are_not_there(server: ReportServer, asked: str) -> None:
-    status, headers, body = ask(server, "/d/a%20b.mp4", Range=asked)
-    assert (status, body) == (416, b"")
-    assert headers["Content-Range"] == "bytes */1024"
 
 
 @pytest.mark.parametrize(
