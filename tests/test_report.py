@@ -49,8 +49,6 @@ from report_scenes import (
 from sources import COMMON, ENCODINGS, Scene, scene
 from waiting import WATCHDOG_S
 
-INT64 = np.iinfo(np.int64)
-
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -95,21 +93,6 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 # ---------------------------------------------------------------- columns and figures
-
-COLUMNS = {
-    "one": [7],
-    "none": [0, 0, 0],
-    "regular": [1_700_000_000_000_000_000 + n * 33_333_333 for n in range(50)],
-    "backward": [5, 4, 3, 10**18, -(10**18), 0],
-    "extremes": [INT64.min, INT64.max, INT64.min, 0, INT64.max, INT64.max, -1],
-    "widths": [sum(1 << 7 * k for k in range(n % 9)) * (-1) ** n for n in range(60)],
-}
-
-
-@pytest.mark.parametrize("name", COLUMNS)
-def test_columns_come_back(name: str) -> None:
-    values = COLUMNS[name]
-    assert unpacked(pack_column(np.array(values, np.int64)), len(values)) == values
 
 
 def test_two_hours_at_60_hz_are_small() -> None:

@@ -160,30 +160,25 @@ def _print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> Non
 def _print_overview(rows: Sequence[facts.Brief]) -> None:
     """Print a line for each dataset, and totals."""
     base = os.path.commonpath([str(row.path.parent) for row in rows])
-    table = [
-        {
-            "dataset": os.path.relpath(str(row.path), base) if base else str(row.path),
-            "begins": _moment(row.start),
-            "seconds": f"{row.seconds:.1f}",
-            "messages": str(row.messages),
-            "cameras": str(len(row.frames)),
-            "frames": str(sum(row.frames.values())),
-            "size": size_text(row.bytes),
-            "profile": row.profile,
+
+    def line(name: str, own: Sequence[facts.Brief], begins: str, profile: str) -> dict[str, str]:
+        return {
+            "dataset": name,
+            "begins": begins,
+            "seconds": f"{sum(row.seconds for row in own):.1f}",
+            "messages": str(sum(row.messages for row in own)),
+            "cameras": str(len({topic for row in own for topic in row.frames})),
+            "frames": str(sum(sum(row.frames.values()) for row in own)),
+            "size": size_text(sum(row.bytes for row in own)),
+            "profile": profile,
         }
-        for row in rows
-    ]
-    total = {
-        "dataset": f"{len(rows)} datasets",
-        "begins": "",
-        "seconds": f"{sum(row.seconds for row in rows):.1f}",
-        "messages": str(sum(row.messages for row in rows)),
-        "cameras": str(len({topic for row in rows for topic in row.frames})),
-        "frames": str(sum(sum(row.frames.values()) for row in rows)),
-        "size": size_text(sum(row.bytes for row in rows)),
-        "profile": "",
-    }
-    print_table([*table, total], _TEXTS, spare=("profile", "messages", "cameras", "begins"))
+
+    table = []
+    for row in rows:
+        name = os.path.relpath(str(row.path), base) if base else str(row.path)
+        table.append(line(name, [row], _moment(row.start), row.profile))
+    table.append(line(f"{len(rows)} datasets", rows, "", ""))
+    print_table(table, _TEXTS, spare=("profile", "messages", "cameras", "begins"))
 
 
 def _moment(time_ns: int | None) -> str:

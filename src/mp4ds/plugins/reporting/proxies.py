@@ -101,12 +101,6 @@ class Look:
             self._high = _range(_sampled(topic), _LOW, _WHITE)[1]
             self.caption = f"16 bits: white is {self._high:.0f}"
 
-    @classmethod
-    def of(cls, stream: Stream, size: tuple[int, int]) -> Look:
-        """The look of a stream."""
-        with closing(Topic([stream])) as topic:
-            return cls(topic, size)
-
     def picture(self, pixels: Pixels) -> Bytes:
         """A new picture, shape (H, W, 3).
 

@@ -12,7 +12,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.resources import files
@@ -26,6 +26,7 @@ from mp4ds._version import __version__
 from mp4ds.dataset.collections import Paths, datasets_in
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.topic import Topic
 from mp4ds.errors import (
     FormatError,
     Mp4dsError,
@@ -257,7 +258,8 @@ def _give_video(
         name = proxy_name(stream, size)
         (made / _PROXIES).mkdir(exist_ok=True)
         old, new = folder / _FOLDER / _PROXIES / name, made / _PROXIES / name
-        look = Look.of(stream, size)
+        with closing(Topic([stream])) as topic:
+            look = Look(topic, size)
         # an old video may have no digest, by which to tell whether it has changed
         if stream.sidecar.video.sha256 is None or not _taken(old, new):
             make_proxy(stream, new, look, size=size, times=camera.times, progress=tell)

@@ -89,12 +89,6 @@ class _Handler(BaseHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
         """Log nothing."""
 
-    def do_HEAD(self) -> None:
-        self._answer(with_body=False)
-
-    def do_GET(self) -> None:
-        self._answer(with_body=True)
-
     def end_headers(self) -> None:
         for name, value in _GUARDS.items():
             self.send_header(name, value)
@@ -112,7 +106,8 @@ class _Handler(BaseHTTPRequestHandler):
         # a link to the page may be anywhere, such as in a web-based terminal
         return site in _SAME_SITE or self.headers.get("Sec-Fetch-Dest") == "document"
 
-    def _answer(self, *, with_body: bool) -> None:
+    def do_GET(self) -> None:
+        """Answer with a file, or a part of it."""
         if not self._is_own():
             self._refuse(HTTPStatus.FORBIDDEN)
             return
@@ -125,9 +120,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND)
             return
         with file:
-            self._send(file, path, with_body)
+            self._send(file, path)
 
-    def _send(self, file: BinaryIO, path: Path, with_body: bool) -> None:
+    def _send(self, file: BinaryIO, path: Path) -> None:
         size = os.fstat(file.fileno()).st_size
         wanted = self.headers.get("Range")
         part = (0, size) if wanted is None else byte_range(wanted, size)
@@ -143,8 +138,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Accept-Ranges", "bytes")
         self.send_header("Cache-Control", "no-cache")
         self.end_headers()
-        if not with_body:
-            return
         file.seek(start)
         left = end - start
         while left and (block := file.read(min(left, _BLOCK))):
