@@ -22,7 +22,7 @@ from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.dataset.views import effective
 from mp4ds.messages.transforms import Transform
 from mp4ds.messages.wire import CalibrationFields
-from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, intrinsics
+from mp4ds.plugins.info import CameraCalibrations, Intrinsics, intrinsics
 from scenes import INFO, PERIOD, START, TF, Record, Scene, calibration, scene
 from sources import SOURCES, write_bag, write_mcap
 
@@ -150,7 +150,7 @@ def test_what_belongs_to_no_other_is_listed_too(packed: bool, tmp_path: Path) ->
 def test_calibrations_without_end_are_counted(
     packed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mp4ds.plugins.intrinsics.MAX_LISTED", 3)
+    monkeypatch.setattr("mp4ds.plugins.info.MAX_LISTED", 3)
     path = recorded(tmp_path, focused(scene("mono8"), range(100, 108)), packed=packed)
     camera = camera_of(intrinsics(path))
     assert [item.message for item in camera.calibrations] == [0, 1, 2]

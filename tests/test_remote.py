@@ -24,8 +24,7 @@ from mp4ds.files.ranges import BLOCK, KEPT_BYTES, Blocks, RemoteFile
 from mp4ds.files.urls import RemotePath, location
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.packer import Packer
-from mp4ds.plugins.info import info
-from mp4ds.plugins.intrinsics import intrinsics
+from mp4ds.plugins.info import info, intrinsics
 from mp4ds.records import Message
 from remote_servers import Request, Server, web_server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores, web

@@ -22,7 +22,6 @@ from mp4ds.files.urls import location
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.options import HOW, SliceOptions, iso_text
 from mp4ds.plugins import info as facts
-from mp4ds.plugins.intrinsics import CameraCalibrations, Intrinsics, ListedCalibration, intrinsics
 from mp4ds.processes import each
 
 _TEXTS = {
@@ -70,7 +69,7 @@ def info_command(paths: Sequence[str], what: str | None, options: SliceOptions) 
         raise OptionError("These options work with one recording or dataset only.")
     with progress_of("reading") as tell:
         if what == "intrinsics":
-            show(intrinsics(paths[0]), _print_intrinsics)
+            show(facts.intrinsics(paths[0]), _print_intrinsics)
         elif what == "speed":
             show(facts.reading_speeds(paths[0]), _print_speeds)
         elif what == "checksums":
@@ -246,7 +245,7 @@ _MODELS = {
 }
 
 
-def _print_intrinsics(result: Intrinsics) -> None:
+def _print_intrinsics(result: facts.Intrinsics) -> None:
     """Print the calibrations of all cameras, one after another, and the static transforms."""
     say(f"# {path_text(result.path)}: {result.kind}, {counted(len(result.cameras), 'camera')}")
     say("import numpy as np")
@@ -256,7 +255,7 @@ def _print_intrinsics(result: Intrinsics) -> None:
         _print_transforms(result)
 
 
-def _print_camera(camera: CameraCalibrations) -> None:
+def _print_camera(camera: facts.CameraCalibrations) -> None:
     say("")
     sizes = ", ".join(f"{width}x{height}" for width, height in camera.sizes) or "size not known"
     if camera.topic:
@@ -266,12 +265,12 @@ def _print_camera(camera: CameraCalibrations) -> None:
     if not camera.calibrations:
         say("# no calibration")
     for calibration in camera.calibrations:
-        _print_calibration(camera, calibration)
+        _print_calibration(camera.info_topic, calibration)
     if camera.more:
         say(f"# ... and {camera.more} more calibration changes")
 
 
-def _print_calibration(camera: CameraCalibrations, calibration: ListedCalibration) -> None:
+def _print_calibration(topic: str, calibration: facts.ListedCalibration) -> None:
     since = (
         f"from message {calibration.message} at {calibration.log_time} ns"
         if calibration.message is not None
@@ -280,7 +279,7 @@ def _print_calibration(camera: CameraCalibrations, calibration: ListedCalibratio
     model = calibration.distortion_model
     hint = f" ({_MODELS[model]})" if model in _MODELS else ""
     say(
-        f"# {camera.info_topic}, {since}: {calibration.width}x{calibration.height}, "
+        f"# {topic}, {since}: {calibration.width}x{calibration.height}, "
         f"{model or 'no distortion model'}{hint}, frame {calibration.frame_id!r}"
     )
     if calibration.k[0][0] == 0:
@@ -306,7 +305,7 @@ def _print_matrix(name: str, rows: Sequence[Sequence[float]]) -> None:
         say(line)
 
 
-def _print_transforms(result: Intrinsics) -> None:
+def _print_transforms(result: facts.Intrinsics) -> None:
     say("")
     say("# static transforms: a point p of the child is rotation * p + translation in the parent;")
     say("# (parent, child, translation x y z in metres, rotation x y z w)")

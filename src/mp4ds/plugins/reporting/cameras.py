@@ -14,7 +14,7 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import effective, lens_of
 from mp4ds.errors import FormatError
 from mp4ds.format.models import Calibration
-from mp4ds.plugins.intrinsics import calibration_changes
+from mp4ds.plugins.info import calibration_changes
 from mp4ds.plugins.reporting.proxies import why_not_seen
 from mp4ds.times import Floats, Integers, differences, intervals
 
