@@ -9,7 +9,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
@@ -67,7 +67,10 @@ def uploaded(
             raise type(error)(target, str(error).rstrip("."), kept) from None
         except (KeyboardInterrupt, SystemExit) as error:
             raise interrupted(error, f"the upload is incomplete. {kept}") from None
-        _remove(local)
+        if is_folder:
+            shutil.rmtree(local, ignore_errors=True)
+        else:
+            local.unlink(missing_ok=True)
     return made
 
 
@@ -77,12 +80,11 @@ def local_path(target: RemotePath) -> Path:
     Raises:
         TargetError: Nothing can be uploaded there, or no folder can be created here.
     """
-    shown = target
     if not target.is_writable:
         problem = "is on a web server, which does not accept uploads"
-        raise TargetError(shown, problem, "Give a location in a store, such as s3://.")
+        raise TargetError(target, problem, "Give a location in a store, such as s3://.")
     if target.parent == target:
-        raise TargetError(shown, "is an entire bucket", "Give a folder in it.")
+        raise TargetError(target, "is an entire bucket", "Give a folder in it.")
     digest = hashlib.sha256(str(target).encode()).hexdigest()
     folder = _own_folder() / f"{target.name[:60]}-{digest[:16]}"
     folder.mkdir(exist_ok=True)
@@ -123,17 +125,17 @@ def _claimed(folder: Path, target: RemotePath) -> Iterator[None]:
 
 def _replaced(target: RemotePath, *, is_folder: bool, force: bool, owned: Owned) -> set[str]:
     """Names of the files to replace, empty that of a file; see `outputs.check_target`."""
-    shown, now = target, RemotePath(target.url)
+    now = RemotePath(target.url)
     if not now.exists():
         return set()
     if not force:
-        raise TargetExistsError(shown)
-    old = refuse_not_ours(shown, owned(now))
+        raise TargetExistsError(target)
+    old = refuse_not_ours(target, owned(now))
     if not is_folder:
         return {""}
     begin = len(target.url) + 1
     there = {path.url[begin:] for path in now.files()}
-    refuse_unknown_files(shown, there - old)
+    refuse_unknown_files(target, there - old)
     return there
 
 
@@ -145,42 +147,25 @@ def _probe(path: RemotePath) -> None:
 
 
 def _send(local: Path, target: RemotePath, old: set[str], last: str, report: Report | None) -> None:
+    """Copy a file, whose name in the output is empty, or all files of a folder."""
     for name in sorted(old - {""}, key=lambda name: name != last):
         (target / name).remove()
-    files, done = _files(local, last), 0
-    try:
-        for name, size in files.items():
-            if report:
-                report(name or target.name, done, sum(files.values()))
-            _place(target, name).upload(local / name)
-            done += size
-    except BaseException:
-        for name in files if "" not in old else ():  # files that are not replaced stay
-            with suppress(Mp4dsError):
-                _place(target, name).remove()
-        raise
-
-
-def _place(target: RemotePath, name: str) -> RemotePath:
-    return target / name if name else target
-
-
-def _files(local: Path, last: str) -> Mapping[str, int]:
-    """Sizes of files to upload, bytes, by their names in a folder; of a file, the name is empty."""
     if local.is_file():
-        return {"": local.stat().st_size}
-    files = {
-        path.relative_to(local).as_posix(): path.stat().st_size
-        for path in sorted(local.rglob("*"))
-        if path.is_file()
-    }
-    if last in files:
-        files[last] = files.pop(last)
-    return files
-
-
-def _remove(local: Path) -> None:
-    if local.is_dir():
-        shutil.rmtree(local, ignore_errors=True)
+        files = {"": local.stat().st_size}
     else:
-        local.unlink(missing_ok=True)
+        paths = filter(Path.is_file, sorted(local.rglob("*")))
+        files = {path.relative_to(local).as_posix(): path.stat().st_size for path in paths}
+    done, total = 0, sum(files.values())
+    sent: list[RemotePath] = []
+    try:
+        for name in sorted(files, key=lambda name: name == last):
+            if report:
+                report(name or target.name, done, total)
+            sent.append(target / name)
+            sent[-1].upload(local / name)
+            done += files[name]
+    except BaseException:
+        for place in sent if "" not in old else ():  # a file that is not replaced stays
+            with suppress(Mp4dsError):
+                place.remove()
+        raise
