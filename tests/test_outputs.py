@@ -101,17 +101,6 @@ def test_what_goes_wrong_leaves_nothing(
     assert only(target.parent, *(["out"] if old else []))
 
 
-@pytest.mark.parametrize("kind", ["file", "folder"])
-@pytest.mark.parametrize("old", ["file", "folder"])
-def test_force_replaces_what_may_be_replaced(kind: str, old: str, target: Path) -> None:
-    make(target, old, "old")
-    with staged(target, force=True, owned=anything) as path:
-        make(path, kind)
-        assert read(target) == "old"
-    assert read(target) == "new"
-    assert only(target.parent, "out")
-
-
 def test_nothing_is_replaced_unasked(target: Path) -> None:
     make(target, "file", "old")
     error = refused(target, "already exists.*`force`", owned=anything)
@@ -122,14 +111,10 @@ def test_nothing_is_replaced_unasked(target: Path) -> None:
     assert read(target) == "old"
 
 
-def test_a_dangling_link_is_something(target: Path) -> None:
-    target.symlink_to("nowhere")
-    refused(target, "already exists", owned=anything)
-
-
 def test_a_link_is_not_replaced(target: Path) -> None:
-    make(target.parent / "precious", "folder", "old")
     target.symlink_to("precious")
+    refused(target, "already exists", owned=anything)  # though it leads nowhere
+    make(target.parent / "precious", "folder", "old")
     refused(target, "is a symbolic link.*Give .*precious itself", force=True, owned=anything)
     assert target.is_symlink()
     assert read(target.parent / "precious") == "old"
@@ -266,11 +251,13 @@ def test_a_move_that_fails_brings_the_old_back(
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("old", ["file", "folder"])
 @pytest.mark.parametrize("can", [False, True])
-def test_names_are_exchanged_at_once_where_that_can_be_done(
-    can: bool, kind: str, target: Path, monkeypatch: pytest.MonkeyPatch
+def test_force_replaces_what_may_be_replaced(
+    can: bool, old: str, kind: str, target: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(target, "folder", "old")
+    """Names are exchanged at once where that can be done."""
+    make(target, old, "old")
     renamed: list[Path] = []
     rename = Path.rename
 
@@ -285,6 +272,7 @@ def test_names_are_exchanged_at_once_where_that_can_be_done(
         pytest.skip("this system exchanges no names")
     with staged(target, force=True, owned=anything) as path:
         make(path, kind)
+        assert read(target) == "old"
     assert read(target) == "new"
     assert len(renamed) == (0 if can else 2)
     assert only(target.parent, "out")

@@ -5,11 +5,8 @@ from __future__ import annotations
 import dataclasses
 import io
 import os
-import pty
 import re
-import subprocess
 import sys
-import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta, timezone
@@ -33,7 +30,6 @@ from mp4ds.packing.options import PackOptions, PackProgress
 from mp4ds.packing.pack import pack_each
 from mp4ds.plugins.demo import demo
 from test_terminal import Screen
-from waiting import WATCHDOG_S, until
 
 HOUR = 3600.0
 HOSTILE = "/cam\x1b[31m\n\r\t\u202e\x00\x9b2J"
@@ -297,9 +293,9 @@ def shown_on(screen: io.StringIO) -> Iterator[io.StringIO]:
         yield screen
 
 
-def on_screen(*states: PackProgress, monkeypatch: pytest.MonkeyPatch) -> str:
+def on_screen(*states: PackProgress, monkeypatch: pytest.MonkeyPatch, term: str = "xterm") -> str:
     """What a terminal shows at last."""
-    for name, value in (("COLUMNS", "120"), ("LINES", "24"), ("TERM", "xterm")):
+    for name, value in (("COLUMNS", "120"), ("LINES", "24"), ("TERM", term)):
         monkeypatch.setenv(name, value)
     with shown_on(Screen()) as screen, pack_progress() as take:
         for state in states:
@@ -331,16 +327,11 @@ def test_hostile_names_steer_no_terminal(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "{task.id}" in text
 
 
-@pytest.fixture
-def terminal() -> Iterator[tuple[int, Any]]:
-    """The two ends of a terminal: what is shown, and where to write."""
-    shown_at, write_to = pty.openpty()
-    with os.fdopen(write_to, "w") as stream:
-        yield shown_at, stream
-    os.close(shown_at)
+def test_a_dumb_terminal_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert on_screen(told(0.3), monkeypatch=monkeypatch, term="dumb") == ""
 
 
-# ---------------------------------------------------------------- the command
+# ---------------------------------------------------------------- a job
 
 
 @pytest.fixture(scope="module")
@@ -352,15 +343,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [folder / "day.bag", folder / "night.bag"]
 
 
-def command(*arguments: object) -> list[str]:
-    """Packing quickly, in parts."""
-    quick = ("--quality", "crf=40", "--codec", "h264", "--preset", "ultrafast")
-    return [sys.executable, "-m", "mp4ds", "pack", *map(str, arguments), *quick, "--gop", "4"]
-
-
-def test_the_command_reports_all_its_datasets(
-    drives: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_job_reports_all_its_datasets(drives: list[Path], tmp_path: Path) -> None:
     seen: list[PackProgress] = []
     options = PackOptions(quality="crf=40", codec="h264", preset="ultrafast", gop=4, window=4)
     pack_each(drives, f"{tmp_path}/", options, progress=seen.append)
@@ -376,36 +359,3 @@ def test_the_command_reports_all_its_datasets(
         last = [state for state in seen if state.dataset.name == name][-1]
         assert last.tasks_done == last.tasks_total > 1
         assert list(last.topics.values()) == [(frames, frames)] * 2
-
-
-@pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])
-def test_the_command_on_a_terminal(
-    term: str, drives: list[Path], tmp_path: Path, terminal: tuple[int, Any]
-) -> None:
-    shown_at, stream = terminal
-    process = subprocess.Popen(
-        command(*drives, "--output", f"{tmp_path}/", "--window", "4"),
-        stdout=subprocess.PIPE,
-        stderr=stream,
-        text=True,
-        env={**os.environ, "TERM": term, "COLUMNS": "120", "LINES": "30"},
-    )
-    found: list[bytes] = []
-    threading.Thread(target=lambda: found.extend(_all(shown_at)), daemon=True).start()
-    out, _ = process.communicate(timeout=WATCHDOG_S)
-    assert process.returncode == 0
-    assert "day" in out
-    assert "\x1b" not in out
-    until(lambda: term != "xterm" or b"datasets" in b"".join(found))
-    text = b"".join(found).decode()
-    if term == "dumb":
-        assert text == ""
-    else:
-        assert re.search(r"packing 2 datasets", text)
-        assert re.search(r"parts \d+/\d+", text)
-
-
-def _all(file: int) -> Iterator[bytes]:
-    with suppress(OSError):
-        while data := os.read(file, 4096):
-            yield data

@@ -470,14 +470,17 @@ def test_a_recording_that_changes_while_it_is_packed(
     assert leftovers(tmp_path) == []
 
 
-def test_secrets_are_not_told(tmp_path: Path, web: Server) -> None:
+def test_secrets_are_sent_and_not_told(tmp_path: Path, web: Server) -> None:
+    """The query goes with every request."""
+    write_mcap(tmp_path / "web" / "x.mcap", scene("mono8"))
     (tmp_path / "web" / "x.bag").write_bytes(b"nonsense")
-    url = f"{web.url}/x.bag?{SECRET}"
+    assert info(f"{web.url}/x.mcap?{SECRET}").topics
     for fails in (lambda _: None, lambda _: 403, lambda _: 500):
         web.fails = fails
-        said = call("info", url)
+        said = call("info", f"{web.url}/x.bag?{SECRET}")
         assert "x.bag" in said.err
         assert "4711" not in said.out + said.err
+    assert {path.partition("?")[2] for _, path, _ in web.requests} == {SECRET}
 
 
 def test_a_signed_address_goes_on_while_it_is_the_same(
@@ -494,12 +497,6 @@ def test_a_signed_address_goes_on_while_it_is_the_same(
     going_on = use(monkeypatch, InlineExecutor())
     mp4ds.pack(url, dataset, PackOptions(window=3))
     assert "00000" not in going_on.ran
-
-
-def test_the_query_goes_with_every_request(tmp_path: Path, web: Server) -> None:
-    write_mcap(tmp_path / "web" / "x.mcap", scene("mono8"))
-    assert info(f"{web.url}/x.mcap?{SECRET}").topics
-    assert {path.partition("?")[2] for _, path, _ in web.requests} == {SECRET}
 
 
 # ---------------------------------------------------------------- what is installed
