@@ -48,7 +48,7 @@ from mp4ds.plugins.evaluating.trials import (
     recommend,
 )
 from mp4ds.video.codecs import QualityTarget
-from mp4ds.video.scores import ScoreSummary, largest_crf
+from mp4ds.video.scores import ScoreSummary
 from scenes import TRAITS, Scene, odd_scene
 from sources import ENCODINGS, SOURCES, scene, write_bag
 from waiting import WATCHDOG_S, until
@@ -162,26 +162,7 @@ def test_clips_are_from_the_middle_or_a_given_time() -> None:
         chosen(times, origin, 3, start=11.0)
 
 
-# ---------------------------------------------------------------- search, recommendation
-
-
-@pytest.mark.parametrize("curve", [1.0, 2.0, 0.3])
-def test_the_search_finds_the_largest_crf(curve: float) -> None:
-    tried: list[int] = []
-
-    def score(crf: int) -> float:
-        tried.append(crf)
-        return float(100 - 40 * (crf / 63) ** curve)
-
-    for due in range(1, 64):
-        for guess in (1, 18, 63):
-            target = score(due)
-            tried.clear()
-            assert largest_crf(score, target, guess=guess, largest=63) == (due, True)
-            assert len(tried) <= 14
-    assert largest_crf(lambda crf: 90 - crf, 95, guess=20, largest=63) == (1, False)
-    assert largest_crf(lambda _: 99.0, 95, guess=20, largest=63) == (63, True)
-    assert largest_crf(lambda _: 95.0, 95, guess=1, largest=1) == (1, True)
+# ---------------------------------------------------------------- recommendation
 
 
 def cell(crf: int, score: float, size: float, cpu: float, preset: str = "fast") -> Cell:

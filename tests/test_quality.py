@@ -28,7 +28,7 @@ from mp4ds.packing.tracks import CrfControl, window_frames
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message
-from mp4ds.video.scores import find_ffmpeg, largest_crf, scores_of
+from mp4ds.video.scores import find_ffmpeg, scores_of
 from round_trips import unpacked
 from scenes import Record, instant, scene, together
 from sources import SOURCES
@@ -130,26 +130,6 @@ def test_windows_are_whole_groups_of_pictures(monkeypatch: pytest.MonkeyPatch) -
 
 
 # ---------------------------------------------------------------- which crf
-
-
-def test_the_search_ends_after_a_few_encodings() -> None:
-    tried: list[int] = []
-
-    def score(crf: int) -> float:
-        tried.append(crf)
-        return 60 - 0.5 * crf
-
-    assert largest_crf(score, 40.0, guess=18, largest=63, fall=0.5) == (40, True)
-    assert len(tried) == 4
-    tried.clear()
-    largest_crf(score, 59.4, guess=60, largest=63, fall=2, most=5)
-    assert len(tried) <= 5
-    assert largest_crf(score, 70.0, guess=18, largest=63, fall=0.5, most=5) == (1, False)
-    assert largest_crf(score, 70.0, guess=18, largest=63, smallest=3) == (3, False)
-    tried.clear()
-    crf, reached = largest_crf(score, 30.2, guess=50, largest=63, most=2)
-    assert len(tried) == 2
-    assert reached == (score(crf) >= 30.2)
 
 
 @pytest.mark.parametrize("seed", range(8))

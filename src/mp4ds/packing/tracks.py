@@ -10,10 +10,10 @@ import shutil
 import tempfile
 from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ from mp4ds.video.codecs import (
 from mp4ds.video.encoder import Coding, VideoEncoder, coded_size
 from mp4ds.video.packets import PacketWriter, join_segments
 from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
-from mp4ds.video.scores import SMALLEST, Ffmpeg, find_ffmpeg, largest_crf, scores_of
+from mp4ds.video.scores import SMALLEST, Ffmpeg, find_ffmpeg, scores_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,6 +293,8 @@ _RANGE = 4  # factor by which the fall of scores may differ from the assumed one
 # of the tolerance: a window that exceeds the target by more is re-encoded with fewer bits
 _LAVISH = 0.5
 _MOST_TRIMS = 2  # times
+# of a stream's first images, which are few: the search for its first crf
+_MOST_TRIMS_OF_FIRST = 5
 _NOISE = 1e-9  # of sums of floats
 
 
@@ -309,11 +311,19 @@ class CrfControl:
         largest: The largest allowed.
         tolerance: How far below the target the mean of a window may be.
         fall: About how much a score drops per crf step.
+        most_trims: How many tries there are at most where one with fewer bits may do.
     """
 
     def __init__(
-        self, start: int, smallest: int, largest: int, tolerance: float, fall: float
+        self,
+        start: int,
+        smallest: int,
+        largest: int,
+        tolerance: float,
+        fall: float,
+        most_trims: int = _MOST_TRIMS,
     ) -> None:
+        self._most_trims = most_trims
         self.crf = start
         self._smallest, self._largest = smallest, largest
         self._tolerance = tolerance
@@ -375,7 +385,7 @@ class CrfControl:
         return max(self._smallest, crf // 2, crf - step)
 
     def _smaller(self, tried: Mapping[int, float], best: int, due: float) -> int | None:
-        if len(tried) > _MOST_TRIMS:
+        if len(tried) > self._most_trims:
             return None
         refused = min((crf for crf in tried if crf > best), default=self._largest + 1)
         crf = min(best + int((tried[best] - due) / self._fall), refused - 1)
@@ -392,7 +402,6 @@ class CrfControl:
 
 _FRAMES = 60  # of a window, or one group of pictures if that is longer
 _MOST_FRAMES = 240
-_MOST_SEARCHED = 5  # encodings of the first images
 _USUAL_RATE = 30.0
 
 
@@ -403,6 +412,21 @@ def window_frames(gop: int) -> int:
         gop: Maximum key frame interval, frames.
     """
     return min(max(1, _FRAMES // gop) * gop, _MOST_FRAMES)
+
+
+@dataclass
+class Tries:
+    """The encodings of a window.
+
+    Attributes:
+        due: The score required of it.
+        scores: Crf -> the scores of its frames, in steps of the metric.
+        means: Crf -> their mean, in the order of the tries.
+    """
+
+    due: float
+    scores: dict[int, NDArray[np.int64]] = field(default_factory=dict)
+    means: dict[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -490,39 +514,59 @@ class WindowCoder:
         Raises:
             Refused: No crf reaches it.
         """
-        target, codec = self.target, self.coding.recipe.codec
+        target, control = self.target, self.control(_MOST_TRIMS_OF_FIRST)
         if min(self.coded_size) < SMALLEST:
             raise Refused(f"images with less than {SMALLEST} rows or columns have no {target}")
         step = round(TIMESCALE / (self.rate or _USUAL_RATE)) or 1
-        known: dict[int, float] = {}
         with (
             tempfile.TemporaryDirectory(prefix="mp4ds-") as name,
             closing(self.spool(Path(name, "frames.yuv"))) as spool,
         ):
             for seen in samples:
                 self.keep(seen, spool)
-            due = self.reachable(spool)
-
-            def score(crf: int) -> float:
-                ticks = range(0, len(spool) * step, step)
-                known[crf] = self.mean(self.encode(spool, ticks, crf, Path(name, "sample.mp4")))
-                return known[crf]
-
-            least = LEAST_CRF[codec]
-            crf, reached = largest_crf(
-                score,
-                due,
-                guess=self.coding.crf,
-                largest=MAX_CRF[codec],
-                smallest=least,
-                fall=FALLS[target.metric],
-                most=_MOST_SEARCHED,
-            )
-        # a few frames have less VMAF than many, compared with their originals too: where they fall
-        # a little short, the first window tells
-        if not reached and crf == least and known[crf] < due - target.tolerance:
-            raise out_of_reach(target, due, f"crf {crf} gives {known[crf]:.2f}")
+            ticks = range(0, len(spool) * step, step)
+            tries = self.tries(control, spool, ticks, lambda _: Path(name, "sample.mp4"))
+        crf = control.accepted(tries.means, tries.due, len(samples))
+        if crf is None:
+            crf, mean = min(tries.means.items())
+            # a few frames have less VMAF than many, compared with their originals too: where they
+            # fall a little short, the first window tells
+            if mean < tries.due - target.tolerance:
+                raise out_of_reach(target, tries.due, f"crf {crf} gives {mean:.2f}")
         return crf
+
+    def control(self, most_trims: int = _MOST_TRIMS) -> CrfControl:
+        """What chooses the crf of windows."""
+        codec, target = self.coding.recipe.codec, self.target
+        bounds = LEAST_CRF[codec], MAX_CRF[codec]
+        fall = FALLS[target.metric]
+        return CrfControl(self.coding.crf, *bounds, target.tolerance, fall, most_trims)
+
+    def tries(
+        self,
+        control: CrfControl,
+        frames: PlaneSpool,
+        ticks: Sequence[int],
+        place: Callable[[int], Path],
+    ) -> Tries:
+        """Encode a window until it is good enough, or no crf is.
+
+        Args:
+            control: Chooses each crf.
+            frames: As for `encode`.
+            ticks: As for `encode`.
+            place: The video to make with a crf.
+        """
+        tries = Tries(self.target.score)
+        crf: int | None = control.crf
+        while crf is not None:
+            scores = self.encode(frames, ticks, crf, place(crf))
+            tries.scores[crf], tries.means[crf] = scores, self.mean(scores)
+            is_first = len(tries.means) == 1
+            if is_first and control.accepted(tries.means, tries.due, len(frames)) is None:
+                tries.due = self.reachable(frames)
+            crf = control.next(tries.means, tries.due, len(frames))
+        return tries
 
     def reachable(self, frames: PlaneSpool) -> float:
         """The score required of a window: the target, or less if it is out of reach.
@@ -568,14 +612,7 @@ class _ScoredTrack(_PictureTrack):
         self.coding, self.size = coder.coding, coder.coded_size
         self.options = {**coder.coding.recipe.options, "g": str(coder.coding.gop)}
         self._most = window_frames(coder.coding.gop)
-        codec, target = coder.coding.recipe.codec, coder.target
-        self._control = CrfControl(
-            coder.coding.crf,
-            LEAST_CRF[codec],
-            MAX_CRF[codec],
-            target.tolerance,
-            FALLS[target.metric],
-        )
+        self._control = coder.control()
         self._folder = path.with_name(f".{path.stem}.windows")
         self._folder.mkdir()
         self._spool = coder.spool(self._folder / "frames.yuv")
@@ -597,19 +634,10 @@ class _ScoredTrack(_PictureTrack):
             Refused: No crf is good enough.
         """
         coder, control, target = self._coder, self._control, self._coder.target
-        spool, due = self._spool, target.score
-        frames = len(spool)
-        ticks = self._ticks[-frames:]
-        number = len(self._segments)
-        found: dict[int, NDArray[np.int64]] = {}
-        tried: dict[int, float] = {}
-        crf: int | None = control.crf
-        while crf is not None:
-            found[crf] = coder.encode(spool, ticks, crf, self._segment(number, crf))
-            tried[crf] = coder.mean(found[crf])
-            if len(tried) == 1 and control.accepted(tried, due, frames) is None:
-                due = coder.reachable(spool)
-            crf = control.next(tried, due, frames)
+        spool, frames, number = self._spool, len(self._spool), len(self._segments)
+        place = partial(self._segment, number)
+        tries = coder.tries(control, spool, self._ticks[-frames:], place)
+        tried, due = tries.means, tries.due
         kept = control.accepted(tried, due, frames)
         if kept is None:
             first, least = len(self._ticks) - frames, min(tried)
@@ -617,9 +645,9 @@ class _ScoredTrack(_PictureTrack):
             raise out_of_reach(target, due, f"{made}{tried[least]:.2f}")
         control.keep(tried, kept, due, frames)
         for crf in tried.keys() - {kept}:
-            self._segment(number, crf).unlink()
-        self._segments.append(self._segment(number, kept))
-        self._scores.append(found[kept])
+            place(crf).unlink()
+        self._segments.append(place(kept))
+        self._scores.append(tries.scores[kept])
         self._reencoded += len(tried) > 1
         self._limited += due < target.score
         spool.clear()
