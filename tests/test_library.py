@@ -485,3 +485,13 @@ def test_strings_and_paths_for_everything(kind: Callable[[Path], Any], tmp_path:
     write_mcap(tmp_path / "one.mcap", scene("mono8"))
     mp4ds.pack([kind(tmp_path / "one.mcap")], kind(tmp_path / "other"))
     assert mp4ds.validate(kind(tmp_path)) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "magic"), [("a.mcap", b"\x89MCAP0"), ("a.bag", b"#ROSBAG"), ("a", b"#ROSBAG")]
+)
+def test_the_name_of_an_output_says_its_format(name: str, magic: bytes, tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive.bag", scene("mono8"))
+    mp4ds.pack(tmp_path / "drive.bag", tmp_path / "set")
+    mp4ds.unpack(tmp_path / "set", output=tmp_path / name)
+    assert (tmp_path / name).read_bytes().startswith(magic)

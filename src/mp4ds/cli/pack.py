@@ -144,7 +144,7 @@ def _pack_row(topic: TopicSummary) -> dict[str, str]:
     "--to",
     panel=WHERE,
     metavar="TEXT",
-    help="bag, rosbag2, mcap or images; default: the recorded format.",
+    help="bag, rosbag2, mcap or images; default: by the suffix of OUT, else as recorded.",
 )
 @output_option(
     "OUT", "Output, or a folder for the outputs of several datasets; default: NAME_unpacked."

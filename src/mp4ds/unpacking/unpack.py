@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.protocols import WHOLE, BagReader, BagWriter, RecordingSlice
@@ -139,8 +139,9 @@ def unpack(
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
-        to: ``bag``, ``rosbag2``, ``mcap`` or ``images``; None for the recording's own format, or
-            ``mcap`` for a single video.
+        to: ``bag``, ``rosbag2``, ``mcap`` or ``images``; None for what the suffix of the output
+            says (``.bag`` or ``.mcap``), else the recording's own format, or ``mcap`` for a single
+            video.
         output: The file or folder to make, or its URL; None for the dataset's name, next to it, or
             in the current folder if the dataset is at a URL.
         options: How.
@@ -159,7 +160,7 @@ def unpack(
     chosen = options or UnpackOptions()
     with nullcontext() if chosen.salvage else advising("`salvage` restores what can be read."):
         if to is None:
-            to = _own_format(dataset, chosen)
+            to = _format_of(output) or _own_format(dataset, chosen)
         _check(to, chosen)
         if output and (store := remote(location(output))):
             return _unpack_to_store(dataset, to, store, chosen, progress)
@@ -317,6 +318,12 @@ def _unpack_one(
 ) -> UnpackSummary:
     dataset, output = item
     return unpack(dataset, to, output, options)
+
+
+def _format_of(output: Path | str | None) -> str | None:
+    """The format that the name of an output has as its suffix."""
+    suffix = PurePath(output).suffix if output else ""
+    return next((to for to, its_own in _SUFFIXES.items() if its_own and its_own == suffix), None)
 
 
 def _own_format(dataset: Path | str, options: UnpackOptions) -> str:
