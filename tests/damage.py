@@ -42,7 +42,7 @@ class Piece:
 # ---------------------------------------------------------------- ROS 1 bag
 
 
-def _fields(raw: bytes) -> dict[bytes, bytes]:
+def bag_fields(raw: bytes) -> dict[bytes, bytes]:
     found, at = {}, 0
     while at < len(raw):
         (size,) = struct.unpack_from("<I", raw, at)
@@ -52,11 +52,11 @@ def _fields(raw: bytes) -> dict[bytes, bytes]:
     return found
 
 
-def _bag_records(data: bytes, at: int) -> Iterator[tuple[int, int, int, dict[bytes, bytes]]]:
+def bag_records(data: bytes, at: int) -> Iterator[tuple[int, int, int, dict[bytes, bytes]]]:
     """Start, start of the body, end, and header of each record."""
     while at < len(data):
         (head,) = struct.unpack_from("<I", data, at)
-        fields = _fields(data[at + 4 : at + 4 + head])
+        fields = bag_fields(data[at + 4 : at + 4 + head])
         (size,) = struct.unpack_from("<I", data, at + 4 + head)
         body = at + 8 + head
         yield at, body, body + size, fields
@@ -81,7 +81,7 @@ def bag_pieces(data: bytes) -> list[Piece]:
     """The pieces of a bag, in order; uncompressed chunks fall apart into their records."""
     pieces: list[Piece] = [Piece(0, 13)]
     index = False
-    for record in _bag_records(data, 13):
+    for record in bag_records(data, 13):
         start, body, end, fields = record
         if fields[b"op"] != b"\x05":
             piece = _bag_piece(data, record)
@@ -93,11 +93,11 @@ def bag_pieces(data: bytes) -> list[Piece]:
         if kind == b"none":
             pieces.append(Piece(start, body))
             inner = data[:end]
-            pieces += [_bag_piece(inner, part) for part in _bag_records(inner, body)]
+            pieces += [_bag_piece(inner, part) for part in bag_records(inner, body)]
             continue
         raw = bz2.decompress(data[body:end]) if kind == b"bz2" else _unlz4(data[body:end])
         whole = Piece(start, end)
-        for part in _bag_records(raw, 0):
+        for part in bag_records(raw, 0):
             found = _bag_piece(raw, part)
             whole.messages += found.messages
             whole.defines |= found.defines

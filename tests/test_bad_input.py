@@ -13,8 +13,7 @@ import re
 import shutil
 import signal
 import sqlite3
-import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ import pytest
 import mp4ds
 from coded_scenes import CODED
 from commands import (
-    NEEDS_ROOT,
     Result,
     call,
     refused,
@@ -38,6 +36,7 @@ from compare import compare
 from mp4ds.plugins import demo as demo_of
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
+from test_faults import disk_of
 from waiting import WATCHDOG_S, until
 
 
@@ -176,25 +175,12 @@ def test_a_source_that_cannot_be_read(command: str, name: str, tmp_path: Path) -
         refused(call(command, path, *options), 2, word)
 
 
-def test_one_bad_part_of_several(small_bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "second").mkdir()
-    second = cut("bag")(tmp_path / "second")
-    with unchanged(tmp_path):
-        refused(call("pack", small_bag, second, "-o", tmp_path / "dataset"), 2, str(second))
-
-
 def test_a_source_that_is_given_twice(small_bag: Path, tmp_path: Path) -> None:
     (tmp_path / "link.bag").symlink_to(small_bag.name)
     for other in (small_bag, tmp_path / "." / "drive.bag", tmp_path / "link.bag"):
         with unchanged(tmp_path):
             result = call("pack", small_bag, other, "-o", tmp_path / "dataset")
             refused(result, 2, "is given twice")
-
-
-def test_a_pipe_is_no_recording(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "drive.bag")
-    # it waits for no writer
-    refused(run("info", tmp_path / "drive.bag"), 2, "drive.bag")
 
 
 # ---------------------------------------------------------------- sources that are unusual
@@ -343,25 +329,8 @@ def test_a_target_that_may_not_be_written(
             assert "--force" in result.err
 
 
-@contextlib.contextmanager
-def mounted(folder: Path, *options: str) -> Iterator[Path]:
-    """A file system of its own in memory."""
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", ",".join(options), "tmpfs", str(folder)]
-    try:
-        made = subprocess.run(command, capture_output=True, check=False)
-    except OSError:
-        pytest.skip(NEEDS_ROOT)
-    if made.returncode:
-        pytest.skip(NEEDS_ROOT)
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
-
-
 def test_a_folder_that_is_read_only(demo: Path, tmp_path: Path) -> None:
-    with mounted(tmp_path / "disk", "size=512k,ro") as disk:
+    with disk_of(tmp_path / "disk", "size=512k,ro") as disk:
         for arguments in (
             ("pack", demo / "drive.bag", "-o", disk / "x"),
             ("unpack", demo / "drive", "--to", "mcap", "-o", disk / "x.mcap"),
@@ -391,35 +360,6 @@ def test_a_name_that_is_too_long(small_bag: Path, tmp_path: Path) -> None:
         refused(result, result.code, "File name too long")
 
 
-def test_pack_replaces_a_dataset_with_force_only(
-    small_bag: Path, small_dataset: Path, tmp_path: Path
-) -> None:
-    with unchanged(tmp_path):
-        refused(call("pack", small_bag, "-o", small_dataset), 2, "already exists", "--force")
-    assert call("pack", small_bag, "-o", small_dataset, "--force").code == 0
-    assert mp4ds.validate(small_dataset, deep=True) == []
-    with mp4ds.open(small_dataset) as dataset:
-        assert len(dataset.streams[0]) == 4
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["dataset", "drive.bag"]
-
-
-@pytest.mark.parametrize("to", ["bag", "mcap", "rosbag2", "images"])
-def test_unpack_replaces_its_own_output_with_force_only(
-    to: str, small_dataset: Path, tmp_path: Path
-) -> None:
-    target = tmp_path / f"again{ {'bag': '.bag', 'mcap': '.mcap'}.get(to, '') }"
-    arguments = ("unpack", small_dataset, "--to", to, "-o", target)
-    assert call(*arguments).code == 0
-    first = tree(target) if target.is_dir() else target.stat().st_ino
-    with unchanged(tmp_path):
-        refused(call(*arguments), 2, "already exists", "--force")
-    assert call(*arguments, "--force").code == 0
-    assert target.is_dir() or target.stat().st_ino != first
-    if to == "images":
-        assert tree(target) == first
-    assert len(list(tmp_path.iterdir())) == 2
-
-
 def test_what_is_replaced_stays_until_the_new_one_is_whole(
     small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -437,19 +377,12 @@ def test_what_is_replaced_stays_until_the_new_one_is_whole(
 # ---------------------------------------------------------------- a target that is the source
 
 
-@pytest.mark.parametrize("force", [False, True])
-@pytest.mark.parametrize("kind", ["bag", "rosbag2"])
-def test_packing_onto_the_source(kind: str, force: bool, tmp_path: Path) -> None:
-    name = {"bag": "bag-none", "rosbag2": "rosbag2-sqlite3-v9"}[kind]
+@pytest.mark.parametrize("name", ["bag-none", "rosbag2-sqlite3-v9"])
+def test_packing_onto_the_source(name: str, tmp_path: Path) -> None:
     source = SOURCES[name](tmp_path, scene("mono8", frames=3))[0]
-    with unchanged(tmp_path):
-        refused(call("pack", source, "-o", source, *["--force"] * force), 2, str(source))
-
-
-def test_packing_a_part_of_a_dataset_onto_it(small_dataset: Path, tmp_path: Path) -> None:
-    source = small_dataset / "messages.mcap"
-    with unchanged(tmp_path):
-        refused(call("pack", source, "-o", small_dataset, "--force"), 2, str(small_dataset))
+    for force in ((), ("--force",)):
+        with unchanged(tmp_path):
+            refused(call("pack", source, "-o", source, *force), 2, str(source))
 
 
 @pytest.mark.parametrize("name", ["messages.mcap", "cam_image_raw.mp4", "dataset.yaml", "new.mcap"])
@@ -461,14 +394,6 @@ def test_unpacking_into_the_dataset(
     with unchanged(tmp_path):
         result = call("unpack", small_dataset, "--to", to, "-o", target, "--force")
         refused(result, 2, str(small_dataset))
-
-
-@pytest.mark.parametrize("name", ["cam_image_raw.mp4", "cam_image_raw.yaml"])
-def test_unpacking_a_pair_onto_itself(name: str, small_dataset: Path, tmp_path: Path) -> None:
-    sidecar = small_dataset / "cam_image_raw.yaml"
-    with unchanged(tmp_path):
-        result = call("unpack", sidecar, "--to", "mcap", "-o", small_dataset / name, "--force")
-        refused(result, 2, name)
 
 
 # ---------------------------------------------------------------- a disk that is full
@@ -489,7 +414,7 @@ DEMOS = ("", ".bag", ".mcap")
     "job", ["pack", "pack-lossy", *(f"demo{suffix}" for suffix in DEMOS), *UNPACK_TARGETS]
 )
 def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> None:
-    with mounted(tmp_path / "disk", "size=512k") as disk, unchanged(demo):
+    with disk_of(tmp_path / "disk", "size=512k") as disk, unchanged(demo):
         if job.startswith("demo"):
             result = call("demo", disk / job.replace("demo", "x"), "--seconds", 1)
         elif job == "pack":
@@ -516,7 +441,7 @@ def test_a_disk_that_is_full_of_coded_pictures(kind: str, to: str, tmp_path: Pat
     dataset = tmp_path / "dataset"
     if to == "mcap":
         assert call("pack", source, "-o", dataset).code == 0
-    with mounted(tmp_path / "disk", "size=96k") as disk, unchanged(source.parent):
+    with disk_of(tmp_path / "disk", "size=96k") as disk, unchanged(source.parent):
         if to == "dataset":
             result = call("pack", source, "-o", disk / "x")
         else:
@@ -527,7 +452,7 @@ def test_a_disk_that_is_full_of_coded_pictures(kind: str, to: str, tmp_path: Pat
 
 @pytest.mark.parametrize("job", ["pack", "images"])
 def test_a_disk_without_room_for_another_file(job: str, demo: Path, tmp_path: Path) -> None:
-    with mounted(tmp_path / "disk", "size=64m,nr_inodes=6") as disk:
+    with disk_of(tmp_path / "disk", "size=64m,nr_inodes=6") as disk:
         if job == "pack":
             result = call("pack", demo / "drive.bag", "-o", disk / "x")
         else:
@@ -605,16 +530,14 @@ def test_interrupting_an_unpack(long_demo: Path, tmp_path: Path) -> None:
 BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     **{
         f"quality {value}": (("pack", "BAG", "-o", "OUT", "--quality", value), "lossless, visual")
-        for value in ("best", "crf=64", "crf=-1", "crf=", "crf=1.5", "CRF=20", "crf=\u0661", "")
+        for value in ("best", "crf=64", "crf=1.5", "crf=\u0661", "")
     },
     "codec": (("pack", "BAG", "-o", "OUT", "--codec", "theora"), "h264"),
     "codec-lossless": (("pack", "BAG", "-o", "OUT", "--codec", "av1"), "av1"),
     "codec-lossy": (("pack", "BAG", "-o", "OUT", "--quality", "crf=20", "--codec", "ffv1"), "ffv1"),
     "topics": (("pack", "BAG", "-o", "OUT", "--topics", "/none/*"), "/cam/image_raw"),
-    "second-topics": (("pack", "BAG", "-o", "OUT", "-t", "/imu", "-t", "/none"), "'/none'"),
     "exclude": (("pack", "BAG", "-o", "OUT", "--exclude", "/none/*"), "/cam/image_raw"),
     "to": (("unpack", "DATASET", "--to", "zip", "-o", "OUT"), "bag, rosbag2, mcap"),
-    "to-empty": (("unpack", "DATASET", "--to", "", "-o", "OUT"), "bag, rosbag2, mcap"),
     "storage": (
         ("unpack", "DATASET", "--to", "rosbag2", "--storage", "zip", "-o", "OUT"),
         "sqlite3, mcap",
@@ -625,10 +548,6 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     ),
     "unpack-topics": (("unpack", "DATASET", "--to", "bag", "-o", "OUT", "-t", "/no"), "/imu"),
     "unpack-exclude": (("unpack", "DATASET", "--to", "bag", "-o", "OUT", "-x", "/no"), "/imu"),
-    "images-topics": (
-        ("unpack", "DATASET", "--to", "images", "-o", "OUT", "-t", "/imu"),
-        "/cam/image_raw",
-    ),
     "demo": (("demo", "OUT.db3"), ".mcap, .bag (ROS 1), or without a suffix"),
     "transcode-lossless": (("pack", "BAG", "-o", "OUT", "--transcode"), "--quality"),
     **{
@@ -684,7 +603,7 @@ def test_an_option_that_is_wrong(
         refused(call(*(paths.get(argument, argument) for argument in arguments)), 2, word)
 
 
-@pytest.mark.parametrize("quality", [0, -1, 101])
+@pytest.mark.parametrize("quality", [0, 101])
 def test_a_jpeg_quality_that_is_wrong(quality: int, small_dataset: Path, tmp_path: Path) -> None:
     options = ("--to", "mcap", "-o", tmp_path / "x", "--jpeg-quality", quality)
     with unchanged(tmp_path):
@@ -779,17 +698,6 @@ def test_messages_that_a_target_cannot_hold(to: str, tmp_path: Path) -> None:
         refused(result, 1, "topic /", "json", "--exclude", "mcap")
 
 
-def test_a_damaged_dataset_names_what_and_where(small_dataset: Path, tmp_path: Path) -> None:
-    sidecar = small_dataset / "cam_image_raw.yaml"
-    data = bytearray(sidecar.read_bytes())
-    data[300] ^= 1
-    sidecar.write_bytes(data)
-    with unchanged(tmp_path):
-        result = call("unpack", small_dataset, "--to", "bag", "-o", tmp_path / "out.bag")
-        refused(result, 1, str(sidecar), "[checksum-mismatch]")
-        refused(call("info", small_dataset), 1, str(sidecar), "[checksum-mismatch]")
-
-
 # ---------------------------------------------------------------- --json
 
 
@@ -832,7 +740,6 @@ def test_json_of_success(
     ("arguments", "code"),
     [
         (("pack", "none.bag", "-o", "OUT"), 2),
-        (("pack", "BAG", "-o", "DATASET"), 2),
         (("pack", "BAG", "-o", "OUT", "--quality", "best"), 2),
         (("unpack", "none", "--to", "bag"), 2),
         (("unpack", "DATASET", "--to", "zip"), 2),

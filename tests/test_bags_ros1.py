@@ -16,6 +16,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from conftest import DATA, real
+from damage import bag_fields, bag_records
 from mp4ds.bags import ros1
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.ros1 import Ros1Reader
@@ -89,11 +90,13 @@ def bag_header(index_pos: int, connections: int, chunks: int, *more: tuple[bytes
     return b"#ROSBAG V2.0\n" + head + number(len(padding)) + padding
 
 
-def chunk_record(compression: str, content: bytes, size: int | None = None) -> bytes:
+def chunk_record(
+    compression: str, content: bytes, size: int | None = None, packed: bytes | None = None
+) -> bytes:
     pack = {"bz2": bz2.compress, "lz4": lz4.frame.compress}.get(compression, bytes)
     size = len(content) if size is None else size
     fields = [(b"op", b"\5"), (b"compression", compression.encode()), (b"size", number(size))]
-    return record(fields, pack(content))
+    return record(fields, packed or pack(content))
 
 
 def make_bag(
@@ -105,11 +108,12 @@ def make_bag(
     shift: int = 0,
     counted: int = 0,
     size: int | None = None,
+    packed: bytes | None = None,
 ) -> Path:
     """A bag of connections (topic, header) and chunks of messages (connection, time, payload).
 
-    Damage: index offsets are shifted, counts in the chunk summaries are raised by `counted`, and
-    `size` is what chunks say that they unpack to.
+    Damage: index offsets are shifted, counts in the chunk summaries are raised by `counted`,
+    `size` is what chunks say that they unpack to, and `packed` stands in them instead.
     """
     body, infos = bytearray(), b""
     for chunk in chunks:
@@ -118,7 +122,7 @@ def make_bag(
             entries.setdefault(conn, []).append(stamp(time) + number(len(content) + shift))
             fields = [(b"op", b"\2"), (b"conn", number(conn)), (b"time", stamp(time))]
             content += record(fields, data)
-        body += chunk_record(compression, content, size)
+        body += chunk_record(compression, content, size, packed)
         for conn, found in entries.items():
             counts = [(b"conn", number(conn)), (b"count", number(len(found)))]
             body += record([(b"op", b"\4"), (b"ver", number(1)), *counts], b"".join(found))
@@ -143,27 +147,11 @@ def connections_in(path: Path) -> list[bytes]:
     """Topic and header of all connections in a bag's index, sorted fields joined again."""
     data = path.read_bytes()
     (index,) = struct.unpack_from("<Q", data, data.index(b"index_pos=") + 10)
-    found = []
-    while index < len(data):
-        outer, after = split(data, index)
-        inner, index = split(data, after)
-        if outer[b"op"] == b"\7":
-            found.append(outer[b"topic"] + b"\0" + joined(sorted(inner.items())))
-    return found
-
-
-def split(data: bytes, start: int) -> tuple[dict[bytes, bytes], int]:
-    end = start + 4 + struct.unpack_from("<I", data, start)[0]
-    start += 4
-    fields = {}
-    while start < end:
-        (size,) = struct.unpack_from("<I", data, start)
-        name, equals, value = data[start + 4 : start + 4 + size].partition(b"=")
-        if not equals:
-            return {}, end  # chunk summaries have data here, not fields
-        fields[name] = value
-        start += 4 + size
-    return fields, end
+    return [
+        fields[b"topic"] + b"\0" + joined(sorted(bag_fields(data[body:end]).items()))
+        for _, body, end, fields in bag_records(data, index)
+        if fields[b"op"] == b"\7"
+    ]
 
 
 # ---------------------------------------------------------------- reading and writing
@@ -354,12 +342,6 @@ def test_not_a_bag(tmp_path: Path) -> None:
         refuse(path, problem)
 
 
-def end_of_chunk(data: bytes) -> int:
-    """The byte after the first chunk of a bag."""
-    head = 4109 + 4 + struct.unpack_from("<I", data, 4109)[0]
-    return int(head + 4 + struct.unpack_from("<I", data, head)[0])
-
-
 def test_messages_that_the_index_does_not_list_are_not_lost(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     two = make_bag(path, [plain()], [[(0, 1, b"one"), (0, 2, b"two")]]).read_bytes()
@@ -376,9 +358,10 @@ def test_messages_that_the_index_does_not_list_are_not_lost(tmp_path: Path) -> N
     (index,) = struct.unpack_from("<Q", two, two.index(b"index_pos=") + 10)
     path.write_bytes(bag_header(index - 12, 1, 1) + short[4109:])
     refuse(path, "its index lists 1 messages of 2")
-    none = two[: end_of_chunk(two)] + connection(0, *plain())
+    end_of_chunk = next(bag_records(two, 4109))[2]
+    none = two[:end_of_chunk] + connection(0, *plain())
     none += two[two.index(b"\4\0\0\0op=\6") - 4 :].replace(b"count=\1", b"count=\0")
-    path.write_bytes(bag_header(end_of_chunk(two), 1, 1) + none[4109:])
+    path.write_bytes(bag_header(end_of_chunk, 1, 1) + none[4109:])
     refuse(path, "its index lists 0 messages of 2")
     twice = two[:entry] + two[entry - 12 : entry] + two[entry + 12 :]
     path.write_bytes(bag_header(index, 1, 1) + twice[4109:])

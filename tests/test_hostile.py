@@ -243,11 +243,6 @@ def test_a_sidecar_larger_than_any(pair: Path) -> None:
     refused(pair, "yaml-invalid")
 
 
-def test_a_text_that_looks_like_a_column_cut_out(pair: Path) -> None:
-    changed(pair, put("columns", "stamp", "values", value="mp4ds column 0"))
-    refused(pair, "column-invalid")
-
-
 def test_many_unknown_keys(pair: Path) -> None:
     edited(pair, b"frames: 8", b"frames: 8" + b"".join(b"\nk%d: 1" % n for n in range(20_000)))
     text = refused(pair, *BAD_DOCUMENT)
@@ -336,13 +331,6 @@ GEOMETRY: dict[str, tuple[Change, set[str]]] = {
 }
 
 
-@pytest.mark.parametrize("name", GEOMETRY)
-def test_sizes_that_ask_for_memory(name: str, pair: Path) -> None:
-    change, codes = GEOMETRY[name]
-    changed(pair, change)
-    refused(pair, *codes)
-
-
 def test_as_many_frames_as_a_hollow_video_has_bytes(pair: Path) -> None:
     os.truncate(pair.with_suffix(".mp4"), MAX_FRAMES)  # takes no room on the disk
     changed(pair, both(LOSSY, claiming(MAX_FRAMES)))
@@ -369,17 +357,16 @@ RESIDUALS: dict[str, str] = {
     "run-of-digits": "0*" + "9" * 5000,
     "many-runs-of-none": "0*0 " * 100_000 + WHOLE,
     "unlimited-spaces": "0 " + " " * 2**17 + "*",
+    "like-a-column-cut-out": "mp4ds column 0",
 }
 
 
-@pytest.mark.parametrize("name", RESIDUALS)
-def test_columns_that_do_not_decode(name: str, pair: Path) -> None:
-    changed(pair, put("columns", "stamp", "values", value=RESIDUALS[name]))
-    text = refused(pair, "column-invalid", "yaml-invalid")
-    assert "columns.stamp" in text or "yaml-invalid" in text
-
-
 COLUMN_CHANGES: dict[str, tuple[Change, set[str]]] = {
+    **GEOMETRY,
+    **{
+        name: (put("columns", "stamp", "values", value=text), {"column-invalid", "yaml-invalid"})
+        for name, text in RESIDUALS.items()
+    },
     **{
         name: (put(*place, value=value), {"column-invalid"})
         for name, (*place, value) in {
@@ -538,39 +525,24 @@ def test_a_video_that_changes_its_size_half_way(size: tuple[int, int], pair: Pat
     refused(pair, "geometry-mismatch", "decode-failed")
 
 
-def test_a_file_header_of_another_size(pair: Path) -> None:
-    # what counts is the size in the coded stream: no other is allocated
+@pytest.mark.parametrize("text", [b"avc1", b"Lavf", b"VideoHandler"])
+def test_a_video_with_other_bytes_in_its_headers(text: bytes, pair: Path) -> None:
+    """A size that nothing allocates, since the one in the stream counts; and no UTF-8."""
     path = pair.with_suffix(".mp4")
     data = bytearray(path.read_bytes())
-    entry = data.index(b"avc1", data.index(b"stsd"))
-    data[entry + 28 : entry + 32] = (16384).to_bytes(2, "big") * 2
+    place = data.index(text, data.index(b"stsd") if text == b"avc1" else 0)
+    if text == b"avc1":
+        data[place + 28 : place + 32] = (16384).to_bytes(2, "big") * 2
+    else:
+        data[place] |= 0x80
     path.write_bytes(data)
     changed(pair, UNSEALED)
     for outcome in (jail.validate(pair), jail.read(pair)):
         assert not outcome.error or outcome.ours
 
 
-@pytest.mark.parametrize("name", [b"Lavf", b"VideoHandler"])
-def test_a_video_with_a_text_that_is_not_utf8(name: bytes, pair: Path) -> None:
-    path = pair.with_suffix(".mp4")
-    data = bytearray(path.read_bytes())
-    data[data.index(name)] |= 0x80
-    path.write_bytes(data)
-    changed(pair, UNSEALED)
-    for outcome in (jail.validate(pair), jail.read(pair)):
-        assert not outcome.error or outcome.ours
-
-
-def test_a_playlist_of_other_files(pair: Path) -> None:
-    path = pair.with_suffix(".mp4")
-    path.rename(pair.with_name("other.mp4"))
-    path.write_text("ffconcat version 1.0\nfile other.mp4\n")
-    changed(pair, LOSSY)
-    refused(pair, "video-unreadable")
-
-
-@pytest.mark.parametrize("form", ["hls", "sdp", "concat", "dash"])
-def test_nothing_is_fetched_from_a_network(form: str, pair: Path) -> None:
+@pytest.mark.parametrize("form", ["hls", "sdp", "concat", "dash", "file"])
+def test_nothing_is_fetched_from_elsewhere(form: str, pair: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(0.05)
         url = f"http://127.0.0.1:{server.getsockname()[1]}/x.mp4"
@@ -579,10 +551,12 @@ def test_nothing_is_fetched_from_a_network(form: str, pair: Path) -> None:
             "sdp": "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\n"
             "m=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
             "concat": f"ffconcat version 1.0\nfile {url}\n",
+            "file": "ffconcat version 1.0\nfile other.mp4\n",
             "dash": '<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011">'
             f"<Period><AdaptationSet><BaseURL>{url}</BaseURL></AdaptationSet></Period></MPD>",
         }[form]
-        pair.with_suffix(".mp4").write_text(text)
+        path = pair.with_suffix(".mp4")
+        path.rename(pair.with_name("other.mp4")).with_name(path.name).write_text(text)
         changed(pair, LOSSY)
         refused(pair, "video-unreadable")
         with pytest.raises(TimeoutError):
@@ -703,34 +677,26 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         for name, value in {
             "none": "",
             "letters": "x y z",
-            "delimiter": "td",
             "zeros": "0 0 0",
-            "two": "2 2 2 2",
             "one": "4",
-            "many": "4 " * 2000 + "4",
             "beyond": "4 " * 100_000 + "4",
             "digits": "4" * 4096,
             "long-zeros": "4096 4096 4096 4096",
             "too-long": "4097 4 4 4",
-            "trailing": "4 4 3 3 +4096",
             "trailing-beyond": "4 4 3 3 +9999",
             "trailing-alone": "+4",
             "trailing-twice": "4 4 3 3 +1 +1",
-            "trailing-first": "+1 4 4 3 3",
             "spaces": " 4  4 3  3 ",
             "signs": "-4 4 3 3",
             "huge": "9" * 4000 + " 4",
         }.items()
     },
-    "framing-av1-none": ("av1", header(framing=""), NOT_AS_RECORDED),
     "framing-av1-units": ("av1", header(framing="4 4"), NOT_AS_RECORDED),
     "framing-vp9": ("vp9", header(framing="4"), NOT_AS_RECORDED),
     "framing-jpeg": ("jpeg", header(framing="td"), NOT_AS_RECORDED),
     # what stands before a picture
     "prefix-long": ("depth", header(prefix="00" * 33), BAD_DOCUMENT),
-    "prefix-half": ("depth", header(prefix="000"), BAD_DOCUMENT),
     "prefix-letters": ("depth", header(prefix="zz"), BAD_DOCUMENT),
-    "prefix-none": ("depth", header(prefix=""), NOT_AS_RECORDED),
     "prefix-most": ("rvl", header(prefix="ab" * 32), NOT_AS_RECORDED),
     # recipes of PNG files
     "png-larger": ("png", twice_as_large, BAD_DOCUMENT),
@@ -744,36 +710,27 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         both(put("image", "width", value=8), put("image", "step", value=8)),
         NOT_AS_RECORDED,
     ),
-    "png-narrow": ("png", both(put("image", "width", value=1), put("image", "step", value=1)), BAD),
     **{
         f"png-{name}": ("png", header(**{f"png__{key}": value}), BAD_DOCUMENT | NOT_AS_RECORDED)
         for name, key, value in [
             ("filters", "filters", "magic"),
-            ("filters-none", "filters", ""),
             ("filters-long", "filters", "sub " * 2**20),
             ("level-0", "level", 0),
             ("strategy-fixed", "strategy", 4),
-            ("memory-1", "memory_level", 1),
             ("header-other", "zlib_header", "ffff"),
             ("chunks-1", "chunk_bytes", 1),
-            ("chunks-256", "chunk_bytes", 256),
             ("before", "before", "A" * 4 * 2**20),
             ("before-broken", "before", "A"),
-            ("after", "after", ""),
             ("after-long", "after", "A" * 4 * 2**20),
         ]
     },
     "png-none": ("png", header(png=None), BAD),
     "png-of-packets": ("h264", header(png={}), BAD_DOCUMENT),
-    "png-float": ("png", both(image_of("32FC1", 4), layout("bytes")), BAD),
     "png-float-colours": ("png", both(image_of("64FC4", 32), layout("bytes")), BAD),
     "png-signed": ("png", image_of("8SC1", 1), BAD),
-    "png-yuv": ("png", both(image_of("yuyv", 2), layout("planar422")), BAD),
     "png-nv24": ("png", both(image_of("nv24", 1), layout("planar444")), BAD),
-    "png-two-channels": ("png", both(image_of("8UC2", 2), layout("stack8")), BAD),
     "png-bayer": ("png16", both(image_of("bayer_rggb8", 1), layout("mosaic8")), BAD),
     # RVL of what it has no form for
-    "rvl-bytes": ("rvl", both(image_of("mono8", 1), layout("gray8")), BAD),
     "rvl-colours": ("rvl", both(image_of("rgb8", 3), layout("rgb24")), BAD),
     "rvl-floats": ("rvl", both(image_of("32FC1", 4), layout("bytes")), BAD),
     "rvl-signed": ("rvl", image_of("16SC1", 2), BAD),
@@ -788,12 +745,9 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         )
         for encoding, size, name in [
             ("16UC1", 2, "gray16"),
-            ("32FC1", 4, "bytes"),
             ("64FC4", 32, "bytes"),
             ("nv12", 1, "planar420"),
-            ("uyvy", 2, "planar422"),
             ("8SC3", 3, "bgr24"),
-            ("rgba8", 4, "rgba"),
             ("bayer_rggb8", 1, "demosaic8"),
         ]
     },
@@ -814,21 +768,13 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     },
     "codec-png": ("jpeg", video_of(codec="png"), BAD_DOCUMENT),
     "packets-of-pixels": ("bits", put("body", value="packet"), BAD),
-    "packets-of-depth": ("rvl", put("body", value="packet"), BAD),
     "pixels-of-packets": ("h264", put("body", value="pixels"), BAD),
-    "pixels-of-jpeg": ("jpeg", put("body", value="pixels"), BAD),
     "png-of-jpeg": ("jpeg", put("body", value="png"), BAD),
-    "jpeg-of-packets": ("h264", put("body", value="jpeg"), BAD),
     "body-unknown": ("h264", put("body", value="tiff"), BAD_DOCUMENT),
     # layouts of packets
     "packets-in-a-table": (
         "jpeg-grey",
         both(image_of("16UC1", 2), layout("table", table=[1, 2])),
-        BAD,
-    ),
-    "packets-of-few-bits": (
-        "jpeg",
-        both(image_of("mono16", 2), layout("gray_bits", bits=12, shift=0)),
         BAD,
     ),
     "packets-of-floats": ("jpeg", both(image_of("64FC4", 32), layout("bytes")), BAD),
@@ -844,7 +790,6 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
             "huge": list(range(60_000)),
         }.items()
     },
-    "table-short": ("table", layout("table", table=[7]), {"digest-mismatch"}),
     "table-other": ("table", layout("table", table=list(range(200))), {"digest-mismatch"}),
     "table-wide": ("table", layout("table", table=list(range(4096))), BAD),
     **{
@@ -874,14 +819,12 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     "pts-none": ("vp9", drop("columns", "pts"), BAD | {"column-invalid"}),
     # formats and templates
     "format-none": ("jpeg", header(format=None), NOT_AS_RECORDED),
-    "format-other": ("jpeg", header(format="png"), NOT_AS_RECORDED),
     "format-huge": ("jpeg", header(format="x" * 2**22), NOT_AS_RECORDED),
     **{
         f"template-{kind}-{name}": (kind, header(template=value), BAD_YAML | NOT_AS_RECORDED)
         for kind in ("h264", "protobuf")
         for name, value in {
             "empty": "",
-            "zeros": "A" * 400,
             "ones": "/" * 400,
             "large": "A" * 2**20,
             "json": base64.b64encode(b'{"timestamp":{"sec":0,"nsec":0}}').decode(),
@@ -898,7 +841,6 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         )
         for name, value in {
             "empty": b"",
-            "zeros": bytes(300),
             "ones": b"\xff" * 300,
             "nested": b"\x0a\x7f" * 2000,
             "offsets": bytes([8, 0, 0, 0]) * 500,
@@ -906,7 +848,6 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         }.items()
     },
     "wire-of-another": ("protobuf", put("wire", value="json"), BAD),
-    "wire-of-ros": ("protobuf", put("wire", value="ros1"), BAD),
     "wire-foreign": ("jpeg", put("wire", value="protobuf"), BAD),
 }
 

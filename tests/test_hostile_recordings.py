@@ -27,12 +27,12 @@ from mp4ds.bags import files
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.files import DamageError, unzstd
 from mp4ds.bags.mcap import McapReader, McapWriter
-from mp4ds.bags.ros1_writer import Ros1Writer
 from mp4ds.bags.rosbag2_metadata import parse_qos
 from mp4ds.errors import RemoteError
 from mp4ds.records import Channel, Message, Schema
 from remote_servers import web_server
 from test_bags_mcap import channel_record, chunk, file_of, record
+from test_bags_ros1 import make_bag, plain
 
 TOPICS = (
     "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,"
@@ -236,7 +236,6 @@ def test_yaml_that_grows(text: str, tmp_path: Path) -> None:
     """As metadata.yaml, and as the QoS profiles of a channel, which stay a text."""
     folder = tmp_path / "a"
     folder.mkdir()
-    (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  version: 5\nx: {text}")
     (folder / "metadata.yaml").write_text(text)
     database(folder / "a_0.db3", TOPICS, MESSAGES, TOPIC)
     outcome = jail.records(folder)
@@ -405,26 +404,14 @@ def test_chunks_that_unpack_to_much(name: str, tmp_path: Path) -> None:
 
 
 def bag_of(path: Path, packed: bytes, size: int) -> None:
-    """A bag of one chunk of bz2 data."""
-    channel = Channel(0, "/a", "ros1", Schema("a/A", "ros1msg", b"uint8[] x"), {"md5sum": "0" * 32})
-    with Ros1Writer(path, compression="bz2") as writer:
-        writer.add_channel(channel)
-        writer.write(Message(channel, 1, 1, 0, b"x" * 10))
-    data = path.read_bytes()
-    at = data.index(b"size=")
-    start = data.index(b"BZh") - 4
-    end = start + 4 + int.from_bytes(data[start : start + 4], "little")
-    said = struct.pack("<I", size)
-    made = data[: at + 5] + said + data[at + 9 : start] + struct.pack("<I", len(packed)) + packed
-    made += data[end:]
-    place = made.index(b"index_pos=") + 10
-    index = int.from_bytes(made[place : place + 8], "little") + len(made) - len(data)
-    path.write_bytes(made[:place] + struct.pack("<Q", index) + made[place + 8 :])
+    chunks = [[(0, 1, b"x")]]
+    make_bag(path, [plain()], chunks, compression="bz2", size=size, packed=packed)
 
 
 def test_a_bag_that_unpacks_to_much(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
-    bag_of(path, bz2.compress(bytes(150 * 2**20)), 150 * 2**20)
+    size = 150 * 2**20
+    bag_of(path, bz2.compress(bytes(size)), size)
     assert "declares 157286400 bytes but has" in jail.records(path).text
     problems = jail.records(path, salvage=True).problems
     assert any("unpacks to more than 134217728 bytes" in problem for problem in problems)
@@ -583,11 +570,8 @@ def test_what_is_written_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("name", ["metadata.yaml", "a_0.db3"])
 def test_files_of_a_folder_that_are_no_files(name: str, tmp_path: Path) -> None:
     database(tmp_path / "a_0.db3", TOPICS, MESSAGES, TOPIC)
-    (tmp_path / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: sqlite3\n"
-        "  relative_file_paths: [a_0.db3]\n"
-    )
-    assert not jail.records(tmp_path).error
+    write_bag_info(tmp_path, "a_0.db3", "")
+    assert not (jail.records(tmp_path)).error
     for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
         (tmp_path / name).unlink()
         make(tmp_path / name)

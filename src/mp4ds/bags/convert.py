@@ -23,6 +23,7 @@ from mp4ds.bags.types import (
     MAX_TAIL,
     RosVersion,
     by_library,
+    closure,
     fields_of,
     has_empty_items,
     incomprehensible,
@@ -50,16 +51,10 @@ Where = Literal["nowhere", "header", "anywhere"]
 
 def where_times_are(types: Typesdict, name: str) -> Where:
     """Whether messages of a type have times: none, one in the header they begin with, or others."""
-
-    def has_time(part: str) -> bool:
-        return part == TIME or any(
-            shape.message and has_time(shape.message) for shape in shapes_of(types, part)
-        )
-
     shapes = shapes_of(types, name)
     is_headed = bool(shapes) and shapes[0].message == HEADER and not shapes[0].is_several
     rest = [shape.message for shape in shapes[is_headed:] if shape.message]
-    if name == TIME or any(map(has_time, rest)):
+    if name == TIME or any(TIME in closure(types, part, {}) for part in rest):
         return "anywhere"
     return "header" if is_headed else "nowhere"
 

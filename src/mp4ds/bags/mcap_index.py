@@ -68,6 +68,7 @@ class ChunkTable:
         self._added = array("Q")
         self._ids = array("H")
         self._counts = array("I")
+        self.finish()
 
     def __len__(self) -> int:
         return len(self._counts)
@@ -93,7 +94,7 @@ class ChunkTable:
     def finish(self) -> None:
         """Sort the chunks by their place in the file."""
         columns = np.array(self._added, np.uint64).reshape(-1, 6)
-        del self._added
+        self._added = array("Q")
         order = np.argsort(columns[:, 0], kind="stable")
         self._offsets, self._lengths, self._index_lengths, self._starts, self._ends, self._sizes = (
             np.ascontiguousarray(columns[order].T)
@@ -235,7 +236,6 @@ class McapSummary:
         private: How many records of each private opcode it holds, and those between the chunks
             once these were looked at.
         others: Byte offsets of the attachments and metadata records, once these were looked at.
-        is_verified: Whether it matches its checksum, as far as that was compared.
     """
 
     offset: int = 0
@@ -245,7 +245,6 @@ class McapSummary:
     chunks: ChunkTable = field(default_factory=ChunkTable)
     private: Counter[int] = field(default_factory=Counter)
     others: array[int] = field(default_factory=lambda: array("Q"))
-    is_verified: bool = True
 
     def add(self, opcode: int, body: bytes) -> None:
         """Add a record.
@@ -365,6 +364,23 @@ class McapSummary:
         return self.statistics is not None and self.statistics.message_count == count
 
 
+def summary_place(stream: RecordStream) -> tuple[int, int]:
+    """Where a summary begins, 0 if there is none, and its checksum, 0 if it has none.
+
+    Raises:
+        SourceError: The file does not end as an MCAP file does.
+    """
+    if stream.size < len(MAGIC) + FOOTER_BYTES:
+        raise stream.cut_short()
+    stream.seek(stream.size - FOOTER_BYTES)
+    # Read separately from its record: in a file cut short, it is not a length.
+    tail = stream.read(FOOTER_BYTES)
+    if tail[-len(MAGIC) :] != MAGIC or tail[0] != Opcode.FOOTER:
+        raise stream.cut_short()
+    summary_start, _, checksum = struct.unpack_from("<QQI", tail, 9)
+    return summary_start, checksum
+
+
 def read_summary(stream: RecordStream) -> McapSummary | None:
     """Read the summary section of a file; the stream's position is undefined afterwards.
 
@@ -375,15 +391,7 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
         SourceError: The file does not end as an MCAP file does.
         DamageError: A record of the summary is damaged.
     """
-    size = stream.size
-    if size < 2 * len(MAGIC) + FOOTER_BYTES - len(MAGIC):
-        raise stream.cut_short()
-    stream.seek(size - FOOTER_BYTES)
-    # Read separately from its record: in a file cut short, it is not a length.
-    tail = stream.read(FOOTER_BYTES)
-    if tail[-len(MAGIC) :] != MAGIC or tail[0] != Opcode.FOOTER:
-        raise stream.cut_short()
-    summary_start, _ = struct.unpack_from("<QQ", tail, 9)
+    summary_start, _ = summary_place(stream)
     if not summary_start:
         return None
     stream.seek(summary_start)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,22 +15,23 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mp4ds.bags.files import DamageError, recover
-from mp4ds.bags.mcap_index import ChunkTable, McapSummary
+from mp4ds.bags.mcap_index import McapSummary, read_summary, summary_place
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
     FRAME,
     MAGIC,
     MAX_RECORD_BYTES,
     MESSAGE_HEAD,
-    OF_SUMMARY,
     PRIVATE_OPCODE,
     Declared,
+    RecordStream,
     chunk_records,
     parse,
     unpack_chunk,
 )
-from mp4ds.bags.salvage.scan import FileSalvage, Framing, RecordFrame, Scan, Window
-from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord
+from mp4ds.bags.salvage.scan import BLOCK, FileSalvage, Framing, RecordFrame, Window
+from mp4ds.errors import SourceError
+from mp4ds.records import Attachment, ChannelStats, Message, MetadataRecord
 
 # ---------------------------------------------------------------- finding records
 
@@ -196,59 +197,34 @@ class McapFraming(Framing):
 
 # ---------------------------------------------------------------- the summary
 
-_MAX_SEARCHED = 256 * 2**20
 
-
-def read_summary(path: Path) -> McapSummary:
-    """What can be read of the summary of a file; empty if its place is unknown.
-
-    What depends on its being complete and correct is left out if it is not.
+def _read_summary(path: Path) -> McapSummary:
+    """The summary of a file; only its place if it is damaged, and nothing if that is unknown.
 
     Raises:
-        SourceError: It cannot be read.
+        SourceError: The file cannot be read.
     """
-    summary = McapSummary()
-    is_whole = True
-    with Window.of_file(path) as window:
-        size = window.size
-        tail = window.look(size - FOOTER_BYTES, FOOTER_BYTES) if size > FOOTER_BYTES else None
-    if tail and tail[0] == Opcode.FOOTER and tail[-len(MAGIC) :] == MAGIC:
-        (start,) = struct.unpack_from("<Q", tail, 9)
-        if len(MAGIC) < start < size - FOOTER_BYTES:
-            with Window.of_file(path, start) as window:
-                covered = size - len(MAGIC) - 4 - start  # by the checksum in the footer
-                if covered <= _MAX_SEARCHED:  # otherwise, checking would take long
-                    (told,) = struct.unpack("<I", tail[-len(MAGIC) - 4 : -len(MAGIC)])
-                    summary.is_verified = told in (0, zlib.crc32(window.peek(covered)))
-                is_whole = _read_from(window, start, summary)
-    if not is_whole or not summary.is_verified:
-        summary.chunks = ChunkTable()
-        summary.statistics = None
-    summary.chunks.finish()
-    return summary
+    place = 0
+    with (
+        closing(RecordStream(path, MAX_RECORD_BYTES)) as stream,
+        suppress(SourceError, DamageError),
+    ):
+        found, checksum = summary_place(stream)
+        if len(MAGIC) < found < stream.size - FOOTER_BYTES:
+            place = found
+        if place and checksum in (0, _checksum(stream, place)):
+            return read_summary(stream) or McapSummary()
+    return McapSummary(place)
 
 
-def _read_from(window: Window, start: int, summary: McapSummary) -> bool:
-    """Add the records from a byte on to a summary; whether there was nothing else."""
-    framing = McapFraming({})
-    is_there = framing.frame(window.peek(framing.lookahead)) is not None
-    if not is_there and window.left > _MAX_SEARCHED:
-        return True  # the rest may be anything
-    summary.offset = start
-    problems: list[str] = []
-    scan = Scan(window, framing, lambda _offset, _size, problem: problems.append(problem))
-    while frame := scan.next():
-        if frame.kind == Opcode.FOOTER:
-            return not problems
-        if frame.kind not in OF_SUMMARY:
-            break
-        body = scan.body(frame)
-        if body is not None:
-            try:
-                summary.add(frame.kind, body)
-            except DamageError as error:
-                problems.append(str(error))
-    return False
+def _checksum(stream: RecordStream, start: int) -> int:
+    """That of a summary and the footer, but for the checksum in it."""
+    stream.seek(start)
+    found, left = 0, stream.size - len(MAGIC) - 4 - start
+    while left:
+        piece = stream.read(min(left, BLOCK))
+        found, left = zlib.crc32(piece, found), left - len(piece)
+    return found
 
 
 # ---------------------------------------------------------------- a pass
@@ -295,7 +271,7 @@ class _Chunk:
         if is_plain:
             start, end = start - _MARGIN, end + _MARGIN
         if crc:
-            with contextlib.suppress(DamageError):
+            with suppress(DamageError):
                 content = unpack_chunk(body)
                 found = list(chunk_records(content))
                 used = records + 8 + length
@@ -347,13 +323,12 @@ class McapSalvage(FileSalvage):
         self._channels = declared.channels
         self._schemas = declared.schemas.values()
         self._skipped = declared.skipped
-        self._summary = read_summary(path)
+        self._summary = _read_summary(path)
         self._index_offset = self._summary.offset or None
         self._is_timed = self._summary.chunks.has_messages
         self._framing = McapFraming(declared.channels, most)
         self._read_profile()
-        if self._summary.is_verified:
-            self._declared.add_summary(self._summary.schemas, self._summary.channels)
+        self._declared.add_summary(self._summary.schemas, self._summary.channels)
 
     def _read_profile(self) -> None:
         with Window.of_file(self.path) as window:
@@ -365,11 +340,6 @@ class McapSalvage(FileSalvage):
             except DamageError:
                 return
             self.profile, self.library = header.profile, header.library
-
-    @property
-    def has_all_channels(self) -> bool:
-        """Whether the file states how many messages it has."""
-        return self._summary.statistics is not None
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -385,7 +355,7 @@ class McapSalvage(FileSalvage):
         summary = self._summary
         self._declared.skipped.clear()
         self._count = _message_count(summary.statistics)
-        self._defined = set(summary.schemas if summary.is_verified else ())
+        self._defined = set(summary.schemas)
         self._undefined: dict[int, int] = {}
         # a damaged uncompressed chunk: where it begins and ends, and what is wrong
         self._plain: tuple[int, int, str] | None = None
@@ -498,25 +468,12 @@ class McapSalvage(FileSalvage):
         Raises:
             DamageError: It is shorter than its fields.
         """
-        if self._channel(channel_id) is None and len(body) >= MESSAGE_HEAD.size:
+        if channel_id not in self._declared.channels and len(body) >= MESSAGE_HEAD.size:
             self._tally.stray(channel_id)
             problem = f"messages of channel {channel_id}, whose record is missing"
             self._log.lost_of_kind(problem, offset, problem).add(1, ())
             return None
         return self._declared.message(body)
-
-    def _channel(self, channel_id: int) -> Channel | None:
-        """The channel with an id; from a doubtful summary only as a last resort."""
-        channels = self._declared.channels
-        summary = self._summary
-        record = None if summary.is_verified else summary.channels.get(channel_id)
-        if channel_id not in channels and record is not None:
-            schema = summary.schemas.get(record.schema_id)
-            if schema is not None and schema.id not in self._defined:
-                self._defined.add(schema.id)
-                self._declared.add_schema(schema)
-            self._declared.add_channel(record)
-        return channels.get(channel_id)
 
     def _chunk(self, frame: RecordFrame) -> Iterator[_Found]:
         """The messages of a chunk, as far as it can be decompressed."""
