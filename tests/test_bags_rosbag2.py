@@ -271,13 +271,13 @@ def test_mcap_storage_keeps_everything(tmp_path: Path) -> None:
         MetadataRecord("mine", {"a": "b"}),
         Message(Channel(8, "/none", "json", None), 2**64 - 1, 1, 1, b""),
     ]
-    with Rosbag2Writer(tmp_path / "a", storage="mcap", library="lib") as writer:
+    with Rosbag2Writer(tmp_path / "a", storage="mcap") as writer:
         writer.add_channel(channel)
         writer.add_channel(Channel(8, "/none", "json", None))
         put(writer, records)
     assert writer.omitted == {}
     reader, found = read(tmp_path / "a")
-    assert reader.library == "lib"
+    assert reader.library.startswith("mp4ds ")
     assert [(m.publish_time, m.sequence) for m in messages(found)] == [(3, 7), (1, 1)]
     assert records[1] in found
     assert records[2] in found

@@ -61,10 +61,6 @@ def test_a_time_that_does_not_fit(name: str, time: int, tmp_path: Path) -> None:
 
 
 def test_what_is_refused_at_once(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="none, bz2 or lz4"):
-        Ros1Writer(tmp_path / "a.bag", "zip")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="zstd, lz4, none"):
-        McapWriter(tmp_path / "a.mcap", profile="", compression="gzip")
     with pytest.raises(OptionError, match="sqlite3, mcap"):
         Rosbag2Writer(tmp_path / "a", storage="bolt")
     with pytest.raises(OSError, match="unable to open"):

@@ -35,7 +35,7 @@ from mp4ds.bags.mcap_records import (
     unpack_chunk,
 )
 from mp4ds.bags.protocols import BagReader, BagWriter, HoldBack, sorted_times
-from mp4ds.errors import ConversionError, Mp4dsError, OptionError, SourceError
+from mp4ds.errors import ConversionError, Mp4dsError, SourceError
 from mp4ds.records import (
     EVERYTHING,
     Attachment,
@@ -101,11 +101,6 @@ class McapReader(BagReader):
             stream.close()
             raise
         return stream
-
-    @property
-    def has_all_channels(self) -> bool:
-        """Whether the file states how many messages each of its channels has."""
-        return self._summary is not None and self._summary.statistics is not None
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -325,12 +320,6 @@ CHUNK_BYTES = 2**20
 MAX_CHANNELS = 2**16 - 1
 _COMPRESSION = "_Writer__compression"  # no public name lets one chunk be compressed otherwise
 
-_COMPRESSIONS = {
-    "zstd": CompressionType.ZSTD,
-    "lz4": CompressionType.LZ4,
-    "none": CompressionType.NONE,
-}
-
 
 class McapWriter(BagWriter):
     """Writes an MCAP file with chunks, indexes and checksums.
@@ -345,7 +334,6 @@ class McapWriter(BagWriter):
         chunk_size: Bytes of messages after which a chunk is closed.
 
     Raises:
-        OptionError: The compression is unknown.
         Mp4dsError: The installed mcap is too new.
         OSError: It cannot be written.
     """
@@ -359,10 +347,6 @@ class McapWriter(BagWriter):
         compression: str = "zstd",
         chunk_size: int = CHUNK_BYTES,
     ) -> None:
-        if compression not in _COMPRESSIONS:
-            raise OptionError(
-                f"compression {compression!r} is not known. Use {', '.join(_COMPRESSIONS)}."
-            )
         super().__init__()
         self.path = path
         self._compresses = compression != "none"
@@ -371,7 +355,7 @@ class McapWriter(BagWriter):
         self._file = path.open("wb")
         try:
             self._writer: Any = Writer(
-                self._file, chunk_size=chunk_size, compression=_COMPRESSIONS[compression]
+                self._file, chunk_size=chunk_size, compression=CompressionType[compression.upper()]
             )
             if not hasattr(self._writer, _COMPRESSION):  # else noticed at the first large message
                 raise Mp4dsError(

@@ -90,7 +90,7 @@ class BagReader(ABC):
     def channels(self) -> Sequence[Channel]:
         """All channels known so far.
 
-        Complete once `records` of everything is exhausted, or if it `has_all_channels`.
+        Complete once `records` of everything is exhausted, or if the recording `is_indexed`.
         """
         return list(self._channels.values())
 
@@ -120,11 +120,6 @@ class BagReader(ABC):
     def position(self) -> int:
         """Bytes of `files` that `records` of everything has consumed, for progress and hashing."""
         return 0
-
-    @property
-    def has_all_channels(self) -> bool:
-        """Whether `channels` is complete before anything is read."""
-        return self.is_indexed
 
     @property
     def is_indexed(self) -> bool:

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import base64
 import binascii
-import bz2
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
-
-import lz4.frame
 
 from mp4ds.bags.protocols import BagWriter
 from mp4ds.bags.ros1 import BASE64, MAGIC, MAX_TIME, UINT32, Op, text_of
-from mp4ds.errors import ConversionError, OptionError, TargetExistsError
+from mp4ds.errors import ConversionError, TargetExistsError
 from mp4ds.records import Channel, Message
 
 _MAX_PAYLOAD = 2**32 - 2**24  # lengths are uint32; leaves room for the rest of the chunk
@@ -28,25 +24,20 @@ _MESSAGE_HEAD = struct.Struct("<II3sBI5sII5sIII")  # op, conn, time, and the pay
 
 
 class Ros1Writer(BagWriter):
-    """Writes a ROS 1 bag.
+    """Writes a ROS 1 bag, whose chunks are not compressed.
 
     Args:
         path: The file, which must not exist.
-        compression: Of the chunks: ``none``, ``bz2`` or ``lz4``.
 
     Raises:
-        OptionError: The compression is unknown.
         TargetExistsError: The file exists.
         OSError: It cannot be written.
     """
 
-    def __init__(self, path: Path, compression: Literal["none", "bz2", "lz4"] = "none") -> None:
-        if compression not in _COMPRESSORS:
-            raise OptionError(f"compression {compression!r} is not known. Use none, bz2 or lz4.")
+    def __init__(self, path: Path) -> None:
         if path.exists():
             raise TargetExistsError(path)
         super().__init__()
-        self._compression = compression
         self._numbers: dict[int, int] = {}  # of connections, by channel id
         self._connections: list[bytes] = []
         self._chunk_infos: list[bytes] = []
@@ -131,11 +122,9 @@ class Ros1Writer(BagWriter):
         if not content:
             return
         place = self._file.tell()
-        packed = _COMPRESSORS[self._compression](content)
-        compression = (b"compression", self._compression.encode())
-        self._file.write(_header(Op.CHUNK, compression, (b"size", _uint32(len(content)))))
-        self._file.write(_uint32(len(packed)))
-        self._file.write(packed)
+        size = _uint32(len(content))
+        self._file.write(_header(Op.CHUNK, (b"compression", b"none"), (b"size", size)) + size)
+        self._file.write(content)
         for number, entries in index.items():
             data = b"".join(_ENTRY.pack(*divmod(time, 10**9), offset) for time, offset in entries)
             counted = ((b"conn", _uint32(number)), (b"count", _uint32(len(entries))))
@@ -175,25 +164,6 @@ def _header(op: Op, *fields: tuple[bytes, bytes]) -> bytes:
 
 def _uint32(number: int) -> bytes:
     return number.to_bytes(4, "little")
-
-
-def _pack_lz4(data: bytes) -> bytes:
-    """LZ4 as ROS 1 reads it: independent blocks, a checksum of the content, no size (lz4s.c)."""
-    packed: bytes = lz4.frame.compress(
-        data,
-        block_size=lz4.frame.BLOCKSIZE_MAX1MB,
-        block_linked=False,
-        content_checksum=True,
-        store_size=False,
-    )
-    return packed
-
-
-_COMPRESSORS: Mapping[str, Callable[[bytes], bytes]] = {
-    "none": bytes,
-    "bz2": bz2.compress,
-    "lz4": _pack_lz4,
-}
 
 
 def _join_header(fields: Iterable[tuple[bytes, bytes]]) -> bytes:

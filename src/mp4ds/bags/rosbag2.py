@@ -99,7 +99,7 @@ class Rosbag2Reader(CombinedReader):
             if reader:
                 self._declare(number, reader)
         self._tables = [reader.tables for reader in self._readers if reader]
-        if all(reader is not None and reader.has_all_channels for reader in self._readers):
+        if self.is_indexed:
             self._declare_listed()
 
     def _find_storage(self) -> tuple[BagInfo | None, list[Path]]:
@@ -350,6 +350,16 @@ def unlisted_storage(folder: Path, listed: Collection[str]) -> list[str]:
 
 _EMPTY_START = 2**63 - 1  # what rosbag2 writes without messages
 _SUFFIXES = {"sqlite3": "db3", "mcap": "mcap"}
+_SINCE = {
+    "compression_format": 3,
+    "compression_mode": 3,
+    "offered_qos_profiles": 4,
+    "files": 5,
+    "custom_data": 6,
+    "type_description_hash": 7,
+    "ros_distro": 8,
+}
+"""Version of metadata.yaml in which a field appeared."""
 
 
 class Rosbag2Writer(BagWriter):
@@ -362,23 +372,13 @@ class Rosbag2Writer(BagWriter):
         folder: Does not exist yet.
         storage: ``sqlite3`` or ``mcap``.
         name: The recording's name, used as the prefix of its storage file; by default the folder's.
-        library: Library string of an MCAP storage; if empty, this library's own.
-        compression: Of the chunks of an MCAP storage: ``zstd``, ``lz4`` or ``none``.
 
     Raises:
-        OptionError: The storage or compression is unknown.
+        OptionError: The storage is unknown.
         OSError: It cannot be written.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        storage: str,
-        name: str = "",
-        library: str = "",
-        compression: str = "zstd",
-    ) -> None:
+    def __init__(self, folder: Path, *, storage: str, name: str = "") -> None:
         if storage not in _SUFFIXES:
             raise OptionError(f"storage {storage!r} is not known. Use {', '.join(_SUFFIXES)}.")
         super().__init__()
@@ -397,9 +397,7 @@ class Rosbag2Writer(BagWriter):
         folder.mkdir()
         path = folder / self._file_name
         self._writer: McapWriter | SqliteWriter = (
-            SqliteWriter(path)
-            if storage == "sqlite3"
-            else McapWriter(path, profile="ros2", library=library, compression=compression)
+            SqliteWriter(path) if storage == "sqlite3" else McapWriter(path, profile="ros2")
         )
 
     @property
@@ -474,33 +472,23 @@ class Rosbag2Writer(BagWriter):
             "starting_time": {"nanoseconds_since_epoch": self._start},
         }
         prefix = "" if version >= 4 else f"{self._name}/"
-        info: dict[str, Any] = {
+        info = {
             "version": version,
             "storage_identifier": self._storage,
             **span,
             "message_count": count,
             "topics_with_message_count": [
-                _topic_entry(self._as_listed(topic), count, version)
-                for topic, count in self._counts.items()
+                _topic_entry(self._as_listed(topic), number, version)
+                for topic, number in self._counts.items()
             ],
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [prefix + self._file_name],
+            "files": [{"path": self._file_name, **span, "message_count": count}],
+            "custom_data": (dict(self._source.custom_data) if self._source else {}) or None,
+            "ros_distro": self._ros_distro,
         }
-        if version >= 3:
-            info |= {"compression_format": "", "compression_mode": ""}
-        info["relative_file_paths"] = [prefix + self._file_name]
-        if version >= 5:
-            info["files"] = [
-                {
-                    "path": self._file_name,
-                    "starting_time": span["starting_time"],
-                    "duration": span["duration"],
-                    "message_count": count,
-                }
-            ]
-        if version >= 6:
-            info["custom_data"] = (dict(self._source.custom_data) if self._source else {}) or None
-        if version >= 8:
-            info["ros_distro"] = self._ros_distro
-        return info
+        return _known_to(version, info)
 
     def _as_listed(self, topic: TopicMetadata) -> TopicMetadata:
         """The topic as listed in the source's metadata.yaml, which may differ from its files."""
@@ -541,16 +529,18 @@ def _parsed(text: str) -> BagInfo | None:
         return None  # none, or edited by hand: a plain one is written
 
 
+def _known_to(version: int, fields: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in fields.items() if version >= _SINCE.get(key, 0)}
+
+
 def _topic_entry(topic: TopicMetadata, count: int, version: int) -> dict[str, Any]:
-    metadata: dict[str, Any] = {
+    by_name = version >= NATIVE_QOS_VERSION
+    metadata = {
         "name": topic.name,
         "type": topic.type_name,
         "serialization_format": topic.serialization_format,
+        "offered_qos_profiles": native_qos(topic.qos or "") if by_name else topic.qos,
+        "type_description_hash": topic.type_hash,
     }
-    if version >= NATIVE_QOS_VERSION:
-        metadata["offered_qos_profiles"] = native_qos(topic.qos or "")
-    elif version >= 4:
-        metadata["offered_qos_profiles"] = topic.qos
-    if version >= 7:
-        metadata["type_description_hash"] = topic.type_hash
+    metadata = _known_to(version, metadata)
     return {"topic_metadata": metadata, "message_count": count}

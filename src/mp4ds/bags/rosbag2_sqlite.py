@@ -180,6 +180,7 @@ _TIME_INDEXES = """
     WHERE NOT list.partial AND info.seqno = 0 AND info.name = 'timestamp'
 """
 _INT64 = -(2**63), 2**63 - 1
+_MOST = 2**31  # as sqlite3's own limit
 
 
 class SqliteReader(BagReader):
@@ -189,7 +190,7 @@ class SqliteReader(BagReader):
 
     Args:
         path: The database.
-        most: Bytes that a message may have; None for no limit but the file's size.
+        most: Bytes that a message may have.
         damaged: Read a file that was cut short, too.
 
     Attributes:
@@ -204,9 +205,8 @@ class SqliteReader(BagReader):
     profile = "ros2"
     position = 0
     is_indexed = False
-    has_all_channels = True
 
-    def __init__(self, path: Path, *, most: int | None = None, damaged: bool = False) -> None:
+    def __init__(self, path: Path, *, most: int = _MOST, damaged: bool = False) -> None:
         self.path = path
         self.files = [path]
         self._most = most
@@ -372,13 +372,15 @@ class SqliteReader(BagReader):
         )
 
     def _message(self, tables: Tables, row_id: int, place: str) -> Message:
-        if self._most is not None:
-            self._check_size(tables, row_id, place)
-        query = "SELECT topic_id, timestamp, data, typeof(data) FROM messages WHERE id = ?"
-        row = next(tables.rows(query, (row_id,)), None)
+        # a decompressed copy may hold a message that is large though its file is small
+        query = (
+            "SELECT topic_id, timestamp, CASE WHEN length(data) <= ? THEN data END, typeof(data),"
+            " length(data) FROM messages WHERE id = ?"
+        )
+        row = next(tables.rows(query, (self._most, row_id)), None)
         if row is None:
             raise self._bad_index()
-        topic_id, timestamp, data, kind = row
+        topic_id, timestamp, data, kind, size = row
         channel = self._channels.get(topic_id)
         if channel is None:
             raise SourceError(
@@ -393,17 +395,10 @@ class SqliteReader(BagReader):
         if kind != b"blob":
             problem = f"{place}: the payload is {kind.decode()}, not a blob"
             raise SourceError(self.path, problem, SALVAGE_REMEDY)
-        return Message(channel, timestamp, timestamp, 0, data)
-
-    def _check_size(self, tables: Tables, row_id: int, place: str) -> None:
-        """Refuse a message that a decompressed copy holds though its file is small."""
-        found = tables.select(
-            "SELECT length(data) FROM messages WHERE id = ?", (row_id,)
-        ).fetchone()
-        size = found[0] if found else None
-        if self._most is not None and isinstance(size, int) and size > self._most:
+        if data is None:
             error = OversizeError(f"it has {size} bytes", self._most)
             raise unreadable(self.path, f": {place}", error, SALVAGE_REMEDY)
+        return Message(channel, timestamp, timestamp, 0, data)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans by channel id."""

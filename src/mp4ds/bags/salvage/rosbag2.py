@@ -46,7 +46,7 @@ class SqliteSalvage(SqliteReader):
 
     Args:
         path: The database.
-        most: Bytes that a message may have; None for no limit but the file's size.
+        most: Bytes that a message may have.
 
     Attributes:
         expected: Expected number of messages, if known from elsewhere.
@@ -60,7 +60,7 @@ class SqliteSalvage(SqliteReader):
     _times = BagReader._times
     _stats = BagReader._stats
 
-    def __init__(self, path: Path, *, most: int | None = None) -> None:
+    def __init__(self, path: Path, *, most: int = 2**31) -> None:
         self.expected: int | None = None
         try:
             super().__init__(path, most=most, damaged=True)
@@ -118,7 +118,7 @@ class SqliteSalvage(SqliteReader):
             if not isinstance(time, int) or time < 0:
                 raise Refused(f"messages of {channel.topic} with a time before 1970")
             (size,) = _first(tables, "length(data)", key)
-            if self._most is not None and isinstance(size, int) and size > self._most:
+            if isinstance(size, int) and size > self._most:
                 error = OversizeError("", self._most)
                 raise Refused(f"messages of {channel.topic} {lost_by(error)}")
             (data,) = _first(tables, "data", key)
