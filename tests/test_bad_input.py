@@ -579,7 +579,7 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         for kind in ("compressed-video", "ffmpeg")
     },
     **{
-        f"below {option}": ((command, *given, option, "0"), f"{option} 0 is below")
+        f"below {option}": ((command, *given, option, "0"), f"{option} 0 is")
         for command, *given, option in (
             ("pack", "BAG", "-o", "OUT", "--gop"),
             ("pack", "BAG", "-o", "OUT", "--jobs"),
