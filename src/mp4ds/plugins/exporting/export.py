@@ -24,11 +24,24 @@ from mp4ds.plugins.exporting.job import ExportJob, ExportOptions, ExportSummary
 NOTE_NAME = "mp4ds_export.json"
 """File in an exported folder that lists what it holds and leaves out."""
 
-FORMATS = {"euroc": "EuRoC", "tum": "TUM", "colmap": "COLMAP", "lerobot": "LeRobot"}
-"""Formats -> display name."""
 
-_Writer = Callable[..., None]
-_WRITERS = {"euroc": write_euroc, "tum": write_tum, "colmap": write_colmap}
+def _write_lerobot(*jobs: ExportJob) -> None:
+    try:
+        write = import_module("mp4ds.plugins.exporting.lerobot").write
+    except ImportError as error:
+        raise OptionError(
+            f"LeRobot needs pyarrow ({error}). Install it: pip install 'mp4ds[lerobot]'"
+        ) from None
+    write(*jobs)
+
+
+_FORMATS: dict[str, tuple[str, Callable[..., None]]] = {
+    "euroc": ("EuRoC", write_euroc),
+    "tum": ("TUM", write_tum),
+    "colmap": ("COLMAP", write_colmap),
+    "lerobot": ("LeRobot", _write_lerobot),
+}
+"""Name of a format -> as its users write it, and what writes it."""
 
 
 def export(
@@ -67,7 +80,7 @@ def export(
     if remote(location(output)):
         raise OptionError(f"{output} is a URL: export to a local folder, then upload it.")
     target = Path(os.path.abspath(output))  # noqa: PTH100
-    write = _WRITERS[to] if to in _WRITERS else _lerobot_writer()
+    name, write = _FORMATS[to]
     with ExitStack() as stack, advising(HOW_TO_SALVAGE):
         opened = [
             stack.enter_context(open_selected(path, chosen.uses, verify_messages=not chosen.slice))
@@ -107,11 +120,11 @@ def export(
         ]
         write(*jobs)
         for job in jobs:
-            job.leave_out_rest(FORMATS[to])
+            job.leave_out_rest(name)
         if not summary.messages:
             why = [f"{topic}: {next(iter(found))}" for topic, found in summary.left_out.items()]
             raise OptionError(
-                f"{FORMATS[to]} cannot hold any topic of {opened[0].path}: "
+                f"{name} cannot hold any topic of {opened[0].path}: "
                 f"{why[0] if why else 'it has no messages'}."
             )
         files = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
@@ -124,27 +137,17 @@ def export(
         return summary
 
 
-def _lerobot_writer() -> _Writer:
-    try:
-        write: _Writer = import_module("mp4ds.plugins.exporting.lerobot").write
-    except ImportError as error:
-        raise OptionError(
-            f"LeRobot needs pyarrow ({error}). Install it: pip install 'mp4ds[lerobot]'"
-        ) from None
-    return write
-
-
 def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
     """Refuse options that are unknown or contradict each other.
 
     Raises:
         OptionError: Says which, and lists the valid ones.
     """
-    if to not in FORMATS:
-        raise OptionError(f"format {to!r} is not known. Use {', '.join(FORMATS)}.")
+    if to not in _FORMATS:
+        raise OptionError(f"format {to!r} is not known. Use {', '.join(_FORMATS)}.")
     if len(paths) > 1 and to != "lerobot":
         raise OptionError(
-            f"{FORMATS[to]} holds a single dataset, but {len(paths)} were given: export them "
+            f"{_FORMATS[to][0]} holds a single dataset, but {len(paths)} were given: export them "
             "one by one."
         )
     options.check_for(to)

@@ -86,8 +86,8 @@ def _lines_of(path: Path) -> Iterator[tuple[int, str]]:
         raise SourceError(path, f"is larger than {_MAX_TEXT} bytes, so it cannot be a list")
     try:
         with path.open(encoding="utf-8-sig") as stream:
-            for number, line in enumerate(iter(lambda: stream.readline(_MAX_LINE), ""), start=1):
-                if len(line) == _MAX_LINE:  # the next piece of it would be taken for a line
+            for number, line in enumerate(iter(lambda: stream.readline(_MAX_LINE + 1), ""), 1):
+                if len(line) > _MAX_LINE:  # what follows of it would be taken for another line
                     raise SourceError(path, f"line {number} is too long for a list")
                 text = line.strip()
                 if text and not text.startswith("#"):

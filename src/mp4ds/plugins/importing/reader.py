@@ -136,7 +136,7 @@ class ImagesReader(BagReader):
         self.files: list[Path] = []
         self.kept: list[Path] = []
         self.transforms: list[Transform] = []
-        self.left_out: Counter[str] = Counter()
+        self._skipped = self.left_out = Counter[str]()
         self._tracks: list[_Track] = []
 
     # ------------------------------------------------ for layouts
@@ -271,11 +271,6 @@ class ImagesReader(BagReader):
     def channels(self) -> Sequence[Channel]:
         """All channels."""
         return [track.channel for track in self._tracks]
-
-    @property
-    def skipped(self) -> Mapping[str, int]:
-        """What is left out: a phrase -> how many."""
-        return self.left_out
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Attachments, then messages by log time."""
