@@ -8,7 +8,6 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,12 +19,11 @@ import pytest
 from numpy.typing import NDArray
 from websockets.sync.client import connect
 
-from waiting import WATCHDOG_S
+from waiting import WATCHDOG_S, until
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
 )
-_SECONDS = WATCHDOG_S
 
 
 class Tab:
@@ -44,7 +42,7 @@ class Tab:
         order = {"id": self._number, "method": method, "params": parameters}
         self._socket.send(json.dumps(order | {"sessionId": self._session}))
         while True:
-            found = json.loads(self._socket.recv(_SECONDS))
+            found = json.loads(self._socket.recv(WATCHDOG_S))
             if found.get("id") == self._number:
                 assert "error" not in found, found["error"]
                 return dict(found["result"])
@@ -75,13 +73,13 @@ class Tab:
             ready: An expression that then gives a true value.
         """
         self.command("Page.navigate", url=url)
-        end = time.monotonic() + _SECONDS
-        while time.monotonic() < end:
+
+        def is_ready() -> bool:
             with suppress(AssertionError):  # the page is not there yet
-                if self.evaluate(ready):
-                    return
-            time.sleep(0.05)
-        pytest.fail(f"{url} does not get ready: {self.problems}")
+                return bool(self.evaluate(ready))
+            return False
+
+        until(is_ready)
 
     def press(self, key: str, *, text: str = "") -> None:
         """Press a key."""
@@ -147,19 +145,16 @@ def chromium(profile: Path, *flags: str, width: int = 1280, height: int = 900) -
 
 def _address(profile: Path, browser: subprocess.Popen[bytes]) -> str:
     """Where the browser takes commands."""
-    end = time.monotonic() + _SECONDS
-    while time.monotonic() < end and browser.poll() is None:
-        with suppress(OSError, ValueError):
-            port, path = (profile / "DevToolsActivePort").read_text().split("\n")[:2]
-            return f"ws://127.0.0.1:{int(port)}{path}"
-        time.sleep(0.05)
-    pytest.fail(f"the browser did not start: {(profile / 'log.txt').read_text()[-2000:]}")
+    told = profile / "DevToolsActivePort"
+    until(lambda: told.is_file() and "\n" in told.read_text(), browser)
+    port, path = told.read_text().split("\n")[:2]
+    return f"ws://127.0.0.1:{int(port)}{path}"
 
 
 def _tab(socket: Any) -> Tab:
     def ask(number: int, method: str, **parameters: Any) -> dict[str, Any]:
         socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
-        while (found := json.loads(socket.recv(_SECONDS))).get("id") != number:
+        while (found := json.loads(socket.recv(WATCHDOG_S))).get("id") != number:
             pass
         return dict(found["result"])
 

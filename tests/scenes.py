@@ -227,7 +227,8 @@ def _others(n: int, log: int) -> list[Record]:
 # ---------------------------------------------------------------- raw messages
 
 
-def image_ros1(
+def raw_image(
+    serialization: str,
     *,
     width: int,
     height: int,
@@ -239,81 +240,55 @@ def image_ros1(
     is_bigendian: int = 0,
     step: int | None = None,
     tail: bytes = b"",
-) -> bytes:
-    """A ROS 1 ``sensor_msgs/Image``, which need not be a sensible one.
-
-    Args:
-        width: Pixels.
-        height: Pixels.
-        encoding: Any string.
-        data: Of any length, whatever step and height say.
-        stamp: Nanoseconds, or (seconds, nanoseconds) to tell an impossible one.
-        seq: Sequence number of the header.
-        frame_id: Any string.
-        is_bigendian: Any byte.
-        step: Bytes a row; by default what `data` and `height` give.
-        tail: Bytes after the message.
-    """
-    step = len(data) // max(1, height) if step is None else step
-    seconds, nanoseconds = divmod(stamp, 10**9) if isinstance(stamp, int) else stamp
-    text = [struct.pack("<I", len(raw)) + raw for raw in (frame_id.encode(), encoding.encode())]
-    return b"".join(
-        (
-            struct.pack("<III", seq, seconds & 0xFFFFFFFF, nanoseconds),
-            text[0] + struct.pack("<II", height, width) + text[1],
-            struct.pack("<BII", is_bigendian, step, len(data)) + data + tail,
-        )
-    )
-
-
-def image_cdr(
-    *,
-    width: int,
-    height: int,
-    encoding: str,
-    data: bytes,
-    stamp: int | tuple[int, int] = START,
-    frame_id: str = "cam",
-    is_bigendian: int = 0,
-    step: int | None = None,
-    tail: bytes = b"",
     little_endian: bool = True,
     padding: bytes = b"\0",
     options: bytes = b"\0\0",
 ) -> bytes:
-    """A ROS 2 ``sensor_msgs/msg/Image``; as `image_ros1`, and further:
+    """A ``sensor_msgs/Image`` of ROS 1 (``ros1``) or 2 (``cdr``), which need not be a sensible one.
 
     Args:
-        little_endian: Byte order of the serialisation.
+        serialization: Which has what it can hold of the following.
+        width: Pixels.
+        height: Pixels.
+        encoding: Any string.
+        data: Of any length, whatever step and height say.
+        stamp: Nanoseconds, or (seconds, nanoseconds) to give an impossible one.
+        seq: Sequence number of the header; of ROS 1.
+        frame_id: Any string.
+        is_bigendian: Any byte.
+        step: Bytes a row; by default what `data` and `height` give.
+        tail: Bytes after the message.
+        little_endian: Byte order of the serialisation; of ROS 2, as what follows.
         padding: The byte that fills alignment gaps; real writers leave garbage there.
         options: Bytes 2 and 3 of the encapsulation header.
     """
+    is_cdr = serialization == "cdr"
     step = len(data) // max(1, height) if step is None else step
     seconds, nanoseconds = divmod(stamp, 10**9) if isinstance(stamp, int) else stamp
-    order, body = "<" if little_endian else ">", bytearray()
+    order, body = "<" if little_endian or not is_cdr else ">", bytearray()
 
-    def number32(value: int) -> None:
-        body.extend(padding * (-len(body) % 4))
-        body.extend(struct.pack(order + "I", value & 0xFFFFFFFF))
+    def numbers(*values: int) -> None:
+        body.extend(padding * (-len(body) % 4 if is_cdr else 0))
+        body.extend(struct.pack(f"{order}{len(values)}I", *(value % 2**32 for value in values)))
 
     def text(value: str) -> None:
-        raw = value.encode() + b"\0"
-        number32(len(raw))
+        raw = value.encode() + b"\0" * is_cdr
+        numbers(len(raw))
         body.extend(raw)
 
-    number32(seconds)
-    number32(nanoseconds)
+    numbers(*([] if is_cdr else [seq]), seconds, nanoseconds)
     text(frame_id)
-    number32(height)
-    number32(width)
+    numbers(height, width)
     text(encoding)
     body.append(is_bigendian)
-    number32(step)
-    number32(len(data))
-    return bytes((0, little_endian)) + options + bytes(body) + data + tail
+    numbers(step, len(data))
+    head = bytes((0, little_endian)) + options if is_cdr else b""
+    return head + bytes(body) + data + tail
 
 
-CDR_ONLY = {"little_endian", "padding", "options"}
+image_ros1 = partial(raw_image, "ros1")
+image_cdr = partial(raw_image, "cdr")
+
 Trait = Callable[[int, bytes], Mapping[str, Any]]
 # What changes in frame n of a plain 32 x 24 mono8 image whose pixels are given; `log` is the log
 # time in nanoseconds. Each trait was seen in real recordings.
@@ -370,9 +345,8 @@ def odd_scene(trait: str, *, frames: int = 8) -> Scene:
         stamp = START + n * PERIOD
         values = {**base, "stamp": stamp, "seq": n, **TRAITS[trait](n, pixels)}
         log = values.pop("log", stamp + 5_000_000)
-        ros1 = image_ros1(**{k: v for k, v in values.items() if k not in CDR_ONLY})
-        cdr = image_cdr(**{k: v for k, v in values.items() if k != "seq"})
-        messages.append(Record("/odd/image", IMAGE, log, ros1=ros1, cdr=cdr))
+        ready = {name: raw_image(name, **values) for name in ("ros1", "cdr")}
+        messages.append(Record("/odd/image", IMAGE, log, **ready))
         words = {"data": f"{n}"}
         messages.append(Record("/chatter", "std_msgs/msg/String", stamp, words))
     return Scene(messages)

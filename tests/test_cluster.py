@@ -23,7 +23,7 @@ from clusters import WITH_NANNY, RealCluster
 from mp4ds.errors import Mp4dsError, OptionError, RemoteError
 from mp4ds.plugins import cluster as access
 from mp4ds.plugins.cluster import cluster_executor
-from waiting import until
+from waiting import is_alive, until
 
 
 @pytest.fixture(autouse=True)
@@ -300,14 +300,6 @@ def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path
 def test_tls_needs_certificates(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="needs certificates"):
         errors(cluster_executor("tls://127.0.0.1:1", 1), clusters.write, tmp_path, "a")
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 # ---------------------------------------------------------------- batch systems

@@ -40,23 +40,6 @@ def test_mutated_files_keep_the_rules(kinds: dict[str, Any], tmp_path: Path) -> 
     assert all(counts[name] for name in kinds)
 
 
-@pytest.mark.parametrize(
-    ("broken", "rule"),
-    [
-        (("mp4ds.bags.salvage.ros1.Ros1Salvage._scanned", lambda *_: iter(())), "salvage"),
-        (("mp4ds.validate", lambda *_, deep=False: [] if deep else ["?"]), "deep does not find"),
-        (("mp4ds.unpack", lambda *_: None), "what was packed is not unpacked"),
-    ],
-)
-def test_a_broken_rule_is_found(
-    broken: tuple[str, Any], rule: str, kinds: dict[str, Any], tmp_path: Path, monkeypatch: Any
-) -> None:
-    monkeypatch.setattr(*broken)
-    wanted = {name: kinds[name] for name in ("bag-none", "video-bag-none")}
-    _, findings = fuzz.run(wanted, count=24, seed=0, seconds=120.0, around=tmp_path)
-    assert any(rule in finding.what for finding, _ in findings)
-
-
 def test_a_connection_that_is_defined_anew_is_salvaged_as_two(tmp_path: Path) -> None:
     def connection(topic: bytes) -> tuple[Any, bytes]:
         return [(b"op", b"\7"), (b"conn", bytes(4)), (b"topic", topic)], b""

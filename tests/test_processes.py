@@ -18,7 +18,7 @@ import pytest
 from mp4ds.errors import Mp4dsError, OptionError
 from mp4ds.packing.packer import StreamThreads
 from mp4ds.processes import ProcessExecutor, each
-from waiting import WATCHDOG_S, until
+from waiting import WATCHDOG_S, is_alive, until
 
 COUNTS = [0, 1, 2, 5]
 
@@ -207,14 +207,6 @@ def test_what_is_called_stays_in_the_process(monkeypatch: pytest.MonkeyPatch) ->
         calls = [executor.submit(counter) for _ in range(3)]
         assert [call.result() for call in calls] == [1, 2, 3]
     assert counter.calls == 0
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 SLEEP = "import os, pathlib, time; pathlib.Path({!r}, str(os.getpid())).touch(); time.sleep(60)"

@@ -16,21 +16,17 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 import mp4ds
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
+from foxglove_wire import SERIALIZATIONS
 from mp4ds.bags.convert import decoder_of
 from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel, Schema
+from round_trips import packed
 from scenes import image_ros1, raw_scene
-from sources import SOURCES, START, Scene, odd_scene, scene, write_bag, write_mcap
+from sources import SOURCES, START, Scene, odd_scene, scene, write_bag
 
 TOPIC = "/cam/image_raw"
 INFO_TOPIC = "/cam/camera_info"
 RULER = b"=" * 80
-
-
-def packed(folder: Path, sources: list[Path], **options: Any) -> Path:
-    """A dataset of a recording."""
-    mp4ds.pack(sources, folder / "dataset", mp4ds.PackOptions(**options))
-    return folder / "dataset"
 
 
 def check_fields(message: Any, values: Mapping[str, Any]) -> None:
@@ -70,7 +66,7 @@ def check_value(own: Any, value: Any) -> None:
 @pytest.mark.parametrize("variant", SOURCES)
 def test_messages_of_every_source(variant: str, tmp_path: Path) -> None:
     source = scene("mono8", frames=6)
-    dataset = packed(tmp_path, SOURCES[variant](tmp_path / "source", source))
+    dataset = packed(tmp_path, source, variant)
     sent = [record for record in source.messages if record.topic != TOPIC]
     with mp4ds.open(dataset) as opened:
         found = list(opened.messages())
@@ -96,9 +92,9 @@ def test_messages_of_every_source(variant: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("variant", FOXGLOVE_SOURCES)
 def test_messages_of_foxglove(variant: str, tmp_path: Path) -> None:
     source = foxglove_scene(partial(scene, "rgb8"), frames=6, width=64, height=48)
-    dataset = packed(tmp_path, FOXGLOVE_SOURCES[variant](tmp_path, source))
+    mp4ds.pack(FOXGLOVE_SOURCES[variant](tmp_path, source), tmp_path / "dataset")
     sent = [record for record in source.messages if record.topic != "/camera/image"]
-    with mp4ds.open(dataset) as opened:
+    with mp4ds.open(tmp_path / "dataset") as opened:
         for topic in ("/tf", "/pose", "/log", "/camera/calibration"):
             due = [record for record in sent if record.topic == topic]
             found = list(opened.messages([topic]))
@@ -112,8 +108,7 @@ def test_messages_of_foxglove(variant: str, tmp_path: Path) -> None:
 
 
 def test_some_topics(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "drive.mcap", scene("mono8"))
-    with mp4ds.open(packed(tmp_path, [tmp_path / "drive.mcap"])) as dataset:
+    with mp4ds.open(packed(tmp_path, scene("mono8"), "mcap-ros2-zstd")) as dataset:
         everything = list(dataset.messages())
         for topics in (["/imu"], ["/tf", "/imu"], [INFO_TOPIC, "/chatter"], [TOPIC], []):
             found = list(dataset.messages(topics))
@@ -132,8 +127,7 @@ def test_some_topics(tmp_path: Path) -> None:
 
 
 def test_nothing_is_read_ahead(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "drive.mcap", scene("mono8"))
-    with mp4ds.open(packed(tmp_path, [tmp_path / "drive.mcap"])) as dataset:
+    with mp4ds.open(packed(tmp_path, scene("mono8"), "mcap-ros2-zstd")) as dataset:
         one, other = dataset.messages(["/imu"]), dataset.messages(["/imu"])
         assert [next(one) for _ in range(3)] == [next(other) for _ in range(3)]
         assert dataset[TOPIC][3].index == 3
@@ -159,9 +153,7 @@ def test_images_stored_verbatim(trait: str, tmp_path: Path) -> None:
 
 
 def test_a_pair_alone_has_its_calibrations(tmp_path: Path) -> None:
-    write_bag(tmp_path / "drive.bag", scene("mono8"))
-    dataset = packed(tmp_path, [tmp_path / "drive.bag"])
-    with mp4ds.open(dataset / "cam_image_raw.mp4") as pair:
+    with mp4ds.open(packed(tmp_path, scene("mono8")) / "cam_image_raw.mp4") as pair:
         found = list(pair.messages())
         assert [message.topic for message in found] == [INFO_TOPIC] * 8
         assert found[0].decoded.distortion_model == "plumb_bob"
@@ -214,8 +206,6 @@ def test_a_type_declared_inside_another_in_a_file_that_comes_before_its_imports(
 @pytest.mark.parametrize("encoding", ["ros1", "cdr", "json", "protobuf"])
 def test_any_bytes(encoding: str) -> None:
     """An object or a WireError, whatever the bytes are."""
-    from foxglove_wire import SERIALIZATIONS
-
     if encoding == "protobuf":
         name, schema = SERIALIZATIONS["protobuf"].schema("foxglove_msgs/msg/Log")
         odd = channel("protobuf", name, schema, "protobuf")
@@ -262,7 +252,7 @@ def test_a_message_of_another_type_is_reported(tmp_path: Path) -> None:
     for variant in ("bag-none", "mcap-ros2-zstd"):
         folder = tmp_path / variant
         source = Scene([*made.messages, *images])
-        dataset = packed(folder, SOURCES[variant](folder / "source", source))
+        dataset = packed(folder, source, variant)
         with mp4ds.open(dataset) as opened:
             first, second = opened.messages(["/said"])
             assert first.decoded.data == "hi"

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 import sys
-import threading
 from collections.abc import Iterator
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from chromium import chromium
 from commands import program
 from mp4ds.cli import COMMANDS
 from mp4ds.cli import commands as command_line
+from remote_servers import Many, serving
 
 ROOT = Path(__file__).parents[1]
 for _module in ("mkdocs", "material", "mkdocstrings_handlers.python"):
@@ -81,17 +81,9 @@ def test_the_reference_has_nothing_private(site: Path) -> None:
 
 @pytest.fixture(scope="module")
 def served(site: Path) -> Iterator[str]:
-    class Quiet(SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}/"
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    handler = partial(SimpleHTTPRequestHandler, directory=str(site))
+    with serving(Many(("127.0.0.1", 0), handler)) as url:
+        yield f"{url}/"
 
 
 @pytest.mark.browser

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -33,6 +36,17 @@ def until(is_so: Callable[[], object], process: subprocess.Popen[Any] | None = N
                 said = process.communicate()
             raise AssertionError(f"it {'hangs' if is_late else 'ended before'}: {said}")
         time.sleep(0.005)
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended, and of which nobody has asked, does not."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    with suppress(OSError):  # where there is no /proc
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return True
 
 
 def lines_run(call: Callable[[], object]) -> int:
