@@ -20,8 +20,7 @@ from mp4ds.errors import Refused
 from mp4ds.messages.serializations import form_of
 from mp4ds.messages.wire import ImageFields, Slots
 from mp4ds.plugins.playing.options import PlayOptions
-from mp4ds.plugins.playing.play import open_player
-from mp4ds.plugins.playing.player import Player, PlaySummary
+from mp4ds.plugins.playing.player import Player, PlaySummary, open_player
 from mp4ds.records import Channel, Message, Schema
 from sources import typestore
 from waiting import WATCHDOG_S

@@ -20,7 +20,7 @@ from damage import Key, all_messages, pieces_of
 from edits import flip
 from mp4ds import FormatError, OptionError, SourceError, UnpackOptions
 from mp4ds.errors import VideoError
-from mp4ds.plugins.playing.play import open_player
+from mp4ds.plugins.playing.player import open_player
 from mp4ds.records import Loss
 from player_scenes import RecordingPublisher
 from round_trips import packed as packed_scene

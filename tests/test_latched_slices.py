@@ -16,7 +16,7 @@ from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.info import info
 from mp4ds.plugins.playing.options import PlayOptions
-from mp4ds.plugins.playing.play import open_player
+from mp4ds.plugins.playing.player import open_player
 from mp4ds.records import Message
 from mp4ds.unpacking.unpack import UnpackOptions
 from player_scenes import (

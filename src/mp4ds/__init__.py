@@ -67,8 +67,8 @@ if TYPE_CHECKING:
     from mp4ds.plugins.exporting.job import ExportSummary as ExportSummary
     from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4 as import_ros_mp4
     from mp4ds.plugins.playing.options import PlayOptions as PlayOptions
-    from mp4ds.plugins.playing.play import play as play
     from mp4ds.plugins.playing.player import PlaySummary as PlaySummary
+    from mp4ds.plugins.playing.player import play as play
     from mp4ds.plugins.recording.options import RecordOptions as RecordOptions
     from mp4ds.plugins.recording.record import RecordSummary as RecordSummary
     from mp4ds.plugins.recording.record import record as record
@@ -100,8 +100,7 @@ _HOMES = {
     "plugins.exporting.job": "ExportOptions ExportSummary",
     "plugins.importing.ros_mp4": "import_ros_mp4",
     "plugins.playing.options": "PlayOptions",
-    "plugins.playing.play": "play",
-    "plugins.playing.player": "PlaySummary",
+    "plugins.playing.player": "PlaySummary play",
     "plugins.recording.options": "RecordOptions",
     "plugins.recording.record": "RecordSummary record",
     "plugins.reporting.report": "ReportOptions ReportSummary report",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -232,43 +232,30 @@ class PlayOptions(ReductionOptions, NodeOptions):
             new = f"{prefix}/{topic.lstrip('/')}" if prefix else topic
         return self.names.renamed(new)
 
+    def wants(self, topic: str) -> bool:
+        """Whether a topic is played: it is excluded by nothing, and included by something.
 
-class Wanted:
-    """Which topics are played: all, or those that `topics` or `regex` include; none excluded.
-
-    A recorded /clock is not played beside another one.
-
-    Raises:
-        OptionError: A regular expression is not valid.
-    """
-
-    def __init__(self, options: PlayOptions) -> None:
-        self._globs = Selection(options.topics, options.exclude)
-        self._by_glob = Selection(options.topics) if options.topics or not options.regex else None
-        self._excluded = Selection((), options.exclude)
-        self._regex = options.regex
-        self._exclude_regex = options.exclude_regex
-        self._has_clock = not (options.leads or options.follow_clock)
-
-    def __call__(self, topic: str) -> bool:
-        """Whether a topic is played."""
-        if not self._excluded(topic) or (topic == CLOCK and not self._has_clock):
+        That is `topics` or `regex`; without both, all are. A recorded /clock is not played beside
+        another one.
+        """
+        has_clock = self.leads or self.follow_clock
+        if not Selection((), self.exclude)(topic) or (topic == CLOCK and has_clock):
             return False
-        if self._exclude_regex and self._exclude_regex.fullmatch(topic):
+        if self.exclude_regex and self.exclude_regex.fullmatch(topic):
             return False
-        is_found = self._regex is not None and self._regex.fullmatch(topic) is not None
-        return is_found or (self._by_glob is not None and self._by_glob(topic))
+        if self.regex and self.regex.fullmatch(topic):
+            return True
+        return bool(self.topics or not self.regex) and self.selected(topic)
 
-    def check(self, topics: Iterable[str]) -> None:
+    def check_topics(self, topics: Sequence[str]) -> None:
         """Refuse patterns that match no topic.
 
         Raises:
             OptionError: Names the pattern and the topics of the recording.
         """
-        known = list(topics)
-        self._globs.check(known)
-        for name, regex in (("regex", self._regex), ("exclude_regex", self._exclude_regex)):
-            if regex is not None and not any(regex.fullmatch(topic) for topic in known):
+        self.selected.check(topics)
+        for name, regex in (("regex", self.regex), ("exclude_regex", self.exclude_regex)):
+            if regex is not None and not any(map(regex.fullmatch, topics)):
                 raise OptionError(
                     f"`{name}` {regex.pattern!r} fully matches no topic; use .* for any text, as "
                     "in '.*camera.*'."

@@ -1,4 +1,4 @@
-"""The player: publishes a timeline at its own pace, or in step with another player's clock."""
+"""Play datasets back to ROS, at their own pace, or in step with another player's clock."""
 
 from __future__ import annotations
 
@@ -7,16 +7,20 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-from mp4ds.errors import OptionError, Refused, RemoteError
+from mp4ds.dataset.collections import datasets_in
+from mp4ds.dataset.salvage import HOW_TO_SALVAGE, open_selected
+from mp4ds.errors import Refused, RemoteError, advising
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Pace, Ticks
 from mp4ds.plugins.playing.timeline import ReadAhead, Restamper, Timeline
-from mp4ds.plugins.ros.node import Node, Service, action, quick_switches
+from mp4ds.plugins.ros.node import Node, Service, action, chosen_world, open_node, quick_switches
 from mp4ds.records import Channel, Message
 
 
@@ -69,8 +73,7 @@ class PlaySummary:
     thinned: dict[str, int] = field(default_factory=dict)
 
 
-# ---------------------------------------------------------------- player
-
+_NODES = {"ros1": "mp4ds_play", "ros2": "rosbag2_player"}
 _REPORT_S = 0.2
 _WAKE_S = 0.1
 _SETTLE_S = 0.2  # as rosbag play: gives subscribers time to connect
@@ -95,6 +98,12 @@ class Player:
         options: How to play it.
         progress: Called a few times a second, by the thread of `run`.
         steady: The monotonic clock, nanoseconds.
+
+    Attributes:
+        address: Where it publishes, for display.
+        start_ns: Log time of the first message.
+        follows_clock: Whether it plays in step with another player's /clock.
+        is_paused: Whether playback is paused.
     """
 
     def __init__(
@@ -106,18 +115,20 @@ class Player:
         progress: Callable[[PlayProgress], None] | None = None,
         steady: Callable[[], int] = time.monotonic_ns,
     ) -> None:
+        self.address = node.address
+        self.start_ns = timeline.start_ns
         self._timeline = timeline
         self._node = node
         self._options = options = options or PlayOptions()
+        self.follows_clock = bool(options.follow_clock)
         self._progress = progress
         self._pace = Pace(options.rate, steady=steady)
-        self._start = _start(options, timeline)
-        self._end = _end(options, timeline, self._start)
+        self._start, self._end = timeline.play_from, timeline.play_until
         self._clock_topics = timeline.named("clock_topics", options.clock_topics)
         self._pause_topics = timeline.named("pause_topics", options.pause_topics)
         self._changed = threading.Condition(threading.RLock())
         self._playback: ReadAhead[Message] | None = None
-        self._is_paused = self._options.paused
+        self.is_paused = self._options.paused
         self._is_stopped = False
         self._is_over = False
         self._is_resting = False  # at the end, kept alive
@@ -139,32 +150,12 @@ class Player:
         self._done = PlaySummary()
         self._restamper = Restamper(self._pace.wall_of) if options.restamp else None
 
-    @property
-    def address(self) -> str:
-        """Where it publishes, for display."""
-        return self._node.address
-
-    @property
-    def follows_clock(self) -> bool:
-        """Whether it plays in step with another player's /clock."""
-        return bool(self._options.follow_clock)
-
     # ------------------------------------------------------------ controls
-
-    @property
-    def is_paused(self) -> bool:
-        """Whether playback is paused."""
-        return self._is_paused
 
     @property
     def rate(self) -> float:
         """Seconds of the recording per second."""
         return self._pace.rate
-
-    @property
-    def start_ns(self) -> int:
-        """Log time of the first message."""
-        return self._timeline.start_ns
 
     def pause(self) -> None:
         """Pause playback."""
@@ -177,11 +168,11 @@ class Player:
     def toggle_paused(self) -> None:
         """Pause or resume playback."""
         with self._changed:
-            self._set_paused(not self._is_paused)
+            self._set_paused(not self.is_paused)
 
     def _set_paused(self, is_paused: bool) -> None:
         with self._changed:
-            self._is_paused = is_paused
+            self.is_paused = is_paused
             self._burst = None
             if is_paused:
                 self._pace.jump(self._time())
@@ -222,12 +213,12 @@ class Player:
             return mine.done
 
     def _can_step(self) -> bool:
-        return self._is_paused and not (self._is_over or self._is_stopped)
+        return self.is_paused and not (self._is_over or self._is_stopped)
 
     def step_back(self) -> bool:
         """While paused, go back by one message."""
         with self._changed:
-            if not self._is_paused or len(self._history) < 2:
+            if not self.is_paused or len(self._history) < 2:
                 return False
             last = self._history.pop()
             while len(self._history) > 1 and self._history[-1] == last:
@@ -371,7 +362,7 @@ class Player:
             seconds, state = self._seconds_until(due)
             if seconds > 0 or due is None:
                 self._report(state)
-                is_awaited = self._options.loop or self._is_paused
+                is_awaited = self._options.loop or self.is_paused
                 if self._followed.silent_s > _FOLLOW_END_S and not is_awaited:
                     self._is_stopped = True
                 elif self._target is None:
@@ -393,8 +384,12 @@ class Player:
         """How long to wait, and the state meanwhile; 0: publish the message now."""
         if due is not None and not self._is_installed(due.channel):
             return 0.0, "playing"
-        self._pause_before(due)
-        if self._is_paused:
+        pauses = due is not None and due.channel.topic in self._pause_topics
+        if pauses and self._pauses_for_topics and due is not self._paused_at:
+            self._paused_at = due
+            if not self.is_paused:
+                self._set_paused(True)
+        if self.is_paused:
             is_wanted = due is not None and self._burst is not None
             return 0.0 if is_wanted else math.inf, "paused"
         if due is None:
@@ -402,7 +397,9 @@ class Player:
             return math.inf, "reading ahead"
         if self._timeline.is_frame(due) and self._replies < 1 and due.log_time != self._last_frame:
             return self._hold(due, self._options.lock_step)
-        if self._is_ahead():
+        ahead = self._pace.now() - self._controlled
+        most = round(self._options.rate_control_max_delay * NS)
+        if self._options.rate_control_topic and ahead > most:
             return self._hold(due, self._options.rate_control_topic)
         if self._options.immediate:
             return 0.0, "playing"
@@ -411,13 +408,6 @@ class Player:
             return self._followed.seconds_until(due.log_time), f"{state} /clock"
         return self._until_due(due), "playing"
 
-    def _pause_before(self, due: Message | None) -> None:
-        pauses = due is not None and due.channel.topic in self._pause_topics
-        if pauses and self._pauses_for_topics and due is not self._paused_at:
-            self._paused_at = due
-            if not self._is_paused:
-                self._set_paused(True)
-
     def _hold(self, due: Message, topic: str) -> tuple[float, str]:
         """Stop the clock at a message that has to wait for a message on another topic."""
         if self._pace.now() >= due.log_time or topic == self._options.rate_control_topic:
@@ -425,12 +415,6 @@ class Player:
             self._pace.pause()
             self._pace.jump(now)
         return math.inf, f"waiting for {topic}"
-
-    def _is_ahead(self) -> bool:
-        ahead = self._pace.now() - self._controlled
-        return bool(self._options.rate_control_topic) and ahead > round(
-            self._options.rate_control_max_delay * NS
-        )
 
     def _until_due(self, due: Message) -> float:
         if not self._pace.is_running:
@@ -487,7 +471,7 @@ class Player:
         """Start over, or wait for a control that does; returns whether to continue. Locked."""
         self._burst = None  # no messages left
         self._changed.notify_all()
-        if self._options.loop and not self.follows_clock and not self._is_paused:
+        if self._options.loop and not self.follows_clock and not self.is_paused:
             if self._target is None:
                 self._target, self._has_looped = self._start, True
                 self._done.loops += 1
@@ -495,10 +479,10 @@ class Player:
         end = time.monotonic() + _FOLLOW_END_S
         while not self._is_stopped and self._target is None and self._node.is_alive:
             is_waiting = self.follows_clock and (self._options.loop or time.monotonic() < end)
-            self._is_resting = self._options.keep_alive and not self._is_paused
-            if not (is_waiting or self._is_paused or self._is_resting):
+            self._is_resting = self._options.keep_alive and not self.is_paused
+            if not (is_waiting or self.is_paused or self._is_resting):
                 return False
-            if self._options.loop and not self._is_paused and not self.follows_clock:
+            if self._options.loop and not self.is_paused and not self.follows_clock:
                 return True  # it was resumed
             self._burst = None
             self._report("at the end")
@@ -515,22 +499,18 @@ class Player:
         if not self._is_installed(due.channel):
             self._done.not_installed[due.channel.topic] += 1
         elif not (self._timeline.is_frame(due) and self._is_late(due.log_time)):
-            if self._has_clock(due):
+            is_chosen = due.channel.topic in self._clock_topics or self._options.clock_topics_all
+            if is_chosen or (self._options.clock is not None and self._options.immediate):
                 self._node.clock(due.log_time)
             self._send(due, due.log_time)
             self._sent(due, burst)
-        self._report("paused" if self._is_paused else "playing")
-
-    def _has_clock(self, due: Message) -> bool:
-        """Whether to publish /clock before a message: as requested, or when not paced by time."""
-        is_chosen = self._options.clock_topics_all or due.channel.topic in self._clock_topics
-        return is_chosen or (self._options.clock is not None and self._options.immediate)
+        self._report("paused" if self.is_paused else "playing")
 
     def _sent(self, due: Message, burst: _Burst | None) -> None:
         with self._changed:
             self._history.append(due.log_time)
             self._reached = max(self._reached, due.log_time)
-            if self._is_paused:
+            if self.is_paused:
                 self._pace.jump(due.log_time)
             if burst is not None:
                 burst.done += 1
@@ -593,34 +573,10 @@ class Player:
         if not self._options.drop or self._options.immediate:
             return False
         with self._changed:
-            is_playing = self._pace.is_running and not self._is_paused
+            is_playing = self._pace.is_running and not self.is_paused
             is_late = is_playing and self._pace.seconds_until(time_ns) * NS <= -CATCH_UP_NS
             self._done.dropped += is_late
         return is_late
-
-
-def _start(options: PlayOptions, timeline: Timeline) -> int:
-    """The first time to play."""
-    start = timeline.start_ns + round(options.start_offset * NS)
-    if start > timeline.end_ns:
-        length = (timeline.end_ns - timeline.start_ns) / NS
-        raise OptionError(
-            f"`start_offset` {options.start_offset:g} is past the end: the recording has "
-            f"{length:.3f} s."
-        )
-    return start
-
-
-def _end(options: PlayOptions, timeline: Timeline, start: int) -> int:
-    """The last time to play. Of several, the latest, as in `ros2 bag play`."""
-    ends = []
-    if options.duration is not None:
-        ends.append(start + round(options.duration * NS))
-    if options.until_sec is not None and options.until_sec >= 0:
-        ends.append(round(options.until_sec * NS))
-    if options.until_nsec is not None and options.until_nsec >= 0:
-        ends.append(options.until_nsec)
-    return min(max(ends, default=timeline.end_ns), timeline.end_ns)
 
 
 # ---------------------------------------------------------------- services
@@ -675,3 +631,69 @@ def _play(player: Player, request: Any) -> Mapping[str, Any]:
 def _seek(player: Player, request: Any) -> Mapping[str, Any]:
     player.seek(_nanoseconds(request.time))
     return {"success": True}
+
+
+# ---------------------------------------------------------------- playing datasets
+
+
+def play(
+    datasets: Sequence[Path | str] | Path | str,
+    options: PlayOptions | None = None,
+    *,
+    progress: Callable[[PlayProgress], None] | None = None,
+) -> PlaySummary:
+    """Play back datasets, publishing their messages at the recorded times.
+
+    Args:
+        datasets: Datasets, or sidecars next to their videos; paths or URLs. Several are merged by
+            log time.
+        options: How to play them.
+        progress: Called a few times a second.
+
+    Returns:
+        What was published, and what was left out.
+
+    Raises:
+        OptionError: An option is wrong.
+        ConversionError: A topic cannot be published there; names it.
+        RemoteError: ROS is not available, or the connection was lost.
+        FormatError: A dataset is damaged.
+    """
+    with open_player(datasets, options, progress=progress) as player:
+        return player.run()
+
+
+@contextmanager
+def open_player(
+    datasets: Sequence[Path | str] | Path | str,
+    options: PlayOptions | None = None,
+    *,
+    node: Node | None = None,
+    progress: Callable[[PlayProgress], None] | None = None,
+) -> Iterator[Player]:
+    """A player of datasets that is not running yet.
+
+    Args:
+        datasets: As for `play`.
+        options: As for `play`.
+        node: Where to publish, not closed here; None: as the options say.
+        progress: As for `play`.
+    """
+    chosen = options or PlayOptions()
+    world = node.world if node else chosen_world("play", chosen.to)
+    chosen = replace(chosen, names=chosen.names.in_world(world))
+    with ExitStack() as stack:
+        stack.enter_context(advising(HOW_TO_SALVAGE))
+        opened = [
+            stack.enter_context(
+                open_selected(place, chosen.wants, jpeg_quality=chosen.jpeg_quality)
+            )
+            for place in datasets_in(datasets)
+        ]
+        timeline = Timeline(opened, chosen, world)
+        node = node or stack.enter_context(open_node(world, chosen, _NODES[world]))
+        follow = chosen.follow_clock
+        if follow is None:
+            follow = not (chosen.leads or chosen.immediate) and node.wants_clock
+        chosen = replace(chosen, follow_clock=follow)
+        yield Player(timeline, node, chosen, progress=progress)

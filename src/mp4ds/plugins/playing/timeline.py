@@ -25,7 +25,8 @@ from mp4ds.bags.types import (
 from mp4ds.dataset.dataset import Ahead, Dataset
 from mp4ds.errors import ConversionError, OptionError, Refused
 from mp4ds.format.fields import DecodedColumns, everything, last_of
-from mp4ds.plugins.playing.options import KINDS, PlayOptions, Wanted, rooted
+from mp4ds.messages.wire import PrimitiveReader, WireError
+from mp4ds.plugins.playing.options import KINDS, PlayOptions, rooted
 from mp4ds.plugins.playing.pace import NS
 from mp4ds.plugins.ros.node import World
 from mp4ds.records import Channel, Message
@@ -160,7 +161,6 @@ class Timeline:
     Args:
         datasets: Open datasets; not closed here.
         options: How to play them.
-        wanted: Which topics to play.
         world: Convert messages to this.
 
     Attributes:
@@ -168,23 +168,23 @@ class Timeline:
         republishers: What converts the messages of each dataset.
         start_ns: Log time of the first message, nanoseconds.
         end_ns: Log time of the last message, nanoseconds.
+        play_from: The first time to play.
+        play_until: The last time to play: of several, the latest, as in `ros2 bag play`.
 
     Raises:
         OptionError: There is nothing to play.
         ConversionError: A topic cannot be published; names it.
     """
 
-    def __init__(
-        self, datasets: Sequence[Dataset], options: PlayOptions, wanted: Wanted, world: World
-    ) -> None:
+    def __init__(self, datasets: Sequence[Dataset], options: PlayOptions, world: World) -> None:
         topics = [topic for dataset in datasets for topic in dataset.all_topics]
-        wanted.check(topics)
-        self._topics = {rooted(topic): topic for topic in topics if wanted(topic)}
+        options.check_topics(topics)
+        self._topics = {rooted(topic): topic for topic in topics if options.wants(topic)}
         for topic in options.rules:
             if topic not in self._topics:
                 raise OptionError(f"`remap` {topic!r}: there is no such topic to play.")
         self._options = options
-        self._parts = [_Part(dataset, options, wanted, world) for dataset in datasets]
+        self._parts = [_Part(dataset, options, world) for dataset in datasets]
         self.channels = [channel for part in self._parts for channel in part.channels]
         self.republishers = [part.republisher for part in self._parts]
         spans = [part.span for part in self._parts if part.span]
@@ -192,6 +192,20 @@ class Timeline:
             raise OptionError("There is no message to play.")
         self.start_ns = min(first for first, _ in spans)
         self.end_ns = max(last for _, last in spans)
+        self.play_from = self.start_ns + round(options.start_offset * NS)
+        if self.play_from > self.end_ns:
+            raise OptionError(
+                f"`start_offset` {options.start_offset:g} is past the end: the recording has "
+                f"{(self.end_ns - self.start_ns) / NS:.3f} s."
+            )
+        ends = []
+        if options.duration is not None:
+            ends.append(self.play_from + round(options.duration * NS))
+        if options.until_sec is not None and options.until_sec >= 0:
+            ends.append(round(options.until_sec * NS))
+        if options.until_nsec is not None and options.until_nsec >= 0:
+            ends.append(options.until_nsec)
+        self.play_until = min(max(ends, default=self.end_ns), self.end_ns)
 
     def play(
         self, start_ns: int, *, is_late: IsLate, on_ready: Callable[[], None]
@@ -253,15 +267,13 @@ class _Part:
         channels: Those that are published.
     """
 
-    def __init__(
-        self, dataset: Dataset, options: PlayOptions, wanted: Wanted, world: World
-    ) -> None:
+    def __init__(self, dataset: Dataset, options: PlayOptions, world: World) -> None:
         self._dataset = dataset
-        self._topics = {item.topic for item in dataset.channels if wanted(item.topic)}
+        self._topics = {item.topic for item in dataset.channels if options.wants(item.topic)}
         self.republisher = Republisher(
             dataset,
             world,
-            selected=wanted,
+            selected=options.wants,
             converts_all=True,
             kind=KINDS[options.publish_as] if options.publish_as else None,
             jpeg_quality=options.jpeg_quality,
@@ -320,7 +332,6 @@ class _Part:
 # ---------------------------------------------------------------- stamps
 
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_POSE = 7 * 8  # bytes: a translation and a quaternion of doubles
 _ENCAPSULATION = 4
 
 
@@ -360,7 +371,7 @@ class Restamper:
                 if seconds or nanoseconds:
                     time = self._wall_of(seconds * NS + nanoseconds)
                     stamp.pack_into(made, place, *divmod(time, NS))
-        except struct.error as error:
+        except (struct.error, WireError) as error:
             problem = f"cannot replace the stamp of a message: {error}"
             raise ConversionError(channel.topic, problem) from None
         return memoryview(made)
@@ -384,19 +395,13 @@ def _stamped(channel: Channel) -> str:
 
 def _of_transforms(data: bytearray, order: str, is_ros1: bool) -> Iterator[int]:
     """Where the stamps of transforms are."""
-    number = struct.Struct(f"{order}I")
-
-    def aligned(place: int, size: int) -> int:
-        return place if is_ros1 else place + -(place - _ENCAPSULATION) % size
-
-    place = 0 if is_ros1 else _ENCAPSULATION
-    (count,) = number.unpack_from(data, place)
-    place += 4
-    for _ in range(count):
-        place = aligned(place, 4) + (4 if is_ros1 else 0)
-        yield place
-        place += 8
+    start = 0 if is_ros1 else _ENCAPSULATION
+    reader = PrimitiveReader(memoryview(data), start, order, aligned=not is_ros1)
+    for _ in range(reader.integer("I")):
+        if is_ros1:
+            reader.take("I")  # seq
+        yield reader.align(4)
+        reader.take("I", 2)
         for _name in ("frame_id", "child_frame_id"):
-            place = aligned(place, 4)
-            place += 4 + number.unpack_from(data, place)[0]
-        place = aligned(place, 8) + _POSE
+            reader.raw(reader.integer("I"))
+        reader.take("d", 7)  # a translation and a quaternion

@@ -436,6 +436,10 @@ class Recorder:
         node: Where messages come from; closed when recording ends.
         others: What the recording holds besides messages.
         progress: Called a few times a second.
+
+    Attributes:
+        address: What it is connected to, for display.
+        is_paused: Whether the recording is paused.
     """
 
     def __init__(
@@ -447,6 +451,7 @@ class Recorder:
         others: Sequence[MetadataRecord],
         progress: Callable[[RecordProgress], None] | None,
     ) -> None:
+        self.address = node.address
         self._target = target
         self._options = options
         self._node = node
@@ -456,18 +461,13 @@ class Recorder:
         self._source = Source(node, options, wanted, self._take)
         self._changed = threading.Event()
         self._is_stopped = False
-        self._is_paused = options.start_paused
+        self.is_paused = options.start_paused
         self._is_split_asked = False
         self._splits: list[Split] = []
         self._process = ProcessExecutor(1, nice=_NICE)
         self._jobs = ThreadPoolExecutor(1, "packing")  # waits for the process
         self._counted: dict[str, tuple[float, TopicProgress]] = {}  # when, and what
         self._error: Exception | None = None
-
-    @property
-    def address(self) -> str:
-        """What it is connected to, for display."""
-        return self._node.address
 
     @property
     def received(self) -> int:
@@ -481,22 +481,17 @@ class Recorder:
 
     # ------------------------------------------------------------ controls
 
-    @property
-    def is_paused(self) -> bool:
-        """Whether the recording is paused."""
-        return self._is_paused
-
     def pause(self) -> None:
         """Pause: ignore messages from now on."""
-        self._is_paused = True
+        self.is_paused = True
 
     def resume(self) -> None:
         """Resume after a pause."""
-        self._is_paused = False
+        self.is_paused = False
 
     def toggle_paused(self) -> None:
         """Pause or resume."""
-        self._is_paused = not self._is_paused
+        self.is_paused = not self.is_paused
 
     def split(self) -> None:
         """Start a new dataset, with the next message."""
@@ -557,7 +552,7 @@ class Recorder:
                 if self._options.duration and time.monotonic() - begun >= self._options.duration:
                     self._is_stopped = True
                 state = f"waiting for {clock}" if clock else "recording"
-                self._report(begun, "paused" if self._is_paused else state)
+                self._report(begun, "paused" if self.is_paused else state)
         finally:
             self._source.close()
             self._buffer.close()
@@ -570,7 +565,7 @@ class Recorder:
         return begun
 
     def _take(self, message: Message) -> None:
-        if not self._is_paused:
+        if not self.is_paused:
             self._buffer.put(message)
 
     def _begin_split(self) -> None:
