@@ -18,7 +18,7 @@ from cyclonedds.builtin import (
 )
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.types import (
     array,
     bounded_str,
@@ -38,16 +38,15 @@ from waiting import WATCHDOG_S
 
 
 def raw(kind: Any) -> Any:
-    """A type whose messages keep the bytes that they came as."""
-    parse = kind.deserialize
+    """A type whose messages are the bytes that they came as; `parse` makes one to be published."""
 
-    def deserialize(cls: Any, data: bytes, *args: Any, **options: Any) -> Any:
-        message = parse(data, *args, **options) if cls.is_parsed else cls.__new__(cls)
+    def deserialize(cls: Any, data: bytes, *_: Any, **__: Any) -> Any:
+        message = cls.__new__(cls)
         message.raw = bytes(data)
         return message
 
+    kind.parse = kind.deserialize
     kind.deserialize = classmethod(deserialize)
-    kind.is_parsed = True
     return kind
 
 
@@ -163,9 +162,8 @@ class Peer:
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._subscriptions = BuiltinDataReader(self._participant, BuiltinTopicDcpsSubscription)
 
-    def subscribe(self, topic: str, kind: str, *, parsed: bool = True, **qos: Any) -> bool:
-        """Subscribe with a type that was declared by hand; large ones are slow to parse."""
-        TYPES[kind].is_parsed = parsed
+    def subscribe(self, topic: str, kind: str, **qos: Any) -> bool:
+        """Subscribe with a type that was declared by hand."""
         dds = Topic(self._participant, topic, TYPES[kind])
         self._readers[topic] = DataReader(self._participant, dds, qos=_qos(**qos))
         self._seen[topic] = []
@@ -178,8 +176,7 @@ class Peer:
         while True:
             for sample in reader.take(1000):
                 if sample.sample_info.valid_data:
-                    fields = _plain(sample) if type(sample).is_parsed else None
-                    seen.append([base64.b64encode(sample.raw).decode(), fields])
+                    seen.append(base64.b64encode(sample.raw).decode())
             if len(seen) >= count or time.monotonic() > end:
                 return seen
             time.sleep(0.005)
@@ -215,7 +212,7 @@ class Peer:
             while not self._writers[topic].matched_sub and time.monotonic() < end:
                 time.sleep(0.005)
         writer = self._writers[topic]
-        writer.write(TYPES[kind].deserialize(base64.b64decode(message)))
+        writer.write(TYPES[kind].parse(base64.b64decode(message)))
         return True
 
     def publish_opaque(self, topic: str, typename: str, type_hash: str, message: str) -> bool:
@@ -315,15 +312,6 @@ def _told(endpoint: Any) -> dict[str, Any]:
         "latched": Policy.Durability.TransientLocal in qos,
         "deadline": deadline,
     }
-
-
-def _plain(value: Any) -> Any:
-    """Fields as lists, large arrays by their sum."""
-    if isinstance(value, IdlStruct):
-        return [_plain(getattr(value, name)) for name in type(value).__annotations__]
-    if isinstance(value, (list, tuple, bytes)):
-        return sum(value) if len(value) > 20 else [_plain(item) for item in value]
-    return value
 
 
 def _say(value: Any) -> None:

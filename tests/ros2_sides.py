@@ -81,14 +81,14 @@ def padded(payload: bytes) -> bytes:
     return payload.ljust((len(payload) + 3) // 4 * 4, b"\0")
 
 
-def connect(side: Side, publisher: Any, recorded: Channel, **options: Any) -> None:
+def connect(side: Side, publisher: Any, recorded: Channel) -> None:
     """Subscribe, and send messages until they arrive: from then on each one does.
 
     Two participants of DDS find each other in several steps, and each side knows only its own.
     """
     topic, kind = recorded.topic, recorded.type_name
     publisher.advertise(recorded)
-    side.peer.subscribe(topic, kind, **options)
+    side.peer.subscribe(topic, kind)
     sent: list[bytes] = []
 
     def arrives() -> bool:
@@ -111,10 +111,8 @@ class DdsPeer(Process):
         self.ask("subscribe", f"rt{topic}", kind, **options)
 
     def received(self, topic: str, count: int, seconds: float = WATCHDOG_S) -> list[bytes]:
-        return [base64.b64decode(raw) for raw, _ in self.fields(topic, count, seconds)]
-
-    def fields(self, topic: str, count: int, seconds: float = WATCHDOG_S) -> Any:
-        return self.ask("received", f"rt{topic}", count, seconds)
+        told = self.ask("received", f"rt{topic}", count, seconds)
+        return [base64.b64decode(message) for message in told]
 
     def forget(self, topic: str) -> None:
         self.ask("forget", f"rt{topic}")
@@ -214,3 +212,10 @@ def rclpy_side(monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
 
 
 SIDES = {"dds": dds_side, "rclpy": rclpy_side}
+
+
+@pytest.fixture(params=SIDES)
+def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
+    """Each of them."""
+    with SIDES[request.param](monkeypatch) as found:
+        yield found

@@ -9,7 +9,7 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,24 +18,10 @@ import pytest
 
 from mp4ds.cli.nodes import Keyboard, keys_in
 from mp4ds.cli.play import player_keys
+from ros2_sides import Controls
 from waiting import until
 
 ESC = b"\x1b"
-
-
-class RecordedControls:
-    """A player that keeps what it was asked for."""
-
-    def __init__(self) -> None:
-        self.rate = 1.0
-        self.calls: list[str] = []
-
-    def set_rate(self, rate: float) -> None:
-        self.calls.append("set_rate")
-        self.rate = rate
-
-    def __getattr__(self, name: str) -> Callable[[], None]:
-        return lambda: self.calls.append(name)
 
 
 @dataclass
@@ -68,40 +54,39 @@ def terminal() -> Iterator[Terminal]:
 # ---------------------------------------------------------------- keys
 
 
-KEYS = {
-    "space": (b" ", "toggle_paused", 1.0),
-    "right": (ESC + b"[C", "play_next", 1.0),
-    "right-application": (ESC + b"OC", "play_next", 1.0),
-    "s": (b"s", "play_next", 1.0),
-    "left": (ESC + b"[D", "step_back", 1.0),
-    "b": (b"b", "step_back", 1.0),
-    "up": (ESC + b"[A", "set_rate", 1.1),
-    "down": (ESC + b"[B", "set_rate", 0.909090909),
-    "t": (b"t", "toggle_topic_pauses", 1.0),
+KEYS: dict[str, tuple[bytes, tuple[Any, ...]]] = {
+    "space": (b" ", ("toggle_paused",)),
+    "right": (ESC + b"[C", ("play_next",)),
+    "right-application": (ESC + b"OC", ("play_next",)),
+    "s": (b"s", ("play_next",)),
+    "left": (ESC + b"[D", ("step_back",)),
+    "b": (b"b", ("step_back",)),
+    "up": (ESC + b"[A", ("set_rate", 2.75)),
+    "down": (ESC + b"[B", ("set_rate", 2.27272727)),
+    "t": (b"t", ("toggle_topic_pauses",)),
 }
 
 
 @pytest.mark.parametrize("name", KEYS)
 def test_each_key(name: str, terminal: Terminal) -> None:
-    typed, call, rate = KEYS[name]
-    controls = RecordedControls()
+    typed, asked = KEYS[name]
+    controls = Controls()
     with Keyboard(player_keys(controls), fd=terminal.fd):
         terminal.type(typed)
-        until(lambda: bool(controls.calls))
-    assert controls.calls == [call]
-    assert controls.rate == rate
+        until(lambda: bool(controls.asked))
+    assert controls.asked == [asked]
 
 
 def test_a_key_that_comes_byte_by_byte(terminal: Terminal) -> None:
-    typed, call, _ = KEYS["right"]
-    controls = RecordedControls()
+    typed, asked = KEYS["right"]
+    controls = Controls()
     with Keyboard(player_keys(controls), fd=terminal.fd):
         for n in range(len(typed)):
-            assert not controls.calls
+            assert not controls.asked
             terminal.type(typed[n : n + 1])
             time.sleep(0.03)
-        until(lambda: bool(controls.calls))
-    assert controls.calls == [call]
+        until(lambda: bool(controls.asked))
+    assert controls.asked == [asked]
 
 
 def test_keys_of_one_piece() -> None:
@@ -115,7 +100,7 @@ def test_keys_of_one_piece() -> None:
 def test_the_terminal_is_as_it_was_after_the_end(terminal: Terminal) -> None:
     before = terminal.attributes
     handlers = {n: signal.getsignal(n) for n in signal.valid_signals()}
-    with Keyboard(player_keys(RecordedControls()), fd=terminal.fd):
+    with Keyboard(player_keys(Controls()), fd=terminal.fd):
         assert terminal.gives_keys
         assert terminal.attributes[3] & termios.ISIG
     assert terminal.attributes == before
@@ -124,7 +109,7 @@ def test_the_terminal_is_as_it_was_after_the_end(terminal: Terminal) -> None:
 
 
 def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
-    controls = RecordedControls()
+    controls = Controls()
     reading, writing = os.pipe()
     os.write(writing, b"  ")
     with Keyboard(player_keys(controls), fd=reading):
@@ -133,26 +118,18 @@ def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
     assert os.read(reading, 10) == b"  "
     os.close(reading)
     os.close(writing)
-    assert not controls.calls
+    assert not controls.asked
 
 
 # ---------------------------------------------------------------- signals, in a session of its own
 
 
 PLAYER = """
-import sys, time
+import time
 from mp4ds.cli.nodes import Keyboard
-from mp4ds.cli.play import player_keys
 from mp4ds.cli.process import prepare_process
-class Player:
-    rate = 1.0
-    def toggle_paused(self): print("toggled", flush=True)
-    def play_next(self): return True
-    def toggle_topic_pauses(self): pass
-    def step_back(self): return True
-    def set_rate(self, rate): return True
 prepare_process()
-with Keyboard(player_keys(Player())):
+with Keyboard({" ": lambda: print("toggled", flush=True)}):
     print("entered", flush=True)
     while True:
         time.sleep(0.05)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,6 @@ from player_scenes import (
     static_transform,
     text,
 )
-from ros2_sides import SIDES, Side, padded
 
 STRING = "std_msgs/msg/String"
 
@@ -87,21 +85,3 @@ def test_as_many_are_offered_as_all_publishers_kept(channel: Channel, depth: int
     if depth < 100:
         messages = [text(f"{n}") for n in range(depth + 5)]
         assert late(channel, *messages) == messages[5:]
-
-
-@pytest.fixture(params=SIDES)
-def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
-    with SIDES[request.param](monkeypatch) as found:
-        yield found
-
-
-def test_late_subscribers_of_ros2_get_all_static_transforms(side: Side) -> None:
-    recorded = static_channel(1, 1, 1, 1)
-    sent = [static_transform(child) for child in STATIC]
-    with side.open() as publisher:
-        publisher.advertise(recorded)
-        for payload in sent:
-            publisher.publish(recorded, payload, 0)
-        side.peer.subscribe("/tf_static", recorded.type_name, latched=True)
-        got = side.peer.received("/tf_static", len(sent))
-    assert [padded(payload) for payload in got] == [padded(payload) for payload in sent]

@@ -6,8 +6,7 @@ import json
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,18 +18,13 @@ from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.errors import ConversionError, OptionError, Refused, RemoteError
 from mp4ds.plugins.playing.player import player_services
 from mp4ds.plugins.ros.node import NodeNames
-from mp4ds.plugins.ros.qos import Qos, load_overrides, offered_qos, recorded_qos
+from mp4ds.plugins.ros.qos import Qos, load_overrides, offered_qos, qos_text, recorded_qos
 from mp4ds.records import Channel, Schema
-from ros2_sides import KINDS, SIDES, STORE, Controls, Side, channel, connect, message, padded
+from ros2_sides import KINDS, STORE, Controls, Side, channel, connect, message, padded
+from ros2_sides import side as side
 from waiting import WATCHDOG_S, until
 
 STRING = "std_msgs/msg/String"
-
-
-@pytest.fixture(params=SIDES)
-def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
-    with SIDES[request.param](monkeypatch) as found:
-        yield found
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -328,26 +322,13 @@ def test_rclpy_reads_a_big_endian_clock(bus: fake_rclpy.Bus) -> None:
 
 
 def test_rclpy_gets_the_whole_quality_of_service(bus: fake_rclpy.Bus) -> None:
-    qos = Qos(
-        history="keep_all",
-        depth=4,
-        reliability="best_effort",
-        durability="transient_local",
-        deadline=1,
-        lifespan=2,
-        liveliness="manual_by_topic",
-        liveliness_lease_duration=3,
-        avoid_ros_namespace_conventions=True,
-    )
-    with Side(None).open(overrides={"/x": qos}) as publisher:
+    with Side(None).open(overrides={"/x": WHOLE}) as publisher:
         publisher.advertise(channel("/x", STRING))
         got = bus.publishers[0].qos
-    assert (got.history.name, got.depth) == ("KEEP_ALL", 4)
-    assert (got.reliability.name, got.durability.name) == ("BEST_EFFORT", "TRANSIENT_LOCAL")
-    assert (got.deadline.nanoseconds, got.lifespan.nanoseconds) == (1, 2)
-    assert got.liveliness.name == "MANUAL_BY_TOPIC"
-    assert got.liveliness_lease_duration.nanoseconds == 3
-    assert got.avoid_ros_namespace_conventions
+    for policy, value in asdict(WHOLE).items():
+        found = getattr(got, policy)
+        found = getattr(found, "nanoseconds", getattr(found, "name", found))
+        assert found == (value.upper() if isinstance(value, str) else value), policy
 
 
 def test_rclpy_passes_messages_on_as_they_are(bus: fake_rclpy.Bus) -> None:
@@ -413,32 +394,32 @@ def profile(style: str, infinity: dict[str, int], **other: Any) -> str:
     return "-" + "\n".join(lines)[1:]
 
 
+WHOLE = Qos(
+    history="keep_all",
+    depth=4,
+    reliability="best_effort",
+    durability="transient_local",
+    deadline=1_000_000_005,
+    lifespan=7,
+    liveliness="manual_by_topic",
+    liveliness_lease_duration=3_000_000_000,
+    avoid_ros_namespace_conventions=True,
+)
+"""Every policy differs from the default."""
+
+
+def test_profiles_are_written_as_rosbag2_does() -> None:
+    profiles = [replace(WHOLE, history="keep_last"), replace(WHOLE, depth=10), Qos()]
+    text = qos_text(profiles)
+    assert [*recorded_qos(text)] == profiles
+    assert "sec: 9223372036\n    nsec: 854775807" in text
+    assert "history: keep_last\n  depth: 4\n  reliability: best_effort" in text
+
+
 @pytest.mark.parametrize("style", ["numbers", "names"])
 @pytest.mark.parametrize("infinity", [*INFINITE, {"sec": 0, "nsec": 0}])
 def test_recorded_profiles_are_read(style: str, infinity: dict[str, int]) -> None:
     assert recorded_qos(profile(style, infinity)) == (Qos(reliability="best_effort"),)
-
-
-def test_policies_with_a_limit_are_read() -> None:
-    text = profile(
-        "names",
-        INFINITE[0],
-        deadline={"sec": 1, "nsec": 5},
-        lifespan={"sec": 0, "nsec": 7},
-        liveliness="manual_by_topic",
-        liveliness_lease_duration={"sec": 3, "nsec": 0},
-        avoid_ros_namespace_conventions="true",
-    )
-    assert recorded_qos(text) == (
-        Qos(
-            reliability="best_effort",
-            deadline=1_000_000_005,
-            lifespan=7,
-            liveliness="manual_by_topic",
-            liveliness_lease_duration=3_000_000_000,
-            avoid_ros_namespace_conventions=True,
-        ),
-    )
 
 
 @pytest.mark.parametrize(
@@ -477,11 +458,6 @@ def test_the_player_offers_what_all_recorded_publishers_did(
     assert offered_qos(recorded, {}) == expected
     assert offered_qos(recorded, {"/other": Qos(depth=7)}) == expected
     assert offered_qos(recorded, {"/x": Qos(depth=7)}) == Qos(depth=7)
-
-
-def test_latching_of_ros1_is_kept() -> None:
-    expected = replace(Qos(), depth=1, durability="transient_local")
-    assert offered_qos(channel("/x", STRING, qos=LATCHED_QOS), {}) == expected
 
 
 def test_overrides_are_read(tmp_path: Path) -> None:

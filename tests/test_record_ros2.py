@@ -22,10 +22,11 @@ from mp4ds.errors import OptionError
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.record import Source, open_recorder, recorder_services
 from mp4ds.plugins.ros.node import Node, NodeNames, open_node
-from mp4ds.plugins.ros.qos import Qos, asked_qos, qos_text, recorded_qos
+from mp4ds.plugins.ros.qos import Qos, asked_qos, recorded_qos
 from mp4ds.plugins.ros.ros2 import installed_definition, is_hidden, standard_definition
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
 from ros2_sides import SIDES, STORE, Controls, Side, channel, message, padded
+from ros2_sides import side as side
 from scenes import scene
 from waiting import until
 
@@ -37,12 +38,6 @@ from mp4ds.plugins.ros.dds_types import ros_type
 STRING, IMAGE, TF = "std_msgs/msg/String", "sensor_msgs/msg/Image", "tf2_msgs/msg/TFMessage"
 LATCHED = "- {history: 1, depth: 5, reliability: 1, durability: 1}"
 BEST_EFFORT = "- {history: 1, depth: 5, reliability: 2, durability: 2}"
-
-
-@pytest.fixture(params=SIDES)
-def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Side]:
-    with SIDES[request.param](monkeypatch) as found:
-        yield found
 
 
 def receiving(
@@ -164,15 +159,15 @@ def test_a_recording_is_a_rosbag2(
 
 
 def test_ros_renames_topics(side: Side) -> None:
-    """And /clock; the recording has the names that were asked for."""
+    """And /clock, and its own services; the recording has the names that were asked for."""
     names = NodeNames("bag", "/robot", (("name", "/front/name"), ("/clock", "/sim")))
     found, clock = channel("/front/name", STRING), 1_700_000_000 * 10**9
-    heard = Heard()
+    heard, controls = Heard(), Controls()
     with side.open(names=names) as publisher:
         publisher.advertise(found)
         publisher.clock(clock)
         node = side.open("rosbag2_recorder", names=names)
-        node.serve(recorder_services(Controls()))
+        node.serve(recorder_services(controls))
         source = receiving(heard.take, "name", node=node, use_sim_time=True, names=names)
         source.start()
 
@@ -182,9 +177,15 @@ def test_ros_renames_topics(side: Side) -> None:
             return any(log == clock for _, log in heard.times)
 
         until(arrives)
-        asked = side.peer.call("/robot/bag/is_paused", "IsPaused", {})
+
+        def call(name: str) -> dict[str, Any]:
+            kind = "".join(map(str.capitalize, name.split("_")))
+            return side.peer.call(f"/robot/bag/{name}", kind, {})
+
+        assert call("is_paused") == {"paused": True}
+        assert [*map(call, ("pause", "resume", "split_bagfile", "stop"))] == [{}] * 4
         source.close()
-    assert asked == {"paused": True}
+    assert controls.asked == [("pause",), ("resume",), ("split",), ("stop",)]
     assert {*heard.payloads} == {*source.topics} == {"/robot/name"}
     assert ("bag" in node.address) != node.address.endswith("(Cyclone DDS)")
 
@@ -230,21 +231,6 @@ def test_the_clock_is_recorded_by_itself(side: Side) -> None:
 
         until(arrives)
     assert {log for _, log in heard.times} <= {*range(clock, clock + 5)}
-
-
-def test_services(side: Side) -> None:
-    """Those of rosbag2's recorder."""
-    controls = Controls()
-    with side.open("rosbag2_recorder") as node:
-        node.serve(recorder_services(controls))
-
-        def call(name: str) -> dict[str, Any]:
-            kind = "".join(map(str.capitalize, name.split("_")))
-            return side.peer.call(f"/rosbag2_recorder/{name}", kind, {})
-
-        assert call("is_paused") == {"paused": True}
-        assert [*map(call, ("pause", "resume", "split_bagfile", "stop"))] == [{}] * 4
-    assert controls.asked == [("pause",), ("resume",), ("split",), ("stop",)]
 
 
 def test_a_message_that_cannot_be_taken(side: Side) -> None:
@@ -409,14 +395,6 @@ def test_a_definition_that_a_node_describes(
 
 
 # ---------------------------------------------------------------- without a network
-
-
-def test_qos_as_rosbag2_writes_it() -> None:
-    profiles = [Qos(depth=3, durability="transient_local", deadline=1_500_000_000), Qos()]
-    assert [*recorded_qos(qos_text(profiles))] == profiles
-    text = qos_text(profiles)
-    assert "sec: 9223372036\n    nsec: 854775807" in text
-    assert "history: keep_last\n  depth: 3\n  reliability: reliable" in text
 
 
 def test_qos_that_hears_all_publishers() -> None:
