@@ -23,12 +23,7 @@ from mp4ds.bags import protocols
 from mp4ds.bags.formats import MultiReader, open_reader, open_sources
 from mp4ds.bags.mcap import McapReader
 from mp4ds.errors import SourceError
-from mp4ds.records import (
-    EVERYTHING,
-    Excerpt,
-    Message,
-    Record,
-)
+from mp4ds.records import EVERYTHING, Excerpt, Message, Record
 from sources import PERIOD, SOURCES, START, Scene, scene, write_bag, write_mcap, write_rosbag2
 from test_bags_ros1 import REAL_BAGS
 

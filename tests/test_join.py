@@ -234,22 +234,6 @@ def test_parts_that_end_at_key_frames_give_the_uncut_file(
     assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
 
 
-@pytest.mark.one_in(6)
-@every_kind
-def test_pyav_seeks_across_the_seams(kind: Kind, joined: Joined) -> None:
-    target, _, _ = joined(kind)
-    with av.open(str(target)) as container:
-        stream = container.streams.video[0]
-        assert stream.start_time == 0
-        order = [*range(TOTAL), *reversed(range(TOTAL))]
-        for number in order:
-            container.seek(number * STEP, stream=stream)
-            times = [frame.pts for frame in container.decode(stream)]
-            begin = next(begin for begin, end in edges() if begin <= number < end)
-            assert times[0] == (begin + (number - begin) // GOP * GOP) * STEP
-            assert times == list(range(times[0], TOTAL * STEP, STEP))
-
-
 @pytest.mark.one_in(18)
 @pytest.mark.parametrize("kind", KINDS, ids=IDS)
 @pytest.mark.parametrize("size", [(640, 360), (1920, 1200)])

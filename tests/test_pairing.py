@@ -9,8 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from conftest import real
-from mp4ds.bags.formats import open_reader
 from mp4ds.errors import OptionError
 from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, ImageFields, Parts
 from mp4ds.packing.calibrations import (
@@ -439,33 +437,3 @@ def test_too_many_channels_are_not_compared() -> None:
         images = [eye(own, f"/eye{n}") for n, own in enumerate(stamps)]
         infos = [eye_info(own, f"/info{n}") for n, own in enumerate(stamps)]
         assert len(paired(*images, *infos)) == count
-
-
-# ---------------------------------------------------------------- real recordings
-
-REAL: list[tuple[str, dict[str, str]]] = [
-    (
-        "bags/fiducials_aruco_marker_raspicam.bag",
-        {"/raspicam_node/camera_info": "/raspicam_node/image/compressed"},
-    ),
-    (
-        "bags/librealsense_depth_color.bag",
-        {
-            f"/device_0/{name}/info/camera_info": f"/device_0/{name}/image/data"
-            for name in ("sensor_0/Depth_0", "sensor_1/Color_0")
-        },
-    ),
-    ("bags/ecto_ros_camera_info.bag", {}),
-    (
-        "rosbag2/geocamxyz_test_bag_sqlite3",
-        {"/test/sensor_msgs/camera_info": "/test/sensor_msgs/image"},
-    ),
-]
-
-
-@pytest.mark.parametrize(("name", "pairs"), REAL)
-def test_real_recordings_by_name(name: str, pairs: dict[str, str]) -> None:
-    with open_reader(real(name)) as reader:
-        topics = {own.id: own.topic for own in reader.channels}
-        found = pair_camera_infos(reader.channels)
-    assert {topics[i]: topics[j] for i, j in found.items()} == pairs
