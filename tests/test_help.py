@@ -50,12 +50,6 @@ def test_usage_tells_what_may_be_left_out(command: str, usage: str, needed: bool
         assert (done.exit_code, f"Missing argument '{usage}'" in done.stderr) == (2, True)
 
 
-def test_images_have_no_options_of_damage_or_shares() -> None:
-    done = CliRunner().invoke(commands, ["import", "images", "--help"])
-    assert "--keep-going" in done.stdout
-    assert not re.search("--(salvage|join|shard|camera-info)", done.stdout)
-
-
 def test_sentences_are_whole(tmp_path: Path) -> None:
     text = " ".join(run("--help", folder=tmp_path).out.split())
     assert all(does in text for _, does in COMMANDS.values())

@@ -72,14 +72,23 @@ def load(text: str) -> Any:
 # ---------------------------------------------------------------- round trip
 
 
+def load_back(document: dict[str, Any]) -> dict[str, Any]:
+    return yamlio.load(yamlio.dump(document, comment="A comment."), "some.yaml")
+
+
 @steady
 @given(Documents)
 def test_any_document_returns(document: dict[str, Any]) -> None:
+    """Also by PyYAML, a reader of YAML 1.1, which takes more words for something else."""
     assert same(load_back(document), document)
-
-
-def load_back(document: dict[str, Any]) -> dict[str, Any]:
-    return yamlio.load(yamlio.dump(document, comment="A comment."), "some.yaml")
+    document = {"mp4ds": "1.0", **document}
+    document.pop("checksum", None)
+    data = yamlio.dump(document)
+    read = yaml.safe_load(data)
+    body = data[: data.rindex(b"checksum")]  # the last line is that of all before
+    assert data == body + f'checksum: "xxh64:{xxhash.xxh64(body).hexdigest()}"\n'.encode()
+    assert read.pop("checksum").startswith("xxh64:")
+    assert same(read, document)
 
 
 @pytest.mark.parametrize("place", ["value", "key", "item", "deep", "beside"])
@@ -98,25 +107,6 @@ def test_nasty_strings_return_everywhere(place: str) -> None:
             },
         }[place]
         assert same(load_back(document), document)
-
-
-@steady
-@given(Documents)
-def test_other_readers_read_the_same(document: dict[str, Any]) -> None:
-    """PyYAML is a reader of YAML 1.1, which takes more words for something else."""
-    document = {"mp4ds": "1.0", **document}
-    document.pop("checksum", None)
-    read = yaml.safe_load(yamlio.dump(document))
-    assert read.pop("checksum").startswith("xxh64:")
-    assert same(read, document)
-
-
-@steady
-@given(Documents)
-def test_the_last_line_is_the_checksum_of_all_before(document: dict[str, Any]) -> None:
-    body, last = yamlio.dump(document).removesuffix(b"\n").rsplit(b"\n", 1)
-    digest = xxhash.xxh64(body + b"\n").hexdigest()
-    assert last == f'checksum: "xxh64:{digest}"'.encode()
 
 
 @steady
@@ -204,10 +194,8 @@ def test_plain_scalars(text: str, value: Any) -> None:
     ("text", "words"),
     [
         ("a: &x 1\nb: *x\n", "anchors"),
-        ("a: &x {b: 1}\n", "anchors"),
         ("a: *x\n", "anchors"),
         ("a: !!str 1\n", "tags"),
-        ("a: !x 1\n", "tags"),
         ("a: ! 1\n", "tags"),
         ("a: !!python/object/apply:os.system [x]\n", "tags"),
         ("!!map {a: 1}\n", "tags"),
@@ -225,14 +213,8 @@ def test_plain_scalars(text: str, value: Any) -> None:
         ("# nothing\n", "no document"),
         ("a: 1e999\n", "finite"),
         ("a: " + "9" * 5000 + "\n", "integer"),
-        (
-            "a: [1\n",
-            "is not valid YAML of the subset, perhaps cut short: line 2: did not find expected",
-        ),
-        (
-            "a: 'b\n",
-            "is not valid YAML of the subset, perhaps cut short: line 2: found unexpected end",
-        ),
+        ("a: [1\n", "subset, perhaps cut short: line 2: did not find expected"),
+        ("a: 'b\n", "subset, perhaps cut short: line 2: found unexpected end"),
         ("a: \x00\n", "not valid"),
         ("a:\n\t- b\n", "not valid"),
         ("[" * 100_000, "nest"),  # PyYAML may refuse it itself, before it gives us 32 levels
