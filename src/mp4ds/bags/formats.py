@@ -183,7 +183,6 @@ def open_writer(
         storage: ``sqlite3`` or ``mcap``, for ``rosbag2``.
 
     Raises:
-        OptionError: The target is unknown.
         OSError: It cannot be written.
     """
     options: Mapping[str, Mapping[str, str]] = {
@@ -191,8 +190,6 @@ def open_writer(
         "rosbag2": {"storage": storage, "name": name},
         "mcap": {"profile": profile, "library": library},
     }
-    if target not in options:
-        raise OptionError(f"`to` {target!r} is not known. Use bag, rosbag2, mcap or images.")
     writer: BagWriter = _class(_CLASSES[target][_WRITER])(path, **options[target])
     return writer
 

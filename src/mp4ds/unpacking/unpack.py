@@ -45,8 +45,9 @@ from mp4ds.unpacking.image_folders import TopicImages, image_names
 from mp4ds.unpacking.pictures import KINDS, ReductionOptions
 from mp4ds.unpacking.republish import Republished, Republisher, check_kind
 
-TARGETS = ("bag", "rosbag2", "mcap", "images")
-_SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
+SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
+"""How the default name of an output ends, by what it is unpacked to."""
+
 _WORLDS = {"bag": "ros1", "rosbag2": "ros2"}
 _OURS = "mp4ds:"  # metadata records in which a dataset keeps the contents of a rosbag2 folder
 
@@ -293,7 +294,7 @@ def unpack_each(
     for dataset in datasets_in(datasets):
         kind = to or _own_format(dataset, options or UnpackOptions())
         stem = dataset.name if dataset.is_dir() else dataset.stem
-        outputs[dataset] = location(folder) / f"{stem}{_SUFFIXES[kind]}" if folder else None
+        outputs[dataset] = location(folder) / f"{stem}{SUFFIXES[kind]}" if folder else None
     named = [output for output in outputs.values() if output is not None]
     twice = [output for output, count in Counter(named).items() if count > 1]
     if twice:
@@ -323,7 +324,7 @@ def _unpack_one(
 def _format_of(output: Path | str | None) -> str | None:
     """The format that the name of an output has as its suffix."""
     suffix = PurePath(output).suffix if output else ""
-    return next((to for to, its_own in _SUFFIXES.items() if its_own and its_own == suffix), None)
+    return next((to for to, its_own in SUFFIXES.items() if its_own and its_own == suffix), None)
 
 
 def _own_format(dataset: Path | str, options: UnpackOptions) -> str:
@@ -338,8 +339,8 @@ def _check(to: str, options: UnpackOptions) -> None:
     Raises:
         OptionError: Says which, and lists the valid ones.
     """
-    if to not in TARGETS:
-        raise OptionError(f"`to` {to!r} is not known. Use {', '.join(TARGETS)}.")
+    if to not in SUFFIXES:
+        raise OptionError(f"`to` {to!r} is not known. Use {', '.join(SUFFIXES)}.")
     if options.storage and to != "rosbag2":
         raise OptionError(f"`storage` works with `to` rosbag2, not with `to` {to}.")
     if options.images and to == "images":
@@ -355,9 +356,9 @@ def default_output(dataset: Path, to: str) -> Path:
     """The default output for a dataset: next to it, never the source's own name."""
     if remote(dataset):
         stem = dataset.name if dataset.is_dir() else dataset.stem
-        return Path(f"{stem}_unpacked{_SUFFIXES[to]}")
+        return Path(f"{stem}_unpacked{SUFFIXES[to]}")
     stem = dataset.resolve().name if dataset.is_dir() else dataset.stem
-    return dataset.resolve().parent / f"{stem}_unpacked{_SUFFIXES[to]}"
+    return dataset.resolve().parent / f"{stem}_unpacked{SUFFIXES[to]}"
 
 
 def _unpack_to_store(
