@@ -20,7 +20,7 @@ from mp4ds.errors import OptionError, SourceError, counted, path_text, size_text
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
-from mp4ds.options import HOW, SliceOptions, iso_text
+from mp4ds.options import HOW, SliceOptions
 from mp4ds.plugins import info as facts
 from mp4ds.processes import each
 
@@ -175,16 +175,9 @@ def _print_overview(rows: Sequence[facts.Brief]) -> None:
     table = []
     for row in rows:
         name = os.path.relpath(str(row.path), base) if base else str(row.path)
-        table.append(line(name, [row], _moment(row.start), row.profile))
+        table.append(line(name, [row], row.begins, row.profile))
     table.append(line(f"{len(rows)} datasets", rows, "", ""))
     print_table(table, _TEXTS, spare=("profile", "messages", "cameras", "begins"))
-
-
-def _moment(time_ns: int | None) -> str:
-    """A time in UTC; empty if there is none."""
-    if time_ns is None:
-        return ""
-    return iso_text(time_ns - time_ns % 10**9)
 
 
 def _print_info(result: facts.Info) -> None:

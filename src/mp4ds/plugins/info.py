@@ -30,7 +30,7 @@ from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, names_dataset
 from mp4ds.messages.serializations import MessageSplitter, is_calibration, is_camera, kind_of
 from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.messages.wire import CalibrationFields, CodedFields, ImageFields
-from mp4ds.options import WHOLE, Slice
+from mp4ds.options import WHOLE, Slice, iso_text
 from mp4ds.packing.calibrations import StampPairing, pair_camera_infos
 from mp4ds.packing.inspection import MessageInspector
 from mp4ds.packing.planning import open_recording
@@ -362,6 +362,11 @@ class Brief:
     def seconds(self) -> float:
         """From the first message to the last."""
         return 0.0 if self.start is None or self.end is None else (self.end - self.start) / 1e9
+
+    @property
+    def begins(self) -> str:
+        """Date and time of the first message, UTC, to the second; empty without messages."""
+        return "" if self.start is None else iso_text(self.start - self.start % 10**9)
 
 
 def brief(path: Path) -> Brief:

@@ -11,12 +11,13 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
+from string import Template
 from typing import Any
 from urllib.parse import quote
 
@@ -47,7 +48,7 @@ from mp4ds.files.outputs import (
 from mp4ds.files.urls import remote
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.options import WHERE, Options, force, iso_text, option
+from mp4ds.options import WHERE, Options, force, option
 from mp4ds.plugins.info import Brief, brief, notes_of, topics_of
 from mp4ds.plugins.reporting.cameras import ReportedCamera, axis_of, untimed
 from mp4ds.plugins.reporting.proxies import (
@@ -530,7 +531,13 @@ def reports(
                 problems += wrong
                 rows.append(_row(path, known, number, place, made))
             write_listing(made)
-        page = _page(html.escape(place.name), _facts(found, problems), rows)
+        shown = [
+            counted(len(found), "dataset"),
+            *(f"not shown: {html.escape(problem)}" for problem in problems),
+        ]
+        page = Template((_PAGE / "overview.html").read_text(encoding="utf-8")).substitute(
+            title=html.escape(place.name), facts="<br>".join(shown), rows="\n".join(rows)
+        )
         write_synced(place / _INDEX, page.encode())
     except OSError as error:
         raise as_write_error(error, place) from error
@@ -559,19 +566,6 @@ def _shown(
     return known, problems
 
 
-def _page(title: str, facts: str, rows: Sequence[str]) -> str:
-    page = (_PAGE / "overview.html").read_text(encoding="utf-8")
-    for name, text in (("title", title), ("facts", facts), ("rows", "\n".join(rows))):
-        page = page.replace(f"<!--{name}-->", text)
-    return page
-
-
-def _facts(found: Sequence[Path], problems: Sequence[str]) -> str:
-    known = [counted(len(found), "dataset")]
-    known += [f"not shown: {html.escape(problem)}" for problem in problems]
-    return "<br>".join(known)
-
-
 def _row(path: Path, known: Brief | None, number: int, place: Path, made: Path) -> str:
     link = quote(Path(os.path.relpath(path / _INDEX, place)).as_posix())
     name = html.escape(os.path.relpath(path, place))
@@ -582,9 +576,8 @@ def _row(path: Path, known: Brief | None, number: int, place: Path, made: Path) 
     if known is not None:
         if known.title:
             name += f"<br><span class=muted>{html.escape(known.title)}</span>"
-        start = known.start
         cells = [
-            "" if start is None else iso_text(start - start % 10**9).replace("T", " ").rstrip("Z"),
+            known.begins.replace("T", " ").rstrip("Z"),
             f"{known.seconds:.1f} s",
             "<br>".join(f"{html.escape(t)}: {n}" for t, n in sorted(known.frames.items())),
             f"{known.bytes / 1e6:.1f} MB",
