@@ -34,14 +34,20 @@ _COLUMN_LINE = re.compile(r"^ *values: [|]", re.MULTILINE)
 _Parser: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _BaseDumper: type[Any] = yaml.SafeDumper
 _NUMBER = re.compile(r"[-+]?(?:0|[1-9][0-9]*)(\.[0-9]+)?([eE][-+]?[0-9]+)?")
-_WORDS = {"": None, "null": None, "~": None, "true": True, "false": False}
+WORDS = {"": None, "null": None, "~": None, "true": True, "false": False}
+"""Plain scalars that are no strings."""
 
 
-class _Dumper(_BaseDumper):  # type: ignore[misc]
-    """Writes the subset: lists indented, multi-line texts as literal blocks."""
+class PlainDumper(_BaseDumper):  # type: ignore[misc]
+    """Writes no anchors."""
 
     def ignore_aliases(self, data: Any) -> bool:
+        """Whether a value is written again where it repeats: any."""
         return True
+
+
+class _Dumper(PlainDumper):
+    """Writes the subset: lists indented, multi-line texts as literal blocks."""
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> Any:
         return super().increase_indent(flow, False)
@@ -283,8 +289,8 @@ def _scalar(event: Any) -> Any:
     text: str = event.value
     if event.style not in (None, ""):
         return text
-    if text in _WORDS:
-        return _WORDS[text]
+    if text in WORDS:
+        return WORDS[text]
     number = _NUMBER.fullmatch(text)
     if not number:
         return text

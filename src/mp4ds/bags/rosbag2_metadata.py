@@ -32,14 +32,11 @@ MCAP_RECORD = "rosbag2"
 _TOP_KEY = "rosbag2_bagfile_information"
 _MAX_BYTES = 64 * 2**20
 _STORAGES = {"db3": "sqlite3", "mcap": "mcap"}
-_BaseDumper: type[Any] = yaml.SafeDumper
 _INTEGER = re.compile(r"-?(?:0|[1-9][0-9]*)")
-_WORDS = {"": None, "null": None, "~": None, "true": True, "false": False}
 
 
-class _Dumper(_BaseDumper):  # type: ignore[misc]
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
+class _Dumper(yamlio.PlainDumper):
+    """Writes texts as rosbag2 does."""
 
 
 def _represent_str(dumper: _Dumper, text: str) -> Any:
@@ -200,8 +197,8 @@ def _scalar(event: Any) -> Any:
     text: str = event.value
     if event.style not in (None, ""):
         return text
-    if text in _WORDS:
-        return _WORDS[text]
+    if text in yamlio.WORDS:
+        return yamlio.WORDS[text]
     return int(text) if _INTEGER.fullmatch(text) else text
 
 

@@ -43,16 +43,7 @@ class Draft:
         if len(topics) > MAX_LOST_TOPICS:
             more = len(topics) - MAX_LOST_TOPICS + 1
             topics = [*topics[: MAX_LOST_TOPICS - 1], f"... and {more} more"]
-        return Loss(
-            file,
-            self.offset,
-            self.size,
-            self.problem,
-            self.messages,
-            tuple(topics),
-            self.start,
-            self.end,
-        )
+        return Loss(file, **{**vars(self), "topics": tuple(topics)})
 
 
 class LossLog:
@@ -65,7 +56,7 @@ class LossLog:
     def __init__(self, file: str) -> None:
         self._file = file
         self._drafts: list[Draft] = []
-        self._more: list[Draft] = []  # the sum of all further ones: none or one
+        self._more = Draft(None, 0, "")  # the sum of all further ones
         self._number_more = 0
         self._kinds: dict[Hashable, Draft] = {}
         self._last_time: int | None = None
@@ -87,7 +78,7 @@ class LossLog:
         Returns:
             The loss they became part of, to be completed.
         """
-        last = self._drafts[-1] if self._drafts and not self._more else None
+        last = self._drafts[-1] if self._drafts and not self._number_more else None
         if (
             join
             and last is not None
@@ -119,12 +110,9 @@ class LossLog:
 
     def _one_more(self, draft: Draft) -> Draft:
         self._number_more += 1
-        if not self._more:
-            self._more.append(Draft(None, 0, ""))
-        more = self._more[0]
-        more.problem = more_places(self._number_more)
-        more.size = (more.size or 0) + (draft.size or 0)
-        return more
+        self._more.problem = more_places(self._number_more)
+        self._more.size = (self._more.size or 0) + (draft.size or 0)
+        return self._more
 
     def finish(self, messages: int | None = None) -> list[Loss]:
         """The losses.
@@ -133,7 +121,7 @@ class LossLog:
             messages: How many are lost in total, if known. The largest loss without a count then
                 gets the remainder.
         """
-        drafts = [*self._drafts, *self._more]
+        drafts = [*self._drafts, *([self._more] if self._number_more else [])]
         if messages and not drafts:
             drafts = [Draft(None, None, "the file declares more messages than it holds", messages)]
         unknown = [draft for draft in drafts if draft.messages is None]

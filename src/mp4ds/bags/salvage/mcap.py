@@ -29,7 +29,7 @@ from mp4ds.bags.mcap_records import (
     parse,
     unpack_chunk,
 )
-from mp4ds.bags.salvage.scan import BLOCK, FileSalvage, Framing, RecordFrame, Window
+from mp4ds.bags.salvage.scan import BLOCK, FileSalvage, Framing, RecordFrame
 from mp4ds.errors import SourceError
 from mp4ds.records import Attachment, ChannelStats, Message, MetadataRecord
 
@@ -331,15 +331,13 @@ class McapSalvage(FileSalvage):
         self._declared.add_summary(self._summary.schemas, self._summary.channels)
 
     def _read_profile(self) -> None:
-        with Window.of_file(self.path) as window:
-            frame = bytes(window.peek(2**16))
-        if frame[len(MAGIC) : len(MAGIC) + 1] == bytes([Opcode.HEADER]):
-            length = int.from_bytes(frame[9:17], "little")
-            try:
-                header = parse(mcap_records.Header, frame[17 : 17 + length])
-            except DamageError:
-                return
-            self.profile, self.library = header.profile, header.library
+        stream = RecordStream(self.path, BLOCK)
+        with closing(stream), suppress(SourceError, DamageError):
+            stream.seek(len(MAGIC))
+            opcode, body = stream.next()
+            if opcode == Opcode.HEADER:
+                header = parse(mcap_records.Header, body)
+                self.profile, self.library = header.profile, header.library
 
     @property
     def span(self) -> tuple[int, int] | None:

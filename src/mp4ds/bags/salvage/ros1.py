@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -125,7 +125,8 @@ class BagIndex:
 
     Attributes:
         channels: By connection number, in the order of the index.
-        chunks: Byte offsets of the chunks, sorted.
+        infos: Of each chunk, by the byte where it begins, in this order once it is finished: first
+            and last log time in ns, and messages by connection.
         due: Byte where the index should begin according to the bag's header; None if unknown.
         offset: Byte where the index was found.
         later: When the chunks from a byte on begin.
@@ -133,10 +134,9 @@ class BagIndex:
 
     def __init__(self) -> None:
         self.channels: dict[int, Channel] = {}
-        self.chunks: list[int] = []
+        self.infos: dict[int, tuple[tuple[int, int], dict[int, int]]] = {}
         self.due: int | None = None
         self.offset: int | None = None
-        self._infos: dict[int, tuple[int, int, bytes]] = {}
 
     def add(self, frame: RecordFrame, body: bytes) -> None:
         """Add a record of the index."""
@@ -144,7 +144,7 @@ class BagIndex:
         if frame.kind == Op.CHUNK_INFO:
             span = fields.time(b"start_time"), fields.time(b"end_time")
             counts = body[: len(body) // CHUNK_COUNT.size * CHUNK_COUNT.size]
-            self._infos[fields.number(b"chunk_pos", 8)] = (*span, counts)
+            self.infos[fields.number(b"chunk_pos", 8)] = span, dict(CHUNK_COUNT.iter_unpack(counts))
         elif channel := _connection(frame, body):
             self.channels.setdefault(channel.id, channel)
 
@@ -157,38 +157,12 @@ class BagIndex:
         Returns:
             Whether all chunks are listed.
         """
-        is_whole = chunks == len(self._infos) and self.offset is not None
-        if not is_whole:
-            self._infos.clear()
-        self.chunks = sorted(self._infos)
-        places = [chunk for chunk in self.chunks if self._infos[chunk][2]]
-        starts = [self._infos[chunk][0] for chunk in places]
-        self.later = LaterStarts(np.array(places, np.uint64), np.array(starts, np.uint64))
+        is_whole = chunks == len(self.infos) and self.offset is not None
+        self.infos = dict(sorted(self.infos.items())) if is_whole else {}
+        starts = {place: span[0] for place, (span, counts) in self.infos.items() if counts}
+        places = np.array(list(starts), np.uint64)
+        self.later = LaterStarts(places, np.array(list(starts.values()), np.uint64))
         return is_whole
-
-    def counts(self, chunk: int) -> dict[int, int] | None:
-        """Messages by connection in the chunk at a byte; None if it is not listed."""
-        if chunk not in self._infos:
-            return None
-        found: dict[int, int] = {}
-        for connection, count in CHUNK_COUNT.iter_unpack(self._infos[chunk][2]):
-            found[connection] = found.get(connection, 0) + count
-        return found
-
-    def span(self, chunk: int) -> tuple[int, int] | None:
-        """First and last log time of the chunk at a byte, ns; None if it is not listed."""
-        info = self._infos.get(chunk)
-        return (info[0], info[1]) if info else None
-
-    def stats(self, connections: Iterable[int]) -> dict[int, ChannelStats]:
-        """Counts and spans by connection, from the chunks; empty if no chunk is listed."""
-        total = {connection: ChannelStats(0, 0, 0) for connection in connections}
-        for chunk in self.chunks:
-            start, end, _ = self._infos[chunk]
-            for connection, count in (self.counts(chunk) or {}).items():
-                if connection in total and count:
-                    total[connection] = total[connection].plus(ChannelStats(count, start, end))
-        return total if self.chunks else {}
 
 
 def _connection(frame: RecordFrame, body: bytes) -> Channel | None:
@@ -277,16 +251,23 @@ class Ros1Salvage(FileSalvage):
             raise other_format(path, start)
         self._index = read_index(path)
         self._index_offset = self._index.offset
-        self._is_timed = bool(self._index.chunks)
+        self._is_timed = bool(self._index.infos)
         self._channels: dict[int, Channel] = dict(self._index.channels)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the bag's index, including lost messages; otherwise empty."""
-        return self._index.stats(self._channels)
+        if not self._index.infos:
+            return {}
+        total = {connection: ChannelStats(0, 0, 0) for connection in self._channels}
+        for span, counts in self._index.infos.values():
+            for connection, count in counts.items():
+                if connection in total and count:
+                    total[connection] = total[connection].plus(ChannelStats(count, *span))
+        return total
 
     def _scanned(self) -> Iterator[Record | None]:
         """All messages, in the order of the file; None at each chunk."""
-        self._next_listed = 0
+        self._listed_ahead = list(reversed(self._index.infos))
         self._contradicted: set[int] = set()
         self._others: dict[tuple[object, ...], Channel] = {}
         self._begins()
@@ -395,18 +376,17 @@ class Ros1Salvage(FileSalvage):
     def _enter(self, offset: int, end: int) -> None:
         """Begin a chunk that should end at a byte."""
         self._pass_listed(offset)
-        starts = self._index.chunks
-        if self._next_listed < len(starts) and starts[self._next_listed] == offset:
-            self._next_listed += 1
-        self._tally.open(self._index.counts(offset), end, self._index.span(offset))
+        if self._listed_ahead and self._listed_ahead[-1] == offset:
+            self._listed_ahead.pop()
+        span, counts = self._index.infos.get(offset, (None, None))
+        self._tally.open(counts, end, span)
         self._earliest = self._index.later.after(offset - 1)
 
     def _pass_listed(self, end: int) -> None:
         """Record as lost the chunks that the index lists before a byte but that were not found."""
-        starts = self._index.chunks
-        while self._next_listed < len(starts) and starts[self._next_listed] < end:
-            self._tally.extend(self._index.counts(starts[self._next_listed]))
-            self._next_listed += 1
+        while self._listed_ahead and self._listed_ahead[-1] < end:
+            _, counts = self._index.infos[self._listed_ahead.pop()]
+            self._tally.extend(counts)
 
     def _lose(self, offset: int, size: int, problem: str) -> None:
         super()._lose(offset, size, problem)
