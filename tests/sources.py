@@ -23,7 +23,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag1 import Writer as BagWriter
 
 from definitions import IMAGE, INFO, PICTURES
-from pictures import BAYER, COMMON, CONTENTS, ENCODINGS, picture
+from pictures import COMMON, ENCODINGS, picture
 from scenes import (
     PERIOD,
     START,
@@ -41,9 +41,7 @@ from scenes import (
 from source_rosbag2 import qos_text, write_rosbag2
 
 __all__ = [
-    "BAYER",
     "COMMON",
-    "CONTENTS",
     "ENCODINGS",
     "IMAGE",
     "INFO",

@@ -145,17 +145,9 @@ BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "damaged.mcap": (damaged, "is damaged"),
     "other-database": (database, "but not of rosbag2"),
     "empty-folder": (empty_folder, "has no metadata.yaml"),
-    "no-metadata": (
-        folder_of(lambda folder: (folder / "metadata.yaml").unlink()),
-        "ros2 bag reindex",
-    ),
     "split-missing": (
         folder_of(lambda folder: sorted(folder.glob("*.db3"))[1].unlink(), files=3),
         "is missing",
-    ),
-    "metadata-junk": (
-        folder_of(lambda folder: (folder / "metadata.yaml").write_bytes(b"\xff: [")),
-        "metadata.yaml",
     ),
 }
 

@@ -576,7 +576,7 @@ def test_a_folder_without_metadata(storage: str, compression: str | None, tmp_pa
     folder = folder_of(tmp_path, storage=storage, compression=compression, files=3)
     expected = keys(usual(folder))
     (folder / "metadata.yaml").unlink()
-    with pytest.raises(SourceError, match=r"has no metadata.yaml.*--salvage"):
+    with pytest.raises(SourceError, match=r"has no metadata.yaml.*`ros2 bag reindex`.*--salvage"):
         usual(folder)
     records, losses = salvaged(folder)
     assert keys(records) == expected
