@@ -14,8 +14,8 @@ from commands import program, typed
 from mp4ds.cli import COMMANDS, commands
 from mp4ds.plugins.demo import demo
 from sources import SOURCES, scene
-
-ROOT = Path(__file__).parents[1]
+from test_tutorials import ROOT, blocks_of
+from test_tutorials import commands as typed_in
 
 
 def run(*command: object, cwd: Path) -> str:
@@ -81,29 +81,19 @@ def test_quickstart(tmp_path: Path) -> None:
     starts = ("mkdir", "mp4ds", "python tools")
     lines = [line for line in script.splitlines() if line.startswith(starts)]
     assert len(lines) == 6
-    shutil.copytree(ROOT / "tools", tmp_path / "tools", dirs_exist_ok=True)
+    shutil.copytree(ROOT / "tools", tmp_path / "tools")
     script = "work=quickstart\n" + "\n".join(lines)
-    out = run("bash", "-euc", script, cwd=tmp_path)
-    assert "no problems" in out
-    assert out.rstrip().endswith("EQUAL")
-
-
-@pytest.mark.slow
-def test_quickstart_over_what_it_left(tmp_path: Path) -> None:
-    test_quickstart(tmp_path)
-    test_quickstart(tmp_path)
+    for _ in range(2):  # also over what it left
+        out = run("bash", "-euc", script, cwd=tmp_path)
+        assert "no problems" in out
+        assert out.rstrip().endswith("EQUAL")
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/commands.md", "docs/conversions.md"])
 def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> None:
     """Each mp4ds line of its shell blocks, on the demo under the names that the page has."""
-    text = (ROOT / page).read_text()
-    lines = [
-        line.split("#")[0].strip()
-        for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
-        for line in block.splitlines()
-        if line.startswith("mp4ds ")
-    ]
+    text = "".join(block for kind, block in blocks_of(ROOT / page) if kind == "sh")
+    lines = [line for line, _ in typed_in(text) if line.startswith("mp4ds ")]
     assert len(lines) >= 3
     source = SOURCES["rosbag2-mcap-v9"](tmp_path / "source", scene("mono8"))[0]
     shutil.copytree(source, tmp_path / "rosbag2_drive")
@@ -119,8 +109,7 @@ def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> No
 
 
 def test_readme_python(demo_dataset: Path, tmp_path: Path) -> None:
-    readme = (ROOT / "README.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    (code,) = (text for kind, text in blocks_of(ROOT / "README.md") if kind == "python")
     shutil.copytree(demo_dataset, tmp_path / "drive")
     run(sys.executable, "-c", code, cwd=tmp_path)
 

@@ -12,7 +12,6 @@ import contextlib
 import io
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,8 +22,8 @@ import pytest
 from commands import Result, typed
 from mp4ds.cli import commands as command_line
 from ros2_sides import alone_in_ros2
-from test_examples import ROOT
 
+ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted((DOCS / "tutorials").glob("*.md"))
 OTHERS = [DOCS / f"{name}.md" for name in ("exporting", "hub", "report")]
@@ -32,16 +31,9 @@ NEEDS = {"--ros2": "cyclonedds", "mp4ds.torch": "torch"}
 """What a line needs beside the package -> the module of it; the page is skipped without."""
 
 
-@dataclass(frozen=True)
-class Block:
-    """A fenced block of a page."""
-
-    kind: str
-    text: str
-
-
-def blocks_of(page: Path) -> list[Block]:
-    return [Block(*found) for found in re.findall(r"```(\w+)\n(.*?)```", page.read_text(), re.S)]
+def blocks_of(page: Path) -> list[tuple[str, str]]:
+    """Kind and text of each fenced block of a page."""
+    return re.findall(r"```(\w+)\n(.*?)```", page.read_text(), re.S)
 
 
 def commands(text: str) -> Iterator[tuple[str, int]]:
@@ -87,36 +79,36 @@ def test_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.chdir(tmp_path)
     alone_in_ros2(monkeypatch)
     blocks = blocks_of(page)
-    for text, module in NEEDS.items():
-        if any(text in block.text for block in blocks) and find_spec(module) is None:
+    for word, module in NEEDS.items():
+        if any(word in text for _, text in blocks) and find_spec(module) is None:
             pytest.skip(f"needs {module}")
     names: dict[str, Any] = {}
     printed = ""
-    for block in blocks:
-        if block.kind == "sh":
+    for kind, text in blocks:
+        if kind == "sh":
             printed = ""
-            for command, code in commands(block.text):
+            for command, code in commands(text):
                 done = run_command(command, tmp_path)
                 assert done.code == code, f"{command}\n{done}"
                 printed += done.out + done.err
-        elif block.kind == "python":
-            printed = run_snippet(block.text, names)
-        elif block.kind == "text":
-            assert printed, f"nothing was run before:\n{block.text}"
-            assert_printed(block.text, printed.replace(f"{tmp_path}/", ""))
+        elif kind == "python":
+            printed = run_snippet(text, names)
+        elif kind == "text":
+            assert printed, f"nothing was run before:\n{text}"
+            assert_printed(text, printed.replace(f"{tmp_path}/", ""))
         else:
-            assert block.kind in ("console", "yaml", "markdown"), block.kind
+            assert kind in ("console", "yaml", "markdown"), kind
 
 
 def test_there_are_tutorials_and_they_run_something() -> None:
     assert [page.stem for page in PAGES] == ["archive", "replay", "share", "train"]
     for page in PAGES:
         blocks = blocks_of(page)
-        count = sum(len(list(commands(block.text))) for block in blocks if block.kind == "sh")
+        count = sum(len(list(commands(text))) for kind, text in blocks if kind == "sh")
         assert count >= 5, page
-        assert any(block.kind == "text" for block in blocks), page
-        for block in blocks:
-            assert "mp4ds " in block.text or block.kind != "sh", block.text
+        assert any(kind == "text" for kind, _ in blocks), page
+        for kind, text in blocks:
+            assert "mp4ds " in text or kind != "sh", text
 
 
 # ---------------------------------------------------------------- options that pages name

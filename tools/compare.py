@@ -2,7 +2,7 @@
 
 Usage::
 
-    python tools/compare.py A B [--ignore-pixels TOPIC_GLOB] [--start NS --end NS] [--json]
+    python tools/compare.py A B [--ignore-pixels TOPIC_GLOB] [--start NS --end NS]
 
 A and B are a ROS 1 ``.bag``, a rosbag2 folder, an ``.mcap`` or a ``.db3``; a split recording is
 given as ``a1.bag,a2.bag``. Exit code: 0 equal, 1 different, 2 unreadable.
@@ -135,26 +135,16 @@ def merged(one: Recording, other: Recording) -> dict[Key, Columns]:
 
 
 def pair(a: Mapping[Key, Columns], b: Mapping[Key, Columns]) -> Iterator[tuple[Key, Key]]:
-    """Channels that belong together, the most alike first; an empty key where there is none."""
+    """Channels that belong together, equal ones first; an empty key where there is none."""
     yield from ((key, key) for key in a if key in b)
-    left, right = [key for key in a if key not in b], [key for key in b if key not in a]
-    alike = sorted(
-        (
-            (len(set(x) & set(y)), len(a[x][0]) == len(b[y][0]), -i, -j)
-            for i, x in enumerate(left)
-            for j, y in enumerate(right)
-            if dict(x)["topic"] == dict(y)["topic"]
-        ),
-        reverse=True,
-    )
-    taken: tuple[set[int], set[int]] = (set(), set())
-    for *_, i, j in alike:
-        if -i not in taken[0] and -j not in taken[1]:
-            taken[0].add(-i)
-            taken[1].add(-j)
-            yield left[-i], right[-j]
-    yield from ((key, ()) for i, key in enumerate(left) if i not in taken[0])
-    yield from (((), key) for j, key in enumerate(right) if j not in taken[1])
+    others = [key for key in b if key not in a]
+    for key in a:
+        if key not in b:
+            topic = dict(key)["topic"]
+            found: Key = next((other for other in others if dict(other)["topic"] == topic), ())
+            others = [other for other in others if other != found]
+            yield key, found
+    yield from (((), key) for key in others)
 
 
 def _more(found: list[str], topic: str, limit: int) -> list[str]:
@@ -418,7 +408,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--limit", type=int, default=5, help="messages listed per channel")
     parser.add_argument("--start", type=int, default=-(2**63), help="of A, log time in ns")
     parser.add_argument("--end", type=int, default=2**64, help="of A, log time in ns; not included")
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
     options = parser.parse_args(arguments)
     try:
         report = examine(
@@ -432,12 +421,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UnreadableError as error:
         print(error, file=sys.stderr)
         return 2
-    if options.json:
-        rows = [vars(row) for row in report.rows.values()]
-        outcome = {"equal": not report.differences, "topics": rows}
-        print(json.dumps(outcome | {"differences": report.differences, "notes": report.notes}))
-    else:
-        print(table(report))
+    print(table(report))
     return 1 if report.differences else 0
 
 
