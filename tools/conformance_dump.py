@@ -77,7 +77,7 @@ def dump(path: Path | str) -> dict[str, Any]:
             found["manifest"] = _manifest(dataset.manifest)
         found["streams"] = [_stream(stream) for stream in dataset.streams]
         if dataset.manifest:
-            found["order"] = [_order(dataset, channel) for channel in dataset.image_channels()]
+            found["order"] = [_order(channel) for channel in dataset.image_channels()]
             found["messages"] = _messages(dataset)
         return found
 
@@ -250,14 +250,14 @@ def _camera_info(stream: Stream) -> Values | None:
 # ---------------------------------------------------------------- the dataset
 
 
-def _order(dataset: Dataset, channel: ChannelGroup) -> Values:
+def _order(channel: ChannelGroup) -> Values:
     """The file of each message of a channel, in the channel's order."""
     places = {
         ordinal: stream.path.name
         for stream in channel.streams
         for ordinal in stream.columns.ordinal.tolist()
     }
-    count = len(places) + channel.recorded(dataset.messages_file.counts)
+    count = len(places) + channel.recorded_count
     return {
         "topic": channel.channel.topic,
         "files": [places.get(ordinal, MESSAGES_NAME) for ordinal in range(count)],

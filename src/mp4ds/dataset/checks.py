@@ -326,8 +326,9 @@ def _check_verbatim(dataset: Dataset, manifest: Manifest) -> Iterator[FormatErro
     totals, counts = Counter[str](), dataset.counts()
     for channel in dataset.channels:
         totals[channel.topic] += counts.get(channel.id, 0)
-    topics = {item.topic for item in manifest.verbatim}
-    recorded = {topic: len(dataset.messages_file.times_of(topic)) for topic in topics}
+    recorded = Counter[str]()
+    for channel in dataset.messages_file.channels:
+        recorded[channel.topic] += dataset.messages_file.counts.get(channel.id, 0)
     for number, item in enumerate(manifest.verbatim):
         recorded[item.topic] -= item.messages
         problem = ""

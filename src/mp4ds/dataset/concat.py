@@ -307,7 +307,9 @@ class _Source:
         found = []
         for topic in dict.fromkeys(item.topic for item in old):
             own = [times for identity, times in self._times.items() if identity[0] == topic]
-            inside = in_span(self.dataset.messages_file.times_of(topic), self.span)
+            file = self.dataset.messages_file
+            ids = [item.id for item in file.channels if item.topic == topic]
+            inside = in_span(file.times_of(ids), self.span)
             if len(inside):
                 times = in_span(np.sort(np.concatenate([_NONE, *own])), self.span)
                 entry = Verbatim(

@@ -214,11 +214,11 @@ class Dataset:
         messages = recorded(Excerpt(topics=frozenset([channel.topic]), others=False))
         numbers: Iterable[int] = count()
         if group is not None:
-            taken, times = group.places, self.messages_file.times()
-            own = [times[key] for key in ids if key in times]
-            numbers = np.setdiff1d(np.arange(len(taken) + sum(map(len, own))), taken).tolist()
-            if not group.is_in_time(own):
-                messages = group.found_in(self.messages_file.in_file_order())
+            taken = group.places
+            count_of_all = len(taken) + group.recorded_count
+            numbers = np.setdiff1d(np.arange(count_of_all), taken).tolist()
+            if not group.is_in_time:
+                messages = group.recorded()
         numbered = zip(numbers, messages, strict=False)
         with_info = (item for item in self.streams if item.topic == channel.topic)
         calibrated = next((item for item in with_info if item.calibrations), None)
@@ -312,7 +312,7 @@ class Dataset:
 
     @cached_property
     def _groups(self) -> list[ChannelGroup]:
-        return channel_groups(self.streams, self.messages_file.channels)
+        return channel_groups(self.streams, self.messages_file)
 
     @cached_property
     def _verbatim_channels(self) -> list[Channel]:
@@ -433,8 +433,7 @@ class Dataset:
             own = [*map(ahead, group.sources(choice, sources or {}))]
             if not is_span:
                 return self._group_messages(group, own, ahead)
-            part = replace(span, topics=frozenset([group.channel.topic]))
-            recorded = ahead(group.found_in(self.messages_file.in_time(part)))
+            recorded = ahead(group.recorded(span))
             return by_time(recorded, *((item for _, item in source) for source in own))
 
         groups = (item for item in self._groups if topics is None or item.channel.topic in topics)
@@ -447,15 +446,16 @@ class Dataset:
         Args:
             topics: Only of these topics; None for all.
         """
-        recorded = dict(self.messages_file.times())
         found = {}
         for group in self._groups:
-            own = [recorded.pop(key) for key in group.recorded_ids if key in recorded]
             if topics is None or group.channel.topic in topics:
-                own += [part.columns.log_time for part in group.parts]
-                found[group.channel.id] = np.sort(np.concatenate(own))
-        wanted = {item.id for item in self.channels if topics is None or item.topic in topics}
-        return found | {key: times for key, times in recorded.items() if key in wanted}
+                own = [part.columns.log_time for part in group.parts]
+                found[group.channel.id] = np.sort(np.concatenate([group.recorded_times, *own]))
+        times = self.messages_file.times
+        for channel in self._verbatim_channels:
+            if channel.id in times and (topics is None or channel.topic in topics):
+                found[channel.id] = times[channel.id]
+        return found
 
     @property
     def slice_start(self) -> int | None:
@@ -481,29 +481,23 @@ class Dataset:
 
     def counts(self) -> dict[int, int]:
         """Number of messages by channel id; decodes nothing."""
-        found = dict(self.messages_file.counts)
+        counts = self.messages_file.counts
+        found = {item.id: counts.get(item.id, 0) for item in self._verbatim_channels}
         for group in self._groups:
-            recorded = sum(found.pop(key, 0) for key in group.recorded_ids)
-            found[group.channel.id] = recorded + sum(map(len, group.parts))
+            found[group.channel.id] = group.recorded_count + sum(map(len, group.parts))
         return found
 
     @property
     def is_in_time(self) -> bool:
         """Whether the messages of a time span are consecutive in each channel."""
-        recorded = self.messages_file.times()
-        return all(
-            group.is_in_time([recorded[key] for key in group.recorded_ids if key in recorded])
-            for group in self._groups
-        )
+        return all(group.is_in_time for group in self._groups)
 
     def gaps(self) -> Iterator[tuple[str, str]]:
         """Topics with missing messages according to the columns, and what is missing."""
         if self.manifest is None:
             return
-        recorded = self.messages_file.counts
         for group in self._groups:
-            gap = group.gap(group.recorded(recorded))
-            if gap:
+            if gap := group.gap:
                 yield group.channel.topic, gap
 
     def _verbatim_records(
@@ -529,10 +523,9 @@ class Dataset:
         ahead: Ahead = iter,
     ) -> Iterator[Message]:
         """One channel's messages from all its files, in the channel's order."""
-        recorded = ahead(group.found_in(self.messages_file.in_file_order()))
         # a pair on its own has only its own messages
         is_whole = self.manifest is not None and not self.is_salvaged
-        return group.merged(own, recorded, str(self.path) if is_whole else None)
+        return group.merged(own, ahead(group.recorded()), str(self.path) if is_whole else None)
 
     def close(self) -> None:
         """Close all videos."""

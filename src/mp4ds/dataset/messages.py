@@ -108,29 +108,23 @@ class MessagesFile:
     def counts(self) -> Mapping[int, int]:
         """Number of messages that can be read by channel id."""
         if self.is_salvaged:  # its index may list more
-            return {key: len(times) for key, times in self.times().items()}
+            return {key: len(times) for key, times in self.times.items()}
         stats = self._reader.stats() if self._reader else {}
         return {key: item.count for key, item in stats.items()}
 
+    @cached_property
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Sorted log times of the messages that can be read, nanoseconds, by channel id."""
-        if self.is_salvaged:
-            return self._salvaged_times
         with _damage_told():
+            if self.is_salvaged:
+                return times_of(self._reader.records() if self._reader else ())
             return self._reader.times() if self._reader else {}
 
-    def times_of(self, topic: str) -> NDArray[np.int64]:
-        """Sorted log times, nanoseconds, of a topic's messages."""
-        times = self.times()
-        found = [
-            times[item.id] for item in self.channels if item.topic == topic and item.id in times
-        ]
+    def times_of(self, ids: Iterable[int]) -> NDArray[np.int64]:
+        """Sorted log times, nanoseconds, of the messages of some channels together."""
+        times = self.times
+        found = [times[key] for key in ids if key in times]
         return np.sort(np.concatenate([np.empty(0, np.int64), *found]))
-
-    @cached_property
-    def _salvaged_times(self) -> Mapping[int, NDArray[np.int64]]:
-        with _damage_told():
-            return times_of(self._reader.records() if self._reader else ())
 
     def in_file_order(self) -> Iterator[Record]:
         """All its records, in file order."""
@@ -296,11 +290,13 @@ class ChannelGroup:
     Attributes:
         channel: The channel as a whole, as in `Dataset.channels`.
         parts: Its messages in videos.
-        recorded_ids: Channels of messages.mcap with the other messages.
+        file: The dataset's messages.mcap.
+        recorded_ids: Its channels there, with the other messages.
     """
 
     channel: Channel
     parts: list[Part]
+    file: MessagesFile
     recorded_ids: set[int]
 
     @property
@@ -308,9 +304,15 @@ class ChannelGroup:
         """The streams with its images; none for calibrations."""
         return [part for part in self.parts if isinstance(part, Stream)]
 
-    def recorded(self, counts: Mapping[int, int]) -> int:
-        """How many of its messages are in messages.mcap, from the counts of its channels there."""
-        return sum(counts.get(key, 0) for key in self.recorded_ids)
+    @property
+    def recorded_count(self) -> int:
+        """How many of its messages are in messages.mcap."""
+        return sum(self.file.counts.get(key, 0) for key in self.recorded_ids)
+
+    @property
+    def recorded_times(self) -> NDArray[np.int64]:
+        """Sorted log times, nanoseconds, of its messages in messages.mcap."""
+        return self.file.times_of(self.recorded_ids)
 
     def sources(
         self, choice: Choice = everything, replaced: Mapping[Part, MessageSource] | None = None
@@ -325,9 +327,16 @@ class ChannelGroup:
             (replaced or {}).get(part, part.messages)(self.channel, choice) for part in self.parts
         ]
 
-    def found_in(self, records: Iterable[Record]) -> Iterator[Message]:
-        """Its messages among the records of messages.mcap, read only if there are any."""
-        for record in records if self.recorded_ids else ():
+    def recorded(self, excerpt: Excerpt | None = None) -> Iterator[Message]:
+        """Its messages in messages.mcap, which is read only if it has any.
+
+        Args:
+            excerpt: Those of it, by log time; None for all, in the order of the file.
+        """
+        if not self.recorded_ids:
+            return
+        own = replace(excerpt, topics=frozenset([self.channel.topic])) if excerpt else None
+        for record in self.file.in_time(own) if own else self.file.in_file_order():
             if isinstance(record, Message) and record.channel.id in self.recorded_ids:
                 yield replace(record, channel=self.channel)
 
@@ -378,38 +387,34 @@ class ChannelGroup:
             number += place <= number
         return number
 
-    def is_in_time(self, recorded: Sequence[NDArray[np.int64]]) -> bool:
+    @property
+    def is_in_time(self) -> bool:
         """Whether its messages are ordered by log time.
 
         They are not if an earlier time comes later, or if messages with equal times are in
         different files.
-
-        Args:
-            recorded: Sorted log times of its messages in messages.mcap, nanoseconds.
         """
-        columns = [part.columns for part in self.parts]
-        count = sum(len(one.ordinal) for one in columns) + sum(map(len, recorded))
+        columns, recorded = [part.columns for part in self.parts], self.recorded_times
+        count = sum(len(one.ordinal) for one in columns) + len(recorded)
         if max(int(one.ordinal[-1]) for one in columns) >= count:
             return False  # there is a gap, which reading everything reports
         times = np.empty(count, np.int64)
         owner = np.zeros(count, np.int64)  # 0: messages.mcap
         for number, one in enumerate(columns, start=1):
             times[one.ordinal], owner[one.ordinal] = one.log_time, number
-        times[owner == 0] = np.sort(np.concatenate([times[:0], *recorded]))
+        times[owner == 0] = recorded
         steps = np.diff(times)
         return bool((steps >= 0).all() and not ((steps == 0) & (np.diff(owner) != 0)).any())
 
-    def gap(self, recorded: int) -> str:
+    @property
+    def gap(self) -> str:
         """What is missing according to the columns; empty if nothing.
 
         The ordinals that they leave free belong to the channel's messages in messages.mcap, so the
         counts must agree.
-
-        Args:
-            recorded: Messages in messages.mcap.
         """
         places = self.places
-        total = len(places) + recorded
+        total = len(places) + self.recorded_count
         if len(np.unique(places)) < len(places):
             return "two messages have the same number"
         if places[-1] >= total:
@@ -417,13 +422,14 @@ class ChannelGroup:
         return ""
 
 
-def channel_groups(streams: Sequence[Stream], recorded: Sequence[Channel]) -> list[ChannelGroup]:
+def channel_groups(streams: Sequence[Stream], file: MessagesFile) -> list[ChannelGroup]:
     """The channels that have messages in videos.
 
     Args:
         streams: All streams.
-        recorded: The channels of messages.mcap.
+        file: messages.mcap.
     """
+    recorded = file.channels
     groups: dict[tuple[object, ...], ChannelGroup] = {}
     first_id = 1 + max((channel.id for channel in recorded), default=0)
     for stream in streams:
@@ -434,6 +440,6 @@ def channel_groups(streams: Sequence[Stream], recorded: Sequence[Channel]) -> li
             if identity not in groups:
                 channel = replace(part.channel, id=first_id + len(groups))
                 ids = {item.id for item in recorded if item.identity == identity}
-                groups[identity] = ChannelGroup(channel, [], ids)
+                groups[identity] = ChannelGroup(channel, [], file, ids)
             groups[identity].parts.append(part)
     return list(groups.values())

@@ -204,7 +204,7 @@ class Republisher:
             item.channel.id
             for item, plans in planned
             if sum(bool(plan.new_kind) for plan in plans) == len(item.streams)
-            and not item.recorded(dataset.messages_file.counts)
+            and not item.recorded_count
         }
         staying = [channel for channel in dataset.channels if channel.id not in emptied]
         self.channels = [channel for channel in staying if selected(channel.topic)]
