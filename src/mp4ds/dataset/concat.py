@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import WHOLE, RecordingSlice, in_span, write_record
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.messages import by_time
+from mp4ds.dataset.messages import Part, by_time
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Refused, VideoError
 from mp4ds.files.outputs import digest_file
@@ -163,43 +163,57 @@ def concat(
 # ---------------------------------------------------------------- what is copied
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """What is copied of the columns of images, or of calibrations.
+
+    Attributes:
+        columns: Of all of them.
+        numbers: Of those that are copied.
+        models: The headers of the images, or the calibrations, which variants are numbers of.
+        offset: What is added to their ordinals.
+    """
+
+    columns: DecodedColumns
+    numbers: Integers
+    models: Sequence[Any]
+    offset: int
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @cached_property
+    def used_models(self) -> list[Any]:
+        """Those of what is copied."""
+        kinds = np.unique(self.columns.variant[self.numbers])
+        return [self.models[kind] for kind in kinds.tolist()]
+
+
+@dataclass(frozen=True, eq=False)
 class _Segment:
     """What is copied of a stream.
 
     Attributes:
         source: The dataset.
         stream: Of the dataset.
-        images: Numbers of the frames.
-        infos: Numbers of the calibrations.
-        offsets: What is added to the ordinals of images, and of calibrations.
+        images: Which images.
+        infos: Which calibrations; None if the stream has no messages with any.
     """
 
     source: _Source
     stream: Stream
-    images: Integers
-    infos: Integers
-    offsets: tuple[int, int]
+    images: _Rows
+    infos: _Rows | None
 
     @property
     def has_all(self) -> bool:
         """Whether the whole video is copied."""
         return len(self.images) == len(self.stream)
 
-    @cached_property
-    def headers(self) -> list[Header]:
-        """Those of its frames."""
-        kinds = np.unique(self.stream.columns.variant[self.images])
-        return [self.stream.sidecar.headers[kind] for kind in kinds.tolist()]
-
-    @cached_property
+    @property
     def calibrations(self) -> list[Calibration]:
         """Those of its camera."""
-        infos = self.stream.infos
-        if infos is None:
-            return []
-        kinds = np.unique(infos.columns.variant[self.infos])
-        return [infos.info.calibrations[kind] for kind in kinds.tolist()]
+        return self.infos.used_models if self.infos else []
 
 
 class _Source:
@@ -253,31 +267,30 @@ class _Source:
             else earlier.get(key, 0)
             for key, own in self._times.items()
         }
-        self.segments = [self._segment(stream) for stream in dataset.streams]
+        for stream in dataset.streams:
+            if len(set(map(selected, stream.topics))) > 1:
+                raise Refused(f"{' and '.join(stream.topics)} share one stream")
+        chosen = (stream for stream in dataset.streams if selected(stream.topic))
+        self.segments = [self._segment(stream) for stream in chosen]
 
     def _segment(self, stream: Stream) -> _Segment:
-        if len(set(map(self.selected, stream.topics))) > 1:
-            raise Refused(f"{' and '.join(stream.topics)} share one stream")
-        if not self.selected(stream.topic):
-            return _Segment(self, stream, _NONE, _NONE, (0, 0))
-        images = self._numbers(stream.columns)
-        if np.any(np.diff(images) != 1):
+        images = self._rows(stream, stream.sidecar.headers)
+        if np.any(np.diff(images.numbers) != 1):
             raise Refused(f"frames of {stream.topic} are not ordered by time")
-        offset = self._offsets[stream.channel.identity]
-        if stream.infos is None:
-            return _Segment(self, stream, images, _NONE, (offset, 0))
-        offsets = offset, self._offsets[stream.infos.channel.identity]
-        return _Segment(self, stream, images, self._numbers(stream.infos.columns), offsets)
+        infos = stream.infos
+        rows = self._rows(infos, infos.info.calibrations) if infos else None
+        return _Segment(self, stream, images, rows)
 
-    def _numbers(self, columns: DecodedColumns) -> Integers:
-        """Numbers of the messages in the span."""
-        start, end = self.span.start, self.span.end
-        is_in = np.ones(len(columns.log_time), np.bool_)
+    def _rows(self, part: Part, models: Sequence[Any]) -> _Rows:
+        """The messages in the span."""
+        start, end, times = self.span.start, self.span.end, part.columns.log_time
+        is_in = np.ones(len(times), np.bool_)
         if start is not None:
-            is_in &= columns.log_time >= start
+            is_in &= times >= start
         if end is not None:
-            is_in &= columns.log_time < end
-        return np.flatnonzero(is_in).astype(np.int64)
+            is_in &= times < end
+        offset = self._offsets[part.channel.identity]
+        return _Rows(part.columns, np.flatnonzero(is_in).astype(np.int64), models, offset)
 
     def count(self, topic: str) -> int:
         """How many messages of a topic are copied."""
@@ -332,7 +345,7 @@ class _Source:
         orphans = [
             infos.messages(channels[infos.channel.identity], within(self.span))
             for segment in self.segments
-            if (infos := segment.stream.infos) and len(segment.infos) and not len(segment.images)
+            if (infos := segment.stream.infos) and segment.infos and not segment.images
         ]
         calibrations = [(message for _, message in messages) for messages in orphans]
         return chain(self.latched, by_time(recorded, *calibrations))
@@ -363,7 +376,7 @@ def _verbatim(sources: Sequence[_Source]) -> list[Verbatim]:
 def _joined_streams(sources: Sequence[_Source]) -> list[_JoinedStream]:
     streams: list[_JoinedStream] = []
     for segment in chain(*(source.segments for source in sources)):
-        if len(segment.images):
+        if segment.images:
             joined = next((stream for stream in streams if stream.takes(segment)), None)
             if joined is None:
                 streams.append(_JoinedStream(segment))
@@ -423,10 +436,10 @@ class _JoinedStream:
             return False
         if stream.hidden_frames or self.first.hidden_frames:
             return False  # what a slice hides refers to nothing in another segment
-        headers = [*self._headers.values(), *segment.headers]
+        headers = [*self._headers.values(), *segment.images.used_models]
         if exceeds_padding(head.padding for head in headers):
             return False
-        if not _has_room(self._headers, segment.headers):
+        if not _has_room(self._headers, segment.images.used_models):
             return False
         if self._frames + len(segment.images) > MAX_FRAMES:
             return False
@@ -439,31 +452,25 @@ class _JoinedStream:
             info.channel == self._info.channel
             and info.wire == self._info.wire
             and _has_room(self._calibrations, segment.calibrations)
-            and self._infos + len(segment.infos) <= MAX_CAMERA_INFOS
+            and self._infos + len(segment.infos or ()) <= MAX_CAMERA_INFOS
         )
 
     def add(self, segment: _Segment) -> None:
         """Add the first segment, or one that it `takes`."""
         self.segments.append(segment)
         self._frames += len(segment.images)
-        for header in segment.headers:
+        for header in segment.images.used_models:
             self._headers.setdefault(repr(header), header)
         info = segment.stream.sidecar.camera_info
-        if info is not None and (not info.messages or len(segment.infos)):
+        if info is not None and (not info.messages or segment.infos):
             self._info = self._info or info
-            self._infos += len(segment.infos)
+            self._infos += len(segment.infos or ())
             for calibration in segment.calibrations:
                 self._calibrations.setdefault(repr(calibration), calibration)
 
     @cached_property
     def _columns(self) -> dict[str, Integers]:
-        return _joined(
-            [
-                (part.stream.columns, part.images, part.stream.sidecar.headers, part.offsets[0])
-                for part in self.segments
-            ],
-            self._headers,
-        )
+        return _joined([part.images for part in self.segments], self._headers)
 
     def write(self, stem: str, folder: Path) -> StreamSidecar:
         """Write the video; the sidecar is returned.
@@ -487,7 +494,7 @@ class _JoinedStream:
             entry = last.source.manifest.file(first.video_path.name)
             verify_file(first.video_path, entry, found=(facts["size"], sha256))
         qualities = [
-            (quality.of(part.images, len(part.stream)), len(part.images))
+            (quality.of(part.images.numbers, len(part.stream)), len(part.images))
             for part in self.segments
             if (quality := part.stream.sidecar.video.quality) is not None
         ]
@@ -495,7 +502,7 @@ class _JoinedStream:
             alone = len(qualities) == 1
             facts["quality"] = qualities[0][0] if alone else Quality.joined(qualities)
         digests = [
-            own.decode(len(part.stream))[part.images]
+            own.decode(len(part.stream))[part.images.numbers]
             for part in self.segments
             if (own := part.stream.sidecar.digests) is not None
         ]
@@ -521,7 +528,8 @@ class _JoinedStream:
         if part.has_all:
             _copy_file(part.stream.video_path, path)
         else:
-            frames = range(int(part.images[0]), int(part.images[-1]) + 1)
+            numbers = part.images.numbers
+            frames = range(int(numbers[0]), int(numbers[-1]) + 1)
             cut_segment(part.stream.video_path, frames, self._ticks(), path)
 
     def _ticks(self) -> list[int]:
@@ -533,14 +541,8 @@ class _JoinedStream:
     def _camera_info(self) -> CameraInfo | None:
         if self._info is None or not self._infos:
             return self._info  # with calibrations that no message told
-        columns = _joined(
-            [
-                (infos.columns, part.infos, infos.info.calibrations, part.offsets[1])
-                for part in self.segments
-                if (infos := part.stream.infos) is not None
-            ],
-            self._calibrations,
-        )
+        rows = [part.infos for part in self.segments if part.infos]
+        columns = _joined(rows, self._calibrations)
         return self._info.model_copy(
             update={
                 "messages": self._infos,
@@ -555,22 +557,18 @@ def _has_room(known: Mapping[str, object], models: Iterable[object]) -> bool:
     return len(known.keys() | set(map(repr, models))) <= MAX_VARIANTS
 
 
-_Rows = tuple[DecodedColumns, Integers, Sequence[object], int]
-"""Columns of a segment, the rows copied, its models, and what is added to the ordinals."""
-
-
-def _joined(segments: Sequence[_Rows], models: Mapping[str, object]) -> dict[str, Integers]:
-    """The columns of segments, one after another, whose variants are numbers of the models."""
+def _joined(rows: Sequence[_Rows], models: Mapping[str, object]) -> dict[str, Integers]:
+    """The columns of rows, one after another, whose variants are numbers of the models."""
     numbers = {key: number for number, key in enumerate(models)}
     columns: dict[str, list[Integers]] = {}
-    for own, rows, variants, offset in segments:
+    for part in rows:
         for name in Columns.model_fields:
-            if (array := getattr(own, name)) is not None:
-                columns.setdefault(name, []).append(array[rows])
+            if (array := getattr(part.columns, name)) is not None:
+                columns.setdefault(name, []).append(array[part.numbers])
         # those that are not used have no number
-        kinds = np.array([numbers.get(repr(model), 0) for model in variants], np.int64)
+        kinds = np.array([numbers.get(repr(model), 0) for model in part.models], np.int64)
         columns["variant"][-1] = kinds[columns["variant"][-1]]
-        columns["ordinal"][-1] = columns["ordinal"][-1] + offset
+        columns["ordinal"][-1] = columns["ordinal"][-1] + part.offset
     return {name: np.concatenate(arrays) for name, arrays in columns.items()}
 
 
