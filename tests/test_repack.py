@@ -147,16 +147,6 @@ def test_jpeg_files_that_were_encoded_anew_are_again(tmp_path: Path) -> None:
         assert [stream.sidecar.body for stream in opened.streams] == ["jpeg"]
 
 
-def test_a_file_that_is_not_as_it_was_packed(recording: Path, tmp_path: Path) -> None:
-    mp4ds.pack(recording, tmp_path / "whole")
-    video = next((tmp_path / "whole").glob("*.mp4"))
-    video.write_bytes(video.read_bytes() + b"\0\0\0\x08free")
-    for options in (PackOptions(), PackOptions(window=4)):
-        with pytest.raises(mp4ds.FormatError, match=r"SHA-256|the manifest says"):
-            mp4ds.pack(tmp_path / "whole", tmp_path / "again", options)
-        assert not (tmp_path / "again").exists()
-
-
 def edit_sidecar(dataset: Path) -> Path:
     """Change a frame_id as an editor would, without the line that tells of it."""
     path = next(dataset.glob("*image_raw.yaml"))
