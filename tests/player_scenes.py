@@ -89,15 +89,6 @@ class RecordingPublisher:
     def serve(self, services: Any) -> None:
         self.services = {service.name: service.answer for service in services}
 
-    def close(self) -> None:
-        self.is_alive = False
-
-    def __enter__(self) -> RecordingPublisher:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def run(
     dataset: Path | list[Path], publisher: RecordingPublisher | None = None, **options: Any

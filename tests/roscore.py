@@ -17,8 +17,8 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 from xmlrpc.client import Fault, ServerProxy, Transport
 
@@ -152,7 +152,7 @@ def asked(uri: str, method: str, *arguments: str) -> Any:
 
 
 class Core:
-    """A master, and the environment of those that use it; a context manager that ends all.
+    """A master, and the environment of those that use it.
 
     Args:
         folder: For what they write.
@@ -260,15 +260,8 @@ class Core:
         while self._processes:
             self._processes.pop().end()
 
-    def __enter__(self) -> Core:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """End all of them."""
         self.end_processes()
         self._master.terminate()
         self._master.wait(SECONDS)
@@ -291,7 +284,7 @@ def missing() -> str:
 def _core(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Core]:
     if why := missing():
         pytest.skip(why)
-    with Core(tmp_path_factory.mktemp("roscore")) as core:
+    with closing(Core(tmp_path_factory.mktemp("roscore"))) as core:
         yield core
 
 

@@ -10,8 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -48,7 +46,7 @@ def run(*arguments: str | Path) -> Result:
 
 
 class Terminal:
-    """A command on a pseudo-terminal."""
+    """A command on a pseudo-terminal; a context manager."""
 
     def __init__(self, *arguments: str | Path) -> None:
         self._master, slave = pty.openpty()
@@ -86,20 +84,13 @@ class Terminal:
         self.read()
         return code
 
-    def close(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
         os.close(self._master)
-
-
-@contextmanager
-def terminal(*arguments: str | Path) -> Iterator[Terminal]:
-    made = Terminal(*arguments)
-    try:
-        yield made
-    finally:
-        made.close()
 
 
 def test_plays_and_tells(drive: Path) -> None:
@@ -112,7 +103,7 @@ def test_plays_and_tells(drive: Path) -> None:
 
 
 def test_keys(drive: Path) -> None:
-    with terminal(drive, "--ros2", "--pause", "--topics", "/camera/*") as shown:
+    with Terminal(drive, "--ros2", "--pause", "--topics", "/camera/*") as shown:
         shown.until("1x paused  0 messages")
         shown.press(b"\x1b[C")
         shown.until("1 messages")
@@ -133,7 +124,7 @@ def test_keys(drive: Path) -> None:
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_signals(drive: Path, number: signal.Signals, code: int) -> None:
     """Ctrl-C ends with 0, as `ros2 bag play` does."""
-    with terminal(drive, "--ros2", "-r", "0.2") as shown:
+    with Terminal(drive, "--ros2", "-r", "0.2") as shown:
         shown.until(r"0\.2x playing  [1-9]")
         os.kill(shown.process.pid, number)
         assert shown.end() == code

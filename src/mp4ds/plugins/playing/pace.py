@@ -29,12 +29,15 @@ class Pace:
     Args:
         rate: Seconds of the recording per second.
         steady: The monotonic clock.
+
+    Attributes:
+        is_running: Whether time passes.
     """
 
     def __init__(self, rate: float = 1.0, *, steady: Callable[[], int] = time.monotonic_ns) -> None:
         self._steady = steady
         self._rate = rate
-        self._is_running = False
+        self.is_running = False
         self._at = 0  # recording time ...
         self._since = steady()  # ... at this time of the monotonic clock
         # how late messages are, nanoseconds: not ready in time, or the player was not scheduled
@@ -50,14 +53,9 @@ class Pace:
         self.jump(self.now())
         self._rate = rate
 
-    @property
-    def is_running(self) -> bool:
-        """Whether time passes."""
-        return self._is_running
-
     def now(self) -> int:
         """The recording time."""
-        if not self._is_running:
+        if not self.is_running:
             return self._at
         return self._at + int((self._steady() - self._since) * self._rate)
 
@@ -69,12 +67,12 @@ class Pace:
     def resume(self) -> None:
         """Let time pass."""
         self.jump(self.now())
-        self._is_running = True
+        self.is_running = True
 
     def pause(self) -> None:
         """Stop time."""
         self.jump(self.now())
-        self._is_running = False
+        self.is_running = False
 
     def seconds_until(self, time_ns: int) -> float:
         """Real seconds until a recording time; negative if it is past.

@@ -361,21 +361,20 @@ class MessageBuffer:
     Args:
         most_bytes: Limit of buffered payloads; beyond, the oldest messages are dropped and counted.
         last_ns: The latest log or publish time that the recording can hold; the first one is 0.
+
+    Attributes:
+        topics: What came of each topic.
+        bytes: Buffered payloads.
     """
 
     def __init__(self, most_bytes: int, last_ns: int = INT64_MAX) -> None:
         self.topics: dict[str, TopicProgress] = {}
         self._most = most_bytes
         self._last_ns = last_ns
-        self._bytes = 0
+        self.bytes = 0
         self._messages: deque[Message] = deque()
         self._changed = threading.Condition()
         self._is_closed = False
-
-    @property
-    def bytes(self) -> int:
-        """Buffered payloads."""
-        return self._bytes
 
     def put(self, message: Message) -> None:
         """Add a message, from any thread; it never waits."""
@@ -389,12 +388,12 @@ class MessageBuffer:
             if min(times) < 0 or max(times) > self._last_ns:
                 topic.untimed += 1
                 return
-            while self._messages and self._bytes + len(message.data) > self._most:
+            while self._messages and self.bytes + len(message.data) > self._most:
                 dropped = self._messages.popleft()
-                self._bytes -= len(dropped.data)
+                self.bytes -= len(dropped.data)
                 self.topics[dropped.channel.topic].dropped += 1
             self._messages.append(message)
-            self._bytes += len(message.data)
+            self.bytes += len(message.data)
             self._changed.notify()
 
     def take(self, wait_s: float) -> Message | None:
@@ -407,7 +406,7 @@ class MessageBuffer:
             self._changed.wait_for(lambda: self._messages or self._is_closed, wait_s)
             if self._messages:
                 message = self._messages.popleft()
-                self._bytes -= len(message.data)
+                self.bytes -= len(message.data)
                 return message
             if self._is_closed:
                 raise EOFError
