@@ -299,6 +299,9 @@ def test_nothing_matches(tmp_path: Path) -> None:
         ({"format": "hsv"}, "format is 'hsv', not one of native, rgb, bgr, gray"),
         ({"format": {"/up": "rgb"}}, "format is given for '/up'"),
         ({"dtype": "float16"}, "dtype is 'float16'"),
+        ({"backend": "other"}, "backend is 'other'"),
+        ({"device": "cuda"}, "needs backend='torchcodec'"),
+        ({"backend": "torchcodec", "format": "gray"}, "gives format='rgb' without resize"),
         ({"cache_files": 0}, "cache_files is 0"),
     ],
 )
@@ -676,6 +679,59 @@ def test_a_kept_sample_does_not_keep_others(drives: list[Path]) -> None:
         image = sample[LEFT]
         assert image.untyped_storage().nbytes() == image.numel()
         assert image.permute(1, 2, 0).is_contiguous()
+
+
+# ---------------------------------------------------------------- torchcodec
+
+
+@pytest.fixture
+def torchcodec() -> None:
+    try:
+        import torchcodec.decoders  # noqa: F401
+    except (ImportError, OSError, RuntimeError) as error:
+        pytest.skip(f"torchcodec cannot be used: {error}")
+
+
+@pytest.mark.usefixtures("torchcodec")
+def test_torchcodec_gives_the_same_frames(drives: list[Path]) -> None:
+    """The right ones, in colours that are nearly the same."""
+    options: dict[str, Any] = {"topics": BOTH, "offsets": (0, -2), "crop": (8, 4, 32, 24)}
+    ours = FrameDataset(drives[0], **options)
+    theirs = FrameDataset(drives[0], **options, backend="torchcodec")
+    wanted = [11, 2, 22, 2]
+    for a, b in zip(ours.__getitems__(wanted), theirs.__getitems__(wanted), strict=True):
+        assert (a["stamp_ns"], a["index"]) == (b["stamp_ns"], b["index"])
+        for topic in BOTH:
+            assert a[topic].shape == b[topic].shape
+            away = (a[topic].int() - b[topic].int()).abs()
+            assert away.float().mean() < 1
+
+
+@pytest.mark.usefixtures("torchcodec")
+@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "av1-10bit"])
+def test_torchcodec_gives_lossy_videos_their_contrast_or_nothing(
+    codec: str, tmp_path: Path
+) -> None:
+    paths = SOURCES["mcap-ros2-none"](tmp_path, camera(LEFT, "rgb8", 0))
+    options = PackOptions(quality="crf=20", codec=codec)
+    drive = mp4ds.pack(paths, tmp_path / "drive", options).dataset
+    ours = FrameDataset(drive)[3][LEFT].float().mean(0).ravel()
+    refusal = ""
+    try:
+        theirs = FrameDataset(drive, backend="torchcodec")[3][LEFT].float().mean(0).ravel()
+    except mp4ds.OptionError as error:
+        refusal = str(error)
+    if codec.startswith("av1") and refusal:  # others tell their range by the pixel format, too
+        assert "its full-range video as limited-range" in refusal
+    else:
+        assert np.polyfit(ours, theirs, 1)[0] == pytest.approx(1, abs=0.04)
+
+
+@pytest.mark.usefixtures("torchcodec")
+def test_torchcodec_refuses_what_it_would_show_wrongly(tmp_path: Path) -> None:
+    drive = packed(tmp_path / "a", camera(LEFT, "bayer_rggb8", 0))
+    with pytest.raises(mp4ds.OptionError, match=r"bayer_rggb8 images .* layout mosaic8"):
+        FrameDataset(drive, backend="torchcodec")[0]
 
 
 # ---------------------------------------------------------------- example and tutorial

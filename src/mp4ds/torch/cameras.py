@@ -10,8 +10,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -24,12 +26,19 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
-from mp4ds.files.urls import location, spelled
+from mp4ds.files.urls import location, remote, spelled
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.times import nearest, synchronize
+from mp4ds.video.codecs import TEN_BITS
 from mp4ds.video.mp4 import read_sample_table
 
 Dtype = Literal["native", "uint8", "float32"]
+Backend = Literal["mp4ds", "torchcodec"]
+
+_T = TypeVar("_T")
+_DTYPES = ("native", "uint8", "float32")
+_BACKENDS = ("mp4ds", "torchcodec")
 
 # A worker must not free what its parent left to the garbage collector: a PyAV container is always
 # in a reference cycle, and freeing its decoder waits for threads that a fork does not copy.
@@ -37,34 +46,61 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=gc.freeze)
 
 
-def views_from(
-    topics: Sequence[str],
-    formats: str | Mapping[str, str],
-    resize: Resize | Mapping[str, Resize],
-    crop: Crop | Mapping[str, Crop],
-) -> list[dict[str, Any]]:
-    """How the frames of each camera are wanted, as `Topic.read` takes it.
+class Pictures:
+    """How the frames of all cameras become tensors.
 
     Args:
         topics: The cameras.
-        formats: One for all, or a mapping by topic; so are the others.
+        format: Of the frames; like `resize` and `crop` one for all, or a mapping by topic.
         resize: Factor, or width and height.
         crop: x, y, width, height.
+        dtype: ``native``, ``uint8`` or ``float32``.
+        channels_first: (C, H, W) instead of (H, W, C).
+        backend: The decoding backend.
+        device: Where the tensors are.
+
+    Attributes:
+        views: Format, size and crop of each camera, as `Topic.read` takes them.
 
     Raises:
         OptionError: One is unknown, or for a topic that does not exist.
     """
-    columns = {
-        "format": _each("format", formats, topics, "rgb"),
-        "resize": _each("resize", resize, topics, None),
-        "crop": _each("crop", crop, topics, None),
-    }
-    views = [dict(zip(columns, view, strict=True)) for view in zip(*columns.values(), strict=True)]
-    for topic, view in zip(topics, views, strict=True):  # now, rather than in a worker
-        one_of("format", view["format"], FORMATS)
-        if view["resize"] is not None:
-            size_after(topic, (1, 1), view["resize"])
-    return views
+
+    def __init__(
+        self,
+        topics: Sequence[str],
+        *,
+        format: str | Mapping[str, str],  # noqa: A002 - as of Topic.read
+        resize: Resize | Mapping[str, Resize],
+        crop: Crop | Mapping[str, Crop],
+        dtype: str,
+        channels_first: bool,
+        backend: str,
+        device: str,
+    ) -> None:
+        self.dtype = str(dtype).removeprefix("torch.")
+        self.channels_first, self.backend, self.device = channels_first, backend, device
+        one_of("dtype", self.dtype, _DTYPES)
+        one_of("backend", backend, _BACKENDS)
+        formats = _each("format", format, topics, "rgb")
+        sizes = _each("resize", resize, topics, None)
+        crops = _each("crop", crop, topics, None)
+        for name in formats:
+            one_of("format", name, FORMATS)
+        for topic, size in zip(topics, sizes, strict=True):
+            if size is not None:  # now, rather than in a worker
+                size_after(topic, (1, 1), size)
+        self.views: list[dict[str, Any]] = [
+            {"format": one, "resize": size, "crop": area}
+            for one, size, area in zip(formats, sizes, crops, strict=True)
+        ]
+        if backend == "mp4ds" and device != "cpu":
+            raise OptionError(f"device={device!r} needs backend='torchcodec'.")
+        is_changed = any(view["format"] != "rgb" or view["resize"] for view in self.views)
+        if backend == "torchcodec" and is_changed:
+            raise OptionError(
+                "backend='torchcodec' only gives format='rgb' without resize; use a transform."
+            )
 
 
 def one_of(name: str, value: str, known: Sequence[str]) -> None:
@@ -73,7 +109,7 @@ def one_of(name: str, value: str, known: Sequence[str]) -> None:
         raise OptionError(f"{name} is {value!r}, not one of {', '.join(known)}.")
 
 
-def _each(name: str, given: Any, topics: Sequence[str], default: Any) -> list[Any]:
+def _each(name: str, given: _T | Mapping[str, _T], topics: Sequence[str], default: _T) -> list[_T]:
     """A value for each topic, from one for all or a mapping."""
     if not isinstance(given, Mapping):
         return [given] * len(topics)
@@ -261,6 +297,117 @@ def _choose(sources: list[CameraSource], topic: str, path: Path | str) -> Camera
     return found[0]
 
 
+# ---------------------------------------------------------------- torchcodec
+
+
+class TorchcodecReader:
+    """Decodes a stream's video by ``torchcodec.decoders.VideoDecoder``.
+
+    Args:
+        topic: The stream's frames.
+        crop: x, y, width, height, pixels; None: all.
+        device: Such as ``cpu`` or ``cuda``.
+
+    Raises:
+        OptionError: torchcodec is missing or misinterprets the video's range or beginning, or the
+            video's pictures are not the images.
+        VideoError: It cannot open the video.
+    """
+
+    def __init__(self, topic: Topic, crop: Crop, device: str) -> None:
+        self._path = topic.parts[0].video_path
+        for stream in topic.streams:
+            _check_layout(stream)
+            if stream.hidden_frames:
+                raise OptionError(
+                    f"topic {stream.topic}: torchcodec returns wrong frames at the beginning of a "
+                    "video cut out of another. Use backend='mp4ds', or a dataset packed with a "
+                    "`codec`."
+                )
+        if remote(self._path):
+            raise OptionError(f"{self._path}: backend='torchcodec' only reads local files.")
+        columns, rows = topic.image_size
+        x, y, width, height = crop or (0, 0, columns, rows)
+        if not (0 <= x < x + width <= columns and 0 <= y < y + height <= rows):
+            raise OptionError(f"topic {topic.topic}: crop {crop} is not inside {columns}x{rows}.")
+        self._rows, self._columns = slice(y, y + height), slice(x, x + width)
+        self._device = device
+        self._decoder = self._opened(device)
+        self._check_range(topic)
+
+    def _opened(self, device: str) -> Any:
+        if find_spec("torchcodec") is None:
+            raise OptionError(
+                "backend='torchcodec' needs torchcodec. Install it with: pip install torchcodec"
+            )
+        try:
+            module = import_module("torchcodec.decoders")
+        except (ImportError, OSError, RuntimeError) as error:
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise OptionError(
+                f"torchcodec is installed but cannot be used: {reason} If it finds no FFmpeg, "
+                "install that."
+            ) from None
+        try:
+            # with exact seeking, frame n is the n-th shown, whatever its presentation time
+            return module.VideoDecoder(
+                str(self._path), dimension_order="NHWC", device=device, seek_mode="exact"
+            )
+        except (RuntimeError, ValueError) as error:
+            raise self._refused(error) from None
+
+    def _check_range(self, topic: Topic) -> None:
+        """Refuse a video whose range torchcodec misinterprets.
+
+        On a CPU, torchcodec 0.13 treats full-range AV1 as limited: contrast is then too high by 255
+        / 219, and dark and bright details are clipped.
+        """
+        with closing(topic):  # it reopens its video when needed
+            first = topic.read([0], format="rgb")[0]
+        ours = first[self._rows, self._columns].astype(np.int16)
+        mistaken = ((ours - 16) * (255 / 219)).clip(0, 255)
+        theirs = self.read([0])[0].cpu().numpy()
+        if np.abs(theirs - mistaken).mean() < np.abs(theirs - ours).mean():
+            raise OptionError(
+                f"topic {topic.topic}: torchcodec decodes its full-range video as limited-range, "
+                "so the contrast would be wrong. Use backend='mp4ds', or a dataset packed with "
+                "`codec` h264."
+            )
+
+    def _refused(self, error: Exception) -> VideoError:
+        reason = " ".join(str(error).split()[:40])
+        return VideoError("decode-failed", self._path, f"torchcodec cannot decode it: {reason}")
+
+    def read(self, frames: Sequence[int]) -> Tensor:
+        """Frames in the requested order, with repetitions; shape (N, H, W, 3), uint8.
+
+        Raises:
+            VideoError: One cannot be decoded.
+        """
+        if not frames:
+            height, width = (part.stop - part.start for part in (self._rows, self._columns))
+            return torch.empty((0, height, width, 3), dtype=torch.uint8, device=self._device)
+        try:
+            pixels: Tensor = self._decoder.get_frames_at(list(frames)).data
+        except (RuntimeError, IndexError, ValueError) as error:
+            raise self._refused(error) from None
+        return pixels[:, self._rows, self._columns]
+
+
+def _check_layout(stream: Stream) -> None:
+    """Refuse pictures that are not the images, or that have more than 8 bits.
+
+    In lossy videos, 10-bit pictures hold 8-bit images.
+    """
+    image, video = stream.sidecar.image, stream.sidecar.video
+    is_8_bits = video.pixel_format in (None, TEN_BITS) or not video.pixel_format.endswith("le")
+    if not LAYOUTS[video.layout].is_shown or not is_8_bits:
+        raise OptionError(
+            f"topic {stream.topic}: {image.encoding} images are stored in the layout "
+            f"{video.layout}, which torchcodec cannot convert to colour. Use backend='mp4ds'."
+        )
+
+
 # ---------------------------------------------------------------- cameras
 
 
@@ -269,21 +416,24 @@ class OpenCamera:
 
     Args:
         source: Which.
-        view: How its frames are wanted.
-        dtype: ``native``, ``uint8`` or ``float32``.
+        view: How its frames are wanted, as in `Pictures.views`.
+        pictures: How they become tensors.
 
     Raises:
         FormatError: The stream breaks a rule of the format.
     """
 
-    def __init__(self, source: CameraSource, view: dict[str, Any], dtype: str) -> None:
+    def __init__(self, source: CameraSource, view: dict[str, Any], pictures: Pictures) -> None:
         self._source = source
         self._view = view
-        self._dtype = dtype
+        self._pictures = pictures
         self._topic = open_source(source)
         if len(self._topic) != source.frames:
             problem = f"has {len(self._topic)} frames, not {source.frames}"
             raise FormatError("frame-count", source.place, problem)
+        self._torchcodec = None
+        if pictures.backend == "torchcodec":
+            self._torchcodec = TorchcodecReader(self._topic, view["crop"], pictures.device)
 
     @property
     def stamps(self) -> NDArray[np.int64]:
@@ -333,13 +483,13 @@ class OpenCamera:
             OptionError: The frames cannot be returned as requested.
         """
         like = self._pixels([])
-        if self._dtype == "uint8" and like.dtype != torch.uint8:
+        if self._pictures.dtype == "uint8" and like.dtype != torch.uint8:
             kind = str(like.dtype).removeprefix("torch.")
             raise OptionError(
                 f"topic {self._source.topic}: has frames of {kind}, not uint8. Give "
                 "dtype='native' to get them as stored, or dtype='float32'."
             )
-        dtype = torch.float32 if self._dtype == "float32" else like.dtype
+        dtype = torch.float32 if self._pictures.dtype == "float32" else like.dtype
         return like.new_empty((0, frames, *like.shape[1:3], *(like.shape[3:] or (1,))), dtype=dtype)
 
     def read(self, frames: Sequence[int], outs: Sequence[Tensor]) -> None:
@@ -361,14 +511,14 @@ class OpenCamera:
             raise self._first_failure(frames, error) from None
 
     def _read(self, frames: Sequence[int], outs: Sequence[Tensor]) -> None:
-        if self._dtype != "float32":
+        if self._torchcodec is None and self._pictures.dtype != "float32":
             # arrays share the memory of tensors; those of grey images have no channels
             rows = [(out.squeeze(-1) if out.shape[-1] == 1 else out).numpy() for out in outs]
             self._topic.read_into(frames, rows, **self._view)
             return
         for pixels, out in zip(self._pixels(frames), outs, strict=True):
             shaped = pixels.view(out.shape)
-            is_scaled = self._dtype == "float32" and self._view["format"] != "native"
+            is_scaled = self._pictures.dtype == "float32" and self._view["format"] != "native"
             if pixels.dtype.is_floating_point or not is_scaled:
                 out.copy_(shaped)
             else:
@@ -376,6 +526,8 @@ class OpenCamera:
 
     def _pixels(self, frames: Sequence[int]) -> Tensor:
         """Frames as decoded, shape (N, H, W) or (N, H, W, C)."""
+        if self._torchcodec is not None:
+            return self._torchcodec.read(frames)
         return torch.from_numpy(self._topic.read(frames, **self._view))  # shares the memory
 
     def _first_failure(self, frames: Sequence[int], error: Mp4dsError) -> SampleError:
@@ -389,6 +541,7 @@ class OpenCamera:
 
     def close(self) -> None:
         """Close the video."""
+        self._torchcodec = None
         self._topic.close()
 
 
@@ -400,21 +553,18 @@ class OpenCameras:
 
     Args:
         most: Maximum number of open cameras.
-        views: How their frames are wanted, of each.
-        dtype: ``native``, ``uint8`` or ``float32``.
+        pictures: How their frames become tensors.
 
     Raises:
-        OptionError: `most` is less than one, or there is no such dtype.
+        OptionError: `most` is less than one.
     """
 
-    def __init__(self, most: int, views: list[dict[str, Any]], dtype: str) -> None:
+    def __init__(self, most: int, pictures: Pictures) -> None:
         self._most = most
-        self._views = views
-        self._dtype = str(dtype).removeprefix("torch.")
+        self._pictures = pictures
         # by process: what a parent opened is kept as it is, since closing or freeing its decoders
         # could hang, and its lock may be held by a thread that a fork did not copy
         self._opened: dict[int, tuple[threading.RLock, OrderedDict[str, OpenCamera]]] = {}
-        one_of("dtype", self._dtype, ("native", "uint8", "float32"))
         if most < 1:
             raise OptionError(f"cache_files is {most}, but must be at least 1.")
 
@@ -435,7 +585,7 @@ class OpenCameras:
                 if found is None:
                     while len(opened) >= self._most:
                         opened.popitem(last=False)[1].close()
-                    found = OpenCamera(source, self._views[camera], self._dtype)
+                    found = OpenCamera(source, self._pictures.views[camera], self._pictures)
                 opened[source.place] = found
                 yield found
         except OptionError:

@@ -16,14 +16,15 @@ from torch.utils.data import Dataset, default_collate, get_worker_info
 from mp4ds.dataset.views import Crop, Resize
 from mp4ds.errors import OptionError, absent, counted
 from mp4ds.torch.cameras import (
+    Backend,
     Dtype,
     OpenCamera,
     OpenCameras,
     Paths,
+    Pictures,
     Recording,
     one_of,
     recordings_of,
-    views_from,
 )
 
 Unit = Literal["frames", "seconds"]
@@ -128,7 +129,7 @@ def _kind(row: torch.Tensor) -> tuple[object, ...]:
 def _longer(like: torch.Tensor, rows: int, *, shared: bool = False) -> torch.Tensor:
     """A new tensor of some rows, like one without any; shared with other processes if asked for."""
     shape = (rows, *like.shape[1:])
-    if not shared:
+    if not shared or like.device.type != "cpu":
         return like.new_empty(shape)
     # as torch's own collate does in a worker
     storage = torch.UntypedStorage._new_shared(prod(shape) * like.itemsize)
@@ -174,6 +175,8 @@ class FrameDataset(Dataset):
         channels_first: (C, H, W), not (H, W, C).
         transform: Called with each sample; its return value replaces the sample.
         cache_files: Maximum number of open videos per process.
+        backend: ``torchcodec`` decodes with torchcodec, whose colours differ slightly.
+        device: With ``torchcodec``, where to decode and keep the tensors, such as ``cuda``.
 
     Attributes:
         topics: The cameras of a sample.
@@ -201,6 +204,8 @@ class FrameDataset(Dataset):
         channels_first: bool = True,
         transform: Transform | None = None,
         cache_files: int = 16,
+        backend: Backend = "mp4ds",
+        device: str = "cpu",
         **others: NoReturn,
     ) -> None:
         for name in others:  # of other libraries, too
@@ -210,9 +215,17 @@ class FrameDataset(Dataset):
         starts = np.cumsum([0, *(recording.rows for recording in self.recordings)])
         self._starts: NDArray[np.int64] = starts.astype(np.int64)
         self._transform = transform
-        views = views_from(self.topics, format, resize, crop)
-        self._cameras = OpenCameras(cache_files, views, dtype)
-        self._channels_first = channels_first
+        self._pictures = Pictures(
+            self.topics,
+            format=format,
+            resize=resize,
+            crop=crop,
+            dtype=dtype,
+            channels_first=channels_first,
+            backend=backend,
+            device=device,
+        )
+        self._cameras = OpenCameras(cache_files, self._pictures)
         self._collates = False
 
     @property
@@ -288,7 +301,7 @@ class FrameDataset(Dataset):
                         stamps = camera.stamps[recording.frames(rows, 0)].tolist()
                 flags[f"{topic}_is_pad"] = torch.from_numpy(padded)
                 for place, out in zip(places, outs, strict=True):
-                    shown = out.movedim(-1, -3) if self._channels_first else out
+                    shown = out.movedim(-1, -3) if self._pictures.channels_first else out
                     samples[place][topic] = shown[0] if self._offsets.is_single else shown
             for n, place in enumerate(places):
                 samples[place] |= {name: padded[n] for name, padded in flags.items()}
