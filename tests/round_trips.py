@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mp4ds
+from compare import compare
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.unpack import UnpackOptions
 from scenes import Scene
@@ -48,15 +50,6 @@ def unpacked(folder: Path, target: str) -> Path:
     return output
 
 
-def round_trip(
-    sources: list[Path], folder: Path, target: str, exclude: list[str] | None = None
-) -> Path:
-    """Pack, validate, unpack; returns what came out."""
-    mp4ds.pack(sources, folder / "dataset", PackOptions(exclude=exclude or ()))
-    assert mp4ds.validate(folder / "dataset", deep=True) == []
-    return unpacked(folder, target)
-
-
 @dataclass(frozen=True)
 class Journey:
     """A recording that was packed, validated and unpacked.
@@ -84,17 +77,27 @@ class Journey:
         return {reason: count for reason, (count, _) in found.verbatim.items()}
 
 
-def journey(folder: Path, write: Source, scene: Scene, target: str, **options: Any) -> Journey:
-    """Write a scene, pack it, validate it, and unpack it.
+def journey(
+    folder: Path,
+    write: Source,
+    scene: Scene,
+    target: str,
+    ignore_pixels: Sequence[str] = (),
+    **options: Any,
+) -> Journey:
+    """Write a scene, pack it, validate it, and unpack it: what comes out is equal.
 
     Args:
         folder: Where to do it; empty.
         write: The source's writer.
         scene: What to record.
         target: One of `TARGETS`.
+        ignore_pixels: Topics whose pixels may differ.
         options: Of the pack.
     """
     sources = write(folder / "source", scene)
     summary = mp4ds.pack(sources, folder / "dataset", PackOptions(**options))
     assert mp4ds.validate(folder / "dataset", deep=True) == []
-    return Journey(sources, unpacked(folder, target), summary, folder / "dataset")
+    output = unpacked(folder, target)
+    assert compare(sources, output, ignore_pixels=ignore_pixels) == []
+    return Journey(sources, output, summary, folder / "dataset")

@@ -73,7 +73,6 @@ EVEN |= {("full", "32FC1")}
 def test_raw_images(content: str, encoding: str, source: str, shape: str, tmp_path: Path) -> None:
     recorded = scene(encoding, frames=FRAMES, content=content, **SHAPES[shape])
     done = journey(tmp_path, SOURCES[source], recorded, own_target(source))
-    assert compare(done.sources, done.output) == []
     messages, frames = done.frames(TOPIC)
     assert messages == FRAMES
     if (content, encoding) in NOT_SMALLER:
@@ -121,7 +120,6 @@ def test_images_that_do_not_fit_what_the_first_were_like(
             early.messages[place] = late.messages[place]
         images += 1
     done = journey(tmp_path, SOURCES[source], early, own_target(source))
-    assert compare(done.sources, done.output) == []
     assert done.frames(TOPIC) == (16, 16)
     with mp4ds.open(done.dataset) as dataset:
         counts = [len(stream) for stream in dataset.streams]
@@ -165,7 +163,6 @@ def test_coded_pictures(name: str, source: str, tmp_path: Path) -> None:
     recorded = CODED[name]()
     topic = image_topic(recorded)
     done = journey(tmp_path, SOURCES[source], recorded, own_target(source))
-    assert compare(done.sources, done.output) == []
     messages, frames = done.frames(topic)
     if name in EVEN_PNG:
         assert (messages, frames) in ((10, 0), (10, 10))
@@ -210,7 +207,6 @@ FOXGLOVE_CASES = [(name, source) for name in FOXGLOVE for source in FOXGLOVE_SOU
 @pytest.mark.parametrize(("name", "source"), share(FOXGLOVE_CASES, len(FOXGLOVE_SOURCES)))
 def test_foxglove_messages(name: str, source: str, tmp_path: Path) -> None:
     done = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE[name](), "mcap")
-    assert compare(done.sources, done.output) == []
     messages, frames = FOXGLOVE_EXPECTED[name]
     assert done.frames("/camera/image") == (messages, frames)
     calibrations = done.frames("/camera/calibration")
@@ -266,19 +262,18 @@ def test_raw_images_in_a_lossy_profile(quality: str, encoding: str, tmp_path: Pa
     """All but the pixels is exact, and the pixels are where loss would harm their meaning."""
     is_lossy = encoding in LOSSY
     recorded = scene(encoding, frames=6, width=94, height=62, pad=2, noisy=not is_lossy)
-    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **QUALITIES[quality])
+    ignored = [TOPIC] if is_lossy else []
+    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", ignored, **QUALITIES[quality])
     assert done.frames(TOPIC) == (6, 6)
     with mp4ds.open(done.dataset) as dataset:
         (stream,) = dataset.streams
     if is_lossy:
         assert stream.sidecar.profile == QUALITIES[quality]["quality"]
-        assert compare(done.sources, done.output, ignore_pixels=[TOPIC]) == []
         assert LOSSY[encoding] <= least_psnr(done, TOPIC) < 90
         differences = compare(done.sources, done.output, limit=99)
         assert differences == [f"{TOPIC} message {n}: payload differs" for n in range(6)]
     else:
         assert stream.sidecar.profile == "lossless"
-        assert compare(done.sources, done.output) == []
 
 
 @pytest.mark.one_in(3)
@@ -289,8 +284,7 @@ def test_narrow_images_in_a_lossy_profile(
 ) -> None:
     """x265 damages pictures, or the memory, where there are up to 48 columns: it is not asked."""
     recorded = scene("mono8", frames=12, width=size[0], height=size[1], noisy=False)
-    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **QUALITIES[quality])
-    assert compare(done.sources, done.output, ignore_pixels=[TOPIC]) == []
+    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", [TOPIC], **QUALITIES[quality])
     if quality == "crf-h265" and size[0] < 64:
         assert done.frames(TOPIC) == (12, 0)
         assert list(done.reasons(TOPIC)) == [
@@ -334,7 +328,7 @@ def test_jpeg_files_that_are_transcoded(name: str, quality: str, tmp_path: Path)
     recorded = CODED[name](frames=8, width=96, height=64)
     topic = image_topic(recorded)
     options = QUALITIES[quality] | {"transcode": True}
-    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **options)
+    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", [topic], **options)
     # the smaller of the two sizes is narrower than x265 is asked for
     narrow = (name, quality) == ("jpeg-mixed-sizes", "crf-h265")
     assert done.frames(topic) == (8, 6 if narrow else 8)
@@ -343,7 +337,6 @@ def test_jpeg_files_that_are_transcoded(name: str, quality: str, tmp_path: Path)
         assert {stream.sidecar.profile for stream in dataset.streams} == {
             QUALITIES[quality]["quality"]
         }
-    assert compare(done.sources, done.output, ignore_pixels=[topic]) == []
     assert compare(done.sources, done.output) != []
     assert LEAST.get(name, 33) <= least_psnr(done, topic) < 90
 
@@ -353,12 +346,8 @@ def test_jpeg_packets_that_are_transcoded(quality: str, tmp_path: Path) -> None:
     recorded = CODED["ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"](width=96, height=64)
     topic = image_topic(recorded)
     options = QUALITIES[quality] | {"transcode": True}
-    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **options)
+    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", [topic], **options)
     assert done.frames(topic) == (10, 10)
-    before, after = (of_topic(path, topic) for path in (done.sources[0], done.output))
-    for one, other in zip(before, after, strict=True):
-        for name in set(vars(one.value)) - {"data"}:
-            assert repr(getattr(one.value, name)) == repr(getattr(other.value, name))
     assert 29 <= least_psnr(done, topic) < 90
     differences = compare(done.sources, done.output, limit=99)
     assert differences == [f"{topic} message {n}: payload differs" for n in range(10)]
@@ -385,7 +374,6 @@ def test_what_else_is_coded_stays_exact_in_every_profile(
     recorded = CODED[name]()
     options = QUALITIES[quality] | {"transcode": True}
     done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **options)
-    assert compare(done.sources, done.output) == []
     assert done.frames(image_topic(recorded)) == EXPECTED[name]
 
 
@@ -393,7 +381,6 @@ def test_what_else_is_coded_stays_exact_in_every_profile(
 def test_jpeg_files_are_kept_unless_asked(quality: str, tmp_path: Path) -> None:
     recorded = CODED["jpeg-rgb"]()
     done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", **QUALITIES[quality])
-    assert compare(done.sources, done.output) == []
     (summary,) = (t for t in done.summary.topics if t.topic == image_topic(recorded))
     assert summary.frames == 10
     assert any("--transcode" in note for note in summary.notes)
@@ -440,7 +427,6 @@ def test_a_robot_with_many_cameras(source: str, tmp_path: Path) -> None:
     others = [m for m in islice(chain(scenes[0].messages), 60) if not m.topic.startswith("/cam")]
     recorded = Scene(sorted(messages + others, key=lambda message: message.log_time))
     done = journey(tmp_path, SOURCES[source], recorded, own_target(source), jobs=2)
-    assert compare(done.sources, done.output) == []
     cameras = {message.topic for message in messages if message.msgtype in PICTURES}
     assert len(cameras) == len(scenes)
     for topic in cameras:
@@ -455,6 +441,5 @@ def test_a_few_small_files_stay_files(frames: int, are_files: bool, tmp_path: Pa
     """109 bytes of PNG would become a video and a sidecar of 4 kB."""
     recorded = CODED["png-gray-cv2"](frames=frames, width=16, height=12)
     done = journey(tmp_path, SOURCES["mcap-ros2-zstd"], recorded, "mcap")
-    assert compare(done.sources, done.output) == []
     reasons = done.reasons("/cam/image_raw/compressed")
     assert any("take less than a video" in reason for reason in reasons) == are_files

@@ -26,25 +26,18 @@ from round_trips import (
     journey,
     output_of,
     own_target,
-    round_trip,
     unpacked,
 )
 from scenes import Scene
 from sources import SOURCES, TRAITS, odd_scene, scene
 
 
-def has_streams(folder: Path) -> bool:
-    return bool(list(folder.glob("*.mp4")))
-
-
 @pytest.mark.one_in(4)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("encoding", ["bayer_gbrg8", "mono16"])
 def test_every_source_returns_to_its_own_format(source: str, encoding: str, tmp_path: Path) -> None:
-    sources = SOURCES[source](tmp_path / "source", scene(encoding))
-    output = round_trip(sources, tmp_path, own_target(source))
-    assert has_streams(tmp_path / "dataset")
-    assert compare(sources, output) == []
+    journey(tmp_path, SOURCES[source], scene(encoding), own_target(source))
+    assert list((tmp_path / "dataset").glob("*.mp4"))
 
 
 # ---------------------------------------------------------------- from any middleware to any
@@ -73,7 +66,6 @@ CROSSED = [
 def test_from_any_ros_to_any_other(camera: str, source: str, target: str, tmp_path: Path) -> None:
     recorded = CAMERAS[camera]()
     done = journey(tmp_path, SOURCES[source], recorded, target)
-    assert compare(done.sources, done.output) == []
     cameras = {m.topic for m in recorded.messages if m.msgtype in PICTURES}
     assert {done.frames(topic) for topic in cameras} <= {(8, 8), (10, 10)}
 
@@ -86,7 +78,6 @@ FOXGLOVE_CAMERAS = ["raw-bgr8", "jpeg-rgb", "video-h264"]
 def test_foxglove_messages_of_ros_go_to_any_other(camera: str, target: str, tmp_path: Path) -> None:
     write = FOXGLOVE_SOURCES["mcap-foxglove-ros2"]
     done = journey(tmp_path, write, FOXGLOVE[camera](), target)
-    assert compare(done.sources, done.output) == []
     assert done.frames("/camera/image") == (10, 10)
 
 
@@ -95,7 +86,6 @@ def test_foxglove_messages_of_ros_go_to_any_other(camera: str, target: str, tmp_
 @pytest.mark.parametrize("target", [*TARGETS][:3])
 def test_what_no_ros_can_hold_is_refused(target: str, camera: str, tmp_path: Path) -> None:
     done = journey(tmp_path, FOXGLOVE_SOURCES["mcap-protobuf"], FOXGLOVE[camera](), "mcap")
-    assert compare(done.sources, done.output) == []
     done.output.unlink()
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(mp4ds.ConversionError) as caught:
@@ -146,9 +136,7 @@ def test_what_ros_can_hold_of_the_rest(target: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("trait", TRAITS)
 @pytest.mark.parametrize("source", ["bag-none", "mcap-ros2-none"])
 def test_odd_messages_return(trait: str, source: str, tmp_path: Path) -> None:
-    sources = SOURCES[source](tmp_path / "source", odd_scene(trait))
-    output = round_trip(sources, tmp_path, own_target(source))
-    assert compare(sources, output) == []
+    journey(tmp_path, SOURCES[source], odd_scene(trait), own_target(source))
 
 
 REAL = sorted(
@@ -173,7 +161,9 @@ REAL_FOLDERS = sorted(
 def test_real_recordings_return(name: str, tmp_path: Path) -> None:
     path = real(name)
     target = "rosbag2" if path.is_dir() or path.suffix == ".db3" else path.suffix[1:]
-    output = round_trip([path], tmp_path, target)
+    mp4ds.pack(path, tmp_path / "dataset")
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    output = unpacked(tmp_path, target)
     assert compare(path, output) == []
     with open_reader(path) as before, open_reader(output) as after:
         # it does not compare them; an index may list a schema, but not the channel that uses it

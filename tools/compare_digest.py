@@ -16,7 +16,8 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
+RAW = "sensor_msgs/Image"
+CODED = ("sensor_msgs/CompressedImage", "ffmpeg_image_transport_msgs/FFMPEGPacket")
 
 
 @dataclass(frozen=True)
@@ -117,19 +118,19 @@ def field_bytes(value: Any, *, skip_data: bool = False) -> Iterator[bytes]:
 
 
 def without_pixels(channel: Channel, payload: bytes) -> tuple[bytes, ...]:
-    """An image message's bytes around its pixels; a compressed one's also without their length."""
+    """An image message's bytes around its pixels, and of a coded one around their length."""
     short = channel.type.replace("/msg/", "/")
     if channel.encoding == "protobuf" and channel.definition:
         message = protobuf_type(channel.definition[1], channel.type).FromString(payload)
         message.ClearField("data")
         return (message.SerializeToString(deterministic=True),)
-    if channel.encoding not in ("ros1", "cdr") or short not in IMAGES:
+    if channel.encoding not in ("ros1", "cdr") or short not in (RAW, *CODED):
         raise ValueError(f"topic {channel.topic}: pixels of {channel.type} cannot be ignored")
     try:
         head, _, tail = payload.rpartition(decoded(channel, payload).data.tobytes())
     except Exception:  # a damaged image has no pixels to leave out
         return (payload,)
-    return (head if short == IMAGES[0] else head[:-4], tail)
+    return (head if short == RAW else head[:-4], tail)
 
 
 @lru_cache
