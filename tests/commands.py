@@ -5,15 +5,19 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 import mp4ds
 from mp4ds.cli import commands as command_line
@@ -95,6 +99,13 @@ def program(
     )
     assert code in (done.returncode, None), done.stdout + done.stderr
     return Result(done.returncode, done.stdout, done.stderr)
+
+
+def ffprobe(path: Path, *options: str) -> Any:
+    """What ffprobe says of a file, as JSON values."""
+    if not shutil.which("ffprobe"):
+        pytest.skip("there is no ffprobe")
+    return json.loads(program("ffprobe", "-v", "error", "-of", "json", *options, path).out)
 
 
 def typed(line: str, folder: Path) -> Result:

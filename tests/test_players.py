@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ import images
 import mp4ds
 from chromium import Tab, played, video_player
 from coded_scenes import CODED
+from commands import ffprobe
 from definitions import PICTURES
 from mp4ds.packing.options import PackOptions
 from pictures import CAREFUL, blocks
@@ -217,13 +217,6 @@ def expected_ticks(dataset: Path) -> list[int]:
 
 
 # ---------------------------------------------------------------- ffmpeg
-
-
-def ffprobe(path: Path, *options: str) -> Any:
-    if not shutil.which("ffprobe"):
-        pytest.skip("there is no ffprobe")
-    command = ["ffprobe", "-v", "error", "-of", "json", *options, str(path)]
-    return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
 
 
 @pytest.mark.one_in(4)

@@ -21,7 +21,6 @@ from compare import compare
 from in_parts import IN_PARTS, WORK, InlineExecutor, Pack, facts, leftovers, use
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.errors import (
-    FormatError,
     OptionError,
     PartsFailedError,
     SourceError,
@@ -180,16 +179,6 @@ def test_a_part_that_is_not_whole_is_made_again(
     else:
         os.truncate(path, 100)
     assert pack.goes_on() == [PARTS[1], PARTS[3]]
-
-
-def test_a_video_that_rotted_is_not_joined(pack: Pack, stopped: Callable[[int], Path]) -> None:
-    video = stopped(3) / PARTS[1] / "cam_image_raw.mp4"
-    data = bytearray(video.read_bytes())
-    data[len(data) // 2] ^= 1
-    video.write_bytes(data)
-    error = pack.refused(r"cam_image_raw.mp4.*was damaged after")
-    assert isinstance(error, FormatError)
-    assert pack.goes_on() == [PARTS[1]]
 
 
 def test_two_at_a_time_are_refused(pack: Pack) -> None:

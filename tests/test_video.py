@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import io
 import itertools
-import json
 import os
 import random
-import shutil
-import subprocess
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from coded_tools import jpeg
+from commands import ffprobe
 from mp4ds.errors import EncoderRefusedError, OptionError, Refused, VideoError
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import CHROMA_SHIFTS, bind, fit, layout_for
@@ -55,13 +53,6 @@ def exists(codec: str, picture_format: str, lossless: bool) -> bool:
 
 LOSSLESS = [pair for pair in itertools.product(CODECS, FORMATS) if exists(*pair, lossless=True)]
 LOSSY = [codec for codec in (*CODECS, "av1-10bit") if exists(codec, "rgb24", lossless=False)]
-
-
-def ffprobe(path: Path, *options: str) -> Any:
-    if not shutil.which("ffprobe"):
-        pytest.skip("there is no ffprobe")
-    command = ["ffprobe", "-v", "error", "-of", "json", *options, str(path)]
-    return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
 
 
 def noise(picture_format: str, width: int, height: int, frames: int) -> list[Any]:
