@@ -134,7 +134,7 @@ class RosForm(Form):
         """Read a message."""
         if bytes(data[: len(self._prefix)]) != self._prefix:
             raise WireError("it does not begin like a plain serialization of its kind")
-        reader = PrimitiveReader(data, len(self._prefix), self._order, aligned=self._ros2)
+        reader = PrimitiveReader(data, len(self._prefix), self._order, is_cdr=self._ros2)
         values: dict[str, Any] = {}
         spans: dict[str, Span] = {}
         body = len(data), len(data)
@@ -147,14 +147,14 @@ class RosForm(Form):
                 spans["stamp"] = start, start + 8
                 values["stamp"] = reader.integer(self._sec_code), reader.integer("I")
                 if name == "header":
-                    values["frame_id"] = reader.string(terminated=self._ros2)
+                    values["frame_id"] = reader.string()
             elif name == "body":
                 size = reader.integer("I")
                 body = reader.offset, reader.offset + size
                 spans["body"] = reader.offset - 4, body[1]
                 reader.raw(size)
             else:
-                values[name] = _take(reader, code, terminated=self._ros2)
+                values[name] = _take(reader, code)
                 if name == "pts":
                     spans["pts"] = reader.offset - 8, reader.offset
         parts = {
@@ -190,28 +190,28 @@ class RosForm(Form):
             fields: Its fields.
             flags: Of a packet.
         """
-        writer = PrimitiveWriter(self._prefix, self._order, aligned=self._ros2)
+        writer = PrimitiveWriter(self._prefix, self._order, is_cdr=self._ros2)
         for name, code in self._layout:
             if name in ("header", "time"):
                 if name == "header" and not self._ros2:
                     writer.put("I", 0)
                 writer.put("I", 0, 0)
                 if name == "header":
-                    writer.string(frame_id, terminated=self._ros2)
+                    writer.string(frame_id)
             elif name == "body":
                 writer.put("I", 0)
             elif name in ("pts", "flags") or (name, self._kind) == ("is_bigendian", CodedFields):
                 writer.put(code, flags if name == "flags" else 0)
             elif name == "frame_id":
-                writer.string(frame_id, terminated=self._ros2)
+                writer.string(frame_id)
             else:
-                _put(writer, code, getattr(fields, name), terminated=self._ros2)
+                _put(writer, code, getattr(fields, name))
         return writer.getvalue()
 
 
-def _take(reader: PrimitiveReader, code: str, *, terminated: bool) -> Any:
+def _take(reader: PrimitiveReader, code: str) -> Any:
     if code == "s":
-        return reader.string(terminated=terminated)
+        return reader.string()
     if code == "d*":
         count = reader.integer("I")
         if count > MAX_DISTORTION:
@@ -222,9 +222,9 @@ def _take(reader: PrimitiveReader, code: str, *, terminated: bool) -> Any:
     return reader.integer(code)
 
 
-def _put(writer: PrimitiveWriter, code: str, value: Any, *, terminated: bool) -> None:
+def _put(writer: PrimitiveWriter, code: str, value: Any) -> None:
     if code == "s":
-        writer.string(value, terminated=terminated)
+        writer.string(value)
     elif code == "d*":
         writer.put("I", len(value))
         writer.put("d", *value)

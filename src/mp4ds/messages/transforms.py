@@ -123,7 +123,7 @@ def _name(frame_id: str) -> str:
 def _parse_ros(encoding: str, name: str, data: memoryview) -> list[Transform]:
     wire = wire_of(encoding, data)
     cdr = wire != "ros1"
-    reader = PrimitiveReader(data, 4 if cdr else 0, _CDR_ORDERS.get(wire, "<"), aligned=cdr)
+    reader = PrimitiveReader(data, 4 if cdr else 0, _CDR_ORDERS.get(wire, "<"), is_cdr=cdr)
     amount, layout = _ROS_TYPES[name]
     count = reader.integer("I") if amount == "list" else 1
     # a message that declares more than it holds gives an error
@@ -134,8 +134,8 @@ def _read_ros(reader: PrimitiveReader, layout: str, *, cdr: bool) -> Transform:
     if layout == "stamped" and not cdr:
         reader.take("I")  # seq
     reader.take("I", 2)  # stamp
-    parent = reader.string(terminated=cdr)
-    child = reader.string(terminated=cdr)
+    parent = reader.string()
+    child = reader.string()
     x, y, z = reader.take("d", 3)
     qx, qy, qz, qw = reader.take("d", 4)
     return Transform(parent, child, (x, y, z), (qx, qy, qz, qw))

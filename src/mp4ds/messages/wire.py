@@ -321,25 +321,25 @@ def text(raw: memoryview) -> str:
 
 
 class PrimitiveReader:
-    """Reads primitives in order; `aligned` skips CDR padding.
+    """Reads primitives and strings in order, of ROS 1 or CDR.
 
     Args:
         data: The payload.
         start: Where the fields begin; alignment counts from here.
         order: ``<`` or ``>``.
-        aligned: Whether primitives are at multiples of their size.
+        is_cdr: Whether primitives are at multiples of their size, and strings end in NUL.
     """
 
-    def __init__(self, data: memoryview, start: int, order: str, *, aligned: bool) -> None:
+    def __init__(self, data: memoryview, start: int, order: str, *, is_cdr: bool) -> None:
         self._data = data
         self._start = start
         self.offset = start
         self._order = order
-        self._aligned = aligned
+        self._is_cdr = is_cdr
 
     def align(self, size: int) -> int:
         """Advance to the next primitive of that size; returns the offset."""
-        if self._aligned:
+        if self._is_cdr:
             self.offset += -(self.offset - self._start) % size
         return self.offset
 
@@ -369,12 +369,11 @@ class PrimitiveReader:
         self.offset = end
         return view
 
-    def string(self, *, terminated: bool) -> str:
+    def string(self) -> str:
         """Read a length-prefixed string, in CDR with its terminating NUL."""
-        size = self.integer("I")
-        raw = self.raw(size)
-        if terminated:
-            if size == 0 or raw[-1] != 0:
+        raw = self.raw(self.integer("I"))
+        if self._is_cdr:
+            if not len(raw) or raw[-1] != 0:
                 raise WireError("a string does not end in NUL")
             raw = raw[:-1]
         return text(raw)
@@ -383,23 +382,23 @@ class PrimitiveReader:
 class PrimitiveWriter:
     """Writes what `PrimitiveReader` reads, with zero padding."""
 
-    def __init__(self, prefix: bytes, order: str, *, aligned: bool) -> None:
+    def __init__(self, prefix: bytes, order: str, *, is_cdr: bool) -> None:
         self._data = bytearray(prefix)
         self._start = len(prefix)
         self._order = order
-        self._aligned = aligned
+        self._is_cdr = is_cdr
 
     def put(self, code: str, *values: float) -> None:
         """Write primitives of a struct code."""
         if not values:
             return
-        if self._aligned:
+        if self._is_cdr:
             self._data += bytes(-(len(self._data) - self._start) % struct.calcsize(code))
         self._data += struct.pack(f"{self._order}{len(values)}{code}", *values)
 
-    def string(self, value: str, *, terminated: bool) -> None:
+    def string(self, value: str) -> None:
         """Write a length-prefixed string."""
-        raw = value.encode() + (b"\0" if terminated else b"")
+        raw = value.encode() + (b"\0" if self._is_cdr else b"")
         self.put("I", len(raw))
         self._data += raw
 

@@ -229,7 +229,7 @@ class ImagesReader(BagReader):
         times, values = stamps[order], rows[order]
 
         def make(number: int) -> bytes:
-            writer = PrimitiveWriter(_PREFIX, "<", aligned=True)
+            writer = PrimitiveWriter(_PREFIX, "<", is_cdr=True)
             _put_header(writer, int(times[number]), frame_id)
             writer.put("d", *values_of(values[number].tolist()))
             return writer.getvalue()
@@ -342,15 +342,15 @@ def _camera_message(
 
 
 def _transforms_message(stamp: int, transforms: Sequence[Transform]) -> bytes:
-    writer = PrimitiveWriter(_PREFIX, "<", aligned=True)
+    writer = PrimitiveWriter(_PREFIX, "<", is_cdr=True)
     writer.put("I", len(transforms))
     for item in transforms:
         _put_header(writer, stamp, item.parent)
-        writer.string(item.child, terminated=True)
+        writer.string(item.child)
         writer.put("d", *item.translation, *item.rotation)
     return writer.getvalue()
 
 
 def _put_header(writer: PrimitiveWriter, stamp: int, frame_id: str) -> None:
     writer.put("I", *divmod(stamp, NS))
-    writer.string(frame_id, terminated=True)
+    writer.string(frame_id)

@@ -396,7 +396,7 @@ def _stamped(channel: Channel) -> str:
 def _of_transforms(data: bytearray, order: str, is_ros1: bool) -> Iterator[int]:
     """Where the stamps of transforms are."""
     start = 0 if is_ros1 else _ENCAPSULATION
-    reader = PrimitiveReader(memoryview(data), start, order, aligned=not is_ros1)
+    reader = PrimitiveReader(memoryview(data), start, order, is_cdr=not is_ros1)
     for _ in range(reader.integer("I")):
         if is_ros1:
             reader.take("I")  # seq
