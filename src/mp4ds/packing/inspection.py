@@ -170,13 +170,13 @@ class MessageInspector:
         )
 
     def _jpeg_image(self, message: Message, form: Form, parts: Parts) -> CameraMessage:
-        found = parse_jpeg(parts.body)
-        encoding = "mono8" if found.components == 1 else "rgb8"
+        width, height, components = parse_jpeg(parts.body)
+        encoding = "mono8" if components == 1 else "rgb8"
         if not self._transcode:
-            key = _coded_key(form, "packet", "mjpeg", encoding, found.width, found.height)
+            key = _coded_key(form, "packet", "mjpeg", encoding, width, height)
             return CameraMessage(message, form, parts, key)
-        _, pixels = jpeg_pixels(parts.body, (found.width, found.height))
-        key = _coded_key(form, "jpeg", "", encoding, found.width, found.height)
+        _, pixels = jpeg_pixels(parts.body, (width, height))
+        key = _coded_key(form, "jpeg", "", encoding, width, height)
         return CameraMessage(message, form, parts, key, pixels=pixels)
 
     def _png_image(self, message: Message, form: Form, parts: Parts) -> CameraMessage:

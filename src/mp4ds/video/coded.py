@@ -302,8 +302,8 @@ class Jpeg(StreamParser):
     """JPEG files: all are key frames."""
 
     def _picture(self, body: memoryview) -> CodedPicture:
-        info = parse_jpeg(body)
-        return CodedPicture(info.width, info.height, keyframe=True)
+        width, height, _ = parse_jpeg(body)
+        return CodedPicture(width, height, keyframe=True)
 
     def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
         return self._link(len(data), begins=True, key=key)
@@ -467,22 +467,7 @@ _SAMPLINGS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class JpegInfo:
-    """What is needed of a JPEG's header.
-
-    Attributes:
-        width: Columns.
-        height: Rows.
-        components: 1 or 3.
-    """
-
-    width: int
-    height: int
-    components: int
-
-
-def parse_jpeg(data: bytes | memoryview) -> JpegInfo:
+def parse_jpeg(data: bytes | memoryview) -> tuple[int, int, int]:
     """Walk a JPEG's markers up to its end.
 
     Huffman tables may be absent, as with many USB cameras: motion JPEG decoders know the usual
@@ -490,6 +475,9 @@ def parse_jpeg(data: bytes | memoryview) -> JpegInfo:
 
     Args:
         data: The whole JPEG, with whatever follows it.
+
+    Returns:
+        Width, height, and the number of colour components: 1 or 3.
 
     Raises:
         Refused: It is not a JPEG, is cut short, or is of a kind that video decoders do not support.
@@ -500,7 +488,7 @@ def parse_jpeg(data: bytes | memoryview) -> JpegInfo:
         if name:
             raise Refused(f"it is {name}, not a JPEG")
         raise Refused("it is not a JPEG: it has no start-of-image marker")
-    info: JpegInfo | None = None
+    found: tuple[int, int, int] | None = None
     scans = 0
     offset = 2
     for _ in range(_MAX_SEGMENTS):
@@ -512,21 +500,21 @@ def parse_jpeg(data: bytes | memoryview) -> JpegInfo:
         segment = _segment(data, offset)
         offset += 2 + len(segment)
         if marker in _FRAMES:
-            if info is not None:
+            if found is not None:
                 raise Refused("its JPEG holds two pictures")
-            info = _frame(segment)
+            found = _frame(segment)
         elif marker in _OTHER_FRAMES:
             raise Refused(f"its JPEG is {_OTHER_FRAMES[marker]}, which few decoders take")
         elif marker == _SOS:
-            if info is None:
+            if found is None:
                 raise Refused("its JPEG has a scan before its frame header")
             scans += 1
             offset = _skip_coded_data(data, offset)
     else:
         raise Refused(f"its JPEG has more than {_MAX_SEGMENTS} segments")
-    if info is None or not scans:
+    if found is None or not scans:
         raise Refused("its JPEG holds no picture")
-    return info
+    return found
 
 
 def _next_marker(data: memoryview, offset: int) -> tuple[int, int]:
@@ -557,7 +545,7 @@ def _skip_coded_data(data: memoryview, offset: int) -> int:
     return found.start()
 
 
-def _frame(segment: memoryview) -> JpegInfo:
+def _frame(segment: memoryview) -> tuple[int, int, int]:
     if len(segment) < 6 or len(segment) != 6 + 3 * segment[5]:
         raise Refused("its JPEG has a frame header of a wrong length")
     precision, components = segment[0], segment[5]
@@ -574,4 +562,4 @@ def _frame(segment: memoryview) -> JpegInfo:
             + " ".join(f"{factor >> 4}x{factor & 15}" for factor in factors)
             + ", which few decoders take"
         )
-    return JpegInfo(width, height, components)
+    return width, height, components
