@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 from mp4ds.errors import Refused
@@ -130,6 +131,7 @@ class _Sequence:
     order_bits: int
 
 
+@lru_cache(maxsize=16)  # it is the same in the track and before each key frame
 def _parse_sequence(payload: bytes) -> _Sequence:
     reader = BitReader(payload[:_SEQUENCE_BYTES])
     reader.bits(4)
