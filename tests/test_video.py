@@ -26,8 +26,7 @@ from mp4ds.video.codecs import Recipe, check_codec, recipe_for
 from mp4ds.video.decoder import VideoDecoder, jpeg_pixels
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.images import ImageFile
-from mp4ds.video.pixels import PictureMaker
-from mp4ds.video.planes import PlaneMaker
+from mp4ds.video.pixels import PictureMaker, PlaneMaker
 from pictures import picture
 from pixel_kinds import rounded
 from republished import psnr

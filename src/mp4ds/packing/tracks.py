@@ -39,7 +39,7 @@ from mp4ds.video.codecs import (
 )
 from mp4ds.video.encoder import Coding, VideoEncoder, coded_size
 from mp4ds.video.packets import PacketWriter, join_segments
-from mp4ds.video.planes import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
+from mp4ds.video.pixels import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
 from mp4ds.video.scores import SMALLEST, Ffmpeg, find_ffmpeg, scores_of
 
 

@@ -1,13 +1,15 @@
-"""Pictures to video frames and back, with the colours tagged and converted as tagged."""
+"""Pictures and planes to video frames and back, their colours tagged and converted as tagged."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
+from av.error import FFmpegError
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
@@ -15,11 +17,13 @@ from mp4ds.errors import VideoError
 from mp4ds.messages.encodings import Picture
 from mp4ds.messages.layouts import CHROMA_SHIFTS
 from mp4ds.video import colour
-from mp4ds.video.codecs import TEN_BITS
+from mp4ds.video.codecs import TEN_BITS, Recipe
 from mp4ds.video.colour import samples
-from mp4ds.video.media import raise_if_scarce
+from mp4ds.video.media import Media, raise_if_scarce
 
-_EIGHT_BITS, _SIXTEEN_BITS = "yuv420p", "yuv420p16le"
+PLANES_FORMAT = "yuv420p"
+"""Pixel format of planes."""
+
 _FULL_RANGE = 2  # in a frame's tags (H.273; ffmpeg's AVColorRange)
 _LUMA, _CHROMA = 0, 1
 
@@ -56,7 +60,7 @@ def widened(frame: av.VideoFrame, *, full_range: bool) -> av.VideoFrame:
 
 def narrowed(frame: av.VideoFrame) -> av.VideoFrame:
     """A 4:2:0 picture of 10 bits, rounded to 8; its tag states the range."""
-    made = av.VideoFrame(frame.width, frame.height, _EIGHT_BITS)
+    made = av.VideoFrame(frame.width, frame.height, PLANES_FORMAT)
     is_full = frame.color_range == _FULL_RANGE
     for index in range(3):
         table = _NARROWER[is_full][_LUMA if index == 0 else _CHROMA]
@@ -420,3 +424,157 @@ class PictureMaker:
             row, column = divmod(index, 2)
             pixels[row::2, column::2] = colours[row:height:2, column:width:2, "rgb".index(color)]
         return pixels
+
+
+# ---------------------------------------------------------------- planes, for lossy encoders
+
+Planes = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]
+"""Luma, and chroma of half the width and height."""
+
+
+class PlaneMaker:
+    """Converts pictures to a lossy encoder's input; not thread-safe.
+
+    Args:
+        picture_format: Pixel format of the pictures.
+    """
+
+    def __init__(self, picture_format: str) -> None:
+        self._picture_format = picture_format
+        self._converter = PictureConverter()
+
+    def make(self, picture: Picture) -> Planes:
+        """The planes of a picture, in new memory; odd sides are padded."""
+        frame = picture_to_frame(picture, self._picture_format, PLANES_FORMAT, self._converter)
+        y, u, v = (plane.copy() for plane in planes_of(frame))
+        rows, columns = y.shape
+        if rows % 2 or columns % 2:
+            y = np.pad(y, ((0, rows % 2), (0, columns % 2)), mode="edge")
+        return y, u, v
+
+
+def planes_of(frame: av.VideoFrame) -> Planes:
+    """The planes of a frame of `PLANES_FORMAT`, as views of it."""
+    y, u, v = (samples(frame, index) for index in range(3))
+    return y, u, v
+
+
+def planes_in(frame: NDArray[np.uint8], width: int, height: int) -> Planes:
+    """The planes of a frame, stored one after another, as views.
+
+    Args:
+        frame: uint8, shape (width * height * 3 / 2,).
+        width: Columns, even.
+        height: Rows, even.
+    """
+    luma = width * height
+    return (
+        frame[:luma].reshape(height, width),
+        frame[luma : luma * 5 // 4].reshape(height // 2, width // 2),
+        frame[luma * 5 // 4 :].reshape(height // 2, width // 2),
+    )
+
+
+def decoded_planes(path: Path) -> Iterator[Planes]:
+    """The frames of a video in order, decoded by one thread.
+
+    Args:
+        path: A video with halved chroma, of 8 bits, or of 10, which are rounded.
+
+    Yields:
+        Views that are valid until the next one is requested.
+
+    Raises:
+        VideoError: It cannot be decoded, or has another format.
+    """
+    media = Media(path)
+    try:
+        media.track.thread_count = 1
+        for frame in media.container.decode(media.track):
+            if frame.format.name == TEN_BITS:
+                frame = narrowed(frame)
+            if frame.format.name not in (PLANES_FORMAT, f"yuvj{PLANES_FORMAT[3:]}"):
+                raise VideoError(
+                    "codec-mismatch", path, f"decodes to {frame.format.name}, not {PLANES_FORMAT}"
+                )
+            yield planes_of(frame)
+    except FFmpegError as error:
+        raise_if_scarce(error)
+        raise VideoError("decode-failed", path, f"cannot be decoded: {error}") from None
+    finally:
+        media.close()
+
+
+def rgb_of(planes: Planes, recipe: Recipe) -> NDArray[np.uint8]:
+    """The colours in which planes are displayed, shape (H, W, 3).
+
+    Args:
+        planes: Of a picture, or of a part of it that begins at an even place.
+        recipe: States how its colours are coded.
+    """
+    rows, columns = planes[0].shape
+    frame = av.VideoFrame(columns, rows, PLANES_FORMAT)
+    for target, plane in zip(planes_of(frame), planes, strict=True):
+        np.copyto(target, plane)
+    converter = PictureConverter(recipe.matrix, source_full_range=recipe.full_range)
+    return np.asarray(converter.convert(frame, "rgb24").to_ndarray(), np.uint8)
+
+
+class PlaneSpool:
+    """The planes of a few frames, in a file; only one is in memory at a time.
+
+    Args:
+        path: The file to make; the caller removes it.
+        width: Columns of a frame, even.
+        height: Rows of a frame, even.
+        frames: How many frames an existing file has, to read it again; None: make a new one.
+    """
+
+    def __init__(self, path: Path, width: int, height: int, *, frames: int | None = None) -> None:
+        self.width, self.height = width, height
+        self._size = width * height * 3 // 2
+        self._file = path.open("w+b" if frames is None else "rb", buffering=0)
+        self._count = frames or 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, planes: Planes) -> None:
+        """Add a frame.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        self._file.seek(self._count * self._size)
+        for plane in planes:
+            data = np.ascontiguousarray(plane).data.cast("B")
+            while data:
+                data = data[self._file.write(data) :]
+        self._count += 1
+
+    def __iter__(self) -> Iterator[Planes]:
+        return map(self.frame, range(self._count))
+
+    def frame(self, number: int) -> Planes:
+        """The planes of one frame, in new memory.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        data = np.empty(self._size, np.uint8)
+        rest = data.data
+        self._file.seek(number * self._size)
+        while rest:
+            count = self._file.readinto(rest)
+            if not count:
+                raise OSError("frames kept on disk were truncated")
+            rest = rest[count:]
+        return planes_in(data, self.width, self.height)
+
+    def clear(self) -> None:
+        """Drop all frames."""
+        self._count = 0
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

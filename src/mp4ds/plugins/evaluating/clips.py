@@ -29,7 +29,7 @@ from mp4ds.plugins.evaluating.trials import FRAMES, TICKS, Clip
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import TIMESCALE, PresentationClock
 from mp4ds.video.codecs import LOSSLESS
-from mp4ds.video.planes import PlaneMaker, PlaneSpool
+from mp4ds.video.pixels import PlaneMaker, PlaneSpool
 from mp4ds.video.scores import SMALLEST
 
 _JPEG = "JPEG files, which `mp4ds pack` re-encodes only with --transcode"

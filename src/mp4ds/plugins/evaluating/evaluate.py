@@ -59,7 +59,7 @@ from mp4ds.video.codecs import (
     parse_quality,
 )
 from mp4ds.video.images import jpeg_bytes
-from mp4ds.video.planes import rgb_of
+from mp4ds.video.pixels import rgb_of
 from mp4ds.video.scores import Ffmpeg, find_ffmpeg, scores_of, summary_of
 
 _DEFAULT_PRESETS = {

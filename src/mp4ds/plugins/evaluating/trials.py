@@ -22,7 +22,7 @@ from mp4ds.video.codecs import LOSSY_GOP, QualityTarget, Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
 from mp4ds.video.images import png_file
 from mp4ds.video.packets import PacketReader
-from mp4ds.video.planes import (
+from mp4ds.video.pixels import (
     PLANES_FORMAT,
     Planes,
     PlaneSpool,
