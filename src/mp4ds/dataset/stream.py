@@ -277,7 +277,7 @@ class Stream(Images):
         """
         rebuilder = self.rebuilder
         if self.sidecar.body == "packet":
-            with self.naming_frames(), self._open_packets() as reader:
+            with self.naming_frames(), self.open_packets() as reader:
                 for index in self.sound_of(unbroken(choice(self.columns), reader.key_numbers)):
                     yield index, rebuilder.packet_payload(index, reader.packet(index))
             return
@@ -285,7 +285,12 @@ class Stream(Images):
             for index, picture in self.pictures(choice):
                 yield index, rebuilder.payload(index, picture)
 
-    def _open_packets(self) -> PacketReader:
+    def open_packets(self) -> PacketReader:
+        """A separate reader of the video's packets.
+
+        Raises:
+            VideoError: The video cannot be read, or does not match the sidecar.
+        """
         video = self.sidecar.video
         return PacketReader(
             self.video_path,
@@ -348,7 +353,7 @@ class Stream(Images):
             with ExitStack() as files:
                 frames: Iterable[tuple[int, Picture | None]]
                 if is_packet:
-                    reader = files.enter_context(self._open_packets())
+                    reader = files.enter_context(self.open_packets())
                     frames = ((index, None) for index in range(len(self)))
                 else:
                     frames = self.pictures(is_strict=False)

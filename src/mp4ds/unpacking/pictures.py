@@ -33,7 +33,6 @@ from mp4ds.options import WHAT, Parsed, TopicOptions, option, parse_resize
 from mp4ds.times import intervals, usual_interval
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.images import ImageFile
-from mp4ds.video.packets import PacketReader
 
 _NS = 1_000_000_000
 
@@ -436,7 +435,7 @@ class Conversion:
         stream = self.stream
         if verify:
             stream.verify_pictures()
-        with _packets(stream) as packets:
+        with stream.open_packets() as packets:
             told = packet_format(self.form, stream.sidecar, packets.pixel_format)
             fields = CodedFields(told, *stream.image_size)
             wanted = unbroken(choice(stream.columns), packets.key_numbers, from_key=True)
@@ -479,7 +478,7 @@ class Conversion:
                     view, make = self._makers[stream.columns.variant[index]]
                     yield index, make(stream.pixels(picture, view, index))
                     continue
-                packets = packets or files.enter_context(_packets(stream))
+                packets = packets or files.enter_context(stream.open_packets())
                 yield index, stream.rebuilder.packet_payload(index, packets.packet(index))
 
 
@@ -534,7 +533,3 @@ def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int,
         stream.verify_video()
     for index, payload in stream.payloads(choice):
         yield index, form.split(memoryview(payload)).body
-
-
-def _packets(stream: Stream) -> PacketReader:
-    return PacketReader(stream.video_path, codec=stream.sidecar.video.codec, frames=len(stream))

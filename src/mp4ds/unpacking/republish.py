@@ -32,7 +32,6 @@ from mp4ds.unpacking.pictures import (
     holds_files,
     is_inverse_depth,
 )
-from mp4ds.video.packets import PacketReader
 
 _TRANSPORTS = ("compressed", "compressedDepth", "ffmpeg", "foxglove", "compressed_video")
 
@@ -437,8 +436,7 @@ def _refers(stream: Stream) -> bool:
     """Whether a stream has messages that are useless without earlier ones."""
     if stream.sidecar.body != "packet":
         return False
-    codec = stream.sidecar.video.codec
-    with PacketReader(stream.video_path, codec=codec, frames=len(stream)) as reader:
+    with stream.open_packets() as reader:
         return not all(reader.keyframes)
 
 
