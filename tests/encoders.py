@@ -78,26 +78,33 @@ def rvl(depth: NDArray[np.uint16]) -> bytes:
     are zigzag coded. Every number becomes nibbles of three bits, lowest first, with the high bit
     set on all but the last; eight nibbles are a little-endian word, first nibble highest.
     """
-    nibbles: list[int] = []
-
-    def number(value: int) -> None:
-        while value > 7:
-            nibbles.append(value & 7 | 8)
-            value >>= 3
-        nibbles.append(value)
-
+    numbers: list[int] = []
     values, at, before = depth.ravel().tolist(), 0, 0
     while at < len(values):
         for zero in (True, False):
             start = at
             while at < len(values) and (values[at] == 0) == zero:
                 at += 1
-            number(at - start)
+            numbers.append(at - start)
         for value in values[start:at]:
             delta = value - before
-            number(2 * delta if delta >= 0 else -2 * delta - 1)
+            numbers.append(2 * delta if delta >= 0 else -2 * delta - 1)
             before = value
-    nibbles += [0] * (-len(nibbles) % 8)
+    return rvl_words([nibble for number in numbers for nibble in rvl_nibbles(number)])
+
+
+def rvl_nibbles(number: int) -> list[int]:
+    """A number of RVL in nibbles."""
+    nibbles = []
+    while number > 7:
+        nibbles.append(number & 7 | 8)
+        number >>= 3
+    return [*nibbles, number]
+
+
+def rvl_words(nibbles: list[int]) -> bytes:
+    """Nibbles of RVL in words, filled up with zeros."""
+    nibbles = nibbles + [0] * (-len(nibbles) % 8)
     digits = "".join(f"{nibble:x}" for nibble in nibbles)
     words = [int(digits[i : i + 8], 16) for i in range(0, len(digits), 8)]
     return struct.pack(f"<{len(words)}I", *words)

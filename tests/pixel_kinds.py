@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.messages.encodings import ENCODINGS, Encoding, Parameters, pixel_view
+from mp4ds.messages.encodings import ENCODINGS, Encoding, pixel_view
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit
 
 Pixels = NDArray[Any]
@@ -127,15 +127,3 @@ def bound(name: str, encoding: Encoding, width: int = 9, height: int = 7, seed: 
 
 PAIRS = [(e.name, layout) for e in ENCODINGS.values() for layout in e.exact]
 """Every encoding with each of its exact layouts."""
-
-__all__ = [
-    "KINDS",
-    "PAIRS",
-    "Parameters",
-    "as_message",
-    "bits_of",
-    "bound",
-    "rounded",
-    "suited",
-    "values",
-]

@@ -13,20 +13,11 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 
 from coded_tools import mutations, refusal
-from encoders import rvl
+from encoders import rvl, rvl_nibbles, rvl_words
 from mp4ds.errors import Refused
 from mp4ds.messages.depth import decode_rvl, encode_rvl
 
 Depth = NDArray[np.uint16]
-
-
-def nibbles_of(value: int) -> list[int]:
-    """A number in groups of three bits, the lowest first."""
-    groups = [value & 7]
-    while value := value >> 3:
-        groups[-1] |= 8
-        groups.append(value & 7)
-    return groups
 
 
 def reference(depth: Depth) -> bytes:
@@ -34,19 +25,9 @@ def reference(depth: Depth) -> bytes:
     return struct.pack("<II", *depth.shape[::-1]) + rvl(depth)
 
 
-def packed(nibbles: list[int]) -> bytes:
-    nibbles = nibbles + [0] * (-len(nibbles) % 8)
-    words = []
-    for start in range(0, len(nibbles), 8):
-        word = 0
-        for nibble in nibbles[start : start + 8]:
-            word = word << 4 | nibble
-        words.append(word)
-    return struct.pack(f"<{len(words)}I", *words)
-
-
 def coded(columns: int, rows: int, *numbers: int) -> bytes:
-    return struct.pack("<II", columns, rows) + packed([n for v in numbers for n in nibbles_of(v)])
+    nibbles = [nibble for number in numbers for nibble in rvl_nibbles(number)]
+    return struct.pack("<II", columns, rows) + rvl_words(nibbles)
 
 
 def random_depth(shape: tuple[int, int], filled: float, top: int) -> Depth:
@@ -123,7 +104,7 @@ def test_what_decodes_alike_is_not_the_same_bytes() -> None:
     for data in (
         coded(3, 1, 1, 0, 0, 2, 2, 2),  # a run cut in two
         coded(2, 1, 0, 2, 2, 2) + bytes(4),  # words after the end
-        struct.pack("<II", 1, 1) + packed([0, 9, 0, 2]),  # a number with a group of nothing
+        struct.pack("<II", 1, 1) + rvl_words([0, 9, 0, 2]),  # a number with a group of nothing
     ):
         assert encode_rvl(decode_rvl(data)) != data
 
