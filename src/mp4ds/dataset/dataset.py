@@ -354,7 +354,8 @@ class Dataset:
             if wanted is not None and group.channel.topic not in wanted:
                 continue
             if not group.streams:
-                calibrations.append(self._group_messages(group, group.sources()))
+                own = self._group_messages(group, group.sources(), group.recorded())
+                calibrations.append(own)
             elif wanted is not None:
                 ids |= group.recorded_ids
         found = self.messages_file.in_time(Excerpt(topics=wanted))
@@ -431,9 +432,11 @@ class Dataset:
 
         def messages(group: ChannelGroup) -> Iterator[Message]:
             own = [*map(ahead, group.sources(choice, sources or {}))]
+            recorded = group.recorded(span if is_span else None)
+            if group.recorded_ids:  # else a thread would be begun for nothing
+                recorded = ahead(recorded)
             if not is_span:
-                return self._group_messages(group, own, ahead)
-            recorded = ahead(group.recorded(span))
+                return self._group_messages(group, own, recorded)
             return by_time(recorded, *((item for _, item in source) for source in own))
 
         groups = (item for item in self._groups if topics is None or item.channel.topic in topics)
@@ -520,12 +523,12 @@ class Dataset:
         self,
         group: ChannelGroup,
         own: Sequence[Iterator[tuple[int, Message]]],
-        ahead: Ahead = iter,
+        recorded: Iterator[Message],
     ) -> Iterator[Message]:
         """One channel's messages from all its files, in the channel's order."""
         # a pair on its own has only its own messages
         is_whole = self.manifest is not None and not self.is_salvaged
-        return group.merged(own, ahead(group.recorded()), str(self.path) if is_whole else None)
+        return group.merged(own, recorded, str(self.path) if is_whole else None)
 
     def close(self) -> None:
         """Close all videos."""
