@@ -352,6 +352,7 @@ def test_a_job_reports_all_its_datasets(drives: list[Path], tmp_path: Path) -> N
     for state in seen:
         states[state.dataset] = state
         shares.append(share_of(states))
+    assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, 1.0)
     # both are known from the beginning, so that the share is of both
     assert {state.dataset.name for state in seen[:2]} == {"day", "night"}

@@ -82,6 +82,7 @@ class PartedPack:
         self._done: dict[str, PartFacts] = {}
         self._before = 0
         self._written = 0
+        self._share = 0.0
         self._next_report = 0.0
 
     def begin(self, *, anew: bool, alone: bool) -> None:
@@ -172,11 +173,13 @@ class PartedPack:
         frames = self.plan.frames
         packed = sum(min(messages[topic], count or 0) for topic, count in frames.items())
         total = sum(count or 0 for count in frames.values())
+        # a part that was just renamed is neither among those begun nor known to be done yet
+        self._share = max(self._share, packed / total if total else 0.0)
         self.report(
             PackProgress(
                 dataset=self.target,
                 phase=phase,
-                done=packed / total if total else None,
+                done=self._share if total else None,
                 bytes_read=size,
                 bytes_total=sum(source.size for source in self.plan.sources),
                 bytes_written=self._written,
