@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from commands import call
-from mp4ds.dataset.collections import datasets_in
+from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import (
     OptionError,
     SourceError,

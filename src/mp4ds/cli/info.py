@@ -15,7 +15,7 @@ from mp4ds.cli.options import argument, command, datasets_argument, jobs_option,
 from mp4ds.cli.output import number, print_table, say, show
 from mp4ds.cli.progress import progress_of
 from mp4ds.dataset.checks import Problem, validate
-from mp4ds.dataset.collections import datasets_in
+from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, SourceError, counted, path_text, size_text
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location

@@ -18,7 +18,7 @@ from mp4ds.cli.options import (
 )
 from mp4ds.cli.output import number, print_table, say, show
 from mp4ds.cli.progress import pack_progress, progress_of
-from mp4ds.dataset.collections import datasets_in
+from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, counted, path_text, size_text
 from mp4ds.options import LONG, WHERE, seconds_text
 from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary

@@ -21,7 +21,7 @@ from mp4ds.cli.options import (
 )
 from mp4ds.cli.output import is_json, print_table, printed, say, show
 from mp4ds.cli.progress import progress_of
-from mp4ds.dataset.collections import datasets_in
+from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, counted, interrupted, path_text, size_text
 from mp4ds.options import WHERE
 from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate

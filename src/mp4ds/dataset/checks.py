@@ -18,8 +18,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from mp4ds.bags.formats import limits_of
-from mp4ds.dataset.collections import datasets_in
-from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.dataset import Dataset, datasets_in
 from mp4ds.dataset.messages import MessagesFile, Part, recorded_storage
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError, VideoError

@@ -1,7 +1,8 @@
-"""An open dataset: its streams, and every message of the recording."""
+"""An open dataset: its streams, and every message of the recording; where datasets are."""
 
 from __future__ import annotations
 
+import glob
 import shlex
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -35,8 +36,8 @@ from mp4ds.errors import (
     counted,
     missing,
 )
-from mp4ds.files.sources import HOW_TO_OPEN, is_folder, video_at
-from mp4ds.files.urls import location
+from mp4ds.files.sources import HOW_TO_OPEN, is_folder, refuse_unfinished, video_at
+from mp4ds.files.urls import RemotePath, location
 from mp4ds.format.fields import MESSAGES_NAME, Choice, everything, within
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
@@ -566,3 +567,67 @@ def open_dataset(path: Path | str, *, track: int | None = None) -> Dataset:
         dataset.close()
         raise OptionError(f"{place}: `track` is for videos without a sidecar.")
     return dataset
+
+
+# ---------------------------------------------------------------- many datasets
+
+Paths = str | Path | Sequence[str | Path]
+"""A path or several."""
+
+
+def datasets_in(paths: Paths) -> list[Path]:
+    """The datasets given by paths, in the same order.
+
+    Args:
+        paths: Datasets, sidecars, videos; folders of datasets, at any depth; patterns such as
+            ``drives/*``; or URLs, but not URL patterns.
+
+    Raises:
+        SourceNotFoundError: A path does not exist, or a pattern matches nothing.
+        SourceError: A folder has no dataset in it or below it.
+    """
+    several = [paths] if isinstance(paths, (str, Path, RemotePath)) else paths
+    return [dataset for path in several for dataset in _datasets_at(location(path))]
+
+
+def _datasets_at(path: Path) -> list[Path]:
+    if path.exists():
+        return _below(path)
+    # Path.glob takes no absolute patterns
+    matches = sorted(glob.glob(str(path))) if glob.has_magic(str(path)) else []  # noqa: PTH207
+    folders = [Path(match) for match in matches if Path(match).is_dir()]
+    if not folders:
+        raise SourceNotFoundError(path)
+    found: list[Path] = []
+    for folder in folders:
+        try:
+            found += _below(folder)
+        except SourceError:
+            continue  # a pattern matches other folders, too
+    if not found:
+        raise SourceError(path, "matches no dataset", "Give folders made by `mp4ds pack`.")
+    return found
+
+
+def _below(path: Path) -> list[Path]:
+    if path.name == MANIFEST_NAME:
+        return [path.parent]
+    if not path.is_dir() or (path / MANIFEST_NAME).is_file():
+        return [path]
+    refuse_unfinished(path)
+    found = sorted(manifest.parent for manifest in path.rglob(MANIFEST_NAME))
+    # names that begin with a dot are being made
+    found = [one for one in found if not _is_hidden(one, path)]
+    if not found:
+        raise SourceError(
+            path,
+            f"holds no dataset: there is no {MANIFEST_NAME} in it or below it",
+            "Give a folder made by `mp4ds pack`.",
+        )
+    return found
+
+
+def _is_hidden(dataset: Path, folder: Path) -> bool:
+    if isinstance(dataset, RemotePath):
+        return False
+    return any(part.startswith(".") for part in dataset.relative_to(folder).parts)

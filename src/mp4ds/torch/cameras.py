@@ -20,8 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mp4ds.dataset.collections import datasets_in
-from mp4ds.dataset.dataset import open_dataset
+from mp4ds.dataset.dataset import datasets_in, open_dataset
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after

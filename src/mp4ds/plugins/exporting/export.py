@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 
 from mp4ds._version import __version__
-from mp4ds.dataset.collections import datasets_in
+from mp4ds.dataset.dataset import datasets_in
 from mp4ds.dataset.recording import slice_of, sliced
 from mp4ds.dataset.salvage import HOW_TO_SALVAGE, open_selected
 from mp4ds.errors import OptionError, advising

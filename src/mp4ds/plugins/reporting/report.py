@@ -24,8 +24,7 @@ from urllib.parse import quote
 import numpy as np
 
 from mp4ds._version import __version__
-from mp4ds.dataset.collections import Paths, datasets_in
-from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.dataset import Dataset, Paths, datasets_in
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.errors import (
