@@ -21,7 +21,6 @@ from sources import (
     Scene,
     image_cdr,
     image_ros1,
-    odd_scene,
     picture,
     write_mcap,
 )
@@ -164,19 +163,6 @@ def test_a_dataset(three: Path) -> None:
             assert pixels[:, 0, 0].tolist() == [0, 1, 3, 4]
         assert dataset.sync(["/top/image"], tolerance_ns=0).indices.tolist() == [[0], [1], [2], [3]]
         assert len(dataset.sync(tolerance_ns=0, reference="/left/image")) == 0
-
-
-def test_a_topic_that_changes_its_size_is_one_column(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "drive.mcap", odd_scene("size-change"))
-    mp4ds.pack(tmp_path / "drive.mcap", tmp_path / "drive")
-    with mp4ds.open(tmp_path / "drive") as dataset:
-        whole = dataset.sync(tolerance_ns=0)
-        assert whole.topics == ("/odd/image",)
-        assert whole.indices[:, 0].tolist() == list(range(8))
-        assert dataset.sync(["odd_image", "odd_image-2"], tolerance_ns=0).topics == (
-            "odd_image",
-            "odd_image-2",
-        )
 
 
 @pytest.mark.parametrize(
