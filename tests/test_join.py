@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import signal
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import av
+import numpy as np
 import pytest
 
-from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg
+from chromium import Tab, played, video_player
+from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg, superframe
 from coded_tools import encode as encode_packets
 from coded_tools import scene as packet_scene
 from commands import program
@@ -21,6 +25,7 @@ from mp4ds.video.codecs import Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.mp4 import read_sample_entry
 from mp4ds.video.packets import PacketReader, PacketWriter, join_segments
+from pictures import blocks as means_of_blocks
 from test_packets import write as write_packets
 from test_video import LOSSLESS, LOSSY, decode, encode, noise, same, scene_pictures, video_decoder
 
@@ -234,6 +239,22 @@ def test_parts_that_end_at_key_frames_give_the_uncut_file(
     assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
 
 
+@pytest.mark.one_in(6)
+@every_kind
+def test_pyav_seeks_across_the_seams(kind: Kind, joined: Joined) -> None:
+    target, _, _ = joined(kind)
+    with av.open(str(target)) as container:
+        stream = container.streams.video[0]
+        assert stream.start_time == 0
+        order = [*range(TOTAL), *reversed(range(TOTAL))]
+        for number in order:
+            container.seek(number * STEP, stream=stream)
+            times = [frame.pts for frame in container.decode(stream)]
+            begin = next(begin for begin, end in edges() if begin <= number < end)
+            assert times[0] == (begin + (number - begin) // GOP * GOP) * STEP
+            assert times == list(range(times[0], TOTAL * STEP, STEP))
+
+
 @pytest.mark.one_in(18)
 @pytest.mark.parametrize("kind", KINDS, ids=IDS)
 @pytest.mark.parametrize("size", [(640, 360), (1920, 1200)])
@@ -292,6 +313,15 @@ def test_copied_packets_give_the_uncut_file(name: str, tmp_path: Path) -> None:
         frames = list(container.decode(video=0))
     assert [frame.pts for frame in frames] == ticks
     assert not any(frame.is_corrupt for frame in frames)
+
+
+def test_a_vp9_superframe(tmp_path: Path) -> None:
+    frames = [packet.data for packet in encode_packets(ENCODINGS["vp9"], frames=4, gop=9)]
+    bodies = [frames[0], superframe(frames[1], frames[2]), frames[3]]
+    write_packets(tmp_path / "a.mp4", "vp9", bodies)
+    join_segments([tmp_path / "a.mp4"] * 2, range(6), tmp_path / "joined.mp4")
+    with PacketReader(tmp_path / "joined.mp4", codec="vp9", frames=6) as reader:
+        assert list(reader.packets()) == bodies * 2
 
 
 # ---------------------------------------------------------------- times
@@ -382,6 +412,33 @@ def test_rates_that_change_between_segments(codec: str, tmp_path: Path) -> None:
     join_segments([paths["a"], paths["b"]], range(2), tmp_path / "j.mp4")
     with pytest.raises(Mp4dsError, match=r"avcC|hvcC|av1C"):
         join_segments([paths["a"], paths["c"]], range(2), tmp_path / "j.mp4")
+
+
+X265 = "bframes=0:log-level=none:repeat-headers=1:min-keyint=5:ref=1"
+
+
+@pytest.mark.parametrize(
+    ("codec", "options", "width", "match"),
+    [
+        ("h264", {"x264-params": "ref=4:8x8dct=0"}, 64, "avcC"),
+        ("h265", {"x265-params": X265}, 64, "hvcC"),
+        *((codec, {}, 80, "their size") for codec in ("vp9", "av1")),
+    ],
+)
+def test_parameter_sets_that_change_between_segments(
+    codec: str, options: dict[str, str], width: int, match: str, tmp_path: Path
+) -> None:
+    a, b = ENCODINGS[codec], replace(ENCODINGS[codec], options=ENCODINGS[codec].options | options)
+    for name, packets in (
+        ("a", encode_packets(a, frames=4, width=64)),
+        ("b", encode_packets(b, frames=4, width=width)),
+    ):
+        write_packets(tmp_path / f"{name}.mp4", codec, [packet.data for packet in packets])
+        join_segments([tmp_path / f"{name}.mp4"] * 2, range(8), tmp_path / "j.mp4")
+    (tmp_path / "j.mp4").unlink()
+    with pytest.raises(Mp4dsError, match=match):
+        join_segments([tmp_path / "a.mp4", tmp_path / "b.mp4"], range(8), tmp_path / "j.mp4")
+    assert not (tmp_path / "j.mp4").exists()
 
 
 @pytest.mark.parametrize(("count", "match"), [(9, "5 frames, but 4 are needed"), (11, "10 frames"),
@@ -487,6 +544,16 @@ def test_packets_that_the_muxer_mistakes(tmp_path: Path) -> None:
     assert not (tmp_path / "j.mp4").exists()
 
 
+def test_packets_that_the_muxer_joins(tmp_path: Path) -> None:
+    """A VP9 frame that is not shown and the next one."""
+    path = tmp_path / "a.mp4"
+    bodies = [p.data for p in encode_packets(ENCODINGS["vp9"], frames=4, gop=20)]
+    write_packets(path, "vp9", bodies)
+    rewrite(path, "vp9", 1, hide(bodies[1]))
+    with pytest.raises(VideoError, match="one is damaged"):
+        join_segments([path], range(4), tmp_path / "j.mp4")
+
+
 # ---------------------------------------------------------------- large files
 
 
@@ -528,3 +595,95 @@ def test_memory_is_bounded(
     told = program("-c", MEASURE, small, segment, target, packets, copies, cwd=TESTS).out
     assert target.stat().st_size > packets * size * copies
     assert int(told) < bound
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from mp4ds.video.packets import join_segments
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
+try:
+    join_segments([Path(sys.argv[1])] * 2, range(40), Path(sys.argv[2]))
+except OSError as error:
+    print(type(error).__mro__[-4].__name__, error.strerror)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="the system limits no files")
+@pytest.mark.parametrize("short", [1, 700, 5_000, 300_000, 2_000_000])
+def test_a_disk_that_is_full(short: int, tmp_path: Path) -> None:
+    """In the packets, in the index at the end, and in its last byte."""
+    segment = large(tmp_path / "a.mp4", 20, 100_000)
+    target = tmp_path / "j.mp4"
+    join_segments([segment, segment], range(40), target)
+    length = target.stat().st_size
+    told = program("-c", FULL, segment, target, length - short, cwd=TESTS).out
+    assert "File too large" in told
+    assert not target.exists()
+
+
+# ---------------------------------------------------------------- a browser
+
+PLAYED = [
+    ("h264", "gray", True),
+    ("h264", "yuv420p", True),
+    *((codec, kind, False) for codec in ("h264", "av1") for kind in ("rgb24", "yuv420p")),
+]
+PLAYED_IDS = [IDS[KINDS.index(kind)] for kind in PLAYED]
+PACKETS_PLAYED = ["h264", "av1", "vp9"]
+SOUGHT = (0, 5, 6, 7, 10, 3)  # the last of a segment, the first, ...
+
+
+@pytest.fixture(scope="module")
+def player(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with video_player(tmp_path_factory.mktemp("player")) as tab:
+        yield tab
+
+
+def joined_in_parts(name: str, folder: Path, ticks: list[int]) -> Path:
+    """A video of two or more segments, of pictures or of packets."""
+    target, segments = folder / "joined.mp4", []
+    if name in PLAYED_IDS:
+        kind = PLAYED[PLAYED_IDS.index(name)]
+        encoding = {"gray": "mono8", "rgb24": "rgb8", "yuv420p": "nv12"}[kind[1]]
+        pictures: list[Any] = scene_pictures(encoding, 96, 66, TOTAL)
+        if encoding == "nv12":
+            pictures = [(p[:66], p[66:, ::2].copy(), p[66:, 1::2].copy()) for p in pictures]
+        for begin, end in edges():
+            segments.append(folder / f"{begin}.mp4")
+            encode(segments[-1], recipe_of(kind), pictures[begin:end], kind[1], gop=GOP)
+    else:
+        made = ENCODINGS[name.removeprefix("packets-")]
+        packets = [p.data for p in encode_packets(made, frames=TOTAL, width=96, height=66, gop=6)]
+        for begin in (0, 6):
+            segments.append(folder / f"{begin}.mp4")
+            write_packets(segments[-1], made.codec, packets[begin : begin + 6])
+    join_segments(segments, ticks, target)
+    return target
+
+
+@pytest.mark.browser
+@pytest.mark.one_in(6)
+@pytest.mark.parametrize("name", [*PLAYED_IDS, *(f"packets-{name}" for name in PACKETS_PLAYED)])
+def test_a_browser_plays_across_the_seams(name: str, player: Tab, tmp_path: Path) -> None:
+    ticks = [number * 100_000 for number in range(TOTAL)]
+    path = joined_in_parts(name, tmp_path, ticks)
+    result = played(player, path, [ticks[number] / 1e6 + 0.05 for number in SOUGHT])
+    assert result["size"] == [96, 66]
+    assert result["decoded"] == TOTAL
+    assert result["ended"] == pytest.approx(result["duration"], abs=0.05)
+    with av.open(str(path)) as container:
+        luma = [
+            np.frombuffer(frame.planes[0], np.uint8).reshape(66, -1)[:, :96].astype(float)
+            for frame in container.decode(video=0)
+        ]
+    blocks = [
+        means_of_blocks(np.repeat(plane[..., None], 3, axis=2))[..., 0].ravel() for plane in luma
+    ]
+    for number, found in zip(SOUGHT, result["frames"], strict=True):
+        assert found["mediaTime"] == pytest.approx(number / 10, abs=2e-6)
+        shown = np.array(found["means"]).reshape(48, 3) @ (0.2126, 0.7152, 0.0722)
+        likeness = [np.corrcoef(shown, block)[0, 1] for block in blocks]
+        assert int(np.argmax(likeness)) == number
+        assert likeness[number] > 0.95
