@@ -20,11 +20,24 @@ from mp4ds.plugins.playing.player import player_services
 from mp4ds.plugins.ros.node import NodeNames
 from mp4ds.plugins.ros.qos import Qos, load_overrides, offered_qos, qos_text, recorded_qos
 from mp4ds.records import Channel, Schema
+from player_scenes import STATIC, static_channel, static_transform
 from ros2_sides import KINDS, STORE, Controls, Side, channel, connect, message, padded
 from ros2_sides import side as side
 from waiting import WATCHDOG_S, until
 
 STRING = "std_msgs/msg/String"
+
+
+def test_late_subscribers_get_all_static_transforms(side: Side) -> None:
+    recorded = static_channel(1, 1, 1, 1)
+    sent = [static_transform(child) for child in STATIC]
+    with side.open() as publisher:
+        publisher.advertise(recorded)
+        for payload in sent:
+            publisher.publish(recorded, payload, 0)
+        side.peer.subscribe("/tf_static", recorded.type_name, latched=True)
+        got = side.peer.received("/tf_static", len(sent))
+    assert [padded(payload) for payload in got] == [padded(payload) for payload in sent]
 
 
 @pytest.mark.parametrize("kind", KINDS)
