@@ -284,6 +284,24 @@ def test_pause_service(roscore: Core, recording: Path) -> None:
         assert published.ask("is_paused") == (wanted == "true")
 
 
+def test_use_sim_time(roscore: Core, recording: Path) -> None:
+    published = driver(roscore, recording)
+    assert published.ask("wants_clock") is False
+    assert roscore.run("rosparam", "set", "/use_sim_time", "true")[0] == 0
+    try:
+        assert published.ask("wants_clock") is True
+        # a node that begins now does not wait for a time that nobody tells
+        later = driver(roscore, recording)
+        later.ask("advertise")
+        receiver = roscore.receiver(*CAMERA)
+        until(lambda: sum(later.ask("subscribers")) >= 2)
+        later.ask("publish")
+        assert len(receiver.take(16)) == 16
+        later.ask("close")
+    finally:
+        roscore.run("rosparam", "delete", "/use_sim_time")
+
+
 # ---------------------------------------------------------------- slow and gone
 
 

@@ -12,11 +12,12 @@ from typing import Any
 import pytest
 
 import mp4ds
+from commands import program
 from conftest import real
 from mp4ds.bags.formats import open_reader
 from mp4ds.records import Message
 from player_scenes import make_drive
-from roscore import PLAY, RECORD, Core, python
+from roscore import PLAY, RECORD, Core, missing, python
 from roscore import _core as _core
 from roscore import roscore as roscore
 from waiting import WATCHDOG_S, until
@@ -77,6 +78,20 @@ def test_as_rosbag_record(roscore: Core, tmp_path: Path, name: str) -> None:
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
 
 
+def test_topics_that_are_named(roscore: Core, tmp_path: Path) -> None:
+    bag = make_drive(tmp_path / "drive.bag")
+    commands = {  # with -e all are regular expressions, as for rosbag record
+        "globs": ours(tmp_path / "globs", "/camera/*", "/tf"),
+        "patterns": ours(tmp_path / "patterns", "/camera/.*", "-e", "/tf"),
+    }
+    topics = {"/camera/image_raw", "/tf"}
+    recorded(roscore, [*commands.values()], bag, topics)
+    for name in commands:
+        with mp4ds.open(tmp_path / name) as dataset:
+            found = {channel.topic for channel in dataset.channels}
+            assert found == topics, name
+
+
 def spooled(folder: Path) -> int:
     """Bytes of a recording that are not packed yet."""
     return sum(path.stat().st_size for path in folder.glob("*.mcap"))
@@ -107,3 +122,12 @@ def test_a_clock_that_starts_late(roscore: Core, tmp_path: Path) -> None:
     assert times
     assert min(due) <= min(times)
     assert max(times) <= max(due) + 10**9
+
+
+def test_without_a_master(tmp_path: Path) -> None:
+    if why := missing():
+        pytest.skip(why)
+    env = {"PATH": "/usr/bin:/bin", "ROS_MASTER_URI": "http://127.0.0.1:1/"}
+    done = program(*ours(tmp_path / "live", "-a"), env=env, code=1)
+    assert "no ROS master answers" in done.err
+    assert not list(tmp_path.iterdir())
