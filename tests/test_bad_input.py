@@ -132,6 +132,12 @@ def empty_folder(folder: Path) -> Path:
     return folder / "drive"
 
 
+def pipe(folder: Path) -> Path:
+    """Which nobody writes into: reading it would wait for ever."""
+    os.mkfifo(folder / "drive.bag")
+    return folder / "drive.bag"
+
+
 BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "missing": (lambda folder: folder / "none.bag", "no such file"),
     "name-too-long": (lambda folder: folder / ("x" * 300 + ".bag"), "xxx.bag"),
@@ -145,6 +151,11 @@ BAD_SOURCES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "damaged.mcap": (damaged, "is damaged"),
     "other-database": (database, "but not of rosbag2"),
     "empty-folder": (empty_folder, "has no metadata.yaml"),
+    "pipe": (pipe, "drive.bag"),
+    "metadata-junk": (
+        folder_of(lambda folder: (folder / "metadata.yaml").write_bytes(b"\xff: [")),
+        "metadata.yaml",
+    ),
     "split-missing": (
         folder_of(lambda folder: sorted(folder.glob("*.db3"))[1].unlink(), files=3),
         "is missing",
@@ -165,6 +176,13 @@ def test_a_source_that_cannot_be_read(command: str, name: str, tmp_path: Path) -
     options = ("-o", tmp_path / "dataset") if command == "pack" else ()
     with unchanged(tmp_path):
         refused(call(command, path, *options), 2, word)
+
+
+def test_one_bad_part_of_several(small_bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "second").mkdir()
+    second = cut("bag")(tmp_path / "second")
+    with unchanged(tmp_path):
+        refused(call("pack", small_bag, second, "-o", tmp_path / "dataset"), 2, str(second))
 
 
 def test_a_source_that_is_given_twice(small_bag: Path, tmp_path: Path) -> None:
@@ -377,6 +395,12 @@ def test_packing_onto_the_source(name: str, tmp_path: Path) -> None:
             refused(call("pack", source, "-o", source, *force), 2, str(source))
 
 
+def test_packing_a_part_of_a_dataset_onto_it(small_dataset: Path, tmp_path: Path) -> None:
+    source = small_dataset / "messages.mcap"
+    with unchanged(tmp_path):
+        refused(call("pack", source, "-o", small_dataset, "--force"), 2, str(small_dataset))
+
+
 @pytest.mark.parametrize("name", ["messages.mcap", "cam_image_raw.mp4", "dataset.yaml", "new.mcap"])
 @pytest.mark.parametrize("to", ["bag", "mcap"])
 def test_unpacking_into_the_dataset(
@@ -386,6 +410,14 @@ def test_unpacking_into_the_dataset(
     with unchanged(tmp_path):
         result = call("unpack", small_dataset, "--to", to, "-o", target, "--force")
         refused(result, 2, str(small_dataset))
+
+
+@pytest.mark.parametrize("name", ["cam_image_raw.mp4", "cam_image_raw.yaml"])
+def test_unpacking_a_pair_onto_itself(name: str, small_dataset: Path, tmp_path: Path) -> None:
+    sidecar = small_dataset / "cam_image_raw.yaml"
+    with unchanged(tmp_path):
+        result = call("unpack", sidecar, "--to", "mcap", "-o", small_dataset / name, "--force")
+        refused(result, 2, name)
 
 
 # ---------------------------------------------------------------- a disk that is full

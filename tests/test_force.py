@@ -135,6 +135,16 @@ def test_an_evaluation_goes_into_its_own_folder_only(
         )
 
 
+@pytest.mark.parametrize("kind", [*FOLDERS, *FILES])
+def test_a_link_is_kept(kind: str, made: Path, tmp_path: Path) -> None:
+    name, command = FILES[kind] if kind in FILES else ("out", FOLDERS[kind])
+    line = arguments(command, made, tmp_path / name)
+    (tmp_path / f"real-{name}").mkdir()
+    (tmp_path / name).symlink_to(f"real-{name}")
+    with unchanged(tmp_path):
+        refused(call(*line, "--force"), 2, "is a symbolic link", f"real-{name} itself")
+
+
 def test_a_report_goes_with_its_dataset(made: Path, tmp_path: Path) -> None:
     dataset = tmp_path / "drive"
     shutil.copytree(made / "drive", dataset)
