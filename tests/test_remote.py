@@ -220,6 +220,13 @@ def test_every_source_on_a_web_server(
     round_trip(paths, [f"{web.url}/{path.name}" for path in paths], tmp_path, source)
 
 
+@pytest.mark.slow
+def test_windows_are_packed_by_other_processes(tmp_path: Path, put: Put) -> None:
+    write_bag(tmp_path / "drive.bag", scene("mono8", frames=6))
+    mp4ds.pack(put(tmp_path / "drive.bag"), tmp_path / "dataset", PackOptions(window=3, jobs=1))
+    assert compare([tmp_path / "drive.bag"], unpacked(tmp_path, "bag")) == []
+
+
 @pytest.mark.parametrize("source", ["bag-lz4", "mcap-ros2-zstd", "rosbag2-mcap-split"])
 def test_info_and_intrinsics_say_the_same(
     source: str, tmp_path: Path, web: Server, put: Put
@@ -337,6 +344,14 @@ def test_a_dataset_is_used_there_as_here(
     mp4ds.unpack(url, "bag", tmp_path / "again.bag")
     mp4ds.unpack(here, "bag", tmp_path / "local.bag")
     assert compare([tmp_path / "again.bag"], tmp_path / "local.bag") == []
+
+
+def test_an_unpack_without_a_name_comes_here(
+    packed_bag: Path, put: Put, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mp4ds.unpack(put(packed_bag), "mcap")
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset_unpacked.mcap"]
 
 
 def test_problems_of_a_dataset_are_found_there(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ import pytest
 from PIL import Image
 
 import mp4ds
+from commands import call
 from compare import compare
 from in_parts import InlineExecutor, facts, use
 from mp4ds.errors import (
@@ -344,6 +346,24 @@ def test_images_are_uploaded(packed_bag: Path, store: Store, tmp_path: Path) -> 
         mp4ds.unpack(packed_bag, "images", url)
     mp4ds.unpack(packed_bag, "images", url, UnpackOptions(force=True, image_format="jpeg"))
     assert not any(name.endswith(".png") for name in store.names())
+
+
+def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -> None:
+    def run(*arguments: str) -> Any:
+        result = call(*arguments, "--json")
+        assert result.code == 0, result.err
+        return json.loads(result.out)
+
+    recording, dataset = put(source), f"{folder_url}/dataset"
+    assert run("info", recording)["path"] == recording
+    packed = run("pack", recording, "-o", dataset, "--codec", "h264", "--preset", "ultrafast")
+    assert packed["dataset"] == dataset
+    assert run("info", dataset)["kind"] == "dataset"
+    assert run("info", dataset, "--intrinsics")["path"] == dataset
+    assert run("validate", dataset, "--deep") == {"path": dataset, "deep": True, "problems": []}
+    again = f"{folder_url}/again.bag"
+    assert run("unpack", dataset, "--to", "bag", "-o", again)["output"] == again
+    assert run("info", again)["topics"] == run("info", recording)["topics"]
 
 
 # ---------------------------------------------------------------- folders of images
