@@ -679,10 +679,14 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
             "letters": "x y z",
             "zeros": "0 0 0",
             "one": "4",
+            "many": "4 " * 2000 + "4",
             "beyond": "4 " * 100_000 + "4",
             "digits": "4" * 4096,
             "long-zeros": "4096 4096 4096 4096",
             "too-long": "4097 4 4 4",
+            "delimiter": "td",
+            "trailing": "4 4 3 3 +4096",
+            "trailing-first": "+1 4 4 3 3",
             "trailing-beyond": "4 4 3 3 +9999",
             "trailing-alone": "+4",
             "trailing-twice": "4 4 3 3 +1 +1",
@@ -691,11 +695,14 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
             "huge": "9" * 4000 + " 4",
         }.items()
     },
+    "framing-av1-none": ("av1", header(framing=""), NOT_AS_RECORDED),
     "framing-av1-units": ("av1", header(framing="4 4"), NOT_AS_RECORDED),
     "framing-vp9": ("vp9", header(framing="4"), NOT_AS_RECORDED),
     "framing-jpeg": ("jpeg", header(framing="td"), NOT_AS_RECORDED),
     # what stands before a picture
     "prefix-long": ("depth", header(prefix="00" * 33), BAD_DOCUMENT),
+    "prefix-half": ("depth", header(prefix="000"), BAD_DOCUMENT),
+    "prefix-none": ("depth", header(prefix=""), NOT_AS_RECORDED),
     "prefix-letters": ("depth", header(prefix="zz"), BAD_DOCUMENT),
     "prefix-most": ("rvl", header(prefix="ab" * 32), NOT_AS_RECORDED),
     # recipes of PNG files
@@ -718,6 +725,9 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
             ("level-0", "level", 0),
             ("strategy-fixed", "strategy", 4),
             ("header-other", "zlib_header", "ffff"),
+            ("memory-1", "memory_level", 1),
+            ("chunks-256", "chunk_bytes", 256),
+            ("after", "after", ""),
             ("chunks-1", "chunk_bytes", 1),
             ("before", "before", "A" * 4 * 2**20),
             ("before-broken", "before", "A"),
@@ -726,6 +736,8 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     },
     "png-none": ("png", header(png=None), BAD),
     "png-of-packets": ("h264", header(png={}), BAD_DOCUMENT),
+    "png-yuv": ("png", both(image_of("yuyv", 2), layout("planar422")), BAD),
+    "png-two-channels": ("png", both(image_of("8UC2", 2), layout("stack8")), BAD),
     "png-float-colours": ("png", both(image_of("64FC4", 32), layout("bytes")), BAD),
     "png-signed": ("png", image_of("8SC1", 1), BAD),
     "png-nv24": ("png", both(image_of("nv24", 1), layout("planar444")), BAD),
@@ -768,6 +780,9 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     },
     "codec-png": ("jpeg", video_of(codec="png"), BAD_DOCUMENT),
     "packets-of-pixels": ("bits", put("body", value="packet"), BAD),
+    "packets-of-depth": ("rvl", put("body", value="packet"), BAD),
+    "pixels-of-jpeg": ("jpeg", put("body", value="pixels"), BAD),
+    "jpeg-of-packets": ("h264", put("body", value="jpeg"), BAD),
     "pixels-of-packets": ("h264", put("body", value="pixels"), BAD),
     "png-of-jpeg": ("jpeg", put("body", value="png"), BAD),
     "body-unknown": ("h264", put("body", value="tiff"), BAD_DOCUMENT),
@@ -775,6 +790,11 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     "packets-in-a-table": (
         "jpeg-grey",
         both(image_of("16UC1", 2), layout("table", table=[1, 2])),
+        BAD,
+    ),
+    "packets-of-few-bits": (
+        "jpeg",
+        both(image_of("mono16", 2), layout("gray_bits", bits=12, shift=0)),
         BAD,
     ),
     "packets-of-floats": ("jpeg", both(image_of("64FC4", 32), layout("bytes")), BAD),
@@ -790,6 +810,7 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
             "huge": list(range(60_000)),
         }.items()
     },
+    "table-short": ("table", layout("table", table=[7]), {"digest-mismatch"}),
     "table-other": ("table", layout("table", table=list(range(200))), {"digest-mismatch"}),
     "table-wide": ("table", layout("table", table=list(range(4096))), BAD),
     **{
@@ -848,6 +869,7 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         }.items()
     },
     "wire-of-another": ("protobuf", put("wire", value="json"), BAD),
+    "wire-of-ros": ("protobuf", put("wire", value="ros1"), BAD),
     "wire-foreign": ("jpeg", put("wire", value="protobuf"), BAD),
 }
 
