@@ -26,7 +26,7 @@ from PIL import Image
 import mp4ds
 from chromium import chromium
 from coded_scenes import CODED
-from commands import call, typed
+from commands import call, refused, typed
 from mp4ds.cli.report import print_evaluation
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, TargetError
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
@@ -600,3 +600,11 @@ def test_the_commands_of_the_page(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     out = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, text=True)
     assert out.count("av1 12 crf 24") == 2
+
+
+@needs_vmaf
+def test_the_commands_of_the_paper_are_understood(tmp_path: Path) -> None:
+    lines = re.findall(r"^mp4ds .*", (ROOT / "docs" / "paper.md").read_text(), re.MULTILINE)
+    assert len(lines) == 3
+    for line in lines:
+        refused(typed(line, tmp_path), 2, "no such file or folder")

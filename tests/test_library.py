@@ -363,6 +363,13 @@ def test_frames_of_a_topic_that_changes_come_as_recorded(publishers: int, tmp_pa
                 ask()
 
 
+def test_frame_ids_that_change(tmp_path: Path) -> None:
+    with mp4ds.open(packed(tmp_path, odd_scene("frame-id-change"))) as dataset:
+        names = [frame.frame_id for frame in dataset["/odd/image"]]
+        assert names == ["/cam/optical \u00e4", ""] * 4
+        assert dataset["/odd/image"][3].frame_id == ""
+
+
 # ---------------------------------------------------------------- pairs on their own
 
 
