@@ -157,6 +157,10 @@ def test_what_is_there_is_kept(force: bool, source: Path, store: Store) -> None:
 
 def test_force_replaces_the_manifest_first(source: Path, store: Store) -> None:
     mp4ds.pack(source, store.url, FAST)
+    store.server.forget()
+    with pytest.raises(TargetExistsError, match=rf"{store.url}: already exists"):
+        mp4ds.pack(source, store.url, FAST)
+    assert (store.server.put(), store.names()) == ([], FILES)
     store.files.pipe_file(f"{store.url}/old.mp4", b"of another pack")
     store.files.pipe_file(f"{store.url}2/cam.mp4", b"a neighbour")
     with pytest.raises(TargetError, match=r"holds 1 item that mp4ds did not write \(old\.mp4\)"):
