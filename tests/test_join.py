@@ -184,7 +184,8 @@ def test_pictures_are_those_of_the_segments(kind: Kind, joined: Joined) -> None:
     assert all(map(same, found, expected))
     with video_decoder(target, **all_told, sequential=False) as decoder:
         for number in (*range(TOTAL), *reversed(range(TOTAL))):
-            planes = tuple(plane.copy() for plane in decoder.picture(number))
+            ((_, picture),) = decoder.pictures_at([number])
+            planes = tuple(plane.copy() for plane in picture)
             assert same(planes if len(planes) > 1 else planes[0], expected[number]), number
 
 

@@ -134,6 +134,7 @@ def test_no_packet_is_read_but_those_of_the_chain(tmp_path: Path) -> None:
         for told in (recorded, None):
             access = Counting(path, codec="av1", frames=FRAMES, maker=maker, references=told)
             pictures.append(list(access.pictures_of([number])))
+            assert access.seeking is None
             if told is not None:
                 assert access.reads == len({sample for sample, _ in chains[number]})
             access.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from conftest import real
 from mp4ds.dataset.images import VideoImages
 from mp4ds.dataset.topic import Topic
-from mp4ds.video.access import FrameAccess
+from mp4ds.video.access import FrameReader
 from mp4ds.video.mp4 import SampleEntry, TrackColour, read_sample_entry
 from test_access import opened
 from test_references import FRAMES, HEIGHT, RECIPES, WIDTH, encoded_file
@@ -70,8 +71,10 @@ def test_decoders_know_what_the_track_says(
         assert expected[0][:2] == (colour[2], colour_range)
     maker: Any = Tagged()
     if name != "mjpeg":  # which libjpeg decodes, whatever the track says
-        with FrameAccess(path, codec=recipe.codec, frames=FRAMES, maker=maker) as access:
-            assert [found for _, found in access.pictures_of(range(FRAMES))] == expected
+        reader = FrameReader(path, codec=recipe.codec, frames=FRAMES, maker=maker)
+        with closing(reader):
+            assert [found for _, found in reader.pictures_of(range(FRAMES))] == expected
+            assert reader.seeking is None
     video = Topic([VideoImages(path)])
     every = [frame.data for frame in video]
     assert np.array_equal(video.read([7, 30]), [every[7], every[30]])
@@ -82,7 +85,7 @@ def test_a_track_without_colours(tmp_path: Path) -> None:
     path = tmp_path / "v.mp4"
     path.write_bytes(encoded_file(RECIPES["ffv1"]))
     assert read_sample_entry(path).colour is None
-    with opened(path, RECIPES["ffv1"]) as access:
+    with closing(opened(path, RECIPES["ffv1"])) as access:
         assert access.table.entry.colour is None
 
 

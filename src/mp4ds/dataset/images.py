@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -24,7 +24,7 @@ from mp4ds.messages.serializations import MessageSplitter
 from mp4ds.messages.wire import CodedFields, ImageFields, Parts
 from mp4ds.options import seconds_text
 from mp4ds.records import Channel, Excerpt, Message
-from mp4ds.video.access import FrameAccess, FrameReader
+from mp4ds.video.access import FrameReader
 from mp4ds.video.decoder import read_video_file
 from mp4ds.video.images import coded_pixels
 from mp4ds.video.pixels import Scale
@@ -103,8 +103,8 @@ class Images(ABC):
     # ------------------------------------------------------------ pictures
 
     @abstractmethod
-    def open_reader(self) -> FrameReader:
-        """A separate decoder for frames by number."""
+    def open_reader(self) -> FrameReader | VerbatimImages:
+        """A separate decoder for frames by number, to be closed."""
 
     def pictures(
         self, choice: Choice = everything, scale: Scale | None = None
@@ -113,7 +113,7 @@ class Images(ABC):
 
         Each is valid until the next one is requested.
         """
-        with self.open_reader() as reader:
+        with closing(self.open_reader()) as reader:
             yield from reader.pictures_of(list(choice(self.columns)), scale)
 
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
@@ -265,12 +265,9 @@ class VideoImages(Images):
 
     def open_reader(self) -> FrameReader:
         """A separate decoder for frames by number."""
-        file, maker = self._file, self._file.maker()
+        file = self._file
         return FrameReader(
-            lambda: FrameAccess(
-                file.path, codec=file.codec, frames=len(self), maker=maker, track=file.track
-            ),
-            file.decoder,
+            file.path, codec=file.codec, frames=len(self), maker=file.maker(), file=file
         )
 
 
@@ -442,14 +439,18 @@ class VerbatimImages(Images):
 
     # ------------------------------------------------------------ as a decoder
 
-    def open_reader(self) -> FrameReader:
-        """A reader that gives the pixels as recorded; they are decoded by `picture`."""
-        return FrameReader(None, lambda: self)
+    def open_reader(self) -> VerbatimImages:
+        """Itself: nothing has to be open."""
+        return self
 
-    def picture(self, index: int, scale: Scale | None = None) -> Picture:
-        """The pixels of a frame, as recorded."""
-        self._last = index, self.shown(index)
-        return (self._last[1].pixels,)
+    def pictures_of(self, numbers: Sequence[int], *_: object) -> Iterator[tuple[int, Picture]]:
+        """Pixels of some frames as recorded, each with its number; see `FrameReader.pictures_of`.
+
+        They have no other scale.
+        """
+        for number in numbers:
+            self._last = number, self.shown(number)
+            yield number, (self._last[1].pixels,)
 
     def close(self) -> None:
         """Nothing stays open."""

@@ -22,7 +22,7 @@ from mp4ds.messages import depth
 from mp4ds.messages.encodings import Picture, Pixels
 from mp4ds.messages.layouts import Layout
 from mp4ds.records import Channel, Message
-from mp4ds.video.access import FrameAccess, FrameReader
+from mp4ds.video.access import FrameReader
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.packets import PacketReader
 from mp4ds.video.pixels import PictureMaker, Scale
@@ -164,10 +164,7 @@ class Stream(Images):
         """A separate decoder for frames by number."""
         recorded = self.sidecar.video.references
         references = recorded.decode if recorded else None
-        return FrameReader(
-            lambda: FrameAccess(self.video_path, **self._told(), references=references),
-            lambda: self.open_video(sequential=False),
-        )
+        return FrameReader(self.video_path, **self._told(), references=references)
 
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
         """Write the pixels of a picture, as recorded."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import index as as_integer
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.images import Images, Integers
+from mp4ds.dataset.images import Images, Integers, VerbatimImages
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import Crop, Resize, View, output
 from mp4ds.errors import Mp4dsError, OptionError, missing
@@ -63,7 +63,7 @@ class _Opened:
     """
 
     lock: threading.RLock = field(default_factory=threading.RLock)
-    readers: dict[int, FrameReader] = field(default_factory=dict)
+    readers: dict[int, FrameReader | VerbatimImages] = field(default_factory=dict)
     views: dict[int, tuple[str, View]] = field(default_factory=dict)
     inherited: list[object] = field(default_factory=list)
 
@@ -592,7 +592,7 @@ class Topic:
         """Frames of a part in a given order; increasing runs are decoded in one go."""
         falls = np.flatnonzero(np.diff(own) < 0) + 1
         part = self.parts[owner]
-        with part.open_reader() as reader:  # a separate one: more may be read meanwhile
+        with closing(part.open_reader()) as reader:  # a separate one: more may be read meanwhile
             for run in np.split(own, falls):
                 pictures = reader.pictures_of(run.tolist(), view.scale)
                 yield from self._one_by_one(owner, view, pictures)

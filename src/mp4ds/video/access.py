@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import av
 import numpy as np
@@ -20,7 +20,7 @@ from mp4ds.files.ranges import expect
 from mp4ds.messages.encodings import Picture, Pixels
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded import StreamParser, UnknownStructure
-from mp4ds.video.decoder import JpegDecoder
+from mp4ds.video.decoder import JpegDecoder, VideoDecoder, VideoFile
 from mp4ds.video.media import raise_if_scarce
 from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.pixels import PictureMaker, Scale
@@ -205,24 +205,29 @@ class Chains:
 # ---------------------------------------------------------------- access
 
 
-class FrameAccess:
-    """Random access to the frames of one mp4. A context manager.
+class FrameReader:
+    """Frames of one mp4 by number; others are decoded only if necessary.
+
+    What a frame depends on is recorded or parsed, and a decoder gets only that. Where this is not
+    known, or the index cannot be used, frames are decoded from the key frame before: ffmpeg reads
+    more videos than we do, and tells what is wrong with the others.
 
     One thread at a time may use it, in the process that opened it.
 
     Args:
         path: The video.
-        codec: Name in the registry.
-        frames: Expected number of frames; None to take it from the video.
+        codec: Name in the registry, or ffmpeg's.
+        frames: Expected number of frames.
         maker: Makes pictures of its frames.
-        threads: Of the decoder. One takes the least CPU time; with more, one frame comes sooner.
         references: Decodes what the sidecar says about them, which saves reading packets to find
             out, from the number of packets of each group; ValueError if that is of another video.
-        track: See `read_sample_table`.
+        file: What is known of a third-party video.
+
+    Attributes:
+        seeking: Decodes from key frames, once that is the only way; else None.
 
     Raises:
-        UnknownStructure: Its frames cannot be decoded one by one.
-        VideoError: ``video-unreadable`` or ``frame-count``.
+        VideoError: It cannot be read, or does not match what is expected.
         FormatError: ``references-invalid``: what the sidecar says does not fit the video.
     """
 
@@ -231,43 +236,62 @@ class FrameAccess:
         path: Path,
         *,
         codec: str,
-        frames: int | None,
+        frames: int,
         maker: PictureMaker,
-        threads: int = 1,
         references: Callable[[NDArray[np.int64]], Structures] | None = None,
-        track: int | None = None,
+        file: VideoFile | None = None,
     ) -> None:
         self._path = path
-        self._track = track
         self._codec = codec
+        self._frames = frames
         self._maker = maker
-        self._threads = threads
-        self._file: BinaryIO = path.open("rb")
+        self._video = file
+        self._context: Any = None
+        # what the decoder received: numbers of pieces of a group; None: it has to begin anew
+        self._group: Group | None = None
+        self._fed: set[int] = set()
+        self.seeking: VideoDecoder | None = None
+        with suppress(UnknownStructure, VideoError, OSError):
+            self._open(references)
+            return
+        self.seeking = self._open_seeking()
+
+    def _open(self, references: Callable[[NDArray[np.int64]], Structures] | None) -> None:
+        self._file: BinaryIO = self._path.open("rb")
         try:
-            self.table = self._read_table(frames)
+            self.table = self._read_table()
             recorded = self._recorded(references) if references else None
-            self._chains = Chains(self.table, codec, self._packet, recorded)
+            self._chains = Chains(self.table, self._codec, self._packet, recorded)
         except BaseException:
             self._file.close()
             raise
         hidden = len(self.table.sizes) - len(self.table.order)
         self._numbers = np.arange(len(self.table.sizes)) - hidden
         self._numbers[self.table.order] = np.arange(len(self.table.order))
-        self._context: Any = None
-        self._session: _Session | None = None
 
-    def _read_table(self, frames: int | None) -> SampleTable:
+    def _open_seeking(self) -> VideoDecoder:
+        return VideoDecoder(
+            self._path,
+            codec=self._codec,
+            frames=self._frames,
+            maker=self._maker,
+            sequential=False,
+            file=self._video,
+        )
+
+    def _read_table(self) -> SampleTable:
         try:
             size = self._path.stat().st_size
-            table = read_sample_table(self._file, size, str(self._path), self._track)
+            track = self._video.track if self._video else None
+            table = read_sample_table(self._file, size, str(self._path), track)
         except Refused as error:
             raise UnknownStructure(f"its index cannot be used: {error}") from None
         known = CODECS.get(self._codec)
         if known is None or table.entry.codec not in known.entries:
             raise UnknownStructure(f"its track is {table.entry.codec!r}")
-        if frames is not None and len(table.order) != frames:
+        if len(table.order) != self._frames:
             raise VideoError(
-                "frame-count", self._path, f"has {len(table.order)} frames, not {frames}"
+                "frame-count", self._path, f"has {len(table.order)} frames, not {self._frames}"
             )
         if (table.entry.width, table.entry.height) != self._maker.coded_size:
             raise UnknownStructure("its frames have a different size")
@@ -301,35 +325,42 @@ class FrameAccess:
         Args:
             numbers: 0 <= number < frames, increasing.
             scale: See `PictureMaker.make`.
-            outs: Its `out`, by frame.
+            outs: Its `out`, by frame; it may stay unused.
 
         Yields:
             Views that are valid until the next one is requested.
 
         Raises:
-            UnknownStructure: What the frames refer to is not known; the remaining frames were not
-                yielded.
-            VideoError: ``decode-failed``, naming the frame.
+            VideoError: ``decode-failed``, naming the frame; or see `VideoDecoder.pictures_at`.
             FormatError: ``references-invalid``.
         """
-        samples = self.table.order[np.asarray(numbers, np.int64)].tolist()
-        for wanted in self._chains.split(samples) if samples else ():
-            yield from self._of_group(wanted, scale, outs or {})
+        done = 0
+        if self.seeking is None:
+            samples = self.table.order[np.asarray(numbers, np.int64)].tolist()
+            with suppress(UnknownStructure):
+                for wanted in self._chains.split(samples) if samples else ():
+                    for pair in self._of_group(wanted, scale, outs or {}):
+                        done += 1
+                        yield pair
+                return
+            self.seeking = self._open_seeking()
+            self._close_access()
+        yield from self.seeking.pictures_at(numbers[done:], scale)
 
     def _of_group(
         self, wanted: list[int], scale: Scale | None, outs: Mapping[int, Pixels]
     ) -> Iterator[tuple[int, Picture]]:
         self._announce(self._chains.unknown(wanted[0], max(wanted)))
-        group = self._group(wanted)
-        chain = group.chain(wanted)
-        shown = {group.shows[sample - group.first] for sample in wanted}
-        if self._session is None or not self._session.goes_on(group, chain, shown):
-            self._begin(group)
+        try:
+            group = self._chains.group(wanted[0], max(wanted))
+        except StructureError as error:
+            raise self._unfit(error) from None
+        missing = self._begin(group, wanted)
         due = {sample: int(self._numbers[sample]) for sample in wanted}
         try:
-            for frame in self._decoded(chain):
+            for frame in self._decoded(group, missing):
                 if frame.is_corrupt:
-                    self._context = self._session = None
+                    self._context = self._group = None
                     raise_if_scarce()
                     raise self._damage(due, "is marked as corrupt")
                 number = due.pop(frame.pts, None) if frame.pts is not None else None
@@ -339,37 +370,26 @@ class FrameAccess:
                     return
         except FFmpegError as error:
             raise_if_scarce(error)
-            self._context = self._session = None
+            self._context = self._group = None
             raise self._damage(due, f"cannot be decoded: {reason_of(error)}") from None
         raise self._damage(due, "was not found")
-
-    def _group(self, wanted: list[int]) -> Group:
-        try:
-            return self._chains.group(wanted[0], max(wanted))
-        except StructureError as error:
-            raise self._unfit(error) from None
 
     def _damage(self, due: Mapping[int, int], what: str) -> VideoError:
         return VideoError("decode-failed", self._path, what, frame=min(due.values()))
 
-    def _decoded(self, chain: list[int]) -> Iterator[av.VideoFrame]:
-        session = self._session
-        if session is None:
-            return
-        missing = [number for number in chain if number not in session.fed]
-        self._announce(dict.fromkeys(session.group.pieces[number].sample for number in missing))
+    def _decoded(self, group: Group, missing: list[int]) -> Iterator[av.VideoFrame]:
+        self._announce(dict.fromkeys(group.pieces[number].sample for number in missing))
         sample, packet = -1, b""
         for number in missing:
-            piece = session.group.pieces[number]
+            piece = group.pieces[number]
             if piece.sample != sample:
                 sample, packet = piece.sample, self._packet(piece.sample)
-            data = av.Packet(self._cut(session.group, piece, packet))
+            data = av.Packet(self._cut(group, piece, packet))
             data.pts = data.dts = sample
-            session.fed.add(number)
-            session.last = number
+            self._fed.add(number)
             yield from self._context.decode(data)
         # some decoders hold frames back; once they gave them they take nothing more
-        self._session = None
+        self._group = None
         yield from self._context.decode(None)
 
     def _cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
@@ -380,12 +400,24 @@ class FrameAccess:
             problem = f"is damaged: {error}"
             raise VideoError("decode-failed", self._path, problem, frame=number) from None
 
-    def _begin(self, group: Group) -> None:
+    def _begin(self, group: Group, wanted: list[int]) -> list[int]:
+        """Numbers of the pieces that the decoder is still to be given, in the order coded.
+
+        It goes on if these come after all that it was given, and no picture is wanted that has
+        come out already: one comes out once.
+        """
+        chain = group.chain(wanted)
+        if group is self._group:
+            shown = {group.shows[sample - group.first] for sample in wanted}
+            missing = [number for number in chain if number not in self._fed]
+            if self._fed.isdisjoint(shown) and missing[0] > max(self._fed, default=-1):
+                return missing
         if self._context is None:
             self._context = self._new_context()
         else:
             self._context.flush_buffers()
-        self._session = _Session(group)
+        self._group, self._fed = group, set()
+        return chain
 
     def _new_context(self) -> Any:
         if self._codec == "mjpeg":
@@ -397,7 +429,7 @@ class FrameAccess:
         context.width, context.height = entry.width, entry.height
         if entry.colour:
             entry.colour.apply(context)
-        context.thread_count = self._threads
+        context.thread_count = 1
         context.thread_type = "SLICE"
         # concealed damage would depend on which frames were decoded before
         context.options = {"err_detect": "explode"}
@@ -423,124 +455,11 @@ class FrameAccess:
 
     def close(self) -> None:
         """Close the file."""
-        self._context = self._session = None
+        if self.seeking is None:
+            self._close_access()
+        else:
+            self.seeking.close()
+
+    def _close_access(self) -> None:
+        self._context = self._group = None
         self._file.close()
-
-    def __enter__(self) -> FrameAccess:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-@dataclass(slots=True)
-class _Session:
-    """A decoder's progress through a group.
-
-    Attributes:
-        group: Which it is.
-        fed: Numbers of the pieces it has received.
-        last: The last of them.
-    """
-
-    group: Group
-    fed: set[int] = field(default_factory=set)
-    last: int = -1
-
-    def goes_on(self, group: Group, chain: list[int], shown: set[int]) -> bool:
-        """Whether all that is still needed comes after what it was given.
-
-        Args:
-            group: The group of what is wanted.
-            chain: Numbers of the pieces that are needed.
-            shown: Those of them that make pictures come out: a picture comes out once.
-        """
-        if group is not self.group or not self.fed.isdisjoint(shown):
-            return False
-        return all(number > self.last for number in chain if number not in self.fed)
-
-
-# ---------------------------------------------------------------- reader
-
-
-class Seeking(Protocol):
-    """A decoder that reaches a frame by decoding from the key frame before it."""
-
-    def picture(self, index: int, scale: Scale | None = None) -> Picture:
-        """The picture of a frame; see `PictureMaker.make`."""
-
-    def close(self) -> None:
-        """Close the file."""
-
-
-class FrameReader:
-    """Gives frames by number; others are decoded only if necessary.
-
-    A context manager. One thread at a time may use it, in the process that opened it.
-
-    Args:
-        open_access: Opens the decoder of single frames and their references; None if there is none.
-        open_decoder: Opens the decoder from key frames, used where that is impossible.
-
-    Raises:
-        VideoError: Neither can be opened; the error of the latter.
-    """
-
-    def __init__(
-        self, open_access: Callable[[], FrameAccess] | None, open_decoder: Callable[[], Seeking]
-    ) -> None:
-        self._open_decoder = open_decoder
-        self._access: FrameAccess | None = None
-        self._decoder: Seeking | None = None
-        if open_access is not None:
-            # ffmpeg reads more, and tells what it does not
-            with suppress(UnknownStructure, VideoError, OSError):
-                self._access = open_access()
-        if self._access is None:
-            self._decoder = open_decoder()
-
-    def pictures_of(
-        self,
-        numbers: Sequence[int],
-        scale: Scale | None = None,
-        outs: Mapping[int, Pixels] | None = None,
-    ) -> Iterator[tuple[int, Picture]]:
-        """Pictures of some frames, each with its number.
-
-        Args:
-            numbers: 0 <= number < frames, increasing.
-            scale: See `PictureMaker.make`.
-            outs: Its `out`, by frame; it may stay unused.
-
-        Yields:
-            Views that are valid until the next one is requested.
-
-        Raises:
-            VideoError: One cannot be decoded.
-        """
-        done = 0
-        if self._access is not None:
-            try:
-                for pair in self._access.pictures_of(numbers, scale, outs):
-                    done += 1
-                    yield pair
-                return
-            except UnknownStructure:
-                self._access.close()
-                self._access = None
-        if self._decoder is None:
-            self._decoder = self._open_decoder()
-        for number in numbers[done:]:
-            yield number, self._decoder.picture(number, scale)
-
-    def close(self) -> None:
-        """Close the file."""
-        for part in (self._access, self._decoder):
-            if part is not None:
-                part.close()
-
-    def __enter__(self) -> FrameReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

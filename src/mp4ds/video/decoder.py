@@ -91,6 +91,9 @@ class JpegDecoder:
 
 # ---------------------------------------------------------------- decoder
 
+_Position = tuple[Iterator[av.VideoFrame], av.VideoFrame, int]
+"""Of a decoder: the frames that come next, the last one wanted, and the number after that."""
+
 _MOST_THREADS = 16  # that ffmpeg chooses of itself
 _ERRORS = (FFmpegError, OSError, ValueError)  # PyAV has the last for a codec without a decoder
 
@@ -130,8 +133,7 @@ class VideoDecoder:
         self._jpeg = JpegDecoder(maker.coded_size) if codec == "mjpeg" else None
         # frames that the decoder has begun beyond the last that it gave
         self._in_flight = min(os.cpu_count() or 1, _MOST_THREADS) + 1 if sequential else 1
-        self._running: Iterator[tuple[int, Picture]] | None = None
-        self._asked: tuple[int, Scale | None] = -1, None
+        self._position: _Position | None = None
         self._media = Media(path, file.track if file else None)
         self._container = self._media.container
         try:
@@ -176,8 +178,9 @@ class VideoDecoder:
     ) -> Iterator[tuple[int, Picture]]:
         """Some pictures, each with its frame's number, as views that hold until the next one.
 
-        Decoding begins at the key frame before the first one. Frames in between are decoded, and
-        left out at key frames that are far enough ahead; they are not made into pictures.
+        Decoding begins at the key frame before the first one, or goes on where an earlier call
+        ended. Frames in between are decoded, and left out at key frames that are far enough ahead;
+        they are not made into pictures.
 
         Args:
             indices: 0 <= index < frames, increasing. The next one is asked for only when the
@@ -204,43 +207,25 @@ class VideoDecoder:
         for index, frame in self._chosen(indices, is_strict=False):
             yield index, None if frame is None else self._maker.make(frame, index, scale)
 
-    def picture(self, index: int, scale: Scale | None = None) -> Picture:
-        """One picture; the next ones continue decoding, others seek to the key frame before them.
-
-        Args:
-            index: 0 <= index < frames.
-            scale: See `PictureMaker.make`.
-
-        Raises:
-            VideoError: It cannot be decoded.
-        """
-        last, as_before = self._asked
-        self._asked = index, scale
-        if self._running is None or index <= last or scale != as_before:
-            self._running = self.pictures_at(iter(lambda: self._asked[0], None), scale)
-        try:
-            return next(self._running)[1]
-        except BaseException:
-            self._running = None
-            raise
-
     def _chosen(
         self, indices: Iterable[int], *, is_strict: bool
     ) -> Iterator[tuple[int, av.VideoFrame | None]]:
         """The frames with some numbers; None for one that the decoder does not output.
 
         Args:
-            indices: The numbers.
+            indices: The numbers, increasing.
             is_strict: Whether it is an error if a key frame cannot be sought, or a frame decoded.
         """
         ticks, keys = self._index
-        frames: Iterator[av.VideoFrame] = iter(())
-        frame: av.VideoFrame | None = None
-        due = -self._in_flight - 1
+        # what went on in spite of errors is nothing to begin with
+        position = self._position if is_strict else None
+        frames, frame, due = position or (iter(()), None, -self._in_flight - 1)
         for index in indices:
+            self._position = None  # until the frame is there
             tick = int(ticks[index])
             group = int(np.searchsorted(keys, index, side="right")) - 1
-            if (keys[group] if group >= 0 else 0) > due + self._in_flight:
+            start = keys[group] if group >= 0 else 0
+            if index < due - 1 or start > due + self._in_flight:
                 frames, frame = self._decoded_from(group, index, is_strict=is_strict), None
             frame = _shown_from(tick, frame, frames)
             # of others, a key frame is sought by decoding time, which may lead to a later one
@@ -250,7 +235,12 @@ class VideoDecoder:
                 frames = self._decoded_from(earlier, index, is_strict=is_strict)
                 frame = _shown_from(tick, None, frames)
             due = index + 1
-            yield index, frame if frame is not None and frame.pts == tick else None
+            if frame is None or frame.pts != tick:
+                yield index, None
+                continue
+            if is_strict:
+                self._position = frames, frame, due
+            yield index, frame
 
     def _decoded_from(self, group: int, index: int, *, is_strict: bool) -> Iterator[av.VideoFrame]:
         """The frames from a key frame on, of which one is wanted; -1: from the first."""
@@ -261,6 +251,7 @@ class VideoDecoder:
         return self._decoded(first, is_strict=is_strict)
 
     def _seek(self, tick: int, index: int) -> None:
+        self._position = None
         try:
             self._container.seek(tick, stream=self._stream)
         except (FFmpegError, OSError) as error:
@@ -308,6 +299,7 @@ class VideoDecoder:
 
     def close(self) -> None:
         """Close the file."""
+        self._position = None  # which refers to this object
         self._media.close()
 
     def __enter__(self) -> VideoDecoder:
@@ -366,17 +358,6 @@ class VideoFile:
             picture_size=self.size,
             matrix=None,
             full_range=False,
-        )
-
-    def decoder(self) -> VideoDecoder:
-        """A separate decoder of its frames as 8-bit RGB."""
-        return VideoDecoder(
-            self.path,
-            codec=self.codec,
-            frames=len(self.ticks),
-            maker=self.maker(),
-            sequential=False,
-            file=self,
         )
 
 
