@@ -186,7 +186,10 @@ def shown_pictures(dataset: Path, *, centred: bool = False) -> list[NDArray[np.u
         matrix=None if video.matrix == "smpte170m" else video.matrix,
         full_range=video.full_range,
     ) as decoder:
-        pictures = [tuple(plane.copy() for plane in planes) for planes in decoder.pictures()]
+        pictures = [
+            tuple(plane.copy() for plane in planes)
+            for _, planes in decoder.pictures_at(range(frames))
+        ]
     if centred:
         return [without_site(picture) for picture in pictures]
     if grey:

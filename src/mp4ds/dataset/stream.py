@@ -203,7 +203,7 @@ class Stream(Images):
         """The wanted pictures in order, each with its number, from a separate decoder.
 
         Args:
-            choice: Which are wanted; may be asked twice. If all are, the video must end after them.
+            choice: Which are wanted; may be asked twice.
             scale: See `PictureMaker.make`.
             is_strict: Whether a picture that cannot be decoded is an error, and not None. What was
                 recorded as packets may have some without any damage to the video: they refer to
@@ -213,16 +213,13 @@ class Stream(Images):
             Views that are valid until the next one is requested.
 
         Raises:
-            VideoError: See `VideoDecoder.pictures`.
+            VideoError: See `VideoDecoder.pictures_at`.
         """
         done = -1
         with self.naming_frames():
             if self.sound is None:
                 try:
                     with self.open_video(sequential=True) as decoder:
-                        if is_strict and choice is everything:
-                            yield from enumerate(decoder.pictures(scale))
-                            return
                         for index, picture in decoder.pictures_at(choice(self.columns), scale):
                             yield index, picture
                             done = index

@@ -91,9 +91,6 @@ class JpegDecoder:
 
 # ---------------------------------------------------------------- decoder
 
-_Position = tuple[Iterator[av.VideoFrame], av.VideoFrame, int]
-"""Of a decoder: the frames that come next, the last one wanted, and the number after that."""
-
 _MOST_THREADS = 16  # that ffmpeg chooses of itself
 _ERRORS = (FFmpegError, OSError, ValueError)  # PyAV has the last for a codec without a decoder
 
@@ -133,7 +130,8 @@ class VideoDecoder:
         self._jpeg = JpegDecoder(maker.coded_size) if codec == "mjpeg" else None
         # frames that the decoder has begun beyond the last that it gave
         self._in_flight = min(os.cpu_count() or 1, _MOST_THREADS) + 1 if sequential else 1
-        self._position: _Position | None = None
+        # the frames that come next, and the number of their first, if a call ended in between
+        self._position: tuple[Iterator[av.VideoFrame], int] | None = None
         self._media = Media(path, file.track if file else None)
         self._container = self._media.container
         try:
@@ -150,28 +148,6 @@ class VideoDecoder:
     def coded_frames(self) -> int:
         """Frames in the file's index, without those hidden by an edit list at the beginning."""
         return len(self._stream.index_entries) - self._media.hidden
-
-    def pictures(self, scale: Scale | None = None) -> Iterator[Picture]:
-        """All pictures in order, as views that are valid until the next one is requested.
-
-        Args:
-            scale: See `PictureMaker.make`.
-
-        Raises:
-            VideoError: ``decode-failed`` with the frame's number, or ``frame-count`` when the
-                video ends early or continues.
-        """
-        self._seek(0, 0)
-        number = 0
-        for frame in self._decoded(0, is_strict=True):
-            if number == self._frames:
-                raise VideoError("frame-count", self._path, f"has more than {self._frames} frames")
-            yield self._maker.make(frame, number, scale)
-            number += 1
-        if number != self._frames:
-            raise VideoError(
-                "frame-count", self._path, f"ends after {number} of {self._frames} frames"
-            )
 
     def pictures_at(
         self, indices: Iterable[int], scale: Scale | None = None
@@ -219,13 +195,14 @@ class VideoDecoder:
         ticks, keys = self._index
         # what went on in spite of errors is nothing to begin with
         position = self._position if is_strict else None
-        frames, frame, due = position or (iter(()), None, -self._in_flight - 1)
+        frames, due = position or (iter(()), -self._in_flight - 1)
+        frame: av.VideoFrame | None = None
         for index in indices:
             self._position = None  # until the frame is there
             tick = int(ticks[index])
             group = int(np.searchsorted(keys, index, side="right")) - 1
             start = keys[group] if group >= 0 else 0
-            if index < due - 1 or start > due + self._in_flight:
+            if index < due or start > due + self._in_flight:
                 frames, frame = self._decoded_from(group, index, is_strict=is_strict), None
             frame = _shown_from(tick, frame, frames)
             # of others, a key frame is sought by decoding time, which may lead to a later one
@@ -239,8 +216,9 @@ class VideoDecoder:
                 yield index, None
                 continue
             if is_strict:
-                self._position = frames, frame, due
+                self._position = frames, due
             yield index, frame
+            frame = None  # the next one is another, even if it is shown at the same time
 
     def _decoded_from(self, group: int, index: int, *, is_strict: bool) -> Iterator[av.VideoFrame]:
         """The frames from a key frame on, of which one is wanted; -1: from the first."""
