@@ -7,7 +7,7 @@ import io
 import os
 import struct
 from collections.abc import Iterable, Iterator
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -224,18 +224,14 @@ class VideoDecoder:
         """The frames from a key frame on, of which one is wanted; -1: from the first."""
         ticks, keys = self._index
         first = int(keys[group]) if group >= 0 else 0
-        with nullcontext() if is_strict else suppress(VideoError):
-            self._seek(int(ticks[first]), index)
-        return self._decoded(first, is_strict=is_strict)
-
-    def _seek(self, tick: int, index: int) -> None:
-        self._position = None
         try:
-            self._container.seek(tick, stream=self._stream)
+            self._container.seek(int(ticks[first]), stream=self._stream)
         except (FFmpegError, OSError) as error:
             raise_if_scarce(error)
-            problem = f"cannot be reached: {reason_of(error)}"
-            raise VideoError("decode-failed", self._path, problem, frame=index) from None
+            if is_strict:
+                problem = f"cannot be reached: {reason_of(error)}"
+                raise VideoError("decode-failed", self._path, problem, frame=index) from None
+        return self._decoded(first, is_strict=is_strict)
 
     @cached_property
     def _index(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -185,9 +185,9 @@ def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
 class PacketReader:
     """The packets of an mp4's video track. A context manager.
 
-    They are read from where the file's index says, which ffmpeg reads; a forged index costs no
-    memory beyond the file's size. Packet 0 is the first that is shown; those that an edit list
-    hides before it have negative numbers.
+    They are read from where the file's index says, which ffmpeg reads: the format allows fragments,
+    which `read_sample_table` refuses. A forged index costs no memory beyond the file's size. Packet
+    0 is the first that is shown; those that an edit list hides before it have negative numbers.
 
     Args:
         path: The video.
