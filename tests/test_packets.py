@@ -117,18 +117,15 @@ def test_start_codes(name: str, framing: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("delimited", [True, False, None])
-def test_temporal_delimiters(delimited: bool | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize("metadata", [b"", b"\x2a\x06\x04\xb5\0\0\0\x80"])
+def test_temporal_delimiters_and_metadata(
+    delimited: bool | None, metadata: bytes, tmp_path: Path
+) -> None:
     bodies = []
     for number, packet in enumerate(encode(ENCODINGS["av1"])):
-        bare = packet.data.removeprefix(av1.DELIMITER)
         keep = number % 2 == 0 if delimited is None else delimited
+        bare = metadata + packet.data.removeprefix(av1.DELIMITER)
         bodies.append(av1.DELIMITER + bare if keep else bare)
-    check(tmp_path / "a.mp4", "av1", bodies)
-
-
-def test_av1_metadata(tmp_path: Path) -> None:
-    packets = [packet.data for packet in encode(ENCODINGS["av1"])]
-    bodies = [packet[:2] + b"\x2a\x06\x04\xb5\0\0\0\x80" + packet[2:] for packet in packets]
     check(tmp_path / "a.mp4", "av1", bodies)
 
 

@@ -45,13 +45,15 @@ def index(path: Path) -> SampleTable:
         return read_sample_table(file, path.stat().st_size, str(path))
 
 
+def sample_reader(path: Path, table: SampleTable) -> Callable[[int], bytes]:
+    data = path.read_bytes()
+    return lambda sample: data[table.places[sample] :][: table.sizes[sample]]
+
+
 def chains_of(path: Path, codec: str, recorded: Structures | None) -> list[Pieces]:
     """For every packet the bytes that a decoder is given to show its picture."""
-    table, data = index(path), path.read_bytes()
-
-    def read(sample: int) -> bytes:
-        return data[table.places[sample] :][: table.sizes[sample]]
-
+    table = index(path)
+    read = sample_reader(path, table)
     chains = Chains(table, codec, read, recorded)
     found = []
     for sample in range(len(table.sizes)):
@@ -95,15 +97,11 @@ def test_groups_that_were_not_asked_for_long_are_forgotten(
 ) -> None:
     recipe = RECIPES["x264-b3-none-ref4-w2"]
     path = written(tmp_path, recipe)
-    table, data = index(path), path.read_bytes()
+    table = index(path)
     most = max(np.diff(np.append(np.flatnonzero(table.sync), len(table.sizes))))
     monkeypatch.setattr(access, "KEPT_FRAMES", 2 * most)
-
-    def read(sample: int) -> bytes:
-        return data[table.places[sample] :][: table.sizes[sample]]
-
     known = [len(pieces) for pieces in chains_of(path, recipe.codec, None)]
-    chains = Chains(table, recipe.codec, read, None)
+    chains = Chains(table, recipe.codec, sample_reader(path, table), None)
     for sample in np.random.default_rng(0).integers(0, len(table.sizes), 200).tolist():
         group = chains.group(sample, sample)
         assert len(group.chain([sample])) == known[sample]

@@ -192,13 +192,11 @@ def test_fields_are_found_by_the_recorded_descriptor() -> None:
     assert parse_transforms(PROTOBUF, data) == []  # of other numbers: unknown fields
     assert parse_transforms(channel("protobuf", MANY, renumbered), data) == TREE
     for order in (1, -1):
-        mixed = descriptor_pb2.FileDescriptorSet(file=sorted(files.file, key=len_of)[::order])
+        mixed = descriptor_pb2.FileDescriptorSet(
+            file=sorted(files.file, key=lambda file: file.ByteSize())[::order]
+        )
         own = channel("protobuf", MANY, mixed.SerializeToString())
         assert parse_transforms(own, data) == TREE
-
-
-def len_of(file: Any) -> int:
-    return len(file.SerializeToString())
 
 
 @pytest.mark.parametrize(
