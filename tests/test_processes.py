@@ -252,8 +252,10 @@ def failing(number: int) -> int:
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
-def test_items_in_their_order(jobs: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+def test_items_in_their_order(jobs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By modules that are found where the caller finds them, not in the current folder."""
+    (tmp_path / "queue.py").write_text("raise SystemExit('from the current folder')")
+    monkeypatch.chdir(tmp_path)
     found = list(each(squared, range(6), jobs))
     assert [(item, made[0]) for item, made in found] == [(n, n * n) for n in range(6)]
     assert (os.getpid() in {made[1] for _, made in found}) == (jobs == 1)

@@ -1,8 +1,4 @@
-"""Calls that run in processes of this machine.
-
-``python -m mp4ds.processes`` is such a process: it takes calls from a socket that it
-inherits, and answers each there.
-"""
+"""Calls that run in processes of this machine."""
 
 from __future__ import annotations
 
@@ -231,8 +227,12 @@ class _Process:
         self._calls, theirs = Pipe()
         with theirs:
             socket = theirs.fileno()
+            # Not by -m, which would import what lies in the current folder first; and modules are
+            # found where this process finds them.
+            path = [place for place in sys.path if isinstance(place, str)]
+            program = f"import sys; sys.path[:] = {path!r}; from {__name__} import serve; serve()"
             self._process = subprocess.Popen(
-                [sys.executable, "-m", __spec__.name, str(socket), str(nice)],
+                [sys.executable, "-c", program, str(socket), str(nice)],
                 stdin=subprocess.DEVNULL,
                 stdout=self._stderr,
                 stderr=self._stderr,
@@ -289,8 +289,8 @@ class _Process:
 # ---------------------------------------------------------------- in such a process
 
 
-def _serve() -> None:
-    """Make calls until there are no more."""
+def serve() -> None:
+    """Be such a process: take calls from an inherited socket, and answer each there."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     socket, nice = map(int, sys.argv[1:])
     os.nice(nice)
@@ -338,7 +338,3 @@ def _resident_bytes() -> int:
     with suppress(OSError, ValueError, IndexError):
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0
-
-
-if __name__ == "__main__":
-    _serve()
