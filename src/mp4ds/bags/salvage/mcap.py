@@ -198,13 +198,17 @@ class McapFraming(Framing):
 # ---------------------------------------------------------------- the summary
 
 
-def _read_summary(path: Path) -> McapSummary:
-    """The summary of a file; only its place if it is damaged, and nothing if that is unknown.
+def _read_summary(path: Path) -> tuple[McapSummary, McapSummary]:
+    """The summary of a file: where it matches its checksum, and as far as it can be read otherwise.
+
+    Returns:
+        The summary; only its place if it is damaged, and nothing if that is unknown. And a damaged
+        one up to the damage; empty for a sound one.
 
     Raises:
         SourceError: The file cannot be read.
     """
-    place = 0
+    place, read = 0, McapSummary()
     with (
         closing(RecordStream(path, MAX_RECORD_BYTES)) as stream,
         suppress(SourceError, DamageError),
@@ -212,9 +216,11 @@ def _read_summary(path: Path) -> McapSummary:
         found, checksum = summary_place(stream)
         if len(MAGIC) < found < stream.size - FOOTER_BYTES:
             place = found
-        if place and checksum in (0, _checksum(stream, place)):
-            return read_summary(stream) or McapSummary()
-    return McapSummary(place)
+            is_sound = checksum in (0, _checksum(stream, place))
+            is_found = read_summary(stream, read) is not None
+            if is_sound:
+                return (read if is_found else McapSummary()), McapSummary()
+    return McapSummary(place), read
 
 
 def _checksum(stream: RecordStream, start: int) -> int:
@@ -323,7 +329,7 @@ class McapSalvage(FileSalvage):
         self._channels = declared.channels
         self._schemas = declared.schemas.values()
         self._skipped = declared.skipped
-        self._summary = _read_summary(path)
+        self._summary, self._doubtful = _read_summary(path)
         self._index_offset = self._summary.offset or None
         self._is_timed = self._summary.chunks.has_messages
         self._framing = McapFraming(declared.channels, most)
@@ -466,12 +472,23 @@ class McapSalvage(FileSalvage):
         Raises:
             DamageError: It is shorter than its fields.
         """
-        if channel_id not in self._declared.channels and len(body) >= MESSAGE_HEAD.size:
+        if not self._has_channel(channel_id) and len(body) >= MESSAGE_HEAD.size:
             self._tally.stray(channel_id)
             problem = f"messages of channel {channel_id}, whose record is missing"
             self._log.lost_of_kind(problem, offset, problem).add(1, ())
             return None
         return self._declared.message(body)
+
+    def _has_channel(self, channel_id: int) -> bool:
+        """Whether a channel is known; from a damaged summary as a last resort."""
+        record = self._doubtful.channels.get(channel_id)
+        if channel_id not in self._declared.channels and record is not None:
+            schema = self._doubtful.schemas.get(record.schema_id)
+            if schema is not None and schema.id not in self._defined:
+                self._defined.add(schema.id)
+                self._declared.add_schema(schema)
+            self._declared.add_channel(record)
+        return channel_id in self._declared.channels
 
     def _chunk(self, frame: RecordFrame) -> Iterator[_Found]:
         """The messages of a chunk, as far as it can be decompressed."""
