@@ -351,7 +351,7 @@ def test_names_of_files_are_no_formulas(tmp_path: Path) -> None:
 
 ROS_CALIBRATION = """\
 image_width: 32
-image_height: 24
+image_height: 24.
 camera_name: narrow
 camera_matrix:
   rows: 3
@@ -448,7 +448,7 @@ T_BS:
          0.0, 0.0, 0.0, 1.0]
 
 rate_hz: 20
-resolution: [32, 24]
+resolution: [32., 24]
 camera_model: pinhole
 intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv
 distortion_model: radial-tangential
@@ -716,6 +716,7 @@ def test_bad_plain_folders_are_refused(
             ROS_CALIBRATION.replace("30.5", ".nan"),
             "camera_matrix.0: Input should be a valid number",
         ),
+        (ROS_CALIBRATION.replace("32", "true", 1), "image_width: it is not a number"),
         ("a: !!opencv-matrix {}\n", "tags"),
     ],
 )

@@ -318,6 +318,21 @@ def test_messages_without_their_channel(intact: Intact, salvaged_as: SalvagedAs)
         assert loss.messages in (count, count - 1)  # one may be taken for part of the damage
 
 
+def test_a_damaged_summary_tells_of_channels_as_a_last_resort(
+    intact: Intact, salvaged_as: SalvagedAs
+) -> None:
+    data, pieces = intact("mcap-unchunked")
+    piece = next(p for p in pieces if "/imu" in p.defines.values() and not p.is_index)
+    damaged = bytearray(data)
+    damaged[piece.start : piece.end] = bytes(piece.end - piece.start)
+    damaged[-12] ^= 1  # of the summary's checksum
+    records, _ = salvaged_as("mcap-unchunked", bytes(damaged))
+    (number,) = piece.defines
+    count = sum(m[0] == number for p in pieces for m in p.messages)
+    found = sum(count for key, count in keys(records).items() if key[0] == "/imu")
+    assert found in (count, count - 1)  # one may be taken for part of the damage
+
+
 def test_messages_without_their_schema_are_kept(intact: Intact, salvaged_as: SalvagedAs) -> None:
     data, pieces = intact("mcap-unchunked")
     image = next(piece for piece in pieces if "/cam/image_raw" in piece.defines.values())

@@ -77,7 +77,16 @@ _Four = Annotated[_Numbers, Field(min_length=4, max_length=4)]
 _Nine = Annotated[_Numbers, Field(min_length=9, max_length=9)]
 _Twelve = Annotated[_Numbers, Field(min_length=12, max_length=12)]
 _Sixteen = Annotated[_Numbers, Field(min_length=16, max_length=16)]
-_Side = Annotated[int, Field(gt=0, lt=2**31)]
+
+
+def _whole(value: Any) -> Any:
+    """A number that may be written as a float, which may be a string as above."""
+    if isinstance(value, bool):
+        raise ValueError("it is not a number")
+    return float(value) if isinstance(value, str) else value
+
+
+_Side = Annotated[int, BeforeValidator(_whole), Field(gt=0, lt=2**31)]
 
 
 class _Saved(BaseModel):
@@ -87,7 +96,7 @@ class _Saved(BaseModel):
     distortion_model: str
     distortion_coefficients: _Numbers
     rectification_matrix: _Nine = _IDENTITY
-    projection_matrix: _Twelve | None = None
+    projection_matrix: _Twelve = ()
 
 
 class _Pinhole(BaseModel):
