@@ -467,15 +467,15 @@ class Rosbag2Writer(BagWriter):
         """The content of metadata.yaml in the layout of its version."""
         version = self._version()
         count = sum(self._counts.values())
-        span = {
-            "duration": {"nanoseconds": max(0, self._end - self._start)},
-            "starting_time": {"nanoseconds_since_epoch": self._start},
-        }
+        duration = {"nanoseconds": max(0, self._end - self._start)}
+        start = {"nanoseconds_since_epoch": self._start}
+        file = {"path": self._file_name, "starting_time": start, "duration": duration}
         prefix = "" if version >= 4 else f"{self._name}/"
         info = {
             "version": version,
             "storage_identifier": self._storage,
-            **span,
+            "duration": duration,
+            "starting_time": start,
             "message_count": count,
             "topics_with_message_count": [
                 _topic_entry(self._as_listed(topic), number, version)
@@ -484,7 +484,7 @@ class Rosbag2Writer(BagWriter):
             "compression_format": "",
             "compression_mode": "",
             "relative_file_paths": [prefix + self._file_name],
-            "files": [{"path": self._file_name, **span, "message_count": count}],
+            "files": [{**file, "message_count": count}],
             "custom_data": (dict(self._source.custom_data) if self._source else {}) or None,
             "ros_distro": self._ros_distro,
         }
