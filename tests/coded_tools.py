@@ -152,10 +152,10 @@ def mutations(data: bytes, count: int, head: int = 400) -> Iterator[bytes]:
         yield bytes(changed)
 
 
-def refusal(call: Callable[..., object], *arguments: Any) -> str:
+def refusal(call: Callable[..., object], *arguments: Any, **options: Any) -> str:
     """The reason of a refusal; empty if there is none. Any other error goes through."""
     try:
-        call(*arguments)
+        call(*arguments, **options)
     except Refused as reason:
         return str(reason)
     return ""

@@ -53,19 +53,14 @@ def exif() -> bytes:
     return told.tobytes()
 
 
-def jpeg_segments(data: bytes) -> list[tuple[int, bytes]]:
-    """Markers before the first scan and their whole segments, then ``(0, the rest)``."""
-    found, at = [(0xD8, data[:2])], 2
-    while data[at + 1] != 0xDA:
-        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        found.append((data[at + 1], data[at:end]))
-        at = end
-    return [*found, (0, data[at:])]
-
-
 def without_huffman_tables(data: bytes) -> bytes:
     """A baseline JPEG of the standard tables as webcams send it: without the tables."""
-    return b"".join(segment for marker, segment in jpeg_segments(data) if marker != 0xC4)
+    kept, at = data[:2], 2
+    while data[at + 1] != 0xDA:  # the first scan
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        kept += data[at:end] if data[at + 1] != 0xC4 else b""
+        at = end
+    return kept + data[at:]
 
 
 # ---------------------------------------------------------------- compressedDepth

@@ -114,14 +114,10 @@ FOXGLOVE: Mapping[str, MakeScene] = {
 # ---------------------------------------------------------------- MCAP files
 
 
-def write_foxglove(path: Path, scene: Scene, serialization: str) -> None:
-    """An MCAP file of a scene whose messages are of foxglove_msgs.
-
-    Args:
-        path: The file to write.
-        scene: Such as those of `FOXGLOVE`.
-        serialization: One of `SERIALIZATIONS`.
-    """
+def _source(folder: Path, scene: Scene, *, serialization: str) -> list[Path]:
+    """An MCAP file of a scene whose messages are of foxglove_msgs."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "drive.mcap"
     how, ids = SERIALIZATIONS[serialization], dict[str, int]()
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=1 << 15, compression=CompressionType.ZSTD)
@@ -134,12 +130,7 @@ def write_foxglove(path: Path, scene: Scene, serialization: str) -> None:
             payload, time = how.payload(record), record.log_time
             writer.add_message(ids[record.topic], time, payload, time - 500_000, number)
         writer.finish()  # type: ignore[no-untyped-call]
-
-
-def _source(folder: Path, scene: Scene, *, serialization: str) -> list[Path]:
-    folder.mkdir(parents=True, exist_ok=True)
-    write_foxglove(folder / "drive.mcap", scene, serialization)
-    return [folder / "drive.mcap"]
+    return [path]
 
 
 # Each writes into a folder, which it makes, and returns the paths that make up the recording.

@@ -68,7 +68,9 @@ def fill(message: Message, values: Mapping[str, Any]) -> Message:
         elif _is_list(field):
             getattr(message, field.name).extend(float(number) for number in given)
         elif field.type == FieldDescriptor.TYPE_BYTES:
-            setattr(message, field.name, as_bytes(given))
+            is_bytes = isinstance(given, bytes)
+            data = given if is_bytes else np.asarray(given, np.uint8).tobytes()
+            setattr(message, field.name, data)
         else:
             setattr(message, field.name, given)
     return message
@@ -77,11 +79,6 @@ def fill(message: Message, values: Mapping[str, Any]) -> Message:
 def _is_time(field: FieldDescriptor) -> bool:
     kind = field.message_type
     return kind is not None and kind.full_name == "google.protobuf.Timestamp"
-
-
-def as_bytes(data: Any) -> bytes:
-    """Bytes, or an array of them."""
-    return data if isinstance(data, bytes) else np.asarray(data, np.uint8).tobytes()
 
 
 def _protobuf(record: Record) -> bytes:

@@ -312,6 +312,3 @@ def test_damaged_parameters(tmp_path: Path) -> None:
     with pytest.raises(VideoError) as caught:
         standing_alone(path, "h264")
     assert caught.value.code in ("decode-failed", "video-unreadable")
-
-
-# ---------------------------------------------------------------- real videos
