@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from encoders import encoded
+from encoders import Packet, encoded
 from mp4ds.errors import Refused
 
 WIDTH, HEIGHT = 64, 48
@@ -84,15 +84,6 @@ DECODERS = {"h265": "hevc", "av1": "libdav1d"}
 IN_ORDER = [name for name, encoding in ENCODINGS.items() if encoding.in_order]
 
 
-@dataclass(frozen=True)
-class Packet:
-    """What an encoder gave: the bytes, whether it is a key frame, and its time shown."""
-
-    data: bytes
-    keyframe: bool
-    pts: int
-
-
 def encode(
     encoding: Encoding,
     *,
@@ -103,14 +94,13 @@ def encode(
     all_p: bool = False,
 ) -> list[Packet]:
     """Encode the scene; with `all_p`, without B-frames although they are allowed."""
-    packets = encoded(
+    return encoded(
         encoding.encoder,
         encoding.pixel_format,
         {"g": str(gop), **encoding.options},
         scene(frames, width, height),
         all_p=all_p,
     )
-    return [Packet(bytes(packet), packet.is_keyframe, packet.pts) for packet in packets]
 
 
 def jpeg(pixels: NDArray[np.uint8], mode: str | None = None, **options: Any) -> bytes:

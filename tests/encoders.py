@@ -187,8 +187,7 @@ def packets(name: str, *, frames: int, width: int, height: int, seed: int = 0) -
         np.ascontiguousarray(picture("rgb8", frame=n, width=width, height=height, rng=rng))
         for n in range(frames)
     )
-    coded = encoded(encoder, pixel_format, {"g": str(GOP), **dict(options)}, pictures)
-    return [Packet(bytes(packet), packet.pts, packet.is_keyframe) for packet in coded]
+    return encoded(encoder, pixel_format, {"g": str(GOP), **dict(options)}, pictures)
 
 
 def encoded(
@@ -198,8 +197,8 @@ def encoded(
     pictures: Iterable[Pixels],
     *,
     all_p: bool = False,
-) -> list[Any]:
-    """PyAV's packets of RGB pictures; with `all_p`, without B-frames though they are allowed."""
+) -> list[Packet]:
+    """Packets of RGB pictures; with `all_p`, without B-frames though they are allowed."""
     os.environ.setdefault("SVT_LOG", "0")
     context: Any = av.CodecContext.create(encoder, "w")
     packets: list[Any] = []
@@ -215,7 +214,8 @@ def encoded(
         if all_p and number:
             frame.pict_type = PictureType.P
         packets += context.encode(frame)
-    return packets + context.encode(None)
+    packets += context.encode(None)
+    return [Packet(bytes(packet), packet.pts, packet.is_keyframe) for packet in packets]
 
 
 def nal_units(data: bytes) -> list[tuple[int, bytes]]:

@@ -14,7 +14,6 @@ from coded_tools import (
     ENCODINGS,
     IN_ORDER,
     Encoding,
-    Packet,
     encode,
     hide,
     mutations,
@@ -22,6 +21,7 @@ from coded_tools import (
     superframe,
 )
 from conftest import real
+from encoders import Packet
 from mp4ds.errors import Refused
 from mp4ds.video import av1, h264, h265
 from mp4ds.video.codecs import CODECS, PACKET_CODECS
@@ -59,7 +59,7 @@ def test_streams_in_order(name: str, width: int, height: int) -> None:
     for packet in packets:
         picture = parser.picture(memoryview(packet.data))
         assert (picture.width, picture.height) == (width, height)
-        assert picture.keyframe == (packet.keyframe or encoding.codec == "mjpeg")
+        assert picture.keyframe == (packet.is_key or encoding.codec == "mjpeg")
 
 
 def test_every_codec_is_tried() -> None:
@@ -73,7 +73,7 @@ def test_pictures_out_of_order(name: str) -> None:
     packets = encode(encoding, frames=12, gop=12)
     parser = CODECS[encoding.codec].parser()
     reasons = [refusal(parser.picture, packet.data) for packet in packets]
-    times = [packet.pts for packet in packets]
+    times = [packet.number for packet in packets]
     first = next(n for n in range(1, len(times)) if times[n] < times[n - 1])
     assert reasons[:first] == [""] * first
     assert set(reasons[first:]) == {REORDERED}
@@ -83,7 +83,7 @@ def test_pictures_out_of_order(name: str) -> None:
 def test_reordering_that_is_allowed_but_not_done(name: str) -> None:
     """Past the wrap of the picture order count, over several key frames."""
     packets = encode(ENCODINGS[name], frames=150, gop=140, all_p=True)
-    assert [packet.pts for packet in packets] == list(range(150))
+    assert [packet.number for packet in packets] == list(range(150))
     assert first_refused(ENCODINGS[name].codec, [packet.data for packet in packets]) is None
 
 
@@ -132,7 +132,7 @@ def packets_of(path: Path, codec: str) -> tuple[list[Packet], tuple[int, int]]:
             found: list[Any] = [packet] if packet.size else []
             if unpack:
                 found = list(unpack.filter(packet if packet.size else None))
-            packets += [Packet(bytes(p), p.is_keyframe, p.pts) for p in found]
+            packets += [Packet(bytes(p), p.pts, p.is_keyframe) for p in found]
         return packets, (context.width, context.height)
 
 
@@ -140,7 +140,7 @@ def packets_of(path: Path, codec: str) -> tuple[list[Packet], tuple[int, int]]:
 def test_real_videos(name: str) -> None:
     """Refused exactly from the first picture that is out of order."""
     packets, size = packets_of(real(f"video/{name}"), REAL[name])
-    times = [packet.pts for packet in packets]
+    times = [packet.number for packet in packets]
     expected = next((n for n in range(1, len(times)) if times[n] < times[n - 1]), len(times))
     parser = CODECS[REAL[name]].parser()
     for number, packet in enumerate(packets):
@@ -149,7 +149,7 @@ def test_real_videos(name: str) -> None:
             continue
         picture = parser.picture(packet.data)
         assert (picture.width, picture.height) == size
-        assert picture.keyframe == packet.keyframe
+        assert picture.keyframe == packet.is_key
 
 
 # ---------------------------------------------------------------- beginnings and gaps
@@ -159,7 +159,7 @@ def test_real_videos(name: str) -> None:
 def test_after_a_gap_the_next_key_frame_is_awaited(name: str) -> None:
     codec = ENCODINGS[name].codec
     packets = encode(ENCODINGS[name])
-    second = next(n for n, packet in enumerate(packets) if n and packet.keyframe)
+    second = next(n for n, packet in enumerate(packets) if n and packet.is_key)
     assert second > 2
     for lose in (StreamParser.leave_out, lambda parser: refusal(parser.picture, b"\xff junk")):
         parser = CODECS[codec].parser()

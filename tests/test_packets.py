@@ -77,7 +77,7 @@ def test_packets_come_back(name: str, tmp_path: Path) -> None:
     packets = encode(ENCODINGS[name])
     check(tmp_path / "a.mp4", codec, [packet.data for packet in packets])
     with PacketReader(tmp_path / "a.mp4", codec=codec, coded_size=SIZE) as reader:
-        assert list(reader.keyframes) == [packet.keyframe or codec == "mjpeg" for packet in packets]
+        assert list(reader.keyframes) == [packet.is_key or codec == "mjpeg" for packet in packets]
         assert reader.ticks == array("q", [number * STEP for number in range(len(packets))])
         everything = list(reader.packets())
         for index in (5, 0, len(packets) - 1, 5):
@@ -294,12 +294,12 @@ def test_packets_stand_alone(name: str, tmp_path: Path) -> None:
     packets = encode(ENCODINGS[name])
     write(path, codec, [packet.data for packet in packets])
     given = standing_alone(path, codec)
-    keys = [number for number, packet in enumerate(packets) if packet.keyframe]
+    keys = [number for number, packet in enumerate(packets) if packet.is_key]
     for key in keys:
         assert decodes(codec, given[key:]) == len(packets) - key
     parser = CODECS[codec].parser()
     assert [parser.picture(body).keyframe for body in given] == [
-        packet.keyframe or codec == "mjpeg" for packet in packets
+        packet.is_key or codec == "mjpeg" for packet in packets
     ]
 
 

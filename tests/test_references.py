@@ -18,6 +18,7 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from coded_tools import DECODERS, mutations, refusal, scene
+from encoders import Packet
 from mp4ds.video import av1
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded import CodedFrame, StreamParser
@@ -25,15 +26,6 @@ from mp4ds.video.coded import CodedFrame, StreamParser
 WIDTH, HEIGHT, FRAMES, GOP = 128, 96, 45, 20
 QUIET = "log-level=error:pools=none:frame-threads=1"
 Option = tuple[str, str]
-
-
-@dataclass(frozen=True)
-class Packet:
-    """A packet as the file holds it."""
-
-    data: bytes
-    pts: int
-    key: bool
 
 
 @dataclass(frozen=True)
@@ -214,7 +206,7 @@ def parser_of(clip: Clip) -> StreamParser:
 def parsed(clip: Clip, first: int = 0) -> list[list[CodedFrame]]:
     """The coded frames of every packet from one on."""
     parser = parser_of(clip)
-    return [parser.frames(packet.data, key=packet.key) for packet in clip.packets[first:]]
+    return [parser.frames(packet.data, key=packet.is_key) for packet in clip.packets[first:]]
 
 
 def chains(frames: list[list[CodedFrame]]) -> list[list[tuple[int, CodedFrame]]]:
@@ -236,18 +228,18 @@ def chains(frames: list[list[CodedFrame]]) -> list[list[tuple[int, CodedFrame]]]
 
 def check(clip: Clip) -> int:
     """Decode the frame of each packet alone; how many coded frames were left out."""
-    whole = shown(clip, [(packet.data, packet.pts) for packet in clip.packets])
+    whole = shown(clip, [(packet.data, packet.number) for packet in clip.packets])
     frames = parsed(clip)
     left_out = 0
     for number, chain in enumerate(chains(frames)):
         assert sum(frame.shown for frame in frames[number]) == 1
         given = [
-            (clip.packets[at].data[frame.start : frame.end], clip.packets[at].pts)
+            (clip.packets[at].data[frame.start : frame.end], clip.packets[at].number)
             for at, frame in chain
         ]
-        pts = clip.packets[number].pts
+        pts = clip.packets[number].number
         assert shown(clip, given)[pts] == whole[pts], f"packet {number}"
-        first = max(n for n in range(number + 1) if clip.packets[n].key)
+        first = max(n for n in range(number + 1) if clip.packets[n].is_key)
         assert chain[0][0] >= first
         left_out += sum(map(len, frames[first : number + 1])) - len(chain)
     return left_out
@@ -259,7 +251,7 @@ def test_frames_decode_from_what_they_refer_to(name: str) -> None:
     recipe = RECIPES[name]
     clip = encoded(recipe)
     assert len(clip.packets) == FRAMES
-    keys = [number for number, packet in enumerate(clip.packets) if packet.key]
+    keys = [number for number, packet in enumerate(clip.packets) if packet.is_key]
     assert len(keys) == 1 if "intra-only" in name else len(keys) >= -(-FRAMES // recipe.gop)
     left_out = check(clip)
     hierarchical = recipe.codec == "av1" or "bframes=" in str(recipe.options)
@@ -273,7 +265,7 @@ def test_a_parser_may_begin_at_any_key_packet(name: str) -> None:
     clip = encoded(RECIPES[name])
     whole = parsed(clip)
     for number, packet in enumerate(clip.packets):
-        if packet.key:
+        if packet.is_key:
             assert parsed(clip, number) == whole[number:]
         else:
             parser = parser_of(clip)
@@ -285,9 +277,9 @@ def test_a_parser_may_begin_at_any_key_packet(name: str) -> None:
 def test_what_reaches_across_key_packets_is_refused(name: str) -> None:
     clip = encoded(REFUSED[name])
     parser = parser_of(clip)
-    reasons = [refusal(parser.frames, p.data, key=p.key) for p in clip.packets]
+    reasons = [refusal(parser.frames, p.data, key=p.is_key) for p in clip.packets]
     first = next(number for number, reason in enumerate(reasons) if reason)
-    keys = [number for number, packet in enumerate(clip.packets) if packet.key]
+    keys = [number for number, packet in enumerate(clip.packets) if packet.is_key]
     following = next((number for number in keys if number > first), FRAMES)
     assert all(reasons[first:following])
 
@@ -339,7 +331,7 @@ def test_a_picture_of_several_slices() -> None:
     more[6] &= 0x7F  # not its first slice
     parser = parser_of(clip)
     for packet in clip.packets[:3]:
-        frames = parser.frames(packet.data, key=packet.key)
+        frames = parser.frames(packet.data, key=packet.is_key)
     frames = parser.frames(data + bytes(more), key=False)
     assert frames == [CodedFrame(0, 2 * len(data), (1,), shown=True)]
     assert "one picture" in refusal(parser.frames, data + data, key=False)
@@ -622,9 +614,11 @@ def show(slot: int) -> bytes:
 def test_av1_key_frames_shown_later() -> None:
     """Showing one fills all slots, as if it came then (7.21)."""
     clip = encoded(RECIPES["svt-10-low-delay"])
-    packets = [replace(packet, key=packet.key and not n) for n, packet in enumerate(clip.packets)]
+    packets = [
+        replace(packet, is_key=packet.is_key and not n) for n, packet in enumerate(clip.packets)
+    ]
     key = GOP
-    assert clip.packets[key].key
+    assert clip.packets[key].is_key
     hidden = hidden_key(clip, packets[key].data, 7)
     packets[key - 1] = replace(packets[key - 1], data=packets[key - 1].data + hidden)
     packets[key] = replace(packets[key], data=show(7))
@@ -649,7 +643,7 @@ def test_damage_is_refused_or_read(name: str) -> None:
         for data in mutations(packet.data, 200, head=100):
             parser = parser_of(clip)
             parser.frames(clip.packets[0].data, key=True)
-            refusal(parser.frames, data, key=packet.key)  # and raises nothing else
+            refusal(parser.frames, data, key=packet.is_key)  # and raises nothing else
             refusal(parser.frames, clip.packets[1].data, key=False)
     for data in mutations(clip.configuration or b"\0", 500):
         refusal(CODECS[clip.codec].parser, data)
