@@ -279,7 +279,7 @@ def bodies_of(name: str) -> list[tuple[bytes, bool]]:
     """Packets of an encoder and whether each is a key frame, every fourth at least."""
     packets = encode_packets(ENCODINGS[name], frames=14, gop=4)
     codec = ENCODINGS[name].codec
-    return [(packet.data, packet.keyframe or codec in ("mjpeg", "png")) for packet in packets]
+    return [(packet.data, packet.is_key or codec in ("mjpeg", "png")) for packet in packets]
 
 
 def cut_at_keys(bodies: Sequence[tuple[bytes, bool]]) -> list[list[bytes]]:
