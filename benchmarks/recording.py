@@ -26,6 +26,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -282,7 +283,7 @@ def main() -> None:
         logs.mkdir()
         for name in arguments.only or SECTIONS:
             print(f"\n### {name}\n\n- load before: {os.getloadavg()[0]:.2f}\n", flush=True)
-            with Core(logs) as core:
+            with closing(Core(logs)) as core:
                 if name == "steady":
                     beside(core, folder, arguments.seconds, *STEADY)
                 elif name == "overload":
