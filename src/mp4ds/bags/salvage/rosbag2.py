@@ -207,7 +207,7 @@ class Rosbag2Salvage(Rosbag2Reader):
     """
 
     is_indexed = False
-    _mcap_reader = partial(McapSalvage, is_alone=False)
+    _mcap_reader = staticmethod(partial(McapSalvage, is_alone=False))
     _sqlite_reader = SqliteSalvage
     _times = BagReader._times  # by reading everything, which no damage stops
 
