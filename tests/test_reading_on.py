@@ -240,7 +240,7 @@ def test_far_key_frames_are_sought(
 def test_a_video_that_ends_early(long: Path, tmp_path: Path) -> None:
     with Dataset(long) as dataset:
         (stream,) = dataset.streams
-        decoder = VideoDecoder(stream.video_path, **{**stream._told(), "frames": 199})
+        decoder = VideoDecoder(stream.video_path, **{**stream._expected(), "frames": 199})
         with decoder, pytest.raises(VideoError) as caught:
             list(decoder.pictures_at([0]))
         assert caught.value.code == "frame-count"

@@ -116,9 +116,9 @@ class _Call:
 class ProcessExecutor(Executor):
     """Runs calls in processes of its own, each of them one call at a time, waited for by a thread.
 
-    Other than of a `ProcessPoolExecutor`, its processes do not import the caller's main module,
+    Unlike those of a `ProcessPoolExecutor`, its processes do not import the caller's main module,
     which would have to be guarded; and where one of them is killed, its call alone is made once
-    more, after all others. Errors of the system arrive as `Mp4dsError`, which survives pickling.
+    more. Errors of the system arrive as `Mp4dsError`, which survives pickling.
 
     A context manager: leaving it with an exception ends running calls.
 

@@ -469,7 +469,6 @@ class Rosbag2Writer(BagWriter):
         count = sum(self._counts.values())
         duration = {"nanoseconds": max(0, self._end - self._start)}
         start = {"nanoseconds_since_epoch": self._start}
-        file = {"path": self._file_name, "starting_time": start, "duration": duration}
         prefix = "" if version >= 4 else f"{self._name}/"
         info = {
             "version": version,
@@ -484,7 +483,14 @@ class Rosbag2Writer(BagWriter):
             "compression_format": "",
             "compression_mode": "",
             "relative_file_paths": [prefix + self._file_name],
-            "files": [{**file, "message_count": count}],
+            "files": [
+                {
+                    "path": self._file_name,
+                    "starting_time": start,
+                    "duration": duration,
+                    "message_count": count,
+                }
+            ],
             "custom_data": (dict(self._source.custom_data) if self._source else {}) or None,
             "ros_distro": self._ros_distro,
         }

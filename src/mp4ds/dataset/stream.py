@@ -144,10 +144,10 @@ class Stream(Images):
             VideoError: The video cannot be read, or does not match the sidecar.
         """
         is_sound = self.sound is None
-        return VideoDecoder(self.video_path, **self._told(), sequential=sequential and is_sound)
+        return VideoDecoder(self.video_path, **self._expected(), sequential=sequential and is_sound)
 
-    def _told(self) -> dict[str, Any]:
-        """What the sidecar tells a decoder about the video; a maker serves one decoder."""
+    def _expected(self) -> dict[str, Any]:
+        """What a decoder may expect of the video, by the sidecar; a maker serves one decoder."""
         _ = self.columns  # which checks that the video is there, and long enough
         image, video = self.sidecar.image, self.sidecar.video
         maker = PictureMaker(
@@ -164,7 +164,7 @@ class Stream(Images):
         """A separate decoder for frames by number."""
         recorded = self.sidecar.video.references
         references = recorded.decode if recorded else None
-        return FrameReader(self.video_path, **self._told(), references=references)
+        return FrameReader(self.video_path, **self._expected(), references=references)
 
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
         """Write the pixels of a picture, as recorded."""

@@ -247,7 +247,7 @@ class FrameReader:
         self._maker = maker
         self._video = file
         self._context: Any = None
-        # what the decoder received: numbers of pieces of a group; None: it has to begin anew
+        # what the decoder received: numbers of pieces of a group; None: start over
         self._group: Group | None = None
         self._fed: set[int] = set()
         self.seeking: VideoDecoder | None = None

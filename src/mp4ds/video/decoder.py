@@ -154,9 +154,9 @@ class VideoDecoder:
     ) -> Iterator[tuple[int, Picture]]:
         """Some pictures, each with its frame's number, as views that hold until the next one.
 
-        Decoding begins at the key frame before the first one, or goes on where an earlier call
-        ended. Frames in between are decoded, and left out at key frames that are far enough ahead;
-        they are not made into pictures.
+        Decoding begins at the key frame before the first one, or continues where an earlier call
+        stopped. Frames in between are decoded, and left out at key frames that are far enough
+        ahead; they are not made into pictures.
 
         Args:
             indices: 0 <= index < frames, increasing. The next one is asked for only when the

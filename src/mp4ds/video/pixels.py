@@ -447,10 +447,7 @@ class PlaneMaker:
         """The planes of a picture, in new memory; odd sides are padded."""
         frame = picture_to_frame(picture, self._picture_format, PLANES_FORMAT, self._converter)
         y, u, v = (plane.copy() for plane in planes_of(frame))
-        rows, columns = y.shape
-        if rows % 2 or columns % 2:
-            y = np.pad(y, ((0, rows % 2), (0, columns % 2)), mode="edge")
-        return y, u, v
+        return _pad_to_even(y), u, v
 
 
 def planes_of(frame: av.VideoFrame) -> Planes:
