@@ -126,8 +126,8 @@ def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
 
 PLAYER = """
 import time
+from mp4ds.cli import prepare_process
 from mp4ds.cli.nodes import Keyboard
-from mp4ds.cli.process import prepare_process
 prepare_process()
 with Keyboard({" ": lambda: print("toggled", flush=True)}):
     print("entered", flush=True)

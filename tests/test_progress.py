@@ -19,13 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from commands import Result, program
-from mp4ds.cli.progress import (
-    Log,
-    duration_text,
-    pack_progress,
-    rows_of,
-    share_of,
-)
+from mp4ds.cli.output import Log, duration_text
+from mp4ds.cli.pack import pack_progress, rows_of, share_of
 from mp4ds.packing.options import PackOptions, PackProgress
 from mp4ds.packing.pack import pack_each
 from mp4ds.plugins.demo import demo
@@ -259,7 +254,7 @@ def test_the_end_is_told_however_it_comes(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("mp4ds.cli.progress._LEAST_PAUSE", 0.0)
+    monkeypatch.setattr("mp4ds.cli.output._LEAST_PAUSE", 0.0)
     with suppress(error or ValueError), pack_progress() as take:
         take(told(0.5))
         if error is not None:
@@ -276,7 +271,7 @@ def test_a_short_pack_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_a_short_pack_does_not_import_rich() -> None:
     code = (
-        "import sys, mp4ds.cli.progress as p\n"
+        "import sys, mp4ds.cli.pack as p\n"
         "with p.pack_progress(): pass\n"
         "print([name for name in sys.modules if name.split('.')[0] == 'rich'])"
     )

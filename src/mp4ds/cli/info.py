@@ -12,8 +12,7 @@ from pathlib import Path
 import click
 
 from mp4ds.cli.options import argument, command, datasets_argument, jobs_option, option, takes
-from mp4ds.cli.output import number, print_table, say, show
-from mp4ds.cli.progress import progress_of
+from mp4ds.cli.output import number, print_table, progress_of, say, show
 from mp4ds.dataset.checks import Problem, validate
 from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, SourceError, counted, path_text, size_text

@@ -17,10 +17,9 @@ from typing import Any, TypeVar
 
 import click
 
+from mp4ds.cli import DEBUG, ending_signals
 from mp4ds.cli.options import Command, option
-from mp4ds.cli.output import be_quiet, complain
-from mp4ds.cli.process import DEBUG, caught_signals
-from mp4ds.cli.progress import Row, display
+from mp4ds.cli.output import Row, be_quiet, complain, display
 from mp4ds.errors import OptionError
 from mp4ds.options import WHERE, Options
 from mp4ds.options import option as field_option
@@ -105,10 +104,33 @@ def node_progress(
 def node_controls(
     options: RosOptions, stop: Callable[[], None], keys: Mapping[str, Callable[[], object]]
 ) -> Iterator[Sequence[int]]:
-    """Stop a node on signals, which are returned, and run actions when keys are pressed."""
-    keyboard = nullcontext() if options.disable_keyboard_controls else Keyboard(keys)
-    with caught_signals(stop) as caught, keyboard:
-        yield caught
+    """Run actions when keys are pressed, and let a node end in its own time at Ctrl-C and the like.
+
+    At the second signal, it ends at once.
+
+    Args:
+        options: Of the node.
+        stop: Ends it.
+        keys: The action of each key.
+
+    Yields:
+        The numbers of the signals that came.
+    """
+    caught: list[int] = []
+
+    def end(number: int, _: FrameType | None) -> None:
+        if caught:  # asked again: whatever holds it up is not waited for
+            raise KeyboardInterrupt
+        caught.append(number)
+        stop()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, *ending_signals())}
+    try:
+        with nullcontext() if options.disable_keyboard_controls else Keyboard(keys):
+            yield caught
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class NodeCommand(Command):

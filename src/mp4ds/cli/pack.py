@@ -1,9 +1,14 @@
-"""``mp4ds pack``, also known as ``mp4ds repack``, and ``mp4ds unpack``."""
+"""Making datasets and turning them back: ``pack``, ``unpack``, ``import``, ``export``, ``demo``."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
+
+import click
 
 import mp4ds
 from mp4ds.cli.options import (
@@ -16,12 +21,29 @@ from mp4ds.cli.options import (
     parse_share,
     takes,
 )
-from mp4ds.cli.output import number, print_table, say, show
-from mp4ds.cli.progress import pack_progress, progress_of
+from mp4ds.cli.output import (
+    Row,
+    display,
+    number,
+    plain,
+    print_table,
+    progress_of,
+    say,
+    show,
+)
 from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, counted, path_text, size_text
-from mp4ds.options import LONG, WHERE, seconds_text
-from mp4ds.packing.options import PackOptions, PackSummary, TopicSummary
+from mp4ds.options import HOW, LONG, WHERE, seconds_text
+from mp4ds.packing.options import (
+    ImageFolder,
+    PackOptions,
+    PackProgress,
+    PackSummary,
+    TopicSummary,
+)
+from mp4ds.plugins.demo import demo
+from mp4ds.plugins.exporting.export import export
+from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
 from mp4ds.records import Loss, latched_text
 from mp4ds.unpacking.unpack import UnpackOptions, UnpackProgress, UnpackSummary, unpack, unpack_each
 
@@ -135,6 +157,93 @@ def _pack_row(topic: TopicSummary) -> dict[str, str]:
     }
 
 
+# ---------------------------------------------------------------- progress of packs
+
+_DIGITS = 9  # digits of a share: with a float's full precision, the time left may overflow
+
+States = dict[Path, PackProgress]
+"""Last reported state of each dataset, in the order in which they began."""
+
+
+def share_of(states: States) -> float | None:
+    """Share of packs that is done, by bytes of the sources; None if unknown."""
+    total = packed = 0.0
+    for state in states.values():
+        share, weight = packed_share(state), max(1.0, state.bytes_total)
+        if share is None:
+            return None
+        total, packed = total + weight, packed + weight * share
+    return round(packed / total, _DIGITS) if total else None
+
+
+def rows_of(states: States) -> list[Row]:
+    """All packs, and each dataset or, of one, each camera."""
+    if len(states) > 1:
+        all_of_it = Row(
+            f"packing {len(states)} datasets", _amounts(*states.values()), share_of(states)
+        )
+        rows = [Row(one.dataset.name, _text(one), packed_share(one)) for one in states.values()]
+        return [all_of_it, *rows]
+    (state,) = states.values()
+    cameras = [
+        Row(
+            topic,
+            str(done) if total is None else f"{done}/{total}",
+            min(1.0, done / total) if total else None,
+        )
+        for topic, (done, total) in state.topics.items()
+    ]
+    return [Row(f"packing {state.dataset.name}", _text(state), share_of(states)), *cameras]
+
+
+def packed_share(state: PackProgress) -> float | None:
+    """Share of a dataset that is packed, 0 to 1; None if unknown."""
+    if state.phase == "planning":
+        return 0.0
+    if state.phase != "packing":
+        return 1.0
+    if state.done is not None:
+        return round(min(1.0, max(0.0, state.done)), _DIGITS)
+    return min(1.0, state.tasks_done / state.tasks_total) if state.tasks_total else None
+
+
+def _text(state: PackProgress) -> str:
+    phase = "" if state.phase == "packing" else f"{state.phase} {plain(state.note)}".strip()
+    return "  ".join(filter(None, (phase, _amounts(state))))
+
+
+def _amounts(*states: PackProgress) -> str:
+    """Parts done and total, if there are any, and bytes read and written."""
+    total, failed = sum(s.tasks_total for s in states), sum(s.failed for s in states)
+    read, written = sum(s.bytes_read for s in states), sum(s.bytes_written for s in states)
+    texts = [
+        f"parts {sum(s.tasks_done for s in states)}/{total}" if total else "",
+        f"{failed} failed" if failed else "",
+        f"{size_text(read)} -> {size_text(written)}",
+    ]
+    return "  ".join(filter(None, texts))
+
+
+@contextmanager
+def pack_progress(*, whole: bool = True) -> Iterator[Callable[[PackProgress], None]]:
+    """Show the progress of packs while the context lasts.
+
+    Args:
+        whole: Whether this run is to do all of the job; of a share, the time left is not shown.
+
+    Yields:
+        What takes the progress, several times a second.
+    """
+    states: States = {}
+    with display(timed=whole) as show:
+
+        def take(state: PackProgress) -> None:
+            states[state.dataset] = state
+            show(rows_of(states))
+
+        yield take
+
+
 # ---------------------------------------------------------------- unpack
 
 
@@ -242,3 +351,105 @@ def _print_latched(latched: Mapping[str, int], left_out: Sequence[str]) -> None:
     if left_out:
         topics = ", ".join(left_out)
         say(f"left out, as too large: latched messages from before the start: {topics}")
+
+
+# ---------------------------------------------------------------- import, export, demo
+
+_force = option("--force", "-f", is_flag=True, panel=WHERE, help="Replace an existing output.")
+
+
+@click.group("import")
+def import_command() -> None:
+    """Make a dataset from images, or from a video made by the paper's tool."""
+
+
+@command("images")
+@argument("folder", "FOLDER", "Folder of images, plain or in a known layout.")
+@output_option("DATASET", "Folder to create.", required=True)
+@takes(ImageFolder, "images")
+@takes(PackOptions, without=("camera_info", "join", "salvage"))
+def images_command(folder: str, output: str, images: ImageFolder, options: PackOptions) -> None:
+    """Make a dataset from a folder of timestamped images.
+
+    EuRoC and TUM RGB-D folders are imported with all their cameras. Lossless by default. To
+    resume a long import that was interrupted, run the same command again.
+    """
+    with pack_progress() as progress:
+        summary = mp4ds.pack(folder, output, replace(options, images=images), progress=progress)
+    show(summary, print_pack)
+
+
+@command("ros-mp4")
+@argument("video", "VIDEO", "The mp4 file.")
+@argument("sidecar", "YAML", "The YAML file that belongs to it.")
+@output_option("DATASET", "Folder to create.", required=True)
+@_force
+def ros_mp4_command(video: str, sidecar: str, output: str, force: bool) -> None:
+    """Convert an mp4 and YAML made by the tool published with the paper.
+
+    The video is not re-encoded: its packets are copied.
+    """
+    show(mp4ds.import_ros_mp4(video, sidecar, output, force=force), print_pack)
+
+
+import_command.add_command(images_command)
+import_command.add_command(ros_mp4_command)
+
+
+@command()
+@argument(
+    "output",
+    "OUTPUT",
+    "What to write: .mcap, .bag (ROS 1), or no suffix for rosbag2.  [default: demo.mcap]",
+    default="demo.mcap",
+    type=click.Path(path_type=Path),
+)
+@option(
+    "--seconds",
+    type=float,
+    default=3.0,
+    panel=HOW,
+    metavar="N",
+    help="Length of the recording.  [default: 3]",
+)
+@_force
+def demo_command(output: Path, seconds: float, force: bool) -> None:
+    """Make a small test recording: two cameras (Bayer and RGB), calibrations, IMU, tf."""
+    messages = demo(output, seconds=seconds, force=force)
+    text = f"{path_text(output)}: {counted(messages, 'message')}"
+    show({"output": output, "messages": messages}, lambda _: say(text))
+
+
+@command()
+@argument("to", "FORMAT", "euroc, tum, colmap or lerobot.")
+@argument(
+    "datasets",
+    "DATASET...",
+    "A dataset; for lerobot one or more, each an episode.",
+    nargs=-1,
+    required=True,
+)
+@output_option("OUT", "Folder to create.", required=True, type=click.Path(path_type=Path))
+@takes(ExportOptions)
+def export_command(to: str, datasets: Sequence[str], output: Path, options: ExportOptions) -> None:
+    """Export a dataset to another tool's format, keeping what that format supports.
+
+    What is left out is counted by topic and listed, here and in mp4ds_export.json.
+    """
+    with progress_of("exporting") as tell:
+        summary = export(datasets, to, output, options, progress=tell)
+    show(summary, _print_export)
+
+
+def _print_export(summary: ExportSummary) -> None:
+    """Print what was written, and every message that was not."""
+    total = sum(summary.messages.values())
+    topics = counted(len(summary.messages), "topic")
+    say(f"{path_text(summary.output)}: {counted(total, 'message')} of {topics}")
+    for place, topic in summary.places.items():
+        say(f"{place}: {topic}")
+    for note in summary.notes:
+        say(f"note: {note}")
+    for topic, reasons in summary.left_out.items():
+        for reason, count in reasons.items():
+            say(f"left out: {counted(count, 'message')} of {topic}: {reason}")

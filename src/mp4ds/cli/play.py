@@ -18,8 +18,7 @@ from mp4ds.cli.nodes import (
     node_progress,
 )
 from mp4ds.cli.options import argument, command, option, takes
-from mp4ds.cli.output import complain, is_quiet, say, show, shown
-from mp4ds.cli.progress import Row
+from mp4ds.cli.output import Row, complain, is_quiet, say, show, shown
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary, open_player
 from mp4ds.plugins.ros.node import SERVICE_EVENTS

@@ -17,9 +17,8 @@ from mp4ds.cli.nodes import (
     node_progress,
 )
 from mp4ds.cli.options import argument, command, option, takes
-from mp4ds.cli.output import complain, is_quiet, say, show
+from mp4ds.cli.output import Row, complain, is_quiet, say, show
 from mp4ds.cli.pack import print_pack
-from mp4ds.cli.progress import Row
 from mp4ds.errors import counted, path_text
 from mp4ds.files.sources import salvage_command
 from mp4ds.options import WHERE, parse_pattern

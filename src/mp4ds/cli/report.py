@@ -19,8 +19,7 @@ from mp4ds.cli.options import (
     output_option,
     takes,
 )
-from mp4ds.cli.output import is_json, print_table, printed, say, show
-from mp4ds.cli.progress import progress_of
+from mp4ds.cli.output import is_json, print_table, printed, progress_of, say, show
 from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, counted, interrupted, path_text, size_text
 from mp4ds.options import WHERE
