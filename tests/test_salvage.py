@@ -24,7 +24,7 @@ from conftest import DATA, real
 from damage import INJURIES, Key, Piece, all_messages, pieces_of, sound_messages
 from mp4ds import SourceError
 from mp4ds.bags.formats import open_sources
-from mp4ds.bags.salvage.losses import LossLog
+from mp4ds.bags.salvage.scan import LossLog
 from mp4ds.format.manifest import LossEntry
 from mp4ds.records import (
     EVERYTHING,

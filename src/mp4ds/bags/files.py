@@ -9,7 +9,7 @@ from bz2 import BZ2Decompressor
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import lz4.frame
 import zstandard
@@ -249,35 +249,24 @@ _CLOSE = 16
 _MAGIC = {b"BZh": "bz2", b"\x04\x22\x4d\x18": "lz4", ZSTD_MAGIC: "zstd"}
 
 
-class Recovered(NamedTuple):
-    """Content of a chunk that may be damaged.
-
-    Attributes:
-        content: What could be decompressed, from the beginning.
-        used: Bytes of the data that belong to it; 0 if unknown.
-        problem: What is wrong, a phrase; empty if nothing is.
-        is_sound: Whether the content is correct, though some of it may be missing.
-    """
-
-    content: bytes
-    used: int
-    problem: str
-    is_sound: bool = True
-
-
-def recover(compression: str, data: memoryview, size: int) -> Recovered:
-    """Decompress as much as possible.
+def recover(compression: str, data: memoryview, size: int) -> tuple[bytes, int, str, bool]:
+    """Decompress as much as possible of a chunk.
 
     Args:
         compression: Its name: ``none`` or empty, ``bz2``, ``lz4`` or ``zstd``; if damaged, it is
             inferred from the data.
         data: As stored; may be cut short.
         size: Expected size; no more is decompressed, and no more than data of this length can hold.
+
+    Returns:
+        What could be decompressed, from the beginning; bytes of the data that belong to it, 0 if
+        unknown; what is wrong, a phrase, empty if nothing is; and whether the content is correct,
+        though some of it may be missing.
     """
     if compression in ("", "none"):
         content = bytes(data[:size])
         problem = "" if len(content) == size else "a chunk is cut short"
-        return Recovered(content, len(content), problem)
+        return content, len(content), problem, True
     most = most_held(len(data))
     limit = f", the limit ({DECOMPRESSED} sets another)" if size > most else ""
     size = min(size, most)
@@ -285,9 +274,9 @@ def recover(compression: str, data: memoryview, size: int) -> Recovered:
     found = next((name for magic, name in _MAGIC.items() if start.startswith(magic)), compression)
     if found not in _MACHINES:
         problem = f"a chunk is compressed with {compression!r}, which is not supported"
-        return Recovered(b"", 0, problem)
+        return b"", 0, problem, True
     with suppress(DamageError):
-        return Recovered(*_unpacked(found, data, size), "")
+        return (*_unpacked(found, data, size), "", True)
     machine = _MACHINES[found]()
     gathered = io.BytesIO()  # pieces in a list would need the memory twice
     is_verified = found == "bz2"  # it has a checksum for each block
@@ -311,7 +300,7 @@ def recover(compression: str, data: memoryview, size: int) -> Recovered:
                 break
     except _DAMAGE:
         problem, is_sound = f"the {found} data of a chunk is damaged", is_verified
-    return Recovered(gathered.getvalue(), used, problem, is_sound)
+    return gathered.getvalue(), used, problem, is_sound
 
 
 def _small_pieces(length: int) -> Iterator[tuple[int, int]]:

@@ -244,7 +244,7 @@ class McapReader(BagReader):
             except DamageError as error:
                 raise stream.damaged(error) from None
             if held is not None and self._summary:
-                until = self._summary.chunks.later.after(stream.start)
+                until = self._summary.chunks.later(stream.start)
                 yield from held.release(until)
             if record:
                 yield record

@@ -24,7 +24,7 @@ from mp4ds.bags.mcap_records import (
     RecordStream,
     parse,
 )
-from mp4ds.bags.protocols import LaterStarts
+from mp4ds.bags.protocols import later_starts
 from mp4ds.errors import SourceError
 from mp4ds.records import ChannelStats, Excerpt
 
@@ -61,7 +61,7 @@ class ChunkTable:
     Fill it with `add`, then call `finish` before any query.
 
     Attributes:
-        later: When the chunks begin.
+        later: Returns the earliest log time in the chunks after a byte offset; None after the last.
     """
 
     def __init__(self) -> None:
@@ -107,7 +107,7 @@ class ChunkTable:
         # A chunk without messages has start 0, which would hold back everything before it.
         self._empty = (self._held == 0) & (self._starts == 0) & (self._ends == 0)
         self._known_starts = np.where(self._empty, np.uint64(_LATEST), self._starts)
-        self.later = LaterStarts(self._offsets, self._known_starts)
+        self.later = later_starts(self._offsets, self._known_starts)
 
     @property
     def has_messages(self) -> bool:

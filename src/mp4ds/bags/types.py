@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rosbags.interfaces import Msgdef, Nodetype
 from rosbags.serde import SerdeError
@@ -141,22 +141,8 @@ def shapes_of(types: Typesdict, name: str) -> list[FieldShape]:
 # ---------------------------------------------------------------- bounds
 
 
-class Size(NamedTuple):
-    """Minimum size of a message of a type, with empty sequences.
-
-    Attributes:
-        least: Bytes, in any serialization.
-        steps: Fields, including those of its parts and of one item per sequence.
-        depth: Levels of nested messages, including those in sequences.
-    """
-
-    least: int
-    steps: int
-    depth: int
-
-
-def sizes_of(types: Typesdict) -> dict[str, Size]:
-    """The size of each type.
+def sizes_of(types: Typesdict) -> dict[str, int]:
+    """The minimum size of a message of each type, with empty sequences: bytes in any serialization.
 
     Args:
         types: Definitions, complete.
@@ -164,29 +150,31 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
     Raises:
         Refused: A type contains itself, or is larger than any real message.
     """
-    sizes: dict[str, Size] = {}
+    # bytes; fields, including those of its parts and of one item per sequence; and levels of nested
+    # messages, including those in sequences
+    sizes: dict[str, tuple[int, int, int]] = {}
 
-    def size_of(name: str, level: int) -> Size:
+    def size_of(name: str, level: int) -> tuple[int, int, int]:
         if name in sizes:
             return sizes[name]
         if level > _MAX_DEPTH:
             raise Refused(f"{name} contains itself, or is nested too deeply")
         least, steps, depth = 0, 1, 0
         for shape in shapes_of(types, name):
-            part = Size(_BYTES_OF.get(shape.base, 1), 0, 0)
+            part_least, part_steps, part_depth = _BYTES_OF.get(shape.base, 1), 0, 0
             if shape.message:
-                part = size_of(shape.message, level + 1)
+                part_least, part_steps, part_depth = size_of(shape.message, level + 1)
             elif shape.base == "string":
-                part = Size(4, 1, 0)
-            depth = max(depth, part.depth + 1)
+                part_least, part_steps = 4, 1
+            depth = max(depth, part_depth + 1)
             if shape.bound is not None:
-                part = Size(4, part.steps, 0)
+                part_least = 4
             length = 1 if shape.length is None else shape.length
-            least += length * part.least
-            steps += 1 + length * part.steps
+            least += length * part_least
+            steps += 1 + length * part_steps
         if steps > _MAX_STEPS or depth > _MAX_DEPTH:
             raise Refused(f"{name} has more fields than any real message")
-        sizes[name] = Size(least, steps, depth)
+        sizes[name] = least, steps, depth
         return sizes[name]
 
     parts = 0
@@ -197,13 +185,13 @@ def sizes_of(types: Typesdict) -> dict[str, Size]:
             parts += 1 if is_plain else 1 + (1 if shape.length is None else shape.length)
     if parts > _MAX_PARTS:
         raise Refused(f"its definition has more than {_MAX_PARTS} fields")
-    return sizes
+    return {name: least for name, (least, _, _) in sizes.items()}
 
 
-def has_empty_items(types: Typesdict, sizes: dict[str, Size]) -> bool:
+def has_empty_items(types: Typesdict, sizes: dict[str, int]) -> bool:
     """Whether there are arrays of messages of zero bytes."""
     return any(
-        shape.is_several and shape.message and not sizes[shape.message].least
+        shape.is_several and shape.message and not sizes[shape.message]
         for name in types
         for shape in shapes_of(types, name)
     )
@@ -231,7 +219,7 @@ class BoundedStore(Typestore):
         found = self.cache.get(typename)
         if found is None:
             found = by_library(incomprehensible(typename), super().get_msgdef, typename)
-            least = self._sizes[typename].least
+            least = self._sizes[typename]
             check = partial(_checked, least=least) if least else self._counted
             checked: dict[str, Any] = {name: check(getattr(found, name)) for name in _READING}
             found = self.cache[typename] = replace(found, **checked)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ from mp4ds.bags.mcap_records import (
     parse,
     unpack_chunk,
 )
-from mp4ds.bags.salvage.scan import BLOCK, FileSalvage, Framing, RecordFrame
+from mp4ds.bags.salvage.scan import BLOCK, FileSalvage, Lose, RecordFrame, Scan, Window
 from mp4ds.errors import SourceError
 from mp4ds.records import Attachment, ChannelStats, Message, MetadataRecord
 
@@ -92,7 +92,7 @@ def _fields_end(kind: int, body: memoryview) -> int | None:
     return at
 
 
-class McapFraming(Framing):
+class _Scan(Scan):
     """Finds records by opcode and length; MCAP has no sync markers.
 
     In sequence, anything the format allows is a record. After damage, it must be of a kind whose
@@ -100,6 +100,8 @@ class McapFraming(Framing):
     record.
 
     Args:
+        window: What to read.
+        lose: Called with what is skipped.
         channels: Ids of the known channels; may grow.
         longest: Bytes of a record are fewer.
     """
@@ -116,7 +118,14 @@ class McapFraming(Framing):
         }
     )
 
-    def __init__(self, channels: Collection[int], longest: int = _MAX_LENGTH) -> None:
+    def __init__(
+        self,
+        window: Window,
+        lose: Lose,
+        channels: Collection[int],
+        longest: int,
+    ) -> None:
+        super().__init__(window, lose)
         self._channels = channels
         self._longest = longest
 
@@ -136,18 +145,14 @@ class McapFraming(Framing):
         return RecordFrame(opcode, _HEAD, _HEAD + length)
 
     def find(
-        self,
-        view: memoryview,
-        end: int,
-        is_followed: Callable[[int], bool],
-        kinds: Collection[int] | None = None,
+        self, view: memoryview, end: int, ahead: int = 0, kinds: Collection[int] | None = None
     ) -> int | None:
         """The start of the first certain record."""
         for start in self._candidates(view, end):
             if kinds is not None and view[start] not in kinds:
                 continue
             size = self._sure_size(view[start:])
-            if size == 0 or (size and is_followed(start + size)):
+            if size == 0 or (size and self.is_followed(ahead + start + size)):
                 return start
         return None
 
@@ -283,17 +288,16 @@ class _Chunk:
                 used = records + 8 + length
                 span = (start, end)
                 return cls(content, is_plain, records + 8, used, "", False, span, found)
-        unpacked = recover(compression, body[records + 8 :][:length], min(size, MAX_RECORD_BYTES))
-        problem = unpacked.problem
-        if crc and zlib.crc32(unpacked.content) == crc:
+        data, most = body[records + 8 :][:length], min(size, MAX_RECORD_BYTES)
+        content, used, damage, is_sound = recover(compression, data, most)
+        problem = damage
+        if crc and zlib.crc32(content) == crc:
             problem = ""
         elif crc and not problem:
             problem = "a chunk does not match its checksum: what could be read of it may be altered"
-        used = records + 8 + unpacked.used if unpacked.used else 0
-        is_doubtful = bool(problem) and (not unpacked.is_sound or not unpacked.problem)
-        return cls(
-            unpacked.content, is_plain, records + 8, used, problem, is_doubtful, (start, end)
-        )
+        used = records + 8 + used if used else 0
+        is_doubtful = bool(problem) and (not is_sound or not damage)
+        return cls(content, is_plain, records + 8, used, problem, is_doubtful, (start, end))
 
 
 def _message_count(statistics: mcap_records.Statistics | None) -> int | None:
@@ -332,9 +336,12 @@ class McapSalvage(FileSalvage):
         self._summary, self._doubtful = _read_summary(path)
         self._index_offset = self._summary.offset or None
         self._is_timed = self._summary.chunks.has_messages
-        self._framing = McapFraming(declared.channels, most)
+        self._longest = most
         self._read_profile()
         self._declared.add_summary(self._summary.schemas, self._summary.channels)
+
+    def _scan_of(self, window: Window, lose: Lose) -> Scan:
+        return _Scan(window, lose, self._declared.channels, self._longest)
 
     def _read_profile(self) -> None:
         stream = RecordStream(self.path, BLOCK)
@@ -368,7 +375,7 @@ class McapSalvage(FileSalvage):
         ended = False
         while frame := self._scan.next():
             self._found += 1
-            self._earliest = summary.chunks.later.after(self._window.offset)
+            self._earliest = summary.chunks.later(self._window.offset)
             if frame.kind == Opcode.FOOTER:
                 ended = True
                 self._end(frame)
@@ -389,8 +396,7 @@ class McapSalvage(FileSalvage):
                 self._log.lost(None, None, problem).add(0, [topic])
 
     def _read_header(self) -> None:
-        window = self._window
-        frame = self._framing.frame(window.peek(self._framing.lookahead))
+        window, frame = self._window, self._scan.here()
         if frame is None or frame.kind != Opcode.HEADER or not self._scan.is_followed(frame.size):
             self._scan.resync(window.offset, "the header is damaged", passed=0)
             return
@@ -513,7 +519,7 @@ class McapSalvage(FileSalvage):
             return
         start, end, problem = self._plain
         offset = self._window.offset
-        if offset < end and kind not in self._framing.outer:
+        if offset < end and kind not in self._scan.outer:
             return
         self._plain = None
         if not self._tally.losses:

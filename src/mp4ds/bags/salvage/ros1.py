@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mp4ds.bags.files import DamageError, open_source, recover
-from mp4ds.bags.protocols import LaterStarts
+from mp4ds.bags.protocols import later_starts
 from mp4ds.bags.ros1 import (
     CHUNK_COUNT,
     INDEX_ENTRY,
@@ -24,7 +24,7 @@ from mp4ds.bags.ros1 import (
     split_header,
     times_in,
 )
-from mp4ds.bags.salvage.scan import FileSalvage, Framing, RecordFrame, Scan, Window
+from mp4ds.bags.salvage.scan import FileSalvage, Lose, RecordFrame, Scan, Window
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record
 
@@ -48,7 +48,7 @@ _FIELDS: Mapping[int, Mapping[bytes, int]] = {
 }
 
 
-class _Framing(Framing):
+class _Scan(Scan):
     """Finds records by the fields of their headers.
 
     An uncompressed chunk is framed by its header alone, so that its records are read like any other
@@ -85,11 +85,7 @@ class _Framing(Framing):
         return RecordFrame(op[0], head, head + body, fields)
 
     def find(
-        self,
-        view: memoryview,
-        end: int,
-        is_followed: Callable[[int], bool],
-        kinds: Collection[int] | None = None,
+        self, view: memoryview, end: int, ahead: int = 0, kinds: Collection[int] | None = None
     ) -> int | None:
         """The start of the first record: a header with all its fields is proof enough."""
         for match in _ROS1_OP.finditer(view):
@@ -129,7 +125,7 @@ class BagIndex:
             and last log time in ns, and messages by connection.
         due: Byte where the index should begin according to the bag's header; None if unknown.
         offset: Byte where the index was found.
-        later: When the chunks from a byte on begin.
+        later: Returns the earliest log time in the chunks after a byte; None after the last.
     """
 
     def __init__(self) -> None:
@@ -161,7 +157,7 @@ class BagIndex:
         self.infos = dict(sorted(self.infos.items())) if is_whole else {}
         starts = {place: span[0] for place, (span, counts) in self.infos.items() if counts}
         places = np.array(list(starts), np.uint64)
-        self.later = LaterStarts(places, np.array(list(starts.values()), np.uint64))
+        self.later = later_starts(places, np.array(list(starts.values()), np.uint64))
         return is_whole
 
 
@@ -180,10 +176,9 @@ def read_index(path: Path) -> BagIndex:
         SourceError: The bag is encrypted, or cannot be read.
     """
     index = BagIndex()
-    framing = _Framing()
     with Window.of_file(path) as window:
         window.skip(len(MAGIC))
-        header = framing.frame(window.peek(framing.lookahead))
+        header = _Scan(window).here()
         size = window.size or 0
     chunks = None
     if header and header.kind == Op.BAG:
@@ -200,12 +195,11 @@ def read_index(path: Path) -> BagIndex:
 
 def _read_records(path: Path, offset: int, index: BagIndex) -> None:
     """Read an index at its expected place."""
-    framing = _Framing()
     with Window.of_file(path, offset) as window:
-        if framing.frame(window.peek(framing.lookahead)) is None:
+        scan = _Scan(window)
+        if scan.here() is None:
             return
         index.offset = offset
-        scan = Scan(window, framing, lambda *_: None)
         while frame := scan.next():
             if frame.kind not in _OF_INDEX:
                 return
@@ -216,9 +210,8 @@ def _read_records(path: Path, offset: int, index: BagIndex) -> None:
 
 def _search_connections(path: Path, offset: int, index: BagIndex) -> None:
     """Search for connections from a byte on, if the index is not at its expected place."""
-    framing = _Framing()
     with Window.of_file(path, offset) as window:
-        scan = Scan(window, framing, lambda *_: None)
+        scan = _Scan(window)
         if offset > len(MAGIC):
             scan.resync(offset, "", passed=0)
         while frame := scan.next():
@@ -241,7 +234,6 @@ class Ros1Salvage(FileSalvage):
     profile = "ros1"
     magic = MAGIC
     kind = "a ROS 1 bag"
-    _framing = _Framing()
 
     def __init__(self, path: Path, *, is_alone: bool = True) -> None:
         super().__init__(path, is_alone=is_alone)
@@ -253,6 +245,9 @@ class Ros1Salvage(FileSalvage):
         self._index_offset = self._index.offset
         self._is_timed = bool(self._index.infos)
         self._channels: dict[int, Channel] = dict(self._index.channels)
+
+    def _scan_of(self, window: Window, lose: Lose) -> Scan:
+        return _Scan(window, lose)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the bag's index, including lost messages; otherwise empty."""
@@ -353,21 +348,22 @@ class Ros1Salvage(FileSalvage):
         offset = self._window.offset
         have, proven = self._peek_chunk(frame)
         compression = frame.fields[b"compression"].decode(errors="replace")
-        found = recover(compression, have[frame.head :], frame.fields.number(b"size"))
-        problems = [found.problem] if found.problem else []
-        for part, body in self._inside(found.content, problems):
+        size = frame.fields.number(b"size")
+        content, used, problem, is_sound = recover(compression, have[frame.head :], size)
+        problems = [problem] if problem else []
+        for part, body in self._inside(content, problems):
             if part.kind == Op.MESSAGE:
                 message = self._message(part, body, offset)
                 connection = part.fields.number(b"conn")
-                if message and found.is_sound:
+                if message and is_sound:
                     self._tally.gave(connection, message.log_time)
                     yield message
                 elif message:
                     self._tally.hold(connection, message)
             elif part.kind == Op.CONNECTION and not self._connect(part, body, is_sure=not problems):
                 problems.append("a connection record is damaged")
-        used = frame.head + found.used
-        self._leave_chunk(frame, used, problems, proven=proven, whole=not found.problem)
+        used += frame.head
+        self._leave_chunk(frame, used, problems, proven=proven, whole=not problem)
 
     def _listed(self, fields: Fields, body: bytes, offset: int) -> None:
         entries = np.frombuffer(body, INDEX_ENTRY, count=len(body) // INDEX_ENTRY.itemsize)
@@ -380,7 +376,7 @@ class Ros1Salvage(FileSalvage):
             self._listed_ahead.pop()
         span, counts = self._index.infos.get(offset, (None, None))
         self._tally.open(counts, end, span)
-        self._earliest = self._index.later.after(offset - 1)
+        self._earliest = self._index.later(offset - 1)
 
     def _pass_listed(self, end: int) -> None:
         """Record as lost the chunks that the index lists before a byte but that were not found."""

@@ -1,20 +1,31 @@
-"""Reads the records of a damaged file once, and goes on after damage."""
+"""Reads the records of a damaged file once, goes on after damage, and counts what is lost."""
 
 from __future__ import annotations
 
 import io
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from mp4ds.bags.files import open_source
+from numpy.typing import NDArray
+
+from mp4ds.bags.files import DECOMPRESSED, DamageError, OversizeError, open_source
 from mp4ds.bags.protocols import BagReader, HoldBack
 from mp4ds.bags.ros1 import Fields
-from mp4ds.bags.salvage.losses import LossLog, Tally
 from mp4ds.errors import SourceError
-from mp4ds.records import Excerpt, Loss, Message, Record
+from mp4ds.records import (
+    MAX_LOSSES,
+    MAX_LOST_TOPICS,
+    Excerpt,
+    Loss,
+    Message,
+    Record,
+    more_places,
+)
 
 BLOCK = 2**20
 _PIECE = 16 * 2**20
@@ -132,6 +143,10 @@ MAX_UNPROVEN = 64 * 2**20
 """Maximum size of a record accepted although no other record follows it."""
 
 
+Lose = Callable[[int, int, str], None]
+"""Called with bytes that are skipped: their offset and size, and what is wrong, a phrase."""
+
+
 @dataclass(frozen=True, slots=True)
 class RecordFrame:
     """A record's extent, from its first bytes.
@@ -149,8 +164,12 @@ class RecordFrame:
     fields: Fields = field(default_factory=Fields)
 
 
-class Framing(ABC):
-    """How a format frames its records.
+class Scan(ABC):
+    """The records of a file, or of a chunk; its subclass knows how a format frames them.
+
+    Args:
+        window: What to read.
+        lose: Called with what is skipped.
 
     Attributes:
         lookahead: Number of bytes that suffice to recognise a record.
@@ -160,66 +179,49 @@ class Framing(ABC):
     lookahead: int
     outer: Collection[int]
 
+    def __init__(self, window: Window, lose: Lose = lambda *_: None) -> None:
+        self._window = window
+        self._lose = lose
+
     @abstractmethod
     def frame(self, view: memoryview) -> RecordFrame | None:
         """The record at the start of these bytes, if they look like one."""
 
     @abstractmethod
     def find(
-        self,
-        view: memoryview,
-        end: int,
-        is_followed: Callable[[int], bool],
-        kinds: Collection[int] | None = None,
+        self, view: memoryview, end: int, ahead: int = 0, kinds: Collection[int] | None = None
     ) -> int | None:
         """The start of the first certain record.
 
         Args:
             view: The bytes to search.
             end: Byte before which it must begin.
-            is_followed: Whether a record, or the end, is at a byte of the view or past it.
+            ahead: Bytes from the reader to the view.
             kinds: Only records of these kinds; None for all.
         """
 
-
-class Scan:
-    """The records of a file, or of a chunk.
-
-    Args:
-        window: What to read.
-        framing: How its records are framed.
-        lose: Called with skipped bytes: offset, size, a phrase.
-    """
-
-    def __init__(
-        self, window: Window, framing: Framing, lose: Callable[[int, int, str], None]
-    ) -> None:
-        self._window = window
-        self._framing = framing
-        self._lose = lose
+    def here(self) -> RecordFrame | None:
+        """The next record, if there is one right here."""
+        return self.frame(self._window.peek(self.lookahead))
 
     def next(self) -> RecordFrame | None:
         """The next record, without consuming it; None at the end."""
-        while True:
-            view = self._window.peek(self._framing.lookahead)
-            if not view:
-                return None
-            frame = self._framing.frame(view)
-            if frame:
+        while self._window.peek(1):
+            if frame := self.here():
                 return frame
             self.resync(self._window.offset, "no valid record here")
+        return None
 
     def body(self, frame: RecordFrame) -> bytes | None:
         """Consume a record. None if it is damaged; the scan has then advanced past it."""
         if not self.is_proven(frame):
             self.resync(self._window.offset, self.cut_or_damaged(frame))
             return None
-        whole = self._window.peek(frame.size + self._framing.lookahead)
+        whole = self._window.peek(frame.size + self.lookahead)
         following = whole[frame.size :]
-        if following and not self._framing.frame(following):
-            body = whole[frame.head :]
+        if following and not self.frame(following):
             size = frame.size - frame.head
-            if self._framing.find(body, size, self._follows(frame.head)) is not None:
+            if self.find(whole[frame.head :], size, frame.head) is not None:
                 self.resync(self._window.offset, "a record has a wrong length")
                 return None
         self._window.skip(frame.size)
@@ -237,11 +239,8 @@ class Scan:
 
     def is_followed(self, size: int) -> bool:
         """Whether a record, or the end, follows after that many bytes."""
-        ahead = self._window.look(size, self._framing.lookahead)
-        return not ahead or self._framing.frame(memoryview(ahead)) is not None
-
-    def _follows(self, start: int) -> Callable[[int], bool]:
-        return lambda distance: self.is_followed(start + distance)
+        ahead = self._window.look(size, self.lookahead)
+        return not ahead or self.frame(memoryview(ahead)) is not None
 
     def cut_or_damaged(self, frame: RecordFrame) -> str:
         """What is wrong with an unproven record, in words."""
@@ -265,13 +264,13 @@ class Scan:
             passed: Bytes ahead of the reader in which no record begins, as is already known.
             kinds: Stop only at a record of these kinds; None for all.
         """
-        window, reach = self._window, self._framing.lookahead
+        window, reach = self._window, self.lookahead
         window.skip(passed)
         while True:
             view = window.peek(BLOCK + reach)
             at_end = len(view) < BLOCK + reach
             end = len(view) if at_end else BLOCK
-            found = self._framing.find(view, end, self._follows(0), kinds)
+            found = self.find(view, end, kinds=kinds)
             if found is not None:
                 window.skip(found)
                 break
@@ -280,6 +279,264 @@ class Scan:
                 break
         if window.offset > start:
             self._lose(start, window.offset - start, problem)
+
+
+# ---------------------------------------------------------------- losses
+
+
+@dataclass(eq=False)
+class Draft:
+    """A loss that is still being extended. See `Loss`."""
+
+    offset: int | None
+    size: int | None
+    problem: str
+    messages: int | None = None
+    topics: dict[str, None] = field(default_factory=dict)
+    start: int | None = None
+    end: int | None = None
+
+    def add(self, messages: int, topics: Iterable[str]) -> None:
+        """Count messages that were lost."""
+        self.messages = (self.messages or 0) + messages
+        self.topics.update(dict.fromkeys(topics))
+
+    def finished(self, file: str) -> Loss:
+        """The loss."""
+        topics = list(self.topics)
+        if len(topics) > MAX_LOST_TOPICS:
+            more = len(topics) - MAX_LOST_TOPICS + 1
+            topics = [*topics[: MAX_LOST_TOPICS - 1], f"... and {more} more"]
+        return Loss(file, **{**vars(self), "topics": tuple(topics)})
+
+
+class LossLog:
+    """The losses of one file, in the order found.
+
+    Args:
+        file: The file's name.
+    """
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+        self._drafts: list[Draft] = []
+        self._more = Draft(None, 0, "")  # the sum of all further ones
+        self._number_more = 0
+        self._kinds: dict[Hashable, Draft] = {}
+        self._last_time: int | None = None
+        self._open_ended: list[Draft] = []
+
+    def gave(self, time: int) -> None:
+        """Record that a message with a log time, ns, was read."""
+        self._last_time = time
+        if self._open_ended:
+            for draft in self._open_ended:
+                draft.end = time
+            self._open_ended.clear()
+
+    def lost(
+        self, offset: int | None, size: int | None, problem: str, *, join: bool = True
+    ) -> Draft:
+        """Record bytes that could not be read; contiguous losses are joined.
+
+        Returns:
+            The loss they became part of, to be completed.
+        """
+        last = self._drafts[-1] if self._drafts and not self._number_more else None
+        if (
+            join
+            and last is not None
+            and offset is not None
+            and last.offset is not None
+            and last.size is not None
+            and last.offset + last.size == offset
+        ):
+            last.size += size or 0
+            return last
+        draft = Draft(offset, size, problem, start=self._last_time)
+        if len(self._drafts) < MAX_LOSSES - 1:
+            self._drafts.append(draft)
+            self._open_ended.append(draft)
+            return draft
+        return self._one_more(draft)
+
+    def lost_of_kind(self, kind: Hashable, offset: int | None, problem: str) -> Draft:
+        """Like `lost`, for something found repeatedly that is one loss.
+
+        Returns:
+            The loss of that kind, without a size, since it may be scattered.
+        """
+        if kind not in self._kinds:
+            if len(self._kinds) >= MAX_LOSSES:
+                return self._one_more(Draft(None, None, problem))
+            self._kinds[kind] = self.lost(offset, None, problem, join=False)
+        return self._kinds[kind]
+
+    def _one_more(self, draft: Draft) -> Draft:
+        self._number_more += 1
+        self._more.problem = more_places(self._number_more)
+        self._more.size = (self._more.size or 0) + (draft.size or 0)
+        return self._more
+
+    def finish(self, messages: int | None = None) -> list[Loss]:
+        """The losses.
+
+        Args:
+            messages: How many are lost in total, if known. The largest loss without a count then
+                gets the remainder.
+        """
+        drafts = [*self._drafts, *([self._more] if self._number_more else [])]
+        if messages and not drafts:
+            drafts = [Draft(None, None, "the file declares more messages than it holds", messages)]
+        unknown = [draft for draft in drafts if draft.messages is None]
+        if messages is not None and unknown:
+            known = sum(draft.messages or 0 for draft in drafts)
+            unknown.sort(key=lambda draft: draft.size or 0, reverse=True)
+            unknown[0].messages = max(0, messages - known)
+            for draft in unknown[1:]:
+                draft.messages = 0
+        return [draft.finished(self._file) for draft in drafts]
+
+
+# ---------------------------------------------------------------- tally
+
+
+class Tally:
+    """Messages read from a section of a file, usually a chunk, and those that an index lists.
+
+    Messages of a chunk with doubtful content are held until its index is read, and only those it
+    lists are returned: damaged data may decompress to something that only looks like messages.
+
+    Args:
+        log: Where losses are recorded.
+        topic_of: The topic of a channel, None if unknown.
+
+    Attributes:
+        held: The messages that are held, and their channels.
+        losses: What was skipped of the section.
+        is_verified: Whether the section is certainly complete: an index that says otherwise is
+            wrong.
+    """
+
+    def __init__(self, log: LossLog, topic_of: Callable[[int], str | None]) -> None:
+        self._log = log
+        self._topic_of = topic_of
+        self.held: list[tuple[int, Message]] = []
+        self._begin(None)
+
+    def _begin(self, expected: Mapping[int, int] | None) -> None:
+        self._expected = None if expected is None else Counter(expected)
+        self._read: Counter[int] = Counter()
+        self._strays: Counter[int] = Counter()
+        self._index_is_whole = False
+        self._listed: Counter[int] = Counter()
+        self._listed_times: Counter[tuple[int, int]] = Counter()  # only while messages are held
+        self._end: int | None = None
+        self._span: tuple[int, int] | None = None
+        self.is_verified = False
+        self.losses: list[Draft] = []
+
+    def open(
+        self,
+        expected: Mapping[int, int] | None,
+        end: int,
+        span: tuple[int, int] | None = None,
+    ) -> None:
+        """Begin a new section, once the previous one is settled.
+
+        Args:
+            expected: Messages by channel from an index at the end of the file, if any.
+            end: Byte where it should end and its own index should begin.
+            span: Earliest and latest possible log time of its messages, ns, if known.
+        """
+        self.close()
+        self._begin(expected)
+        self._end, self._span = end, span
+
+    def extend(self, expected: Mapping[int, int] | None) -> None:
+        """Another section begins within what is lost, and cannot be separated from this one."""
+        if expected is None or self._expected is None:
+            self._expected = None
+        else:
+            self._expected.update(expected)
+
+    def gave(self, channel: int, time: int) -> None:
+        """Count a message that was read, with its log time in ns."""
+        self._log.gave(time)
+        self._read[channel] += 1
+
+    def hold(self, channel: int, message: Message) -> None:
+        """Hold a message that may not be one."""
+        self.held.append((channel, message))
+
+    def settle(self) -> list[Message]:
+        """Decide which of the held messages to return."""
+        held, self.held = self.held, []
+        left, self._listed_times = self._listed_times, Counter()
+        first, last = self._span or (0, inf)
+        sound = []
+        for channel, message in held:
+            key = channel, message.log_time
+            is_listed = left[key] > 0
+            if is_listed if self._index_is_whole else first <= message.log_time <= last:
+                left[key] -= 1
+                sound.append(message)
+                self.gave(channel, message.log_time)
+        return sound
+
+    def stray(self, channel: int) -> None:
+        """Count a message of an unknown channel, separately from lost ones."""
+        self._strays[channel] += 1
+        self._read[channel] += 1
+
+    def lost(self, offset: int, size: int | None, problem: str) -> Draft:
+        """Record skipped bytes."""
+        draft = self._log.lost(offset, size, problem)
+        if all(draft is not known for known in self.losses):
+            self.losses.append(draft)
+        if size is None or self._end is None or offset + size > self._end:
+            self._index_is_whole = False  # part of it may be lost, and that of others may follow
+            self._end = None
+        return draft
+
+    def listed(self, channel: int, times: NDArray[Any], offset: int) -> None:
+        """Add the messages that an index at a byte lists, by their log times, ns."""
+        self._index_is_whole |= offset == self._end
+        self._listed[channel] += len(times)
+        if self.held:
+            self._listed_times.update((channel, time) for time in times.tolist())
+
+    def close(self) -> None:
+        """End the section, and record what is lost of it."""
+        indexes = [self._expected, self._listed if self._index_is_whole else None]
+        found = [self._missing(index) for index in indexes if index is not None]
+        if not found:
+            return
+        total, missing = min(found, key=lambda one: one[0])
+        topics = [topic for key in missing if (topic := self._topic_of(key))]
+        losses = sorted(self.losses, key=lambda draft: draft.size or 0, reverse=True)
+        if losses:
+            losses[0].add(total, topics)
+            for draft in losses[1:]:
+                draft.add(0, ())
+        elif total:
+            problem = "an index does not match the messages"
+            self._log.lost(None, None, problem).add(0 if self.is_verified else total, topics)
+        self.losses = []
+
+    def _missing(self, expected: Counter[int]) -> tuple[int, Counter[int]]:
+        """Number of messages that an index lists and were not read, in total and by channel."""
+        missing = expected - self._read
+        # what was read as of an unknown channel, and is not listed, makes up for what is listed
+        excess = (self._read - expected) & self._strays
+        return max(0, missing.total() - excess.total()), missing
+
+
+def lost_by(error: DamageError) -> str:
+    """What is wrong with messages whose payload cannot be decompressed, a phrase."""
+    if isinstance(error, OversizeError):
+        return f"that decompress to too much ({DECOMPRESSED} is the limit)"
+    return "whose compressed data is damaged"
 
 
 # ---------------------------------------------------------------- the reader
@@ -309,7 +566,6 @@ class FileSalvage(BagReader):
     position = 0
     losses: Sequence[Loss] = ()
 
-    _framing: Framing
     _index_offset: int | None = None  # where the final index begins: no message is lost from there
     _is_timed = False  # whether the file's index tells how long messages must wait for earlier ones
 
@@ -334,7 +590,7 @@ class FileSalvage(BagReader):
         given = 0
         with Window.of_file(self.path) as window:
             self._window = window
-            self._scan = Scan(window, self._framing, self._lose)
+            self._scan = self._scan_of(window, self._lose)
             for record in self._scanned():
                 self.position = window.offset
                 given += isinstance(record, Message)
@@ -352,6 +608,10 @@ class FileSalvage(BagReader):
         if self._is_alone and not self._found and not self.channels:
             raise SourceError(self.path, f"holds no records of {self.kind}")
         self.losses = log.finish(None if self._count is None else max(0, self._count - given))
+
+    @abstractmethod
+    def _scan_of(self, window: Window, lose: Lose) -> Scan:
+        """The records in a window."""
 
     @abstractmethod
     def _scanned(self) -> Iterator[Record | None]:
@@ -385,9 +645,8 @@ class FileSalvage(BagReader):
         self, content: bytes | memoryview, problems: list[str]
     ) -> Iterator[tuple[RecordFrame, bytes]]:
         """The records of a decompressed chunk; what is wrong with it is added to `problems`."""
-        scan = Scan(
+        scan = self._scan_of(
             Window.of_content(bytes(content)),
-            self._framing,
             lambda _offset, _size, problem: problems.append(f"in a chunk, {problem}"),
         )
         while frame := scan.next():
@@ -418,7 +677,7 @@ class FileSalvage(BagReader):
                 offset if problems else offset + used,
                 problems[0] if problems else scan.cut_or_damaged(frame),
                 passed=used,
-                kinds=self._framing.outer,
+                kinds=scan.outer,
             )
             return
         if problems:
