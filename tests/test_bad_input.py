@@ -295,7 +295,7 @@ def test_topics_with_odd_names(topics: tuple[str, ...], tmp_path: Path) -> None:
     packed = round_trip(tmp_path / "drive.mcap", "mcap", tmp_path)
     names = {path.name for path in (tmp_path / "dataset").iterdir()}
     assert all(re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}", name) for name in names)
-    assert len(names) == 2 + 2 * len(topics)
+    assert len(names) == 2 + 3 * len(topics)
     assert "\x1b" not in packed.out
     assert call("info", tmp_path / "dataset").code == 0
 
@@ -795,8 +795,8 @@ def test_json_of_problems(small_dataset: Path) -> None:
 def test_a_newer_minor_version_is_told_in_one_line(small_dataset: Path) -> None:
     path = small_dataset / "cam_image_raw.yaml"
     text = path.read_bytes()
-    text = text[: text.rindex(b"checksum:")].replace(b'mp4ds: "1.1"', b'mp4ds: "1.7"\nfancy: 1')
+    text = text[: text.rindex(b"checksum:")].replace(b'mp4ds: "2.0"', b'mp4ds: "2.7"\nfancy: 1')
     path.write_bytes(text)
     result = run("info", path)
     assert result.code == 0, result.err
-    assert re.fullmatch(r"mp4ds: [^\n]*1\.7[^\n]*\n", result.err), result.err
+    assert re.fullmatch(r"mp4ds: [^\n]*2\.7[^\n]*\n", result.err), result.err

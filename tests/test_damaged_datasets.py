@@ -75,8 +75,7 @@ def test_an_error_of_a_frame_beyond_the_sidecar(packed: tuple[Path, Path]) -> No
 def file_of(dataset: Path, name: str) -> Path:
     """A file of a dataset by the beginning of its name, and its suffix."""
     stem, _, suffix = name.partition(".")
-    (path,) = dataset.glob(f"{stem}*.{suffix}")
-    return path
+    return min(dataset.glob(f"{stem}*.{suffix}"), key=lambda path: len(path.suffixes))
 
 
 def zero(path: Path, start: float, size: int = 512) -> None:

@@ -24,7 +24,7 @@ from mp4ds.bags.formats import open_reader
 from mp4ds.errors import ScoringError
 from mp4ds.format.models import Quality
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.tracks import CrfControl, window_frames
+from mp4ds.packing.windows import CrfControl, window_frames
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message

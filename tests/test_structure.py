@@ -138,6 +138,12 @@ def test_released_schemas_never_change() -> None:
         "v1.1/stream.schema.json": (
             "e40fa5bf1664205580d2c322030e157a5791db9eb91d34c52c7b323fd57dd34d"
         ),
+        "v2.0/dataset.schema.json": (
+            "7cf85ad8dc103742456d1fbbb76c63c112de723b0f19cf18df1b0f9cfe17c0a2"
+        ),
+        "v2.0/stream.schema.json": (
+            "c16fa4fb8195b2b2c501a501a9b0e65635471bf78e12698614d6f903c70eb6f7"
+        ),
     }
 
 

@@ -225,8 +225,11 @@ def _check_files(
         report: See `validate`.
         deep: Check the hash of the others.
     """
+    optional = {entry.video for entry in manifest.streams if entry.view}
     for entry in manifest.files:
         path = folder / entry.name
+        if entry.name in optional and not path.exists():
+            continue  # without it, the dataset is one of its views
         is_small = path.suffix == ".yaml"
         if deep and is_small:
             continue
@@ -245,7 +248,7 @@ def _inconsistent(folder: Path, problem: str) -> FormatError:
 def _check_listed(folder: Path, manifest: Manifest) -> Iterator[FormatError]:
     """Check that each file of the folder, and each stream's files, are in the manifest."""
     listed = {entry.name for entry in manifest.files}
-    own = [name for entry in manifest.streams for name in (entry.sidecar, entry.video)]
+    own = [name for entry in manifest.streams for name in entry.files]
     own.append(MESSAGES_NAME)
     for name in own:
         if name not in listed:
@@ -263,6 +266,7 @@ def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> It
     for what, own, listed in (
         ("topic", sidecar.channel.topic, entry.topic),
         ("video", sidecar.video.file, entry.video),
+        ("view", sidecar.view and sidecar.view.file, entry.view),
         ("frames", sidecar.frames, entry.frames),
     ):
         if own != listed:
@@ -271,8 +275,9 @@ def _check_entry(folder: Path, entry: StreamEntry, sidecar: StreamSidecar) -> It
 
 
 def _check_stream(stream: Stream) -> Iterator[FormatError]:
-    """Check a valid sidecar's columns, its scores and its video."""
-    yield from _wrong_facts(stream.video_path, stream.sidecar.video, deep=False)
+    """Check a valid sidecar's columns, its scores and its videos."""
+    for path, video in stream.videos:
+        yield from _wrong_facts(path, video, deep=False)
     _ = stream.rebuilder  # decodes and checks the columns
     _ = stream.infos and stream.infos.templates
     quality = stream.sidecar.video.quality
@@ -282,20 +287,25 @@ def _check_stream(stream: Stream) -> Iterator[FormatError]:
         except ValueError as error:
             place = f"{stream.path} at video.quality.scores"
             raise FormatError("scores-invalid", place, str(error)) from None
+    for layer in stream.layers:
+        if (count := _count(layer)) != len(stream):
+            problem = f"has {count} frames, but its sidecar says {len(stream)}"
+            yield FormatError("frame-count", layer.video_path, problem)
+
+
+def _count(stream: Stream) -> int:
     with stream.open_video(sequential=True) as decoder:
-        if decoder.coded_frames != len(stream):
-            problem = f"has {decoder.coded_frames} frames, but its sidecar says {len(stream)}"
-            yield FormatError("frame-count", stream.video_path, problem)
+        return decoder.coded_frames
 
 
 def _check_deep(stream: Stream, report: _Report) -> Iterator[FormatError]:
-    """Check a video's hash, and that each frame decodes to a message of its digest, if any."""
+    """Check the videos' hashes, and that each frame decodes to a message of its digest, if any."""
     name = stream.video_path.name
-    report(f"hashing {name}", None)
-    yield from _wrong_facts(stream.video_path, stream.sidecar.video, deep=True)
-    with stream.open_video(sequential=True) as decoder:
-        if decoder.coded_frames != len(stream):
-            return
+    for path, video in stream.videos:
+        report(f"hashing {path.name}", None)
+        yield from _wrong_facts(path, video, deep=True)
+    if any(_count(layer) != len(stream) for layer in stream.layers):
+        return
 
     def tell(number: int) -> None:
         if number % _TELL_EVERY == 0:

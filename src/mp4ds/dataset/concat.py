@@ -53,6 +53,7 @@ from mp4ds.format.models import (
     Header,
     Quality,
     StreamSidecar,
+    exact_name,
     video_facts,
 )
 from mp4ds.format.sidecars import MANIFEST_NAME, FileNames, dump_document, verify_file
@@ -66,7 +67,7 @@ from mp4ds.records import (
     bounded,
 )
 from mp4ds.times import PresentationClock
-from mp4ds.video.mp4 import read_sample_entry
+from mp4ds.video.mp4 import SampleEntry, read_sample_entry
 from mp4ds.video.packets import cut_segment, join_segments
 
 Integers = NDArray[np.int64]
@@ -123,7 +124,11 @@ def concat(
     ranges = [source.range for source in sources if source.range]
     losses = [entry.to_record() for source in sources for entry in source.manifest.losses]
     files = [
-        *((one.video.file, one.video.size or 0, one.video.sha256 or "") for one in sidecars),
+        *(
+            (video.file, video.size or 0, video.sha256 or "")
+            for sidecar in sidecars
+            for video in sidecar.videos
+        ),
         *((name, *digest_file(folder / name)) for name in (MESSAGES_NAME, *(n for n, _ in made))),
     ]
     manifest = old.model_copy(
@@ -137,15 +142,7 @@ def concat(
             )
             if ranges
             else None,
-            "streams": [
-                StreamEntry(
-                    topic=sidecar.channel.topic,
-                    sidecar=name,
-                    video=sidecar.video.file,
-                    frames=sidecar.frames,
-                )
-                for name, sidecar in made
-            ],
+            "streams": [StreamEntry.of(name, sidecar) for name, sidecar in made],
             "transforms": old.transforms
             if len(sources) == 1
             else static_transforms(sidecars, transforms),
@@ -391,7 +388,7 @@ def _write_streams(
     """Write videos and sidecars; each sidecar is returned with its name."""
     names = FileNames()
     firsts = [stream.segments[0].stream for stream in streams]
-    stems = [first.video_path.stem if is_one else names.name_for(first.topic) for first in firsts]
+    stems = [first.path.stem if is_one else names.name_for(first.topic) for first in firsts]
 
     def write(stem: str, stream: _JoinedStream) -> tuple[str, StreamSidecar]:
         report(f"{stem}.mp4")
@@ -410,7 +407,7 @@ class _JoinedStream:
     def __init__(self, first: _Segment) -> None:
         self.segments: list[_Segment] = []
         self._identity = _common(first.stream.sidecar)
-        self._entry = read_sample_entry(first.stream.video_path)
+        self._entries = _entries(first.stream)
         # by their text, in which 0.0 and -0.0 differ, and NaNs are equal
         self._headers: dict[str, Header] = {}
         self._calibrations: dict[str, Calibration] = {}
@@ -434,7 +431,7 @@ class _JoinedStream:
             return False  # most often: the rest takes longer to compare
         if segment.source is self.segments[-1].source or _common(sidecar) != self._identity:
             return False
-        if stream.hidden_frames or self.first.hidden_frames:
+        if stream.hides_frames or self.first.hides_frames:
             return False  # what a slice hides refers to nothing in another segment
         headers = [*self._headers.values(), *segment.images.used_models]
         if exceeds_padding(head.padding for head in headers):
@@ -443,7 +440,8 @@ class _JoinedStream:
             return False
         if self._frames + len(segment.images) > MAX_FRAMES:
             return False
-        if self._entry.differences(read_sample_entry(stream.video_path)):
+        pairs = zip(self._entries, _entries(stream), strict=True)
+        if any(own.differences(other) for own, other in pairs):
             return False  # JPEG files may differ in chroma subsampling
         info = sidecar.camera_info
         if info is None or self._info is None:
@@ -473,26 +471,20 @@ class _JoinedStream:
         return _joined([part.images for part in self.segments], self._headers)
 
     def write(self, stem: str, folder: Path) -> StreamSidecar:
-        """Write the video; the sidecar is returned.
+        """Write the videos; the sidecar is returned.
 
         Raises:
             VideoError: A segment is damaged.
             OSError: It cannot be written.
         """
         first = self.first
-        codec = first.sidecar.video.codec
-        path = folder / f"{stem}.mp4"
-        self._write_video(path)
-        facts = video_facts(path, codec)
-        (*_, last) = self.segments
-        if len(self.segments) == 1 and last.has_all:
-            sha256 = facts["sha256"]
-            if last.stream.sidecar.video.sha256 not in (None, sha256):
-                raise VideoError(
-                    "hash-mismatch", first.video_path, "does not match the SHA-256 in its sidecar"
-                )
-            entry = last.source.manifest.file(first.video_path.name)
-            verify_file(first.video_path, entry, found=(facts["size"], sha256))
+        for part in self.segments if len(self.segments) > 1 else ():
+            part.stream.verify_video()
+        names = [f"{stem}.mp4"]
+        if first.sidecar.view:
+            names.insert(0, exact_name(*names))
+        facts, *of_view = (self._write_video(folder / name, n) for n, name in enumerate(names))
+        view = first.sidecar.view
         qualities = [
             (quality.of(part.images.numbers, len(part.stream)), len(part.images))
             for part in self.segments
@@ -512,25 +504,38 @@ class _JoinedStream:
                 "frames": self._frames,
                 "headers": list(self._headers.values()),
                 "video": first.sidecar.video.model_copy(update=facts),
+                "view": view and view.model_copy(update=of_view[0]),
                 "camera_info": self._camera_info(),
                 "columns": columns_model(self._columns),
                 "digests": digests_model(np.concatenate(digests).tolist()) if digests else None,
             }
         )
 
-    def _write_video(self, path: Path) -> None:
-        if len(self.segments) > 1:
-            for part in self.segments:
-                part.stream.verify_video()
-            join_segments([part.stream.video_path for part in self.segments], self._ticks(), path)
-            return
-        (part,) = self.segments
-        if part.has_all:
-            _copy_file(part.stream.video_path, path)
+    def _write_video(self, path: Path, number: int) -> dict[str, Any]:
+        """Write the video, or the view as number 1, from those of the segments.
+
+        Returns:
+            What the sidecar tells of the file.
+        """
+        videos = [part.stream.videos[number] for part in self.segments]
+        (source, old), part = videos[0], self.segments[0]
+        if len(videos) > 1:
+            join_segments([own for own, _ in videos], self._ticks(), path)
+        elif part.has_all:
+            _copy_file(source, path)
         else:
             numbers = part.images.numbers
             frames = range(int(numbers[0]), int(numbers[-1]) + 1)
-            cut_segment(part.stream.video_path, frames, self._ticks(), path)
+            cut_segment(source, frames, self._ticks(), path)
+        facts = video_facts(path, old.codec)
+        if len(videos) == 1 and part.has_all:
+            if old.sha256 not in (None, facts["sha256"]):
+                raise VideoError(
+                    "hash-mismatch", source, "does not match the SHA-256 in its sidecar"
+                )
+            entry = part.source.manifest.file(source.name)
+            verify_file(source, entry, found=(facts["size"], facts["sha256"]))
+        return facts
 
     def _ticks(self) -> list[int]:
         """When each frame is shown."""
@@ -550,6 +555,10 @@ class _JoinedStream:
                 "columns": columns_model(columns),
             }
         )
+
+
+def _entries(stream: Stream) -> list[SampleEntry]:
+    return [read_sample_entry(path) for path, _ in stream.videos]
 
 
 def _has_room(known: Mapping[str, object], models: Iterable[object]) -> bool:
@@ -574,11 +583,12 @@ def _joined(rows: Sequence[_Rows], models: Mapping[str, object]) -> dict[str, In
 
 def _common(sidecar: StreamSidecar) -> tuple[object, ...]:
     """What all segments of a stream have in common."""
-    video, info = sidecar.video.model_dump(exclude={*FACTS, "quality"}), sidecar.camera_info
+    videos = [video.model_dump(exclude={*FACTS, "quality"}) for video in sidecar.videos]
+    info = sidecar.camera_info
     return (
         info if info and not info.messages else None,  # nothing tells when one applied
         *(sidecar.profile, sidecar.stamps, sidecar.channel, sidecar.wire, sidecar.body),
-        *(sidecar.image, video, sidecar.digests is None, sidecar.video.quality is None),
+        *(sidecar.image, videos, sidecar.digests is None, sidecar.video.quality is None),
         *(sidecar.columns.seq is None, sidecar.columns.pts is None),
     )
 

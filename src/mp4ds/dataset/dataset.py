@@ -26,7 +26,7 @@ from mp4ds.dataset.messages import (
     by_time,
     channel_groups,
 )
-from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.stream import Layer, Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.errors import (
     FormatError,
@@ -35,6 +35,7 @@ from mp4ds.errors import (
     SourceNotFoundError,
     counted,
     missing,
+    size_text,
 )
 from mp4ds.files.sources import HOW_TO_OPEN, is_folder, refuse_unfinished, video_at
 from mp4ds.files.urls import RemotePath, location
@@ -71,6 +72,8 @@ class Dataset:
 
     Args:
         path: The folder, a manifest, a sidecar, or a video next to its sidecar; or its URL.
+        layer: ``exact`` for the frames as recorded, ``view`` for those that the views of lossless
+            cameras show, which decode much faster; None for the exact ones where they are here.
         jpeg_quality: Quality of the JPEG files in messages of transcoded streams, 1 to 100.
 
     Raises:
@@ -82,7 +85,9 @@ class Dataset:
     is_salvaged = False
     damage = ""
 
-    def __init__(self, path: Path | str, *, jpeg_quality: int = 95) -> None:
+    def __init__(
+        self, path: Path | str, *, layer: Layer | None = None, jpeg_quality: int = 95
+    ) -> None:
         self.path = location(path)
         if not self.path.exists():
             raise SourceNotFoundError(self.path)
@@ -113,7 +118,9 @@ class Dataset:
                 problem = f"is a video without its sidecar, {sidecar.name}"
                 raise FormatError("file-missing", self.path, problem)
             sidecars = [sidecar]
-        self.streams = [Stream(sidecar, jpeg_quality=jpeg_quality) for sidecar in sidecars]
+        self.streams = [
+            Stream(sidecar, layer=layer, jpeg_quality=jpeg_quality) for sidecar in sidecars
+        ]
         self.messages_file = MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
 
     @classmethod
@@ -152,6 +159,36 @@ class Dataset:
     def parts(self) -> Sequence[Images]:
         """Its streams; of a video without a sidecar, its images."""
         return [self._video] if self._video else self.streams
+
+    def absence(self, selected: Callable[[str], bool] = lambda _: True) -> str:
+        """Which files that make lossless images exact are not here; empty if all are.
+
+        Args:
+            selected: Of which topics.
+        """
+        streams = (stream for stream in self.streams if selected(stream.topic))
+        absent = [video for stream in streams if (video := stream.absent)]
+        if not absent:
+            return ""
+        size = sum(video.size or 0 for video in absent)
+        return f"exact layer not here: {counted(len(absent), 'file')}, {size_text(size)}"
+
+    def require_exact(self, selected: Callable[[str], bool] = lambda _: True) -> None:
+        """Refuse to take the images of views for those recorded.
+
+        Args:
+            selected: Of which topics.
+
+        Raises:
+            SourceError: Some exact images are not here.
+        """
+        if absence := self.absence(selected):
+            raise SourceError(
+                self.path,
+                f"has views only ({absence}), whose pixels differ from those recorded",
+                "Copy the missing *.exact.mp4 files next to them, or give `quality` visual to go "
+                "on with the views.",
+            )
 
     @property
     def topics(self) -> list[str]:
@@ -543,7 +580,9 @@ class Dataset:
         self.close()
 
 
-def open_dataset(path: Path | str, *, track: int | None = None) -> Dataset:
+def open_dataset(
+    path: Path | str, *, layer: Layer | None = None, track: int | None = None
+) -> Dataset:
     """Open a dataset, or one video with its sidecar. See `Dataset`.
 
     A video without a sidecar or dataset can be opened, too: its topic is the file name without
@@ -552,6 +591,7 @@ def open_dataset(path: Path | str, *, track: int | None = None) -> Dataset:
 
     Args:
         path: See `Dataset`.
+        layer: See `Dataset`.
         track: Which video track of a video without a sidecar, from 0, if it has several.
 
     Raises:
@@ -562,7 +602,7 @@ def open_dataset(path: Path | str, *, track: int | None = None) -> Dataset:
         beside = (place.with_suffix(".yaml"), place.parent / MANIFEST_NAME)
         if not any(path.exists() for path in beside):
             return Dataset.of(place, None, [], MessagesFile(None), VideoImages(place, track))
-    dataset = Dataset(place)
+    dataset = Dataset(place, layer=layer)
     if track is not None:
         dataset.close()
         raise OptionError(f"{place}: `track` is for videos without a sidecar.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -30,6 +30,8 @@ from mp4ds.video.images import coded_pixels
 from mp4ds.video.pixels import Scale
 
 Integers = NDArray[np.int64]
+NumberedPictures = Iterator[tuple[int, Picture | None]]
+"""Pictures with the numbers of their frames; None for one that cannot be decoded."""
 
 
 class Images(ABC):
@@ -103,7 +105,7 @@ class Images(ABC):
     # ------------------------------------------------------------ pictures
 
     @abstractmethod
-    def open_reader(self) -> FrameReader | VerbatimImages:
+    def open_reader(self) -> FrameReader | PredictedFrames | VerbatimImages:
         """A separate decoder for frames by number, to be closed."""
 
     def pictures(
@@ -230,6 +232,41 @@ class Images(ABC):
             return error
         name = self.name_of(error.frame, last)
         return type(error)(error.code, error.place, error.what, frame=error.frame, name=name)
+
+
+class PredictedFrames:
+    """Frames by number, made of two videos.
+
+    Args:
+        own: Reads the stream's video.
+        shown: Reads its view.
+        combine: Makes pictures of those of both.
+    """
+
+    def __init__(
+        self,
+        own: FrameReader | PredictedFrames,
+        shown: FrameReader | PredictedFrames,
+        combine: Callable[[NumberedPictures, NumberedPictures], NumberedPictures],
+    ) -> None:
+        self._own, self._shown, self._combine = own, shown, combine
+
+    def pictures_of(
+        self,
+        numbers: Sequence[int],
+        scale: Scale | None = None,
+        outs: Mapping[int, Pixels] | None = None,
+    ) -> Iterator[tuple[int, Picture]]:
+        """Pictures of some frames, in their own size; see `FrameReader.pictures_of`."""
+        own, shown = (reader.pictures_of(numbers) for reader in (self._own, self._shown))
+        for index, picture in self._combine(own, shown):
+            if picture is not None:
+                yield index, picture
+
+    def close(self) -> None:
+        """Close both files."""
+        self._own.close()
+        self._shown.close()
 
 
 class VideoImages(Images):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 
 import numpy as np
@@ -116,6 +116,7 @@ class MessageRebuilder:
         sidecar: The stream's.
         columns: The stream's.
         place: Name of the sidecar, for errors.
+        write_pixels: Writes the pixels of a picture.
         jpeg_quality: Quality of the JPEG files in transcoded messages, 1 to 100.
 
     Raises:
@@ -123,12 +124,18 @@ class MessageRebuilder:
     """
 
     def __init__(
-        self, sidecar: StreamSidecar, columns: DecodedColumns, place: str, *, jpeg_quality: int = 95
+        self,
+        sidecar: StreamSidecar,
+        columns: DecodedColumns,
+        place: str,
+        write_pixels: Callable[[Picture, Pixels], None],
+        *,
+        jpeg_quality: int = 95,
     ) -> None:
+        self._write_pixels = write_pixels
         self._sidecar = sidecar
         self._place = place
         self._encoding = ENCODINGS[sidecar.image.encoding]
-        self._layout = sidecar.layout
         self.columns = columns
         self._digests = self._decode_digests()
         self._templates = self._make_templates()
@@ -166,7 +173,7 @@ class MessageRebuilder:
         image, recipe = self._sidecar.image, self._recipes[variant]
         shape = self._encoding.shape(image.width, image.height)
         pixels: Pixels = np.empty(shape, self._encoding.dtype)
-        self._layout.to_pixels(picture, pixels)
+        self._write_pixels(picture, pixels)
         prefix = bytes.fromhex(self._sidecar.headers[variant].prefix)
         try:
             if self._jpeg is not None:
@@ -216,7 +223,7 @@ class MessageRebuilder:
             step=image.step,
             is_bigendian=bool(image.is_bigendian),
         )
-        self._layout.to_pixels(picture, out)
+        self._write_pixels(picture, out)
         if padding is not None:
             body = memoryview(payload)[len(head) : len(head) + size]
             put_padding(body, padding, row_bytes=self._row_bytes, step=image.step)

@@ -24,6 +24,7 @@ from mp4ds.format.manifest import About, EarlierDataset
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME
 from mp4ds.options import Slice
 from mp4ds.records import Channel, ChannelStats, Excerpt, Message, Record, Schema
+from mp4ds.video.codecs import VISUAL
 
 
 class DatasetReader(BagReader):
@@ -55,7 +56,7 @@ class DatasetReader(BagReader):
             self._bytes = sum(entry.size for entry in manifest.files)
         else:
             self.format = "mcap"
-            self.files = [item for one in dataset.streams for item in (one.path, one.video_path)]
+            self.files = [item for one in dataset.streams for item in one.files]
 
     @property
     def channels(self) -> Sequence[Channel]:
@@ -188,7 +189,9 @@ def copy_part(
         profile=old.profile,
         sha256=digest_file(dataset.path / MANIFEST_NAME)[1],
     )
+    is_view = any(stream.layer == "view" for stream in dataset.streams)
     changes = {
+        "profile": VISUAL if is_view else old.profile,
         "about": about or old.about,
         "sources": [source.within(part.span) for source in old.sources],
         "derived_from": [*old.derived_from, earlier],

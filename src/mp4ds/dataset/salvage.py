@@ -11,9 +11,8 @@ import numpy as np
 
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import MessagesFile, recorded_format
-from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.stream import Layer, Stream
 from mp4ds.errors import FormatError, SourceError, SourceNotFoundError, VersionError
-from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
 from mp4ds.format.manifest import FileEntry, Manifest, StreamEntry, Verbatim
@@ -39,6 +38,7 @@ def open_selected(
     path: Path | str,
     selected: Callable[[str], bool],
     *,
+    layer: Layer | None = None,
     jpeg_quality: int = 95,
     verify_messages: bool = False,
 ) -> Dataset:
@@ -47,6 +47,7 @@ def open_selected(
     Args:
         path: See `Dataset`.
         selected: Whether a topic is wanted.
+        layer: See `Dataset`.
         jpeg_quality: See `Dataset`.
         verify_messages: Compare messages.mcap with its SHA-256, too.
 
@@ -55,7 +56,7 @@ def open_selected(
         FormatError: It is damaged, and selected topics have, or may have, something to lose.
     """
     try:
-        dataset = Dataset(path, jpeg_quality=jpeg_quality)
+        dataset = Dataset(path, layer=layer, jpeg_quality=jpeg_quality)
         _ = dataset.channels  # opens messages.mcap
         if verify_messages:
             dataset.verify_messages()
@@ -64,7 +65,9 @@ def open_selected(
         raise
     except FormatError as error:
         try:
-            dataset, losses = open_damaged(path, selected=selected, jpeg_quality=jpeg_quality)
+            dataset, losses = open_damaged(
+                path, selected=selected, layer=layer, jpeg_quality=jpeg_quality
+            )
         except (SourceError, FormatError):
             raise error from None
         # nothing vouches for what is still there of a damaged messages.mcap
@@ -80,13 +83,18 @@ def open_selected(
 
 
 def open_damaged(
-    path: Path | str, *, selected: Callable[[str], bool], jpeg_quality: int
+    path: Path | str,
+    *,
+    selected: Callable[[str], bool],
+    layer: Layer | None = None,
+    jpeg_quality: int,
 ) -> tuple[Dataset, list[Loss]]:
     """A dataset, some files of which cannot be read. What can be read of its videos: see `examine`.
 
     Args:
         path: See `Dataset`.
         selected: Whether a topic is wanted; damage to others is not reported.
+        layer: See `Dataset`.
         jpeg_quality: See `Dataset`.
 
     Returns:
@@ -104,9 +112,9 @@ def open_damaged(
         raise SourceNotFoundError(place)
     folder = place.parent if place.name == MANIFEST_NAME else place
     if folder.is_dir():
-        opening = _Opening(folder, selected, jpeg_quality)
+        opening = _Opening(folder, selected, layer, jpeg_quality)
         return opening.dataset(), opening.losses
-    dataset = Dataset(folder, jpeg_quality=jpeg_quality)
+    dataset = Dataset(folder, layer=layer, jpeg_quality=jpeg_quality)
     dataset.is_salvaged = True
     return dataset, []
 
@@ -119,27 +127,28 @@ def examine(stream: Stream) -> list[Loss]:
     Returns:
         What is lost of the others.
     """
-    count, video = len(stream), stream.sidecar.video
+    count = len(stream)
     try:
         _ = stream.rebuilder
     except FormatError as error:
         stream.sound = np.zeros(count, np.bool_)
         name, topics, ends = stream.video_path.name, (stream.topic,), (0, count - 1)
         return [Loss(name, None, None, error.what, count, topics, *_span(stream), ends)]
-    if video.sha256 is not None and digest_file(stream.video_path)[1] == video.sha256:
+    is_hashed = all(video.sha256 for video in stream.sidecar.videos)
+    altered = [path for path, _ in stream.altered_videos()]
+    if is_hashed and not altered:
         return []
+    name = (altered or [stream.video_path])[0].name
     sound = np.ones(count, np.bool_)
     losses, times = [], stream.log_times
     for damage, first, last in stream.damages():
         sound[first : last + 1] = False
         span, ends = (int(times[first]), int(times[last])), (first, last)
         lost, topics = last - first + 1, (stream.topic,)
-        losses.append(
-            Loss(stream.video_path.name, None, None, damage.what, lost, topics, *span, ends)
-        )
-    if stream.sidecar.digests is None and sound.any() and video.sha256 is not None:
+        losses.append(Loss(name, None, None, damage.what, lost, topics, *span, ends))
+    if stream.sidecar.digests is None and sound.any() and is_hashed:
         problem = f"{_ALTERED}, and frames of a lossy video have no digests: some may be altered"
-        losses.append(Loss(stream.video_path.name, None, None, problem, 0, (stream.topic,)))
+        losses.append(Loss(name, None, None, problem, 0, (stream.topic,)))
     stream.sound = sound
     return losses
 
@@ -167,9 +176,16 @@ class _Opening:
         losses: What is lost by files that cannot be read at all, and of messages.mcap.
     """
 
-    def __init__(self, folder: Path, selected: Callable[[str], bool], jpeg_quality: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        selected: Callable[[str], bool],
+        layer: Layer | None,
+        jpeg_quality: int,
+    ) -> None:
         self._folder = folder
         self._selected = selected
+        self._layer: Layer | None = layer
         self._jpeg_quality = jpeg_quality
         self.losses: list[Loss] = []
 
@@ -211,7 +227,7 @@ class _Opening:
     ) -> Stream | None:
         path = self._folder / name
         try:
-            stream = Stream(path, jpeg_quality=self._jpeg_quality)
+            stream = Stream(path, layer=self._layer, jpeg_quality=self._jpeg_quality)
             if manifest is not None and any(map(self._selected, stream.topics)):
                 self._compare(path, manifest.file(name), stream.topics)
             return stream
@@ -265,15 +281,7 @@ class _Opening:
             recording_profile=file.profile,
             sources=[],
             messages=0,
-            streams=[
-                StreamEntry(
-                    topic=stream.topic,
-                    sidecar=stream.path.name,
-                    video=stream.sidecar.video.file,
-                    frames=len(stream),
-                )
-                for stream in streams
-            ],
+            streams=[StreamEntry.of(stream.path.name, stream.sidecar) for stream in streams],
             verbatim=[
                 Verbatim(topic=item.topic, messages=number, first=0, reason="not known")
                 for item in file.channels

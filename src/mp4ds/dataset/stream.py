@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import cached_property
+from itertools import tee
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.images import Images
+from mp4ds.dataset.images import Images, NumberedPictures, PredictedFrames
 from mp4ds.dataset.rebuild import CalibrationMessages, MessageRebuilder, message_at
 from mp4ds.errors import FormatError, OptionError, VideoError
 from mp4ds.files.outputs import digest_file
 from mp4ds.format.fields import Choice, DecodedColumns, decode_columns, everything, unbroken
-from mp4ds.format.models import Calibration, StreamSidecar
+from mp4ds.format.models import Calibration, StreamSidecar, VideoModel
 from mp4ds.format.sidecars import load_stream
 from mp4ds.messages import depth
-from mp4ds.messages.encodings import Picture, Pixels
+from mp4ds.messages.encodings import Picture, Pixels, add_prediction
 from mp4ds.messages.layouts import Layout
 from mp4ds.records import Channel, Message
 from mp4ds.video.access import FrameReader
@@ -27,18 +28,27 @@ from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.packets import PacketReader
 from mp4ds.video.pixels import PictureMaker, Scale
 
+Layer = Literal["exact", "view"]
+"""Which frames are read of a stream that has a view: those recorded, or those that it shows."""
+
 
 class Stream(Images):
     """A video with its sidecar: images of one size and encoding, and their messages.
 
+    Of a stream with a view, one of two layers is read. The view alone is a stream as any other of
+    less quality; the exact images are made of both videos.
+
     Attributes:
-        sidecar: The contents of its sidecar.
+        sidecar: The contents of its sidecar, or what it says of the view.
+        exact_path: The video that makes the images exact, where there is a view; else None.
+        layer: Which frames are read: exact ones as well, where there is no view.
         sound: Which frames are read of a damaged video: those that `damages` does not name, shape
             (frames,). None: all, and damage is an error.
 
     Args:
         path: The sidecar; the video is next to it.
         sidecar: Its contents, if already read.
+        layer: Which frames to read; None: the exact ones if they are here, else the view.
         jpeg_quality: Quality of the JPEG files in messages of a transcoded stream, 1 to 100.
 
     Raises:
@@ -52,12 +62,18 @@ class Stream(Images):
         path: Path,
         *,
         sidecar: StreamSidecar | None = None,
+        layer: Layer | None = None,
         jpeg_quality: int = 95,
     ) -> None:
         self.path = path
         self.sound: NDArray[np.bool_] | None = None
         self._jpeg_quality = jpeg_quality
-        self.sidecar = sidecar or load_stream(path)
+        self._whole = whole = sidecar or load_stream(path)
+        self.exact_path = path.parent / whole.video.file if whole.view else None
+        if self.exact_path and layer is None:
+            layer = "exact" if self.exact_path.exists() else "view"
+        self.layer: Layer = layer if self.exact_path and layer else "exact"
+        self.sidecar = whole.seen if self.layer == "view" else whole
         self.channel = self.sidecar.channel.to_record(0)
         self.topic = self.channel.topic
         self.video_path = path.parent / self.sidecar.video.file
@@ -65,12 +81,45 @@ class Stream(Images):
         self.encoding, self.image_size = image.encoding, (image.width, image.height)
         is_packet = self.sidecar.body == "packet"
         self.are_jpeg_files = is_packet and self.sidecar.video.codec == "mjpeg"
-        self.shows_colours = self.sidecar.shows_colours
+        self.shows_colours = self.sidecar.shows_colours and not self.sidecar.is_predicted
 
     @property
     def topics(self) -> list[str]:
         """Topic of the images, and that of the calibrations if there are any."""
         return [self.topic, *([self.infos.channel.topic] if self.infos else [])]
+
+    @property
+    def absent(self) -> VideoModel | None:
+        """The video that makes its images exact, if it is missing; all else can be read."""
+        is_absent = self.exact_path and self.layer == "view" and not self.exact_path.exists()
+        return self._whole.video if is_absent else None
+
+    @property
+    def layers(self) -> list[Stream]:
+        """The stream, and that of its view if it has one and is not that."""
+        other = self.in_layer("view")
+        return [self] if other is self else [self, other]
+
+    def in_layer(self, layer: Layer) -> Stream:
+        """The stream of a layer; itself if it has only one.
+
+        Raises:
+            OptionError: It is not here.
+        """
+        if layer == self.layer or self.exact_path is None:
+            return self
+        if layer == "exact" and not self.exact_path.exists():
+            raise OptionError(
+                f"{self.topic} has no exact frames here: {self.exact_path.name} is missing. Copy "
+                f"it to {self.path.parent}, or read the layer 'view'."
+            )
+        quality = self._jpeg_quality
+        return Stream(self.path, sidecar=self._whole, layer=layer, jpeg_quality=quality)
+
+    @cached_property
+    def _view(self) -> Stream | None:
+        """What predicts its images; None if nothing does."""
+        return self.in_layer("view") if self.sidecar.is_predicted else None
 
     @cached_property
     def columns(self) -> DecodedColumns:
@@ -107,7 +156,11 @@ class Stream(Images):
     def rebuilder(self) -> MessageRebuilder:
         """Makes the stream's messages."""
         return MessageRebuilder(
-            self.sidecar, self.columns, str(self.path), jpeg_quality=self._jpeg_quality
+            self.sidecar,
+            self.columns,
+            str(self.path),
+            self.write_pixels,
+            jpeg_quality=self._jpeg_quality,
         )
 
     @property
@@ -160,15 +213,42 @@ class Stream(Images):
         )
         return {"codec": video.codec, "frames": self.sidecar.frames, "maker": maker}
 
-    def open_reader(self) -> FrameReader:
+    def open_reader(self) -> FrameReader | PredictedFrames:
         """A separate decoder for frames by number."""
         recorded = self.sidecar.video.references
         references = recorded.decode if recorded else None
-        return FrameReader(self.video_path, **self._expected(), references=references)
+        reader = FrameReader(self.video_path, **self._expected(), references=references)
+        if self._view is None:
+            return reader
+        return PredictedFrames(reader, self._view.open_reader(), self.predicted)
 
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
         """Write the pixels of a picture, as recorded."""
-        self.layout.to_pixels(picture, out)
+        if self._view is None:
+            self.layout.to_pixels(picture, out)
+            return
+        *differences, prediction = picture
+        self.layout.to_pixels(tuple(differences), out)
+        add_prediction(out, prediction, self._view.layout.used_bits)
+
+    def predicted(self, pictures: NumberedPictures, shown: NumberedPictures) -> NumberedPictures:
+        """Pictures of the video, to each of which the view's pixels are added as the last array.
+
+        Args:
+            pictures: Of the video, each with its number.
+            shown: The same of the view.
+        """
+        view = self._view or self
+        prediction: Pixels | None = None  # one for all: pictures are valid until the next
+        for (_, seen), (index, picture) in zip(shown, pictures, strict=True):
+            if seen is None or picture is None:
+                yield index, None
+                continue
+            if prediction is None:
+                prediction = view.recorded_pixels(seen)
+            else:
+                view.write_pixels(seen, prediction)
+            yield index, (*picture, prediction)
 
     def depth_header(self, index: int) -> bytes:
         """What gives the quantised depths of a frame in metres; empty for all others.
@@ -215,25 +295,38 @@ class Stream(Images):
         Raises:
             VideoError: See `VideoDecoder.pictures_at`.
         """
-        done = -1
         with self.naming_frames():
-            if self.sound is None:
-                try:
-                    with self.open_video(sequential=True) as decoder:
-                        for index, picture in decoder.pictures_at(choice(self.columns), scale):
-                            yield index, picture
-                            done = index
-                    return
-                except VideoError as error:
-                    if is_strict or error.frame is None:
-                        raise
-            # from there on on one core; see the decoder
-            with self.open_video(sequential=False) as decoder:
-                rest = (index for index in self.sound_of(choice(self.columns)) if index > done)
-                for index, found in decoder.decodable_pictures(rest, scale):
-                    if found is None and is_strict:
-                        raise self._undecodable(index)
-                    yield index, found
+            if self._view is None:
+                yield from self._decoded(choice, scale, is_strict=is_strict)
+                return
+            self._view.sound = self.sound
+            own = its = choice
+            if is_strict:  # nothing is asked twice then, and what is late by now differs
+                wanted, again = tee(choice(self.columns))
+                own, its = lambda _: wanted, lambda _: again
+            decoded = self._decoded(own, None, is_strict=is_strict)
+            yield from self.predicted(decoded, self._view.pictures(its, is_strict=is_strict))
+
+    def _decoded(self, choice: Choice, scale: Scale | None, *, is_strict: bool) -> NumberedPictures:
+        """The pictures of the video; see `pictures`."""
+        done = -1
+        if self.sound is None:
+            try:
+                with self.open_video(sequential=True) as decoder:
+                    for index, picture in decoder.pictures_at(choice(self.columns), scale):
+                        yield index, picture
+                        done = index
+                return
+            except VideoError as error:
+                if is_strict or error.frame is None:
+                    raise
+        # from there on on one core; see the decoder
+        with self.open_video(sequential=False) as decoder:
+            rest = (index for index in self.sound_of(choice(self.columns)) if index > done)
+            for index, found in decoder.decodable_pictures(rest, scale):
+                if found is None and is_strict:
+                    raise self._undecodable(index)
+                yield index, found
 
     def _undecodable(self, index: int) -> VideoError:
         return VideoError("decode-failed", self.video_path, "cannot be decoded", frame=index)
@@ -294,10 +387,23 @@ class Stream(Images):
         )
 
     @property
-    def hidden_frames(self) -> int:
-        """How many frames the video hides before its first one, which may refer to them."""
-        with PacketReader(self.video_path, codec=self.sidecar.video.codec) as reader:
-            return reader.hidden
+    def videos(self) -> list[tuple[Path, VideoModel]]:
+        """Its video, and the view that predicts it if there is one."""
+        return [(self.path.parent / video.file, video) for video in self.sidecar.videos]
+
+    @property
+    def files(self) -> list[Path]:
+        """The sidecar and the videos."""
+        return [self.path, *(path for path, _ in self.videos)]
+
+    @property
+    def hides_frames(self) -> bool:
+        """Whether a video hides frames before its first one, which may refer to them."""
+        for path, video in self.videos:
+            with PacketReader(path, codec=video.codec) as reader:
+                if reader.hidden:
+                    return True
+        return False
 
     # ------------------------------------------------------------ damage
 
@@ -365,6 +471,17 @@ class Stream(Images):
         except FormatError as error:
             yield error
 
+    def altered_videos(self) -> Iterator[tuple[Path, FormatError]]:
+        """What is wrong with each file of the stream that is missing or has another SHA-256."""
+        for path, video in self.videos:
+            if not path.is_file():
+                yield path, FormatError("file-missing", path, "does not exist")
+            elif video.sha256 is not None and digest_file(path)[1] != video.sha256:
+                problem = (
+                    f"does not match the SHA-256 in its sidecar; it has frames of {self.topic}"
+                )
+                yield path, FormatError("hash-mismatch", path, problem)
+
     def verify_video(self) -> None:
         """Check the video against its SHA-256, for when no message digest would reveal damage.
 
@@ -373,14 +490,9 @@ class Stream(Images):
         Raises:
             FormatError: ``file-missing`` or ``hash-mismatch``.
         """
-        if self.sound is not None:
-            return
-        video = self.sidecar.video
-        if not self.video_path.is_file():
-            raise FormatError("file-missing", self.video_path, "does not exist")
-        if video.sha256 is not None and digest_file(self.video_path)[1] != video.sha256:
-            problem = f"does not match the SHA-256 in its sidecar; it has frames of {self.topic}"
-            raise FormatError("hash-mismatch", self.video_path, problem)
+        if self.sound is None:
+            for _, error in self.altered_videos():
+                raise error
 
     def verify_pictures(self) -> None:
         """Check the video or, if it has no SHA-256, all messages, before pictures are made of it.

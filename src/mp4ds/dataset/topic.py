@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.images import Images, Integers, VerbatimImages
-from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.images import Images, Integers, PredictedFrames, VerbatimImages
+from mp4ds.dataset.stream import Layer, Stream
 from mp4ds.dataset.views import Crop, Resize, View, output
 from mp4ds.errors import Mp4dsError, OptionError, missing
 from mp4ds.format.models import Calibration
@@ -63,7 +63,7 @@ class _Opened:
     """
 
     lock: threading.RLock = field(default_factory=threading.RLock)
-    readers: dict[int, FrameReader | VerbatimImages] = field(default_factory=dict)
+    readers: dict[int, FrameReader | PredictedFrames | VerbatimImages] = field(default_factory=dict)
     views: dict[int, tuple[str, View]] = field(default_factory=dict)
     inherited: list[object] = field(default_factory=list)
 
@@ -103,6 +103,7 @@ class Topic:
         self.parts = list(parts)
         # What other processes opened stays in it, for the reason given at `_Opened`.
         self._processes: dict[int, _Opened] = {}
+        self._layers: dict[Layer, Topic] = {}
 
     if not TYPE_CHECKING:  # else every name would pass for known
 
@@ -131,6 +132,8 @@ class Topic:
         with opened.lock:
             while opened.readers:
                 opened.readers.popitem()[1].close()
+        for topic in self._layers.values():
+            topic.close()
 
     # ------------------------------------------------------------ what they are
 
@@ -341,6 +344,18 @@ class Topic:
             given.add(number)
         return frames
 
+    def in_layer(self, layer: Layer) -> Topic:
+        """The same frames of a layer: ``exact``, or those that the ``view`` shows.
+
+        Raises:
+            OptionError: The exact frames are not here.
+        """
+        if layer not in self._layers:
+            self._layers[layer] = Topic(
+                [part.in_layer(layer) if isinstance(part, Stream) else part for part in self.parts]
+            )
+        return self._layers[layer]
+
     def read(
         self,
         indices: Indices,
@@ -348,6 +363,7 @@ class Topic:
         format: str = "rgb",  # noqa: A002
         resize: Resize = None,
         crop: Crop = None,
+        layer: Layer | None = None,
         out: Pixels | None = None,
     ) -> Pixels:
         """Pixels of frames by number, in one array.
@@ -357,6 +373,7 @@ class Topic:
             format: See `Topic`.
             resize: See `Topic`.
             crop: See `Topic`.
+            layer: See `in_layer`; None: as the dataset was opened.
             out: Where to write them, or None for a new array. Shape and type as returned.
 
         Returns:
@@ -368,6 +385,10 @@ class Topic:
                 would differ, including those not requested.
             VideoError: A frame cannot be decoded.
         """
+        if layer is not None:
+            return self.in_layer(layer).read(
+                indices, format=format, resize=resize, crop=crop, out=out
+            )
         numbers = self._checked(indices)
         views = self._views_alike(format, resize, crop)
         out = output(out, (len(numbers), *views[0].shape), views[0].dtype)

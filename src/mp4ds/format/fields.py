@@ -24,7 +24,7 @@ from mp4ds.video.codecs import MAX_GOP
 
 T = TypeVar("T")
 
-FORMAT_VERSION = "1.1"
+FORMAT_VERSION = "2.0"
 MESSAGES_NAME = "messages.mcap"
 MAX_FRAMES = 2 * 10**7  # 92 hours at 60 Hz; bounds what a sidecar can make a reader allocate
 MAX_CAMERA_INFOS = 10**7

@@ -57,7 +57,24 @@ class StreamEntry(Model):
     topic: str
     sidecar: FileName
     video: FileName
+    view: FileName | None = Field(None, description="Of a stream that has one.")
     frames: Count
+
+    @classmethod
+    def of(cls, name: str, stream: StreamSidecar) -> StreamEntry:
+        """The entry of a stream, whose sidecar has this name."""
+        return cls(
+            topic=stream.channel.topic,
+            sidecar=name,
+            video=stream.video.file,
+            view=stream.view.file if stream.view else None,
+            frames=stream.frames,
+        )
+
+    @property
+    def files(self) -> list[str]:
+        """Names of its files."""
+        return [name for name in (self.sidecar, self.video, self.view) if name]
 
 
 class FileEntry(Model):
@@ -242,7 +259,7 @@ class Manifest(Model):
         for what, names in (
             ("file", [entry.name for entry in self.files]),
             ("sidecar", [entry.sidecar for entry in self.streams]),
-            ("video", [entry.video for entry in self.streams]),
+            ("video", [name for one in self.streams for name in (one.video, one.view) if name]),
         ):
             twice = [name for name, count in Counter(names).items() if count > 1]
             if twice:

@@ -42,7 +42,7 @@ from mp4ds.messages.serializations import WIRES
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
-from mp4ds.video.codecs import CODECS, PACKET_CODECS, TOLERANCES, QualityTarget
+from mp4ds.video.codecs import CODECS, PACKET_CODECS, TOLERANCES, VISUAL, QualityTarget
 from mp4ds.video.pixels import shows_colours
 from mp4ds.video.references import (
     MAX_CHARS,
@@ -538,7 +538,10 @@ class StreamSidecar(Model):
     )
     image: Image
     headers: Annotated[list[Header], Field(min_length=1, max_length=MAX_VARIANTS)]
-    video: VideoModel
+    video: VideoModel = Field(description="What messages are made of.")
+    view: VideoModel | None = Field(
+        None, description="Shows the images, and predicts them; absent: the video does."
+    )
     camera_info: CameraInfo | None = None
     columns: Columns
     digests: Digests | None = Field(None, description="Present in the lossless profile.")
@@ -557,7 +560,21 @@ class StreamSidecar(Model):
         if self.video.width < width or self.video.height < height:
             raise ValueError(f"the video is smaller than its pictures of {width}x{height}")
         self._check_body()
+        if self.view is not None:
+            self._check_view(self.view)
         return self
+
+    def _check_view(self, view: VideoModel) -> None:
+        if self.profile != "lossless" or self.body not in ("pixels", "png", "packet"):
+            raise ValueError(f"a {self.profile} stream with the body {self.body} has no view")
+        if self.video.file != exact_name(view.file):
+            raise ValueError(f"the video beside {view.file} must be {exact_name(view.file)}")
+        due = ENCODINGS[self.image.encoding].lossy
+        if view.layout != due:
+            raise ValueError(f"the view has the layout {view.layout}, not {due}")
+        if view.pixel_format is None:
+            raise ValueError("view.pixel_format must be present")
+        self.seen  # noqa: B018 - checks its pictures
 
     def _check_body(self) -> None:
         body, encoding = self.body, self.image.encoding
@@ -583,6 +600,25 @@ class StreamSidecar(Model):
                 raise ValueError(f"headers.{number}.padding is allowed for the body pixels only")
 
     @property
+    def videos(self) -> list[VideoModel]:
+        """The video, and the view if there is one."""
+        return [self.video, *([self.view] if self.view else [])]
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether the video holds the difference of the images to what the view predicts."""
+        return self.view is not None and self.body != "packet"
+
+    @property
+    def seen(self) -> StreamSidecar:
+        """The stream of the view alone; the stream itself if it has none."""
+        if self.view is None:
+            return self
+        body = "jpeg" if self.body == "packet" else self.body
+        alone = {"view": None, "video": self.view, "profile": VISUAL, "digests": None}
+        return self.model_validate({**dict(self), **alone, "body": body})
+
+    @property
     def shows_colours(self) -> bool:
         """Whether a player shows the images as they are: in 8-bit colours, and no mosaic."""
         layout = self.layout
@@ -603,6 +639,15 @@ class StreamSidecar(Model):
 
 
 # ---------------------------------------------------------------- facts of a finished video
+
+EXACT_SUFFIX = ".exact.mp4"
+"""Of the name of a video that has a view."""
+
+
+def exact_name(view: str) -> str:
+    """The name of the video beside a view."""
+    return view.removesuffix(".mp4") + EXACT_SUFFIX
+
 
 FACTS = ("file", "size", "sha256", "references")
 """Keys of `mp4ds.format.models.Video`."""

@@ -148,7 +148,20 @@ def _from_1_0(old: Document, place: str) -> Document:
     return {**old, "mp4ds": "1.1"}
 
 
-MIGRATIONS: dict[str, Callable[[Document, str], Document]] = {"0": _from_0, "1.0": _from_1_0}
+def _from_1_1(old: Document, place: str) -> Document:
+    """Version 1.1: no stream has a view."""
+    entries = old.get("streams")
+    listed = entries if isinstance(entries, list) else []
+    if any(isinstance(item, dict) and "view" in item for item in (old, *listed)):
+        raise ValueError("views need version 2.0")
+    return {**old, "mp4ds": "2.0"}
+
+
+MIGRATIONS: dict[str, Callable[[Document, str], Document]] = {
+    "0": _from_0,
+    "1.0": _from_1_0,
+    "1.1": _from_1_1,
+}
 """Version that a step starts from -> the step."""
 
 
@@ -394,6 +407,8 @@ class FileNames:
         stem = re.sub(r"[^A-Za-z0-9._-]+", "_", topic.strip("/")).strip("._-") or "topic"
         if len(stem) > _MAX_NAME:
             stem = f"{stem[: _MAX_NAME - 17]}-{xxhash.xxh64(topic.encode()).hexdigest()}"
+        if stem.casefold().endswith(".exact"):
+            stem += "_"  # else its video would have the name of another's exact layer
         if stem.casefold().split(".")[0] in _RESERVED:
             stem = f"topic_{stem}"
         name, number = stem, 1

@@ -242,6 +242,42 @@ def put_padding(data: bytearray | memoryview, padding: bytes, *, row_bytes: int,
     rows[:, row_bytes:] = np.frombuffer(padding, np.uint8).reshape(whole, step - row_bytes)
 
 
+# ---------------------------------------------------------------- predictions
+
+
+def difference(pixels: Pixels, prediction: Pixels, bits: int) -> Pixels:
+    """What an image differs by from its prediction, as an image of the same encoding.
+
+    Args:
+        pixels: Of samples below 2^bits, unsigned.
+        prediction: Of the same shape and type, in native byte order.
+        bits: At most those of a sample.
+
+    Returns:
+        The differences modulo 2^bits, with half of that added: none is in the middle of the range.
+    """
+    found = native(pixels) - prediction
+    found += found.dtype.type(1 << (bits - 1))
+    if bits < 8 * found.itemsize:
+        found &= found.dtype.type((1 << bits) - 1)
+    return found
+
+
+def add_prediction(out: Pixels, prediction: Pixels, bits: int) -> None:
+    """Make an image of its `difference`, in place.
+
+    Args:
+        out: The difference, in any byte order.
+        prediction: As for `difference`.
+        bits: As for `difference`.
+    """
+    kind = prediction.dtype.type
+    out += prediction
+    out -= kind(1 << (bits - 1))  # both wrap around, as intended
+    if bits < 8 * prediction.itemsize:
+        out &= kind((1 << bits) - 1)
+
+
 # ---------------------------------------------------------------- values
 
 Samples = NDArray[Any]

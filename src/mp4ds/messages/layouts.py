@@ -517,6 +517,13 @@ class Layout:
     _values: Values = field(compare=False)  # the others say which
     _arrangement: Arrangement = field(compare=False)
 
+    @property
+    def used_bits(self) -> int:
+        """Of each sample of the images, which may have zeros above."""
+        if self.parameters.bits is not None:
+            return self.parameters.bits + (self.parameters.shift or 0)
+        return 8 * self.encoding.bytes_per_sample
+
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of the image -> of the picture."""
         return self._arrangement.picture_size(width, height)

@@ -156,8 +156,8 @@ def write_manifest(part: PartRecord, origin: Mapping[str, Any], profile: str) ->
         origin: Where it came from; see `origin_of`.
         profile: The requested profile.
     """
-    videos = [sidecar.video for sidecar in part.streams]
-    sidecars = [f"{Path(video.file).stem}.yaml" for video in videos]
+    videos = [video for sidecar in part.streams for video in sidecar.videos]
+    sidecars = [f"{Path(sidecar.seen.video.file).stem}.yaml" for sidecar in part.streams]
     digests = {video.file: (video.size or 0, video.sha256 or "") for video in videos}
     for name in (MESSAGES_NAME, *sidecars):
         digests[name] = digest_file(part.folder / name)
@@ -168,12 +168,7 @@ def write_manifest(part: PartRecord, origin: Mapping[str, Any], profile: str) ->
         messages=sum(topic.messages for topic in part.topics.values()),
         time_range=TimeRange(start=part.span[0], end=part.span[1]) if part.span else None,
         streams=[
-            StreamEntry(
-                topic=sidecar.channel.topic,
-                sidecar=name,
-                video=sidecar.video.file,
-                frames=sidecar.frames,
-            )
+            StreamEntry.of(name, sidecar)
             for name, sidecar in zip(sidecars, part.streams, strict=True)
         ],
         transforms=static_transforms(part.streams, part.transforms),
@@ -244,8 +239,8 @@ def _topics_in(made: Dataset, known: Mapping[str, TopicSummary]) -> dict[str, To
     for stream in made.streams:
         topic, video = topics[stream.topic], stream.sidecar.video
         topic.frames += len(stream)
-        topic.files.append(video.file)
-        topic.packed_bytes += stream.video_path.stat().st_size + stream.path.stat().st_size
+        topic.files.extend(own.file for own in reversed(stream.sidecar.videos))
+        topic.packed_bytes += sum(path.stat().st_size for path in stream.files)
         if stream.infos:
             topics[stream.infos.channel.topic].frames += len(stream.infos)
         if video.quality is not None:
@@ -293,5 +288,5 @@ def dataset_files(path: Path) -> set[str] | None:
         manifest = load_manifest(path / MANIFEST_NAME)
     except (FormatError, SourceError, OSError):
         return None
-    streams = {name for entry in manifest.streams for name in (entry.sidecar, entry.video)}
+    streams = {name for entry in manifest.streams for name in entry.files}
     return {MANIFEST_NAME, *streams, *(entry.name for entry in manifest.files)}

@@ -41,6 +41,7 @@ from mp4ds.files.sources import (
 from mp4ds.files.uploads import local_path, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest, load_stream
+from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import ENCODING
 from mp4ds.packing.long_packs import PartedPack, Report, pack_parts
 from mp4ds.packing.manifest import (
@@ -65,6 +66,7 @@ from mp4ds.packing.tracks import TrackPlan
 from mp4ds.processes import ProcessExecutor, available_cores, memory_bytes
 from mp4ds.video.codecs import (
     LOSSLESS,
+    VISUAL,
     check_codec,
     parse_quality,
 )
@@ -188,8 +190,14 @@ def _pack(
         return _pack_to_store(paths, store, options, progress)
     if any(map(is_unfinished, paths)):
         return _recovered(paths, target, options)
-    if options.quality is None:
+    if _is_copy(paths, options):
         return _copied(paths, target, options, progress)
+    return _encoded(paths, target, options, progress)
+
+
+def _encoded(
+    paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
+) -> PackSummary:
     parted = _planned(paths, target, options, progress)
     if parted.is_new and not parted.plan.is_divided and not options.cluster:
         return until_in_reach(partial(_pack_in_one_pass, parted))
@@ -216,8 +224,9 @@ def _copied(
     try:
         return _copy(paths[0], target, options)
     except Refused as reason:
-        encoded = replace(options, quality=_quality_of(paths), transcode=_has_transcoded(paths))
-        summary = _pack(paths, target, _checked(encoded, paths), progress)
+        quality = options.quality or parse_quality(_quality_of(paths))
+        encoded = replace(options, quality=quality, transcode=_has_transcoded(paths))
+        summary = _encoded(paths, target, _checked(encoded, paths, may_copy=False), progress)
         return replace(summary, not_copied=str(reason))
 
 
@@ -239,10 +248,12 @@ def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
     about = load_about(options.about) if options.about is not None else None
     with (
         advising(COPY_AGAIN),
-        Dataset(path) as dataset,
+        Dataset(path, layer="view" if options.quality else None) as dataset,
         staged(target, force=options.force, owned=dataset_files, sources=[path]) as folder,
     ):
         selected = options.selected
+        if options.quality is None:
+            dataset.require_exact(selected)
         selected.check(channel.topic for channel in dataset.channels)
         folder.mkdir()
         part = slice_of(dataset, options.slice, selected)
@@ -394,10 +405,24 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
 
 def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
     """Whether it is one dataset, and no option asks for encoding its videos."""
-    if options.changing(ENCODING) != PackOptions().changing(ENCODING):
+    kept = replace(options, quality=None)
+    if kept.changing(ENCODING) != PackOptions().changing(ENCODING):
         return False
     is_divided = options.join or options.cluster is not None
-    return not is_divided and len(paths) == 1 and dataset_at(paths[0]) is not None
+    folder = dataset_at(paths[0]) if len(paths) == 1 and not is_divided else None
+    if folder is None or options.quality is None:
+        return folder is not None
+    return options.quality.name == VISUAL and _has_views(folder)
+
+
+def _has_views(folder: Path) -> bool:
+    """Whether every lossless stream of a dataset that could be of less quality has a view."""
+    sidecars = [
+        load_stream(folder / entry.sidecar)
+        for entry in load_manifest(folder / MANIFEST_NAME).streams
+    ]
+    own = [one for one in sidecars if one.body != "packet" and ENCODINGS[one.image.encoding].lossy]
+    return any(one.view for one in own) and all(one.view or one.profile == VISUAL for one in own)
 
 
 def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = True) -> PackOptions:
@@ -418,6 +443,9 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
     if may_copy and _is_copy(paths, options):
         return options
     quality = options.quality or parse_quality(_quality_of(paths))
+    for folder in filter(None, map(dataset_at, paths)):
+        if quality.lossless:
+            Dataset(folder).require_exact(options.selected)
     if options.transcode and quality.lossless:
         raise OptionError(
             "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "

@@ -18,6 +18,7 @@ from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import Refused
 from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, digests_model, exceeds_padding
 from mp4ds.format.models import (
+    EXACT_SUFFIX,
     CameraInfo,
     ChannelModel,
     Header,
@@ -49,7 +50,7 @@ from mp4ds.packing.planning import (
     decide,
     needs_trial,
 )
-from mp4ds.packing.tracks import TrackPlan, open_track
+from mp4ds.packing.tracks import Track, TrackPlan, open_track
 from mp4ds.records import EVERYTHING, Attachment, Channel, Message
 from mp4ds.times import PresentationClock
 
@@ -161,12 +162,13 @@ class StreamWriter:
         self.number = number
         self.channel = seen.message.channel
         self.camera_info: CameraInfo | None = None
-        self.video_path, self._sidecar_path = Path(f"{stem}.mp4"), Path(f"{stem}.yaml")
+        self._view_path, self._sidecar_path = Path(f"{stem}.mp4"), Path(f"{stem}.yaml")
+        self._path = Path(f"{stem}{EXACT_SUFFIX}") if plan.view else self._view_path
         self._plan = plan
         self._table = MessageTable[Header](seen.form, MAX_FRAMES)
         self._digests = array("Q")
         self._clock = PresentationClock()
-        self._track = open_track(plan, self.video_path, seen, threads, rate)
+        self._track = open_track(plan, self._path, self._view_path, seen, threads, rate)
         self._key = seen.key
 
     @property
@@ -229,8 +231,7 @@ class StreamWriter:
             self._track.close()
         except Refused as reason:
             raise self._out_of_reach(reason) from None
-        key, made = self._key, self._track.describe()
-        video = {**made, **video_facts(self.video_path, made["codec"])}
+        key, view = self._key, self._track.view
         sidecar = StreamSidecar(
             mp4ds=FORMAT_VERSION,
             kind="stream",
@@ -247,7 +248,8 @@ class StreamWriter:
                 is_bigendian=key.is_bigendian,
             ),
             headers=self._table.headers,
-            video=VideoModel.model_validate(video),
+            video=_video_model(self._track, self._path),
+            view=_video_model(view, self._view_path) if view else None,
             camera_info=self.camera_info,
             columns=self._table.to_model(),
             digests=digests_model(self._digests) if self._plan.is_exact else None,
@@ -283,8 +285,15 @@ class StreamWriter:
         )
 
     def abandon(self) -> None:
-        """Stop writing; the caller removes the files."""
+        """Stop writing, and remove the videos."""
         self._track.abandon()
+        self._path.unlink(missing_ok=True)
+        self._view_path.unlink(missing_ok=True)
+
+
+def _video_model(track: Track, path: Path) -> VideoModel:
+    made = track.describe()
+    return VideoModel.model_validate({**made, **video_facts(path, made["codec"])})
 
 
 # ---------------------------------------------------------------- cameras
@@ -504,7 +513,7 @@ class Packer:
                     self._declare_rest()
         except BaseException:
             for stream in self._streams:
-                stream.abandon()  # the caller removes the files
+                stream.abandon()
             raise
         part.transforms = self._transforms.transforms
         return part
@@ -587,7 +596,6 @@ class Packer:
                 self.part.streams.append(stream.finish())
             else:
                 stream.abandon()
-                stream.video_path.unlink(missing_ok=True)
 
     def _declare_rest(self) -> None:
         """Keep what the recording declares besides its messages."""

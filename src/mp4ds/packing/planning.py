@@ -28,26 +28,28 @@ from mp4ds.files.sources import SourceState
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import MANIFEST_NAME, load_about
-from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.encodings import ENCODINGS, Encoding
 from mp4ds.messages.layouts import layout_for
 from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.calibrations import find_pairs
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey, depends_on_others
 from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools
 from mp4ds.packing.options import ImageFolder, PackOptions
-from mp4ds.packing.tracks import TrackPlan, WindowCoder
+from mp4ds.packing.tracks import TrackPlan
+from mp4ds.packing.windows import WindowCoder
 from mp4ds.processes import available_cores
 from mp4ds.records import EVERYTHING, Channel, Excerpt, Message
 from mp4ds.video.codecs import (
     AV1,
     DEFAULT_LOSSY,
+    LOSSY_GOP,
     PURPOSE_PRESET,
     fastest_preset,
     lossless_codecs,
     recipe_for,
     visual_setting,
 )
-from mp4ds.video.encoder import Coding, choose
+from mp4ds.video.encoder import Coding, choose, choose_predicted
 
 # ---------------------------------------------------------------- one kind of images
 
@@ -61,6 +63,8 @@ _MAX_LOOKS = 64
 _KEPT_JPEG = "JPEG files are kept as they are; --transcode re-encodes them"
 _MANY = 6  # files, after which any number may follow
 _STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
+_LARGER = 1.05
+"""How much larger than without a view images may become by having one."""
 _NEGLIGIBLE = 1 / 50
 """Share of the raw size below which a video is kept even if zstd would be smaller."""
 
@@ -114,7 +118,7 @@ def decide(
         elif options.is_fast:
             plans = [_fast_plan(first.key, options)]
         else:
-            plans = _lossless_plans(samples, options, threads, known)
+            plans = _lossless_plans(samples, options, threads, rate, known)
         return Decision(first.key, plans)
     except Refused as reason:
         return Decision(first.key, refusal=str(reason))
@@ -163,17 +167,19 @@ def _lossy_plans(
     )
     coding = Coding(layout, recipe, options.group_frames)
     if target is None:
-        return [TrackPlan(coding, str(quality))]
+        return [TrackPlan(coding, profile=str(quality))]
     coder = WindowCoder(coding, (key.width, key.height), target, threads, rate)
     is_jpeg = key.body == "jpeg"
     try:
-        plan = TrackPlan(coding.with_crf(coder.start_crf(samples)), str(target), target)
+        plan = TrackPlan(
+            coding.with_crf(coder.start_crf(samples)), profile=str(target), target=target
+        )
     except EncoderRefusedError as error:
         raise Refused(str(error)) from None
     except Refused as reason:
         if is_jpeg:  # which is smaller than any lossless video of its pixels
             raise
-        return _lossless_plans(samples, options, threads, note=f"kept lossless: {reason}")
+        return _lossless_plans(samples, options, threads, rate, note=f"kept lossless: {reason}")
     # for images that cannot reach it
     return [plan] if is_jpeg else [plan, _general_plan(key, options)]
 
@@ -192,6 +198,7 @@ def _lossless_plans(
     samples: Sequence[CameraMessage],
     options: PackOptions,
     threads: int,
+    rate: float | None,
     known: Collection[str] = (),
     note: str = "",
 ) -> list[TrackPlan]:
@@ -220,13 +227,37 @@ def _lossless_plans(
             note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
     except EncoderRefusedError as error:
         raise Refused(str(error)) from None
+    plan = TrackPlan(best, note=note)
+    view = _view_coding(encoding, options, rate)
+    if view is not None:
+        with suppress(OptionError, EncoderRefusedError):
+            both = choose_predicted(
+                pixels,
+                encoding,
+                view,
+                gop=options.group_frames,
+                threads=threads,
+                codec=codec,
+                preset=options.preset if codec else None,
+            )
+            if both.bytes_per_frame <= _LARGER * best.bytes_per_frame:
+                best, plan = both, TrackPlan(both, view, note=note)
     _refuse_noise(samples, best.bytes_per_frame)
     if codec is None:
         _refuse_few(samples, best.bytes_per_frame)
-    plan = TrackPlan(best, note=note)
     if best.layout.name == encoding.general:
         return [plan]
     return [plan, _general_plan(samples[0].key, options)]
+
+
+def _view_coding(encoding: Encoding, options: PackOptions, rate: float | None) -> Coding | None:
+    """How the view of lossless images is encoded: as `visual` ones are; None without a view."""
+    if encoding.lossy is None:
+        return None
+    crf, preset = visual_setting(rate)
+    layout = layout_for(encoding, lossless=False)
+    recipe = recipe_for(layout.pixel_format, lossless=False, crf=crf, preset=str(preset))
+    return Coding(layout, recipe, LOSSY_GOP)
 
 
 def _fast_plan(key: StreamKey, options: PackOptions) -> TrackPlan:

@@ -1,20 +1,17 @@
 """What a stream's video is made from: pictures encoded here, or copied packets.
 
-Pictures may have to reach a score. Then a window of them is kept on disk as planes, encoded,
-decoded and scored, and encoded again with a lower crf until it is good enough.
+Pictures of a stream with a view are the differences of its images to what the view shows.
 """
 
 from __future__ import annotations
 
 import shutil
-import tempfile
 from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from math import ceil
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,25 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.errors import EncoderRefusedError, Refused
-from mp4ds.format.models import SCORE_STEPS, Color, LayoutParameters
+from mp4ds.format.models import Color, LayoutParameters
 from mp4ds.format.models import Quality as Measured
-from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.encodings import ENCODINGS, Pixels, difference, native
 from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage
-from mp4ds.times import TIMESCALE
+from mp4ds.packing.windows import WindowCoder, out_of_reach, window_frames
 from mp4ds.video.codecs import (
-    LEAST_CRF,
     LOSSLESS,
-    MAX_CRF,
     QualityTarget,
     Recipe,
     lossless_codecs,
     recipe_for,
 )
-from mp4ds.video.encoder import Coding, VideoEncoder, coded_size
+from mp4ds.video.encoder import Coding, Predictor, VideoEncoder
 from mp4ds.video.packets import PacketWriter, join_segments
-from mp4ds.video.pixels import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
-from mp4ds.video.scores import SMALLEST, Ffmpeg, find_ffmpeg, scores_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +42,15 @@ class TrackPlan:
 
     Attributes:
         coding: How its pictures are encoded; None to copy packets.
+        view: How those of a view are, whose images the pictures are the differences to; None
+            without a view.
         profile: The profile in its sidecar.
         target: The score that its pictures have to reach, if there is one.
         note: What the user should know about it; empty if nothing.
     """
 
     coding: Coding | None = None
+    view: Coding | None = None
     profile: str = LOSSLESS
     target: QualityTarget | None = None
     note: str = ""
@@ -67,7 +63,8 @@ class TrackPlan:
     @property
     def text(self) -> str:
         """All that decides about the video, in words."""
-        return self.coding.text if self.coding else "copied"
+        own = self.coding.text if self.coding else "copied"
+        return f"{own}, view {self.view.text}" if self.view else own
 
 
 class Track(ABC):
@@ -75,9 +72,11 @@ class Track(ABC):
 
     Attributes:
         note: What the user should know about it; empty if nothing.
+        view: The track of the view, where there is one; written with this one.
     """
 
     note: str
+    view: Track | None = None
 
     @abstractmethod
     def refuses(self, seen: CameraMessage) -> str | None:
@@ -115,13 +114,19 @@ class Track(ABC):
 
 
 def open_track(
-    plan: TrackPlan, path: Path, seen: CameraMessage, threads: int, rate: float | None
+    plan: TrackPlan,
+    path: Path,
+    view_path: Path,
+    seen: CameraMessage,
+    threads: int,
+    rate: float | None,
 ) -> Track:
     """Begin a video.
 
     Args:
         plan: How to make it.
         path: The file.
+        view_path: That of the view, if there is one.
         seen: The first message.
         threads: Of an encoder.
         rate: Frames per second, where known.
@@ -132,6 +137,8 @@ def open_track(
     if plan.coding is None:
         return _CopiedTrack(path, seen, rate, plan.note)
     size = seen.key.width, seen.key.height
+    if plan.view is not None:
+        return _PredictedTrack(path, view_path, plan, seen, threads, rate)
     if plan.target is None:
         return _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
     coder = WindowCoder(plan.coding, size, plan.target, threads, rate)
@@ -235,6 +242,7 @@ class _EncodedTrack(_PictureTrack):
         threads: int,
         rate: float | None,
         note: str,
+        coded: Callable[[bytes], None] | None = None,
     ) -> None:
         layout = coding.layout
         width, height = layout.picture_size(*size)
@@ -250,6 +258,7 @@ class _EncodedTrack(_PictureTrack):
                     gop=coding.gop,
                     threads=threads,
                     rate=rate,
+                    coded=coded,
                 )
             except EncoderRefusedError as error:
                 path.unlink(missing_ok=True)
@@ -258,20 +267,96 @@ class _EncodedTrack(_PictureTrack):
             self.coding = replace(coding, recipe=recipe)
             self.size = self._encoder.width, self._encoder.height
             self.options = self._encoder.options
-            coded = f"coded as {recipe.codec}: {refusals[0]}" if refusals else ""
-            self.note = "; ".join(filter(None, (note, coded)))
+            other = f"coded as {recipe.codec}: {refusals[0]}" if refusals else ""
+            self.note = "; ".join(filter(None, (note, other)))
             return
         raise Refused(refusals[0])
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         if seen.pixels is not None:
-            self._encoder.write(self.coding.layout.to_picture(seen.pixels), tick)
+            self.encode(seen.pixels, tick)
+
+    def encode(self, pixels: Pixels, tick: int) -> None:
+        """Encode an image."""
+        self._encoder.write(self.coding.layout.to_picture(pixels), tick)
+
+    @property
+    def configuration(self) -> bytes:
+        """What a decoder needs besides the packets."""
+        return self._encoder.configuration
 
     def close(self) -> None:
         self._encoder.close()
 
     def abandon(self) -> None:
         self._encoder.abandon()
+
+
+class _PredictedTrack(Track):
+    """Differences of images to those of a view, which is encoded first.
+
+    The images wait for their view: an encoder may look ahead with as many, and holds them too.
+    """
+
+    view: _EncodedTrack
+
+    def __init__(
+        self,
+        path: Path,
+        view_path: Path,
+        plan: TrackPlan,
+        seen: CameraMessage,
+        threads: int,
+        rate: float | None,
+    ) -> None:
+        if plan.coding is None or plan.view is None:
+            raise ValueError("a plan without a view")
+        size = seen.key.width, seen.key.height
+        self._bits = plan.view.layout.used_bits
+        self._own = _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
+        try:
+            self.view = _EncodedTrack(
+                view_path, plan.view, size, threads, rate, "", coded=self._follow
+            )
+        except BaseException:
+            self._own.abandon()
+            path.unlink(missing_ok=True)
+            raise
+        self.note = self._own.note
+        self._predictor = Predictor(plan.view, size, self.view.configuration)
+        self._waiting: deque[tuple[Pixels, int]] = deque()
+
+    def refuses(self, seen: CameraMessage) -> str | None:
+        return self.view.refuses(seen)
+
+    def write(self, seen: CameraMessage, tick: int) -> None:
+        if seen.pixels is not None:
+            pixels = native(seen.pixels).copy()  # the message may be gone when its turn comes
+            self._waiting.append((pixels, tick))
+            self.view.encode(pixels, tick)
+
+    def _follow(self, packet: bytes | None) -> None:
+        for prediction in self._predictor.images(packet):
+            pixels, tick = self._waiting.popleft()
+            self._own.encode(difference(pixels, prediction, self._bits), tick)
+
+    def close(self) -> None:
+        try:
+            self.view.close()
+            self._follow(None)
+        except BaseException:
+            self._own.abandon()
+            raise
+        self._own.close()
+        if self._waiting:
+            raise RuntimeError(f"{len(self._waiting)} frames of {self.view} were not decoded")
+
+    def abandon(self) -> None:
+        self.view.abandon()
+        self._own.abandon()
+
+    def describe(self) -> dict[str, Any]:
+        return {**self._own.describe(), "color": None}
 
 
 def _recipes(coding: Coding) -> Iterator[Recipe]:
@@ -284,322 +369,6 @@ def _recipes(coding: Coding) -> Iterator[Recipe]:
 
 
 # ---------------------------------------------------------------- aimed at a score
-
-FALLS = {"vmaf": 0.3, "psnr": 0.4, "ssim": 0.001}
-"""Metric -> about how much it drops per crf step, near typical targets."""
-
-_MOST_UP = 8  # maximum crf increase from one window to the next
-_RANGE = 4  # factor by which the fall of scores may differ from the assumed one
-# of the tolerance: a window that exceeds the target by more is re-encoded with fewer bits
-_LAVISH = 0.5
-_MOST_TRIMS = 2  # times
-# of a stream's first images, which are few: the search for its first crf
-_MOST_TRIMS_OF_FIRST = 5
-_NOISE = 1e-9  # of sums of floats
-
-
-class CrfControl:
-    """Chooses the crf of each window in turn.
-
-    The mean of all frames never falls below the target, nor that of a window by more than the
-    tolerance: the surplus of earlier windows can be used by later ones. Nor is a window much better
-    than required, if a second try with fewer bits can avoid it.
-
-    Args:
-        start: The crf of the first window.
-        smallest: The smallest allowed.
-        largest: The largest allowed.
-        tolerance: How far below the target the mean of a window may be.
-        fall: About how much a score drops per crf step.
-        most_trims: How many tries there are at most where one with fewer bits may do.
-    """
-
-    def __init__(
-        self,
-        start: int,
-        smallest: int,
-        largest: int,
-        tolerance: float,
-        fall: float,
-        most_trims: int = _MOST_TRIMS,
-    ) -> None:
-        self._most_trims = most_trims
-        self.crf = start
-        self._smallest, self._largest = smallest, largest
-        self._tolerance = tolerance
-        self._assumed = self._fall = fall
-        self._surplus = 0.0  # over all frames
-
-    def accepted(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        """The largest crf of those tried that is good enough; None if none is.
-
-        Args:
-            tried: Crf -> the mean score of the window's frames.
-            due: The required score.
-            frames: Number of its frames.
-        """
-        least = self._least(due, frames) - _NOISE
-        return max((crf for crf, mean in tried.items() if mean >= least), default=None)
-
-    def next(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        """The crf to re-encode a window with; None if no further try is needed.
-
-        Args:
-            tried: Crf -> the mean score of the window, in the order they were tried.
-            due: The required score.
-            frames: Number of its frames.
-        """
-        self._learn(tried)
-        best = self.accepted(tried, due, frames)
-        if best is None:
-            return self._better(tried, due, frames)
-        is_lavish = tried[best] - due > _LAVISH * self._tolerance
-        return self._smaller(tried, best, due) if is_lavish else None
-
-    def keep(self, tried: Mapping[int, float], crf: int, due: float, frames: int) -> None:
-        """Accept a window as encoded with a crf, and choose the crf of the next one.
-
-        Args:
-            tried: Crf -> the mean score of the window.
-            crf: The one accepted.
-            due: The required score.
-            frames: Number of its frames.
-        """
-        mean = tried[crf]
-        self._surplus = max(0.0, self._surplus + (mean - due) * frames)
-        room = (due - self._least(due, frames)) / 2  # keep half in reserve
-        up = int((mean - due + room) / self._fall)
-        self.crf = min(crf + min(max(up, 0), _MOST_UP), self._largest)
-
-    def _least(self, due: float, frames: int) -> float:
-        return due - min(self._tolerance, self._surplus / frames)
-
-    def _better(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        crf, mean = min(tried.items())
-        if crf == self._smallest:
-            return None
-        short = self._least(due, frames) - mean
-        # doubled each time: a scene whose scores do not rise comes to an end soon; but a half
-        # at the most, as small crf differ more
-        step = max(ceil(short / self._fall), 1 << (len(tried) - 1))
-        return max(self._smallest, crf // 2, crf - step)
-
-    def _smaller(self, tried: Mapping[int, float], best: int, due: float) -> int | None:
-        if len(tried) > self._most_trims:
-            return None
-        refused = min((crf for crf in tried if crf > best), default=self._largest + 1)
-        crf = min(best + int((tried[best] - due) / self._fall), refused - 1)
-        return crf if crf > best else None
-
-    def _learn(self, tried: Mapping[int, float]) -> None:
-        if len(tried) > 1:
-            (crf, mean), (other, its_mean) = list(tried.items())[-2:]
-            found = (its_mean - mean) / (crf - other)
-            self._fall = min(max(found, self._assumed / _RANGE), self._assumed * _RANGE)
-
-
-# ---------------------------------------------------------------- windows
-
-_FRAMES = 60  # of a window, or one group of pictures if that is longer
-_MOST_FRAMES = 240
-_USUAL_RATE = 30.0
-
-
-def window_frames(gop: int) -> int:
-    """Frames of a window: whole groups of pictures, so that windows cost no more key frames.
-
-    Args:
-        gop: Maximum key frame interval, frames.
-    """
-    return min(max(1, _FRAMES // gop) * gop, _MOST_FRAMES)
-
-
-@dataclass
-class Tries:
-    """The encodings of a window.
-
-    Attributes:
-        due: The score required of it.
-        scores: Crf -> the scores of its frames, in steps of the metric.
-        means: Crf -> their mean, in the order of the tries.
-    """
-
-    due: float
-    scores: dict[int, NDArray[np.int64]] = field(default_factory=dict)
-    means: dict[int, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class WindowCoder:
-    """Encodes and scores windows.
-
-    Attributes:
-        coding: How images are encoded; the crf varies.
-        size: Columns and rows of an image.
-        target: The target, whose metric is measured.
-        threads: Of the encoder, and of libvmaf.
-        rate: Frames per second, if known.
-    """
-
-    coding: Coding
-    size: tuple[int, int]
-    target: QualityTarget
-    threads: int
-    rate: float | None
-
-    @cached_property
-    def coded_size(self) -> tuple[int, int]:
-        """Columns and rows of a coded picture."""
-        return coded_size(self.coding.recipe, *self.coding.layout.picture_size(*self.size))
-
-    @cached_property
-    def ffmpeg(self) -> Ffmpeg | None:
-        """The ffmpeg that computes VMAF, if that is the metric.
-
-        Raises:
-            ScoringError: There is none; says how to get one.
-        """
-        return find_ffmpeg() if self.target.metric == "vmaf" else None
-
-    @cached_property
-    def _maker(self) -> PlaneMaker:
-        return PlaneMaker(self.coding.layout.pixel_format)
-
-    def spool(self, path: Path) -> PlaneSpool:
-        """Keeps planes in a file."""
-        return PlaneSpool(path, *self.coded_size)
-
-    def keep(self, seen: CameraMessage, spool: PlaneSpool) -> None:
-        """Add the planes of an image to a spool."""
-        if seen.pixels is not None:
-            spool.append(self._maker.make(self.coding.layout.to_picture(seen.pixels)))
-
-    def encode(
-        self, frames: PlaneSpool, ticks: Sequence[int], crf: int, path: Path
-    ) -> NDArray[np.int64]:
-        """Encode a window.
-
-        Args:
-            frames: The window's frames, at least one.
-            ticks: When each is shown, increasing.
-            crf: Constant rate factor.
-            path: The video to make.
-
-        Returns:
-            The scores of its frames, in steps of the metric (`SCORE_STEPS`).
-
-        Raises:
-            EncoderRefusedError: The encoder does not support such pictures.
-            ScoringError: libvmaf failed.
-            OSError: It cannot be written.
-        """
-        width, height = self.coded_size
-        with VideoEncoder(
-            path,
-            self.coding.with_crf(crf).recipe,
-            picture_format=PLANES_FORMAT,
-            width=width,
-            height=height,
-            gop=self.coding.gop,
-            threads=self.threads,
-            rate=self.rate,
-        ) as encoder:
-            for planes, tick in zip(frames, ticks, strict=True):
-                encoder.write(planes, tick - ticks[0])
-        return self._scores(frames, decoded_planes(path))
-
-    def start_crf(self, samples: Sequence[CameraMessage]) -> int:
-        """The crf at which the first images of a stream reach the score.
-
-        Raises:
-            Refused: No crf reaches it.
-        """
-        target, control = self.target, self.control(_MOST_TRIMS_OF_FIRST)
-        if min(self.coded_size) < SMALLEST:
-            raise Refused(f"images with less than {SMALLEST} rows or columns have no {target}")
-        step = round(TIMESCALE / (self.rate or _USUAL_RATE)) or 1
-        with (
-            tempfile.TemporaryDirectory(prefix="mp4ds-") as name,
-            closing(self.spool(Path(name, "frames.yuv"))) as spool,
-        ):
-            for seen in samples:
-                self.keep(seen, spool)
-            ticks = range(0, len(spool) * step, step)
-            tries = self.tries(control, spool, ticks, lambda _: Path(name, "sample.mp4"))
-        crf = control.accepted(tries.means, tries.due, len(samples))
-        if crf is None:
-            crf, mean = min(tries.means.items())
-            # a few frames have less VMAF than many, compared with their originals too: where they
-            # fall a little short, the first window tells
-            if mean < tries.due - target.tolerance:
-                raise out_of_reach(target, tries.due, f"crf {crf} gives {mean:.2f}")
-        return crf
-
-    def control(self, most_trims: int = _MOST_TRIMS) -> CrfControl:
-        """What chooses the crf of windows."""
-        codec, target = self.coding.recipe.codec, self.target
-        bounds = LEAST_CRF[codec], MAX_CRF[codec]
-        fall = FALLS[target.metric]
-        return CrfControl(self.coding.crf, *bounds, target.tolerance, fall, most_trims)
-
-    def tries(
-        self,
-        control: CrfControl,
-        frames: PlaneSpool,
-        ticks: Sequence[int],
-        place: Callable[[int], Path],
-    ) -> Tries:
-        """Encode a window until it is good enough, or no crf is.
-
-        Args:
-            control: Chooses each crf.
-            frames: As for `encode`.
-            ticks: As for `encode`.
-            place: The video to make with a crf.
-        """
-        tries = Tries(self.target.score)
-        crf: int | None = control.crf
-        while crf is not None:
-            scores = self.encode(frames, ticks, crf, place(crf))
-            tries.scores[crf], tries.means[crf] = scores, self.mean(scores)
-            is_first = len(tries.means) == 1
-            if is_first and control.accepted(tries.means, tries.due, len(frames)) is None:
-                tries.due = self.reachable(frames)
-            crf = control.next(tries.means, tries.due, len(frames))
-        return tries
-
-    def reachable(self, frames: PlaneSpool) -> float:
-        """The score required of a window: the target, or less if it is out of reach.
-
-        VMAF underrates still scenes, even compared with themselves.
-
-        Raises:
-            ScoringError: libvmaf failed.
-        """
-        target = self.target
-        if target.metric != "vmaf":
-            return target.score
-        ceiling = self.mean(self._scores(frames, frames))
-        return min(target.score, ceiling - target.tolerance)
-
-    def mean(self, scores: NDArray[np.int64]) -> float:
-        """The mean of scores given in steps."""
-        return float(np.mean(scores)) / SCORE_STEPS[self.target.metric]
-
-    def _scores(self, frames: PlaneSpool, decoded: Iterable[Planes]) -> NDArray[np.int64]:
-        metric = "psnr_y" if self.target.metric == "psnr" else self.target.metric
-        # motion in the first frame is measured with the second
-        before = frames.frame(1) if self.ffmpeg is not None and len(frames) > 1 else None
-        found = scores_of(
-            frames, decoded, [metric], ffmpeg=self.ffmpeg, threads=self.threads, before=before
-        )[metric]
-        return np.rint(found * SCORE_STEPS[self.target.metric]).astype(np.int64)
-
-
-def out_of_reach(target: QualityTarget, due: float, made: str) -> Refused:
-    """Why a stream is lossless: the target, the required score, and the one reached."""
-    limit = f" of the {due:.2f} that the originals allow" if due < target.score else ""
-    return Refused(f"{target} is out of reach: {made}{limit}")
 
 
 class _ScoredTrack(_PictureTrack):

@@ -171,7 +171,7 @@ def _reading_speed(dataset: Dataset, topic: str) -> ReadingSpeed:
         pass
     in_order = (time.perf_counter() - begun) / count
     frames.close()
-    size = stream.video_path.stat().st_size / len(stream)
+    size = sum(path.stat().st_size for path, _ in stream.videos) / len(stream)
     return ReadingSpeed(topic, size, 1e3 * statistics.median(times), 1e3 * in_order)
 
 
@@ -251,7 +251,7 @@ def _dataset_info(dataset: Dataset) -> Info:
     files = (
         [dataset.path / entry.name for entry in manifest.files]
         if manifest
-        else [stream.video_path for stream in dataset.streams]
+        else [path for stream in dataset.streams for path, _ in stream.videos]
     )
     return _spanned(
         Info(
@@ -300,6 +300,8 @@ def notes_of(dataset: Dataset) -> list[str]:
         notes += [f"lost when packed: {loss.file}: {loss.problem}" for loss in manifest.losses]
         if manifest.topics_left_out:
             notes.append(f"left out when packed: {', '.join(manifest.topics_left_out)}")
+    if absence := dataset.absence():
+        notes.append(f"{absence}; frames are those of the views")
     sidecars = [(stream.topic, stream.sidecar) for stream in dataset.streams]
     notes += [f"{topic}: {it.video.quality}" for topic, it in sidecars if it.video.quality]
     if any(sidecar.stamps == "record-float" for _, sidecar in sidecars):
@@ -313,8 +315,9 @@ def _add_stream(by_topic: dict[str, TopicInfo], stream: Stream) -> None:
     image = f"{sidecar.image.encoding} {sidecar.image.width}x{sidecar.image.height}"
     item.content = ", ".join(filter(None, (item.content, image)))
     stored = f"{sidecar.video.codec} {sidecar.profile}: {sidecar.video.file}"
-    item.stored = ", ".join(filter(None, (item.stored, stored)))
-    files = [file for file in (stream.video_path, stream.path) if file.is_file()]
+    view = f"view: {sidecar.view.file}" if sidecar.view else ""
+    item.stored = ", ".join(filter(None, (item.stored, stored, view)))
+    files = [path for path in stream.files if path.is_file()]
     item.bytes = (item.bytes or 0) + sum(file.stat().st_size for file in files)
     info_model = sidecar.camera_info
     if info_model and info_model.calibrations:

@@ -317,7 +317,7 @@ class TorchcodecReader:
         self._path = topic.parts[0].video_path
         for stream in topic.streams:
             _check_layout(stream)
-            if stream.hidden_frames:
+            if stream.hides_frames:
                 raise OptionError(
                     f"topic {stream.topic}: torchcodec returns wrong frames at the beginning of a "
                     "video cut out of another. Use backend='mp4ds', or a dataset packed with a "

@@ -521,7 +521,7 @@ def _check_video(stream: Stream, form: ImageForm) -> None:
         raise Refused(
             f"its video does not show the images as they look (layout {sidecar.layout.name})"
         )
-    if stream.hidden_frames:
+    if stream.hides_frames:
         raise Refused("the first packets of the slice depend on packets outside it")
 
 

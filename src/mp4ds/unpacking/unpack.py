@@ -17,6 +17,7 @@ from mp4ds.dataset.dataset import Dataset, Paths, datasets_in
 from mp4ds.dataset.messages import recorded_storage
 from mp4ds.dataset.recording import DatasetReader, slice_of, sliced
 from mp4ds.dataset.salvage import examine, open_damaged, open_selected
+from mp4ds.dataset.stream import Layer
 from mp4ds.errors import (
     ConversionError,
     FormatError,
@@ -43,6 +44,7 @@ from mp4ds.records import (
 from mp4ds.unpacking.image_folders import TopicImages, image_names
 from mp4ds.unpacking.pictures import KINDS, ReductionOptions
 from mp4ds.unpacking.republish import Republished, Republisher, check_kind
+from mp4ds.video.codecs import VISUAL
 
 SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
 """How the default name of an output ends, by what it is unpacked to."""
@@ -57,6 +59,10 @@ class UnpackOptions(SliceOptions, ReductionOptions):
 
     latched: bool = latched()
     salvage: bool = option("Restore what can be read of a damaged dataset.", False, panel=WHAT)
+    quality: str | None = option(
+        "visual: the images of the views of lossless cameras; default: as recorded.",
+        choices=(VISUAL,),
+    )
     storage: str | None = option(
         "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap.",
         choices=("sqlite3", "mcap"),
@@ -226,10 +232,17 @@ def _opened(
 ) -> tuple[Dataset, list[Loss]]:
     """The dataset, and what is lost of it by files that cannot be read."""
     selected, quality = options.selected, options.jpeg_quality
+    layer: Layer | None = "view" if options.quality else None
+    losses: list[Loss] = []
     if options.salvage:
-        return open_damaged(dataset, selected=selected, jpeg_quality=quality)
-    opened = open_selected(dataset, selected, jpeg_quality=quality, verify_messages=verify)
-    return opened, []
+        opened, losses = open_damaged(dataset, selected=selected, layer=layer, jpeg_quality=quality)
+    else:
+        opened = open_selected(
+            dataset, selected, layer=layer, jpeg_quality=quality, verify_messages=verify
+        )
+    if layer is None:
+        opened.require_exact(selected)
+    return opened, losses
 
 
 def _needs_messages(dataset: Dataset, options: UnpackOptions) -> bool:

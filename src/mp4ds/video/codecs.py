@@ -411,6 +411,9 @@ def _sited_left(options: Mapping[str, str]) -> dict[str, str]:
 LOSSLESS = "lossless"
 """The quality at which nothing is lost."""
 
+VISUAL = "visual"
+"""The quality at which nothing is seen to be lost, and that of views."""
+
 MAX_GOP = 100_000
 """Maximum key frame interval that may be asked for, frames."""
 
@@ -486,7 +489,7 @@ def parse_quality(value: str | QualitySetting) -> QualitySetting:
     """
     if isinstance(value, QualitySetting):
         return value
-    if value in (LOSSLESS, "visual"):
+    if value in (LOSSLESS, VISUAL):
         return QualitySetting(value)
     match = re.fullmatch(r"crf=([0-9]{1,2})", value)
     if match and int(match.group(1)) <= 63:

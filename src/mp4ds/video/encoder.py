@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -17,11 +17,11 @@ import numpy as np
 from av.error import FFmpegError
 
 from mp4ds.errors import EncoderRefusedError, OptionError
-from mp4ds.messages.encodings import MAX_SIDE, Encoding, Picture, Pixels
-from mp4ds.messages.layouts import Layout, fit
+from mp4ds.messages.encodings import MAX_SIDE, Encoding, Picture, Pixels, difference
+from mp4ds.messages.layouts import Layout, fit, layout_for
 from mp4ds.video.codecs import CODECS, Purpose, Recipe, codecs_to_try, recipe_for
 from mp4ds.video.media import TIME_BASE, new_mp4, raise_if_scarce, rate_hint
-from mp4ds.video.pixels import PictureConverter, picture_to_frame
+from mp4ds.video.pixels import PictureConverter, PictureMaker, picture_to_frame
 
 _THREADS = Path("/proc/self/task")
 
@@ -80,6 +80,7 @@ class VideoEncoder:
         gop: Maximum distance of key frames, in frames.
         threads: Threads of the encoder.
         rate: Frames per second, if known; a hint for the encoder's look-ahead.
+        coded: Called with each packet, in order.
 
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
@@ -96,8 +97,10 @@ class VideoEncoder:
         gop: int,
         threads: int,
         rate: float | None,
+        coded: Callable[[bytes], None] | None = None,
     ) -> None:
         self.recipe = recipe
+        self._coded = coded
         self.frames = 0
         self._picture_format = picture_format
         # a camera's own YUV keeps its range
@@ -156,6 +159,8 @@ class VideoEncoder:
 
     def _mux(self, packets: Sequence[Any]) -> None:
         for packet in packets:
+            if self._coded:
+                self._coded(bytes(packet))
             self._container.mux(packet)
 
     def _encoded(self, frame: av.VideoFrame | None) -> Sequence[Any]:
@@ -176,6 +181,11 @@ class VideoEncoder:
             self._mux(self._encoded(None))
         finally:
             self._container.close()
+
+    @property
+    def configuration(self) -> bytes:
+        """What a decoder needs besides the packets."""
+        return bytes(self._stream.codec_context.extradata or b"")
 
     def abandon(self) -> None:
         """Close the unfinished file; the caller removes it."""
@@ -333,6 +343,70 @@ class Coded:
         return self.key_seconds + (gop - 1) / 2 * self.other_seconds
 
 
+class Predictor:
+    """What a view shows of each image, decoded from the packets of its encoder.
+
+    Args:
+        coding: How the view is encoded.
+        size: Columns and rows of the images.
+        configuration: Of the encoder.
+    """
+
+    def __init__(self, coding: Coding, size: tuple[int, int], configuration: bytes) -> None:
+        recipe, self._layout = coding.recipe, coding.layout
+        picture_size = self._layout.picture_size(*size)
+        width, height = coded_size(recipe, *picture_size)
+        self._maker = PictureMaker(
+            Path(),
+            coded_size=(width, height),
+            picture_format=self._layout.pixel_format,
+            picture_size=picture_size,
+            matrix=recipe.matrix,
+            full_range=recipe.full_range,
+        )
+        encoding = self._layout.encoding
+        self._shape, self._type = encoding.shape(*size), encoding.dtype
+        context: Any = av.CodecContext.create(CODECS[recipe.codec].decoder, "r")
+        context.width, context.height = width, height
+        context.thread_count = 1
+        if configuration:
+            context.extradata = configuration
+        if recipe.codec == "av1":
+            context.options = {"max_frame_delay": "1"}
+        self._context = context
+
+    def images(self, packet: bytes | None) -> Iterator[Pixels]:
+        """The images that are complete with one more packet; None: those still due at the end."""
+        for frame in self._context.decode(av.Packet(packet) if packet is not None else None):
+            pixels: Pixels = np.empty(self._shape, self._type)
+            self._layout.to_pixels(self._maker.make(frame, 0), pixels)
+            yield pixels
+
+
+def predict_on_trial(
+    samples: Sequence[Pixels], coding: Coding, threads: int
+) -> tuple[Coded, list[Pixels]]:
+    """The cost of a view, and what it shows.
+
+    Args:
+        samples: Pixels of consecutive images, at least one.
+        coding: How it is encoded.
+        threads: Threads of the encoder.
+
+    Raises:
+        EncoderRefusedError: The codec does not take such pictures.
+    """
+    layout, recipe = coding.layout, coding.recipe
+    pictures = list(map(layout.to_picture, samples))
+    context, packets = _encoded(pictures, recipe, layout.pixel_format, threads)
+    rows, columns = samples[0].shape[:2]
+    size = columns, int(rows / layout.encoding.rows)
+    predictor = Predictor(coding, size, bytes(context.extradata or b""))
+    data = [*map(bytes, packets), None]
+    shown = [pixels for packet in data for pixels in predictor.images(packet)]
+    return Coded(*_key_and_others(_sizes(packets, len(samples)))), shown
+
+
 def encode_on_trial(
     pictures: Sequence[Picture],
     recipe: Recipe,
@@ -353,9 +427,31 @@ def encode_on_trial(
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
     """
+    context, packets = _encoded(pictures, recipe, picture_format, threads)
+    seconds = _decoding_seconds(context, packets, CODECS[recipe.codec].ffmpeg) if timed else []
+    sizes = _sizes(packets, len(pictures))
+    return Coded(*_key_and_others(sizes), *(_key_and_others(seconds) if timed else ()))
+
+
+def _sizes(packets: Sequence[Any], frames: int) -> list[int]:
+    """Bytes of each frame."""
+    sizes = [0] * frames
+    for packet in packets:
+        sizes[packet.pts] += packet.size
+    return sizes
+
+
+def _encoded(
+    pictures: Sequence[Picture], recipe: Recipe, picture_format: str, threads: int
+) -> tuple[Any, list[Any]]:
+    """The encoder, and its packets of one group of pictures.
+
+    Raises:
+        EncoderRefusedError: The codec does not take such pictures.
+    """
     rows, columns = pictures[0][0].shape[:2]
     width, height = coded_size(recipe, columns, rows)
-    converter = PictureConverter()
+    converter = PictureConverter(source_full_range=recipe.full_range, full_range=recipe.full_range)
     context: Any = av.CodecContext.create(recipe.encoder, "w")
     context.options = {**recipe.options, "g": str(len(pictures))}
     context.time_base = Fraction(1, 30)
@@ -364,13 +460,18 @@ def encode_on_trial(
     try:
         open_encoder(context, recipe, width, height, threads=threads)
         for number, picture in enumerate(pictures):
-            frame = picture_to_frame(picture, picture_format, recipe.pixel_format, converter)
+            frame = picture_to_frame(
+                picture,
+                picture_format,
+                recipe.pixel_format,
+                converter,
+                full_range=recipe.full_range,
+            )
             frame.pts = number
             frame.time_base = context.time_base
             frame.color_range = color_range(recipe)
             packets += context.encode(frame)
         packets += context.encode(None)
-        seconds = _decoding_seconds(context, packets, CODECS[recipe.codec].ffmpeg) if timed else []
     except MemoryError:
         raise
     except (FFmpegError, ValueError) as error:
@@ -378,10 +479,7 @@ def encode_on_trial(
         raise EncoderRefusedError(
             f"{recipe.encoder} does not take pictures of {columns}x{rows}"
         ) from None
-    sizes = [0] * len(pictures)
-    for packet in packets:
-        sizes[packet.pts] += packet.size
-    return Coded(*_key_and_others(sizes), *(_key_and_others(seconds) if timed else ()))
+    return context, packets
 
 
 def _key_and_others(values: Sequence[float]) -> tuple[float, float]:
@@ -422,6 +520,7 @@ def choose(
     threads: int,
     purpose: Purpose | None = None,
     known: Collection[str] = (),
+    layouts: Sequence[Layout] = (),
 ) -> Coding:
     """The best lossless layout, recipe and distance of key frames, found by trying each.
 
@@ -435,6 +534,7 @@ def choose(
         purpose: What the video is for.
         known: Texts of choices made before, for ``training``, for which times are measured: one of
             these that is allowed is chosen again.
+        layouts: The only ones to try; none: all that can hold the samples.
 
     Returns:
         The first, in the order of the encoding's layouts and their codecs, within 2 % of the
@@ -449,7 +549,7 @@ def choose(
     is_fast = purpose is not None and purpose.is_training
     tried: list[tuple[Coding, Coded]] = []
     refusals: list[Exception] = []
-    for layout in _candidates(samples, encoding):
+    for layout in layouts or _candidates(samples, encoding):
         pictures = [layout.to_picture(pixels) for pixels in crops]
         picture_format = layout.pixel_format
         names = codecs_to_try(picture_format) if codec is None else [codec]
@@ -478,6 +578,34 @@ def choose(
         return _fastest(tried, share, (1 + purpose.larger / 100) * smallest, known)
     near = NEAR if purpose is None else 1.0
     return next(choice for choice, _ in tried if choice.bytes_per_frame <= near * smallest)
+
+
+def choose_predicted(
+    samples: Sequence[Pixels], encoding: Encoding, view: Coding, **options: Any
+) -> Coding:
+    """The best coding of the differences of images to what a view shows.
+
+    Args:
+        samples: As for `choose`.
+        encoding: Of the images.
+        view: How the view is encoded.
+        **options: As for `choose`.
+
+    Returns:
+        As `choose`; `bytes_per_frame` includes the view.
+
+    Raises:
+        OptionError: As for `choose`.
+        EncoderRefusedError: No codec takes such pictures.
+    """
+    crops, share = _crops(samples, encoding)
+    coded, shown = predict_on_trial(crops, view, options["threads"])
+    bits = view.layout.used_bits
+    differences = [difference(*pair, bits) for pair in zip(crops, shown, strict=True)]
+    layouts = [layout_for(encoding, lossless=True)]
+    best = choose(differences, encoding, layouts=layouts, **options)
+    size = best.bytes_per_frame + coded.bytes_per_frame(view.gop)
+    return replace(best, bytes_per_frame=size / share)
 
 
 def _fastest(
