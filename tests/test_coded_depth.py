@@ -17,7 +17,7 @@ from coded_tools import mutations, refusal
 from encoders import rvl, rvl_nibbles, rvl_words
 from mp4ds.errors import Refused
 from mp4ds.messages import png
-from mp4ds.messages.depth import DepthImage, decode_depth, decode_rvl, encode_rvl
+from mp4ds.messages.depth import decode_depth, decode_rvl, encode_rvl
 
 Depth = NDArray[np.uint16]
 
@@ -128,10 +128,8 @@ def room() -> Depth:
     return np.where(rng.random(x.shape) < 0.1, 0, values).astype(np.uint16)
 
 
-def rebuilt(image: DepthImage) -> bytes:
-    if image.recipe is None:
-        return image.header + encode_rvl(image.pixels)
-    return image.header + png.rebuild(image.pixels, image.recipe)
+def rebuilt(header: bytes, pixels: Depth, recipe: png.PngRecipe | None) -> bytes:
+    return header + (encode_rvl(pixels) if recipe is None else png.rebuild(pixels, recipe))
 
 
 @pytest.mark.parametrize(
@@ -163,4 +161,4 @@ def test_images_refused(data: bytes, reason: str) -> None:
 def test_damaged_images_are_refused_or_come_back(body: bytes) -> None:
     for damaged in mutations(HEADER + body, 300):
         if not refusal(decode_depth, damaged):
-            assert rebuilt(decode_depth(damaged)) == damaged
+            assert rebuilt(*decode_depth(damaged)) == damaged

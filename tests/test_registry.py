@@ -18,8 +18,7 @@ from mp4ds.messages.encodings import ENCODINGS, Parameters
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind
 from mp4ds.messages.numbers import SCALES
 from mp4ds.messages.png import RULES, zlib_fingerprint
-from mp4ds.messages.protobuf import FOXGLOVE_TYPES
-from mp4ds.messages.serializations import ROS_TYPES, WIRES
+from mp4ds.messages.serializations import FOXGLOVE_TYPES, ROS_TYPES, WIRES
 from mp4ds.video.codecs import (
     PACKET_CODECS,
     VISUAL_TABLE,

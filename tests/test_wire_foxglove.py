@@ -18,7 +18,7 @@ import mp4ds
 from coded_tools import mutations
 from compare import compare
 from foxglove_wire import SERIALIZATIONS, message_class
-from mp4ds.messages.protobuf import ProtobufForm
+from mp4ds.messages.serializations import ProtobufForm
 from mp4ds.messages.wire import (
     MAX_BLANK,
     CalibrationFields,

@@ -38,7 +38,7 @@ from mp4ds.bags.types import (
     version_of,
 )
 from mp4ds.errors import ConversionError, OptionError, Refused
-from mp4ds.messages.protobuf import decoder_of_schema
+from mp4ds.messages.serializations import decoder_of_schema
 from mp4ds.messages.wire import WireError
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -211,22 +210,9 @@ def metres_of(pixels: NDArray[Any], header: bytes = b"") -> NDArray[np.float32]:
     return made
 
 
-@dataclass(frozen=True, slots=True)
-class DepthImage:
-    """A compressedDepth image, unpacked.
-
-    Attributes:
-        header: Twelve bytes, or none where an image stands without a header.
-        pixels: uint16 array of shape (H, W), the values as they are coded.
-        recipe: How the PNG is made again; None for RVL.
-    """
-
-    header: bytes
-    pixels: NDArray[np.uint16]
-    recipe: png.PngRecipe | None
-
-
-def decode_depth(data: bytes | memoryview, hint: png.PngRecipe | None = None) -> DepthImage:
+def decode_depth(
+    data: bytes | memoryview, hint: png.PngRecipe | None = None
+) -> tuple[bytes, Depth, png.PngRecipe | None]:
     """Unpack the data of a message whose bytes can be made again, which is tried.
 
     Whether it is PNG or RVL is told by the content: formats such as ``16UC1; compressedDepth``
@@ -235,6 +221,10 @@ def decode_depth(data: bytes | memoryview, hint: png.PngRecipe | None = None) ->
     Args:
         data: The message's data.
         hint: Recipe of another image of the same topic.
+
+    Returns:
+        The header of twelve bytes, or none where an image stands without one; the values as they
+        are coded, shape (H, W); and how the PNG is made again, None for RVL.
 
     Raises:
         Refused: It is neither, damaged, not of 16 bits, or does not rebuild.
@@ -246,8 +236,8 @@ def decode_depth(data: bytes | memoryview, hint: png.PngRecipe | None = None) ->
         pixels, recipe = png.decode(body, hint)
         if pixels.dtype != np.uint16 or pixels.ndim != 2:
             raise Refused("its depth image is not grey with 16 bits")
-        return DepthImage(header, pixels.astype(np.uint16, copy=False), recipe)
+        return header, pixels.astype(np.uint16, copy=False), recipe
     depth = decode_rvl(body)
     if encode_rvl(depth) != body:
         raise Refused("its RVL does not rebuild byte for byte")
-    return DepthImage(header, depth, None)
+    return header, depth, None

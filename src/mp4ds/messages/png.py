@@ -342,15 +342,6 @@ class PngRecipe:
     after: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Parts:
-    info: PngInfo
-    before: bytes
-    deflated: bytes
-    chunk_bytes: int
-    after: bytes
-
-
 def zlib_build() -> str:
     """The version of the zlib in use, which may name another implementation."""
     return zlib.ZLIB_RUNTIME_VERSION
@@ -402,8 +393,8 @@ def pixels_of(data: bytes | memoryview) -> Pixels:
     Raises:
         Refused: It is incomplete, or of an unsupported kind.
     """
-    parts = _split(data)
-    return _to_pixels(unfilter(_inflate(parts), parts.info.pixel_bytes), parts.info)
+    info, _, deflated, _, _ = _split(data)
+    return _to_pixels(unfilter(_inflate(deflated, info), info.pixel_bytes), info)
 
 
 def decode(data: bytes | memoryview, hint: PngRecipe | None = None) -> tuple[Pixels, PngRecipe]:
@@ -420,28 +411,31 @@ def decode(data: bytes | memoryview, hint: PngRecipe | None = None) -> tuple[Pix
     Raises:
         Refused: It is incomplete, of an unsupported kind, or cannot be rebuilt.
     """
-    parts = _split(data)
-    info = parts.info
-    rows = _inflate(parts)
+    info, first, deflated, chunk_bytes, last = _split(data)
+    rows = _inflate(deflated, info)
     pixel_rows = unfilter(rows, info.pixel_bytes)
     pixels = _to_pixels(pixel_rows, info)
-    before, after = (base64.b64encode(part).decode() for part in (parts.before, parts.after))
+    before, after = (base64.b64encode(part).decode() for part in (first, last))
     if hint is not None:
         recipe = replace(hint, before=before, after=after)
-        if _holds(parts, recipe) and rebuild(pixels, recipe) == data:
+        # what need not be computed comes first
+        is_alike = recipe.zlib_header == deflated[:2].hex() and (
+            not chunk_bytes or recipe.chunk_bytes == chunk_bytes
+        )
+        if is_alike and rebuild(pixels, recipe) == data:
             return pixels, recipe
     rule = find_rule(rows[:, 0], pixel_rows, info.pixel_bytes)
     if rule is None:
         raise Refused(f"{_NO_REBUILD}: its filters follow no known rule")
-    for level, strategy, memory_level, window_bits in _codings(parts.deflated, rows):
+    for level, strategy, memory_level, window_bits in _codings(deflated, rows):
         recipe = PngRecipe(
             filters=rule,
             level=level,
             strategy=strategy,
             memory_level=memory_level,
             window_bits=window_bits,
-            zlib_header=parts.deflated[:2].hex(),
-            chunk_bytes=parts.chunk_bytes,
+            zlib_header=deflated[:2].hex(),
+            chunk_bytes=chunk_bytes,
             before=before,
             after=after,
         )
@@ -505,8 +499,13 @@ def _chunk(body: bytes) -> bytes:
     )
 
 
-def _split(data: bytes | memoryview) -> _Parts:
-    """Split a PNG around its image data."""
+def _split(data: bytes | memoryview) -> tuple[PngInfo, bytes, bytes, int, bytes]:
+    """Split a PNG.
+
+    Returns:
+        Its header; the chunks before its image data; these, joined; bytes of their chunks, 0 for
+        one; and what follows them.
+    """
     info = parse(data)
     if info.color_type == _PALETTE or info.bit_depth not in (8, 16):
         raise Refused(f"its PNG has a palette, or {info.bit_depth} bits a sample")
@@ -531,9 +530,7 @@ def _split(data: bytes | memoryview) -> _Parts:
         raise Refused("its PNG holds no image data")
     if start - 33 > _MAX_AROUND or len(data) - end > _MAX_AROUND:
         raise Refused(f"its PNG has more than {_MAX_AROUND} bytes besides the image")
-    return _Parts(
-        info, bytes(view[33:start]), b"".join(parts), _chunk_rule(sizes), bytes(view[end:])
-    )
+    return info, bytes(view[33:start]), b"".join(parts), _chunk_rule(sizes), bytes(view[end:])
 
 
 def _chunks(data: memoryview, offset: int) -> Iterator[tuple[bytes, int, int]]:
@@ -561,16 +558,15 @@ def _chunk_rule(sizes: list[int]) -> int:
     return size
 
 
-def _inflate(parts: _Parts) -> NDArray[np.uint8]:
+def _inflate(deflated: bytes, info: PngInfo) -> NDArray[np.uint8]:
     """The filtered rows, shape (H, 1 + bytes of a row); never more than the header declares."""
-    info = parts.info
     row_bytes = 1 + info.width * info.pixel_bytes
     size = row_bytes * info.height
-    if size > MAX_IMAGE_BYTES or size > _MAX_RATIO * (len(parts.deflated) + 1):
+    if size > MAX_IMAGE_BYTES or size > _MAX_RATIO * (len(deflated) + 1):
         raise Refused(f"its PNG promises {size} bytes of pixels, which it cannot hold")
     inflater = zlib.decompressobj()
     try:
-        rows = inflater.decompress(parts.deflated, size + 1)
+        rows = inflater.decompress(deflated, size + 1)
     except zlib.error:
         raise Refused("its PNG's image data are damaged") from None
     if len(rows) != size or not inflater.eof or inflater.unused_data:
@@ -584,12 +580,6 @@ def _to_pixels(rows: NDArray[np.uint8], info: PngInfo) -> Pixels:
     if info.bit_depth == 8:
         return rows.reshape(shape)
     return rows.view(">u2").astype(np.uint16).reshape(shape)
-
-
-def _holds(parts: _Parts, recipe: PngRecipe) -> bool:
-    """Whether a recipe matches what need not be computed."""
-    same_chunks = recipe.chunk_bytes == parts.chunk_bytes or not parts.chunk_bytes
-    return same_chunks and recipe.zlib_header == parts.deflated[:2].hex()
 
 
 def _codings(deflated: bytes, rows: NDArray[np.uint8]) -> Iterator[tuple[int, int, int, int]]:

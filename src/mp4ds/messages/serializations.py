@@ -1,19 +1,20 @@
-"""The serializations of camera messages; that of ROS 1 and ROS 2's CDR are here.
+"""The serializations of camera messages: ROS 1, ROS 2's CDR, and Foxglove's in protobuf.
 
-The two differ in order, alignment and header. ROS 1: little-endian, unaligned, header with seq,
-strings without NUL (wiki.ros.org/msg, "Fields"). CDR: a four-byte encapsulation, primitives
-aligned to their size from there, strings with NUL (OMG DDSI-RTPS 2.5, 10; plain CDR only).
+The first two differ in order, alignment and header. ROS 1: little-endian, unaligned, header with
+seq, strings without NUL (wiki.ros.org/msg, "Fields"). CDR: a four-byte encapsulation, primitives
+aligned to their size from there, strings with NUL (OMG DDSI-RTPS 2.5, 10; plain CDR only). Messages
+in protobuf are read by the field numbers of the recorded schema.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Literal
 
 from mp4ds.errors import Refused
-from mp4ds.messages.protobuf import FOXGLOVE_TYPES, ProtobufForm
 from mp4ds.messages.wire import (
+    MAX_BLANK,
     MAX_DISTORTION,
     NS,
     CalibrationFields,
@@ -30,28 +31,15 @@ from mp4ds.messages.wire import (
     WireError,
     join_stamp,
     make_fields,
+    text,
 )
 from mp4ds.records import Channel, Message
 
-
-class _RosWire(NamedTuple):
-    """One of the three plain serializations of ROS.
-
-    Attributes:
-        prefix: The encapsulation at the start of a payload.
-        order: Byte order, in struct's notation.
-        ros2: Whether it is CDR: aligned, NUL-terminated, without seq.
-    """
-
-    prefix: bytes
-    order: str
-    ros2: bool
-
-
+# name -> the encapsulation at the start of a payload, and the byte order in struct's notation
 _ROS_WIRES = {
-    "ros1": _RosWire(b"", "<", ros2=False),
-    "cdr-le": _RosWire(b"\x00\x01\x00\x00", "<", ros2=True),
-    "cdr-be": _RosWire(b"\x00\x00\x00\x00", ">", ros2=True),
+    "ros1": (b"", "<"),
+    "cdr-le": (b"\x00\x01\x00\x00", "<"),
+    "cdr-be": (b"\x00\x00\x00\x00", ">"),
 }
 _PROTOBUF = "protobuf"
 _ZSTD = b"\x28\xb5\x2f\xfd"  # magic of zstd
@@ -120,7 +108,8 @@ class RosForm(Form):
 
     def __init__(self, wire: str, type_name: str, layout: _Layout | None = None) -> None:
         self.wire = wire
-        self._prefix, self._order, self._ros2 = _ROS_WIRES[wire]
+        self._prefix, self._order = _ROS_WIRES[wire]
+        self._ros2 = wire != "ros1"  # CDR: aligned, NUL-terminated, without seq
         self._kind, known = ROS_TYPES[type_name]
         self._layout = layout or known
         self._sec_code = "i" if self._ros2 else "I"
@@ -164,7 +153,7 @@ class RosForm(Form):
             "frame_id": values["frame_id"],
             "fields": make_fields(self._kind, values),
         }
-        return Reading(parts, spans, body)
+        return parts, spans, body
 
     def slot(self, name: str, slots: Slots, body_size: int) -> bytes:
         """The bytes of a slot."""
@@ -238,6 +227,299 @@ def _ros_type(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
+# ---------------------------------------------------------------- protobuf
+
+Kind = Literal["time", "text", "u32", "doubles", "data", "other"]
+"""What a field holds; ``other`` if that is not modelled."""
+
+_STAMPED: dict[str, Kind] = {"timestamp": "time", "frame_id": "text"}
+_EXTENT: dict[str, Kind] = {"width": "u32", "height": "u32"}
+_CODED: dict[str, Kind] = {**_STAMPED, "data": "data", "format": "text"}
+_LENGTHS = {"K": 9, "R": 9, "P": 12}
+
+FOXGLOVE_TYPES: Mapping[str, tuple[type[Fields], Mapping[str, Kind]]] = {
+    "foxglove.RawImage": (
+        ImageFields,
+        {**_STAMPED, **_EXTENT, "encoding": "text", "step": "u32", "data": "data"},
+    ),
+    "foxglove.CompressedImage": (CodedFields, _CODED),
+    "foxglove.CompressedVideo": (CodedFields, _CODED),
+    "foxglove.CameraCalibration": (
+        CalibrationFields,
+        {
+            **_STAMPED,
+            **_EXTENT,
+            "distortion_model": "text",
+            **dict.fromkeys("DKRP", "doubles"),
+        },
+    ),
+}
+"""The fields of each type and what they hold (spec/registry.md, "Message types")."""
+
+_VARINT, _I64, _LEN, _I32 = 0, 1, 2, 5  # wire types
+_UINT64 = (1 << 64) - 1
+_INT64 = 1 << 63
+_SLOTS: Mapping[Kind, str] = {"time": "stamp", "data": "body"}
+_EMPTY: Mapping[Kind, Any] = {"text": "", "u32": 0}  # fields with this value are omitted
+
+# FieldDescriptorProto.Type -> the wire types in which such a field is written
+_DOUBLE, _FIXED32, _STRING, _MESSAGE, _BYTES, _UINT32 = 1, 7, 9, 11, 12, 13
+_TYPES: Mapping[Kind, Mapping[int, tuple[int, ...]]] = {
+    "time": {_MESSAGE: (_LEN,)},
+    "text": {_STRING: (_LEN,)},
+    "u32": {_FIXED32: (_I32,), _UINT32: (_VARINT,)},
+    "doubles": {_DOUBLE: (_LEN, _I64)},
+    "data": {_BYTES: (_LEN,)},
+}
+_REPEATED = 3
+_TIMESTAMPS = ("google.protobuf.Timestamp", ".google.protobuf.Timestamp")
+
+
+_Declared = tuple[str, Kind, tuple[int, ...]]
+"""Name of a field, what it holds, and in which wire types."""
+
+_OTHER: _Declared = "", "other", ()
+
+
+class ProtobufForm(Form):
+    """One of Foxglove's message types.
+
+    Args:
+        type_name: One of `FOXGLOVE_TYPES`.
+        schema: A serialized FileDescriptorSet that declares it.
+
+    Raises:
+        WireError: The type differs, or the schema does not declare it with its fields.
+    """
+
+    wire = "protobuf"
+
+    def __init__(self, type_name: str, schema: bytes) -> None:
+        if type_name not in FOXGLOVE_TYPES:
+            raise WireError(f"type {type_name!r} is not modelled")
+        self._kind, self._kinds = FOXGLOVE_TYPES[type_name]
+        self._declared = _declared(type_name, schema, self._kinds)
+
+    def read(self, data: memoryview) -> Reading:
+        """Read a message."""
+        values: dict[str, Any] = {
+            name: [] if kind == "doubles" else _EMPTY.get(kind)
+            for name, kind in self._kinds.items()
+        }
+        spans: dict[str, Span] = {}
+        body = (len(data), len(data))
+        for number, wire_type, at, start, end in _fields(data):
+            name, kind, wire_types = self._declared.get(number, _OTHER)
+            slot = _SLOTS.get(kind)
+            if slot in spans:
+                raise WireError(f"it has its {name} twice")
+            if slot == "body":
+                body = start, end
+            if (around := end - (body[1] - body[0])) > MAX_BLANK:
+                # before all were read: this bounds the number of fields
+                raise WireError(f"it has {around} bytes besides its data")
+            if kind == "other":
+                continue
+            if wire_type not in wire_types:
+                raise WireError(f"its field {name} is not of the declared type")
+            if slot:
+                spans[slot] = at, end
+            if kind == "doubles":
+                values[name] += _doubles(data[start:end])
+            elif kind != "data":
+                values[name] = _value(kind, wire_type, data[start:end])
+        for name, kind in self._kinds.items():
+            if kind in _SLOTS and _SLOTS[kind] not in spans:
+                raise WireError(f"it has no {name}")
+        parts = {
+            "stamp": values["timestamp"],
+            "seq": None,
+            "pts": None,
+            "frame_id": values["frame_id"],
+            "fields": make_fields(self._kind, _checked(values)),
+        }
+        return parts, spans, body
+
+    def slot(self, name: str, slots: Slots, body_size: int) -> bytes:
+        """The bytes of a slot, with its length."""
+        if name == "body":
+            return _varint_bytes(body_size)
+        timestamp = _timestamp(slots.stamp)
+        return _varint_bytes(len(timestamp)) + timestamp
+
+
+def _checked(values: dict[str, Any]) -> dict[str, Any]:
+    """Values by their names in ROS, where lists have the right lengths."""
+    for name, size in _LENGTHS.items():
+        if name in values and len(values[name]) != size:
+            raise WireError(f"it has {len(values[name])} values in {name}, not {size}")
+    if len(values.get("D", ())) > MAX_DISTORTION:
+        raise WireError(f"it has {len(values['D'])} distortion parameters")
+    return {name.lower(): value for name, value in values.items()}
+
+
+def _declared(type_name: str, schema: bytes, kinds: Mapping[str, Kind]) -> Mapping[int, _Declared]:
+    """The modelled fields by their numbers in the schema."""
+    declared = {field.name: field for field in _declaration(type_name, schema).field}
+    by_number: dict[int, _Declared] = {}
+    for name, kind in kinds.items():
+        field = declared.get(name)
+        if field is None:
+            if name == "frame_id":  # older image schemas have none
+                continue
+            raise WireError(f"its schema has no field {name!r}")
+        is_repeated = field.label == _REPEATED
+        if field.type not in _TYPES[kind] or is_repeated != (kind == "doubles"):
+            raise WireError(f"field {name!r} of its schema is not of Foxglove's type")
+        if kind == "time" and field.type_name not in _TIMESTAMPS:
+            raise WireError(f"field {name!r} of its schema is not a google.protobuf.Timestamp")
+        by_number[field.number] = name, kind, _TYPES[kind][field.type]
+    return by_number
+
+
+def _declaration(type_name: str, schema: bytes) -> Any:
+    """The DescriptorProto of a type."""
+    # only recordings with protobuf need it
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.message import DecodeError
+
+    try:
+        files = FileDescriptorSet.FromString(schema).file
+    except (DecodeError, ValueError):  # the latter by protobuf's pure Python
+        raise WireError("its schema is not a FileDescriptorSet") from None
+    name = tuple(type_name.rsplit(".", 1))
+    # compared one by one: names that are not UTF-8 come as bytes
+    found = [
+        message
+        for file in files
+        for message in file.message_type
+        if (file.package, message.name) == name
+    ]
+    if len(found) != 1:
+        raise WireError(f"its schema declares {type_name} {len(found)} times")
+    return found[0]
+
+
+def _fields(data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
+    """The fields of a message: number, wire type, end of the tag, start and end of the value."""
+    at = 0
+    while at < len(data):
+        tag, at = _varint(data, at)
+        number, wire_type = tag >> 3, tag & 7
+        if number == 0 or tag >> 32:
+            raise WireError("it has an invalid tag")
+        start = at
+        if wire_type == _VARINT:
+            end = _varint(data, at)[1]
+        elif wire_type == _LEN:
+            size, start = _varint(data, at)
+            end = start + size
+        elif wire_type in (_I64, _I32):
+            end = at + (8 if wire_type == _I64 else 4)
+        else:
+            raise WireError(f"it has a field of wire type {wire_type}")
+        if end > len(data):
+            raise WireError(f"it ends at byte {len(data)}, but a field extends to byte {end}")
+        yield number, wire_type, at, start, end
+        at = end
+
+
+def _varint(data: memoryview, at: int) -> tuple[int, int]:
+    """A varint of at most 64 bits, and where it ends."""
+    value = 0
+    for index, byte in enumerate(data[at : at + 10]):
+        value |= (byte & 0x7F) << (7 * index)
+        if byte < 0x80:
+            if value > _UINT64:
+                break
+            return value, at + index + 1
+    raise WireError("a number in it is cut short")
+
+
+def _varint_bytes(value: int) -> bytes:
+    """A varint in as few bytes as possible."""
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def _value(kind: Kind, wire_type: int, raw: memoryview) -> int | str:
+    """The value of a time, a text or a number."""
+    if kind == "time":
+        return _stamp(raw)
+    if kind == "text":
+        return text(raw)
+    if wire_type == _VARINT:
+        return _varint(raw, 0)[0] & 0xFFFFFFFF
+    return int(struct.unpack("<I", raw)[0])
+
+
+def _doubles(raw: memoryview) -> tuple[float, ...]:
+    if len(raw) % 8:
+        raise WireError("a list of numbers in it is cut short")
+    return struct.unpack(f"<{len(raw) // 8}d", raw)
+
+
+def _stamp(raw: memoryview) -> int:
+    """Nanoseconds of a google.protobuf.Timestamp."""
+    values = {1: 0, 2: 0}
+    for number, wire_type, _, start, _ in _fields(raw):
+        if number in values:
+            if wire_type != _VARINT:
+                raise WireError("its timestamp is not of the declared type")
+            value = _varint(raw, start)[0]
+            values[number] = value - (value >> 63 << 64)
+    stamp = join_stamp(values[1], values[2])
+    if not -_INT64 <= stamp < _INT64:  # what a column holds
+        raise WireError("its stamp is beyond 64-bit nanoseconds")
+    return stamp
+
+
+def _timestamp(stamp: int) -> bytes:
+    """A google.protobuf.Timestamp as serializers write it."""
+    sec, nanos = divmod(stamp, NS)
+    if not -(1 << 63) <= sec < 1 << 63:
+        raise WireError("a time is beyond what its message has bits for")
+    out = b"\x08" + _varint_bytes(sec & _UINT64) if sec else b""
+    return out + (b"\x10" + _varint_bytes(nanos) if nanos else b"")
+
+
+def decoder_of_schema(type_name: str, schema: bytes) -> Callable[[memoryview], Any]:
+    """A decoder of messages of any type; it raises WireError for invalid ones.
+
+    Args:
+        type_name: Full name of the messages' type.
+        schema: A serialized FileDescriptorSet that declares it and everything it refers to.
+
+    Raises:
+        WireError: It does not.
+    """
+    # only recordings with protobuf need it
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message import DecodeError
+    from google.protobuf.message_factory import GetMessageClass, GetMessages
+
+    try:
+        pool = DescriptorPool()
+        GetMessages(FileDescriptorSet.FromString(schema).file, pool)
+        # by name, as a type may be declared inside another one
+        message_class = GetMessageClass(pool.FindMessageTypeByName(type_name))
+    except (DecodeError, LookupError, ValueError, TypeError, RecursionError):
+        raise WireError(f"its schema does not declare {type_name}") from None
+
+    def decode(data: memoryview) -> Any:
+        try:
+            return message_class.FromString(bytes(data))
+        except (DecodeError, ValueError):  # the latter by protobuf's pure Python
+            raise WireError(f"it is not a {type_name}") from None
+
+    return decode
+
+
 # ---------------------------------------------------------------- all
 
 
@@ -295,8 +577,8 @@ def wire_of(message_encoding: str, data: memoryview) -> str:
     if message_encoding in ("ros1", _PROTOBUF):
         return message_encoding
     if message_encoding == "cdr":
-        for name, wire in _ROS_WIRES.items():
-            if wire.ros2 and data[:4] == wire.prefix:
+        for name, (prefix, _) in _ROS_WIRES.items():
+            if prefix and data[:4] == prefix:
                 return name
         if data[:4] == _ZSTD:
             raise WireError(

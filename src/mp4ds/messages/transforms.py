@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.messages.protobuf import decoder_of_schema
-from mp4ds.messages.serializations import wire_of
+from mp4ds.messages.serializations import decoder_of_schema, wire_of
 from mp4ds.messages.wire import PrimitiveReader, WireError
 from mp4ds.records import Channel, Schema
 

@@ -11,7 +11,7 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 NS = 10**9
 MAX_BLANK = 1 << 16
@@ -125,19 +125,13 @@ class Slots:
 Span = tuple[int, int]
 
 
-class Reading(NamedTuple):
-    """What a message holds, and where.
+Reading = tuple[Mapping[str, Any], Mapping[str, Span], Span]
+"""What a message holds, and where.
 
-    Attributes:
-        values: Its `Parts` other than body and blank.
-        spans: Start and end of each slot that it has, in order: ``stamp``, ``seq``, ``pts``, and
-            ``body``, which includes the body's length.
-        body: Start and end of the body; empty at the end of a message without one.
-    """
-
-    values: Mapping[str, Any]
-    spans: Mapping[str, Span]
-    body: Span
+Its `Parts` other than body and blank; start and end of each slot that it has, in order: ``stamp``,
+``seq``, ``pts``, and ``body``, which includes the body's length; and start and end of the body,
+empty at the end of a message without one.
+"""
 
 
 class Form(ABC):

@@ -202,12 +202,12 @@ class MessageInspector:
 
     def _depth_image(self, message: Message, form: Form, parts: Parts) -> CameraMessage:
         with self._png_trial():
-            image = depth.decode_depth(parts.body, self._png)
-        self._png = image.recipe or self._png
-        height, width = image.pixels.shape
-        key = _coded_key(form, "png" if image.recipe else "rvl", "", "16UC1", width, height)
-        wrap = BodyFraming(prefix=image.header, png=image.recipe)
-        return CameraMessage(message, form, parts, key, wrap, pixels=image.pixels)
+            header, pixels, recipe = depth.decode_depth(parts.body, self._png)
+        self._png = recipe or self._png
+        height, width = pixels.shape
+        key = _coded_key(form, "png" if recipe else "rvl", "", "16UC1", width, height)
+        wrap = BodyFraming(prefix=header, png=recipe)
+        return CameraMessage(message, form, parts, key, wrap, pixels=pixels)
 
 
 def depends_on_others(channel: Channel, message: Message) -> bool:
