@@ -266,8 +266,8 @@ def test_items_in_their_order(jobs: int, tmp_path: Path, monkeypatch: pytest.Mon
 def held(place: Path, number: int) -> None:
     """Work that lasts until it is ended, and tidies up then."""
     made = place / str(number)
-    made.touch()
     try:
+        made.touch()  # from then on, it may be ended
         time.sleep(WATCHDOG_S)
     finally:
         made.unlink()

@@ -15,7 +15,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -98,19 +97,9 @@ _TERMINATE_SECONDS = 10.0
 _KEPT_BYTES = 400 * 2**20
 
 
-@dataclass
-class _Call:
-    """A call to be made.
-
-    Attributes:
-        future: Gets its result.
-        function: Pickled; a process keeps the one that it was given last, with all that this holds.
-        arguments: Pickled.
-    """
-
-    future: Future[Any]
-    function: bytes
-    arguments: bytes
+_Pickled = tuple[bytes, bytes]
+"""A function and its arguments: a process keeps the function that it was given last, with all that
+this holds."""
 
 
 class ProcessExecutor(Executor):
@@ -131,30 +120,33 @@ class ProcessExecutor(Executor):
         self._most, self._nice = processes, nice
         self._is_closed = self._is_ended = False
         self._taking = threading.Lock()  # no thread is joined that has not been started
-        self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()  # None ends a thread
+        # calls, and what gets their results; None ends a thread
+        self._calls: queue.SimpleQueue[tuple[Future[Any], _Pickled] | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
         self._processes: set[_Process] = set()
 
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Make a call in a process, of a function that can be pickled."""
-        call = _Call(Future(), pickle.dumps(fn), pickle.dumps((args, kwargs)))
+        future: Future[_T] = Future()
+        call = pickle.dumps(fn), pickle.dumps((args, kwargs))
         with self._taking:
             if self._is_closed:
                 raise RuntimeError("no more calls after shutdown")
-            self._calls.put(call)
+            self._calls.put((future, call))
             if len(self._threads) < self._most:
                 # a daemon, unlike those of a ThreadPoolExecutor: a process that is interrupted
                 # again while it ends its calls waits for none of them
                 thread = threading.Thread(target=self._work, daemon=True)
                 self._threads.append(thread)
                 thread.start()
-        return call.future
+        return future
 
     def _work(self) -> None:
         """Make calls, one after another; in a thread."""
         process: _Process | None = None
-        while (call := self._calls.get()) is not None:
-            if not call.future.set_running_or_notify_cancel():
+        while (taken := self._calls.get()) is not None:
+            future, call = taken
+            if not future.set_running_or_notify_cancel():
                 continue
             answer: object = None
             try:
@@ -167,9 +159,9 @@ class ProcessExecutor(Executor):
             except OSError as error:
                 answer = error
             if isinstance(answer, BaseException):
-                call.future.set_exception(answer)
+                future.set_exception(answer)
             else:
-                call.future.set_result(answer)
+                future.set_result(answer)
 
     def _in_place_of(self, old: _Process | None) -> _Process:
         if old is not None:
@@ -194,8 +186,8 @@ class ProcessExecutor(Executor):
             self._is_ended = True
             with suppress(queue.Empty):
                 while True:
-                    if call := self._calls.get_nowait():
-                        call.future.cancel()
+                    if taken := self._calls.get_nowait():
+                        taken[0].cancel()
             ended = list(self._processes)
             for process in ended:
                 process.terminate()
@@ -241,12 +233,12 @@ class _Process:
                 start_new_session=True,
             )
 
-    def make(self, call: _Call) -> Any:
+    def make(self, call: _Pickled) -> Any:
         """Make a call; returns its result, or the error to raise."""
         self._stderr.seek(0)
         self._stderr.truncate()  # earlier calls told nothing of this one
         try:
-            self._calls.send((call.function, call.arguments))
+            self._calls.send(call)
             result, error, self.is_ready = self._calls.recv()
         except (OSError, EOFError):
             self.is_ready = False
@@ -295,7 +287,7 @@ def serve() -> None:
     socket, nice = map(int, sys.argv[1:])
     os.nice(nice)
     caller: Connection[Any, Any] = Connection(socket)
-    calls: queue.SimpleQueue[tuple[bytes, bytes] | None] = queue.SimpleQueue()
+    calls: queue.SimpleQueue[_Pickled | None] = queue.SimpleQueue()
     is_busy = threading.Event()
     threading.Thread(target=_listen, args=(caller, calls, is_busy), daemon=True).start()
     function: Callable[..., Any] | None = None
@@ -321,7 +313,7 @@ def serve() -> None:
 
 def _listen(
     caller: Connection[Any, Any],
-    calls: queue.SimpleQueue[tuple[bytes, bytes] | None],
+    calls: queue.SimpleQueue[_Pickled | None],
     is_busy: threading.Event,
 ) -> None:
     """Take calls; when the last has come, this process ends, and at once if nobody waits."""

@@ -44,20 +44,15 @@ class _Camera:
     offset: float  # metres beside the middle of the car
 
 
-@dataclass(frozen=True)
-class _Topic:
-    type_name: str
-    node: str
-    qos: str = DEFAULT_QOS
-
-
 _CAMERAS = (_Camera("left", "bayer_rggb8", 1, 0.1), _Camera("right", "rgb8", 3, -0.1))
+_LATCHED = "/tf_static"
+# topic -> type, and the node that publishes it
 _TOPICS = {
-    "/tf_static": _Topic("tf2_msgs/msg/TFMessage", "/robot_state_publisher", LATCHED_QOS),
-    "/imu": _Topic("sensor_msgs/msg/Imu", "/imu_driver"),
-    "/tf": _Topic("tf2_msgs/msg/TFMessage", "/odometry"),
+    _LATCHED: ("tf2_msgs/msg/TFMessage", "/robot_state_publisher"),
+    "/imu": ("sensor_msgs/msg/Imu", "/imu_driver"),
+    "/tf": ("tf2_msgs/msg/TFMessage", "/odometry"),
     **{
-        f"/{camera.name}/{name}": _Topic(f"sensor_msgs/msg/{kind}", f"/{camera.name}_driver")
+        f"/{camera.name}/{name}": (f"sensor_msgs/msg/{kind}", f"/{camera.name}_driver")
         for camera in _CAMERAS
         for name, kind in (("image_raw", "Image"), ("camera_info", "CameraInfo"))
     },
@@ -97,30 +92,36 @@ def demo(output: Path | str = "demo.mcap", *, seconds: float = 3.0, force: bool 
     return count
 
 
-class _Writer(Writer):
-    """Also writes the QoS and the type hash of topics, as ``ros2 bag record`` does."""
+def _declared(writer: Writer, channel: Channel) -> Any:
+    """Add a topic with its QoS and type hash, as ``ros2 bag record`` does.
 
-    def declare(self, channel: Channel) -> Any:
-        """Add a topic; returns the schema that `write_message` takes."""
-        definition = channel.schema.data.decode() if channel.schema else ""
-        schema = self.register_msgdef(channel.type_name, definition)
-        self._channel_ids[channel.topic] = self._writer.register_channel(
-            channel.topic, channel.message_encoding, schema.id, dict(channel.metadata)
-        )
-        return schema
+    Returns:
+        The schema that `write_message` takes.
+    """
+    definition = channel.schema.data.decode() if channel.schema else ""
+    schema = writer.register_msgdef(channel.type_name, definition)
+    # otherwise the first message would declare it, without metadata
+    writer._channel_ids[channel.topic] = writer._writer.register_channel(
+        channel.topic, channel.message_encoding, schema.id, dict(channel.metadata)
+    )
+    return schema
 
 
 def _record(path: Path, seconds: float) -> int:
     messages = sorted(_messages(seconds), key=lambda item: item[:2])
     # rosbag2 does not compress, either
-    with path.open("wb") as file, _Writer(file, compression=CompressionType.NONE) as writer:
+    with path.open("wb") as file, Writer(file, compression=CompressionType.NONE) as writer:
         schemas = {
-            name: writer.declare(ros2_channel(number, name, topic.type_name, topic.qos))
-            for number, (name, topic) in enumerate(_TOPICS.items())
+            topic: _declared(writer, ros2_channel(number, topic, type_name, _qos_of(topic)))
+            for number, (topic, (type_name, _)) in enumerate(_TOPICS.items())
         }
         for time, topic, seq, make in messages:
             writer.write_message(topic, schemas[topic], make(), time, time, seq)
     return len(messages)
+
+
+def _qos_of(topic: str) -> str:
+    return LATCHED_QOS if topic == _LATCHED else DEFAULT_QOS
 
 
 def _copy(original: Path, path: Path, kind: str, name: str) -> None:
@@ -134,7 +135,7 @@ def _copy(original: Path, path: Path, kind: str, name: str) -> None:
         for channel in reader.channels:
             made = converter.channel(channel)
             if kind == "bag":
-                callerid = {"callerid": _TOPICS[channel.topic].node}
+                callerid = {"callerid": _TOPICS[channel.topic][1]}
                 made = replace(made, metadata={**made.metadata, **callerid})
             channels[channel.id] = made
             writer.add_channel(made)
@@ -154,7 +155,7 @@ _Made = tuple[int, str, int, Callable[[], dict[str, Any]]]
 
 def _messages(seconds: float) -> Iterator[_Made]:
     rng = np.random.default_rng(1)
-    yield START_NS, "/tf_static", 0, _mounts
+    yield START_NS, _LATCHED, 0, _mounts
     # images are made as they are written: only one is in memory at a time
     for hertz, topic, make in ((IMU_HZ, "/imu", _imu), (TF_HZ, "/tf", _odometry)):
         for seq in range(max(1, int(seconds * hertz))):

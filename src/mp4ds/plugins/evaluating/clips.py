@@ -8,7 +8,6 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain, product
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import xxhash
@@ -39,20 +38,10 @@ _SECOND = 1_000_000_000
 _DETAIL = (96, 128)  # rows and columns shown side by side
 
 
-class Shot(NamedTuple):
-    """One image of a camera.
-
-    Attributes:
-        kind: ROS encoding, width and height.
-        pixels: Of the encoding.
-        stamp: Header stamp, nanoseconds.
-        log_time: When it was recorded, nanoseconds.
-    """
-
-    kind: tuple[str, int, int]
-    pixels: Pixels
-    stamp: int
-    log_time: int
+_Kind = tuple[str, int, int]
+Shot = tuple[_Kind, Pixels, int, int]
+"""One image of a camera: its ROS encoding, width and height; pixels of the encoding; header stamp,
+and when it was recorded, nanoseconds."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +127,7 @@ def _of_channel(
                     seen = inspector.inspect(record)
                     if seen.pixels is not None:
                         kind = seen.key.encoding, seen.key.width, seen.key.height
-                        yield Shot(kind, seen.pixels, seen.parts.stamp, record.log_time)
+                        yield kind, seen.pixels, seen.parts.stamp, record.log_time
             number += 1
 
     return Camera(channel.topic, times, read, lossy)
@@ -160,7 +149,7 @@ def _of_topic(topic: Topic) -> Camera:
             numbers = [int(order[index]) for index in indices[at : at + _AT_ONCE]]
             for frame in topic.get(numbers, format=form):
                 kind = (frame.encoding, *topic.image_size)
-                yield Shot(kind, frame.data, frame.stamp_ns, frame.log_time_ns)
+                yield kind, frame.data, frame.stamp_ns, frame.log_time_ns
 
     return Camera(topic.topic, topic.log_times[order], read, lossy)
 
@@ -207,20 +196,20 @@ def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
     first = next(shots, None)
     if first is None:
         raise Refused("has no readable images in its clip")
-    layout = _layout_of(first)
+    layout = _layout_of(first[0])
     maker, clock, digest = PlaneMaker(layout.pixel_format), PresentationClock(), xxhash.xxh3_128()
-    encoding, width, height = first.kind
+    encoding, width, height = first[0]
     size = width + width % 2, height + height % 2
     ticks: list[int] = []
     with closing(PlaneSpool(folder / FRAMES, *size)) as spool:
-        for shot in chain([first], shots):
-            if shot.kind != first.kind:
+        for kind, pixels, stamp, log_time in chain([first], shots):
+            if kind != first[0]:
                 continue
-            planes = maker.make(layout.to_picture(shot.pixels))
+            planes = maker.make(layout.to_picture(pixels))
             spool.append(planes)
             for plane in planes:
                 digest.update(plane.data)
-            ticks.append(clock.tick(shot.stamp, shot.log_time))
+            ticks.append(clock.tick(stamp, log_time))
         middle = (len(ticks) - 1) // 2
         detail = _detail(spool.frame(middle)[0])
     np.save(folder / TICKS, ticks)
@@ -243,8 +232,8 @@ def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
     )
 
 
-def _layout_of(shot: Shot) -> Layout:
-    name, width, height = shot.kind
+def _layout_of(kind: _Kind) -> Layout:
+    name, width, height = kind
     if ENCODINGS[name].lossy is None:
         raise Refused(
             f"has {name} images, which are not 8-bit images: `mp4ds pack` keeps them lossless"

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain
 
 import numpy as np
@@ -49,40 +48,43 @@ def inverse(pose: Pose) -> Pose:
     return found
 
 
-class StaticTree:
+def static_poses(dataset: Dataset) -> Callable[[str, str], Pose | None]:
     """Relative poses of frames, by the static transforms of a dataset.
 
     Args:
         dataset: Its messages and its manifest have them.
+
+    Returns:
+        A function that returns the pose of a frame in another one; None if no static transforms
+        connect them.
     """
+    listed = dataset.manifest.transforms if dataset.manifest else []
+    collector = TransformCollector(item.to_record() for item in listed)
+    topics = {channel.topic for channel in dataset.channels if collector.takes(channel)}
+    if topics:
+        for record in dataset.records(start=INT64_MIN, topics=topics):
+            if isinstance(record, Message):
+                collector.add(record.channel, record.data)
+    by_child = {item.child.removeprefix("/"): item for item in collector.transforms}
 
-    def __init__(self, dataset: Dataset) -> None:
-        listed = dataset.manifest.transforms if dataset.manifest else []
-        collector = TransformCollector(item.to_record() for item in listed)
-        topics = {channel.topic for channel in dataset.channels if collector.takes(channel)}
-        if topics:
-            for record in dataset.records(start=INT64_MIN, topics=topics):
-                if isinstance(record, Message):
-                    collector.add(record.channel, record.data)
-        self._by_child = {item.child.removeprefix("/"): item for item in collector.transforms}
-
-    def pose(self, frame: str, within: str) -> Pose | None:
-        """Pose of a frame in another one; None if no static transforms connect them."""
-        if not frame or not within:
-            return None
-        root, own = self._in_root(frame)
-        other_root, other = self._in_root(within)
-        return inverse(other) @ own if root == other_root else None
-
-    def _in_root(self, frame: str) -> tuple[str, Pose]:
+    def in_root(frame: str) -> tuple[str, Pose]:
         """The root of a frame's tree, and the pose of the frame in it."""
         pose, name, seen = np.eye(4), frame.removeprefix("/"), set[str]()
-        while name in self._by_child and name not in seen:  # a cycle has no root
+        while name in by_child and name not in seen:  # a cycle has no root
             seen.add(name)
-            item = self._by_child[name]
+            item = by_child[name]
             pose = pose_matrix(item.translation, item.rotation) @ pose
             name = item.parent.removeprefix("/")
         return name, pose
+
+    def pose_of(frame: str, within: str) -> Pose | None:
+        if not frame or not within:
+            return None
+        root, own = in_root(frame)
+        other_root, other = in_root(within)
+        return inverse(other) @ own if root == other_root else None
+
+    return pose_of
 
 
 def _poses(job: ExportJob) -> Measures | None:
@@ -111,7 +113,7 @@ def write_euroc(job: ExportJob) -> None:
     poses, cameras, imus = _poses(job), [*job.png_cameras()], _imus(job)
     frames = [*(imu.frame_id for imu in imus), *(camera.frame_id for camera in cameras)]
     body = frames[0] if frames else ""
-    tree = StaticTree(job.dataset)
+    static_pose = static_poses(job.dataset)
     job.write_lines("mav0/body.yaml", [f"comment: {json.dumps(body)}"])
 
     def write_sensor(
@@ -123,7 +125,7 @@ def write_euroc(job: ExportJob) -> None:
         job.write_lines(f"{place}/sensor.yaml", [*text, *lines])
 
     def pose_of(frame: str, topic: str) -> Pose | None:
-        pose = tree.pose(frame, body)
+        pose = static_pose(frame, body)
         if pose is None:
             job.note(f"{topic}: no static transforms give T_BS of {frame!r} in {body!r}")
         return pose
@@ -149,7 +151,7 @@ def write_euroc(job: ExportJob) -> None:
         turned = ((time, (*v[:3], v[6], *v[3:6])) for time, v in poses.rows())
         rows = _csv(_POSE_HEAD, turned)
         job.write_lines(f"{place}/data.csv", rows, place=place, topic=poses.topic)
-        write_sensor(place, "pose", poses.topic, tree.pose(poses.body, body))
+        write_sensor(place, "pose", poses.topic, static_pose(poses.body, body))
 
 
 def _csv(head: str, rows: Iterable[Row]) -> Iterator[str]:
@@ -312,10 +314,11 @@ def colmap_model(calibration: Calibration) -> tuple[str, list[float]] | None:
 def _image_lines(
     job: ExportJob, cameras: Sequence[tuple[ExportedCamera, Sequence[str]]], poses: Measures
 ) -> Iterator[str]:
-    tree, track = StaticTree(job.dataset), PoseTrack.of(poses.rows())
+    static_pose = static_poses(job.dataset)
+    count, pose_at = interpolated(poses.rows())
     image = 0
     for number, (camera, files) in enumerate(cameras, start=1):
-        place = tree.pose(camera.frame_id, poses.body)
+        place = static_pose(camera.frame_id, poses.body)
         if place is None:
             job.note(
                 f"{camera.topic}: no static transforms connect {camera.frame_id!r} to "
@@ -324,7 +327,7 @@ def _image_lines(
             continue
         missing = 0
         for time, name in zip(camera.times.tolist(), files, strict=True):
-            pose = track.at(time)
+            pose = pose_at(time)
             if pose is None:
                 missing += 1
                 continue
@@ -338,47 +341,41 @@ def _image_lines(
                 f"{camera.topic}: {missing} of {len(camera)} images are before the first or "
                 "after the last pose, so they are not in images.txt"
             )
-    job.keep(poses.topic, len(track.times))
+    job.keep(poses.topic, count)
     job.places[f"{_MODEL}/images.txt"] = poses.topic
     job.note(f"{poses.topic}: poses of images are interpolated between the recorded ones")
 
 
-@dataclass(frozen=True)
-class PoseTrack:
-    """Poses of a body over time, for interpolation.
+def interpolated(rows: Iterable[Row]) -> tuple[int, Callable[[int], Pose | None]]:
+    """Poses of a body over time: of several with the same time, the first.
 
-    Attributes:
-        times: Nanoseconds, increasing, shape (poses,).
-        values: Position x, y, z and quaternion x, y, z, w; shape (poses, 7).
+    Those without an orientation are left out: a quaternion that nobody set is all zeros.
+
+    Args:
+        rows: Position x, y, z and quaternion x, y, z, w.
+
+    Returns:
+        How many there are, and a function that returns the interpolated pose at a time; None
+        outside the first and last.
     """
+    found = [(time, row) for time, row in rows if np.isfinite(row).all() and any(row[3:])]
+    times = np.array([time for time, _ in found], np.int64)
+    times, places = np.unique(times, return_index=True)
+    values = np.array([row for _, row in found], np.float64).reshape(-1, 7)[places]
 
-    times: NDArray[np.int64]
-    values: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, rows: Iterable[Row]) -> PoseTrack:
-        """The poses of rows by time: the first of several with the same time.
-
-        Those without an orientation are left out: a quaternion that nobody set is all zeros.
-        """
-        found = [(time, row) for time, row in rows if np.isfinite(row).all() and any(row[3:])]
-        times = np.array([time for time, _ in found], np.int64)
-        values = np.array([row for _, row in found], np.float64).reshape(-1, 7)
-        times, places = np.unique(times, return_index=True)
-        return cls(times, values[places])
-
-    def at(self, time: int) -> Pose | None:
-        """The interpolated pose at a time; None outside the first and last."""
-        after = int(np.searchsorted(self.times, time))
-        if after < len(self.times) and self.times[after] == time:
-            return pose_matrix(self.values[after, :3], self.values[after, 3:])
-        if not 0 < after < len(self.times):
+    def at(time: int) -> Pose | None:
+        after = int(np.searchsorted(times, time))
+        if after < len(times) and times[after] == time:
+            return pose_matrix(values[after, :3], values[after, 3:])
+        if not 0 < after < len(times):
             return None
-        start, end = int(self.times[after - 1]), int(self.times[after])
+        start, end = int(times[after - 1]), int(times[after])
         share = (time - start) / (end - start)
-        before, later = self.values[after - 1], self.values[after]
+        before, later = values[after - 1], values[after]
         position = (1 - share) * before[:3] + share * later[:3]
         return pose_matrix(position, _between(before[3:], later[3:], share))
+
+    return len(times), at
 
 
 def _between(

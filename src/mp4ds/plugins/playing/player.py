@@ -19,7 +19,7 @@ from mp4ds.dataset.salvage import HOW_TO_SALVAGE, open_selected
 from mp4ds.errors import Refused, RemoteError, advising
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Pace, Ticks
-from mp4ds.plugins.playing.timeline import ReadAhead, Restamper, Timeline
+from mp4ds.plugins.playing.timeline import ReadAhead, Timeline, restamper
 from mp4ds.plugins.ros.node import Node, Service, action, chosen_world, open_node, quick_switches
 from mp4ds.records import Channel, Message
 
@@ -148,7 +148,7 @@ class Player:
         self._next_report = 0.0
         self._installed: dict[int, tuple[Channel, bool]] = {}  # whether its type is, by id()
         self._done = PlaySummary()
-        self._restamper = Restamper(self._pace.wall_of) if options.restamp else None
+        self._restamped = restamper(self._pace.wall_of) if options.restamp else None
 
     # ------------------------------------------------------------ controls
 
@@ -526,7 +526,7 @@ class Player:
     def _send(self, due: Message, time_ns: int) -> None:
         if not self._is_installed(due.channel):
             return
-        payload = due.data if self._restamper is None else self._restamper.restamped(due)
+        payload = due.data if self._restamped is None else self._restamped(due)
         self._node.publish(due.channel, payload, time_ns)
         topic = due.channel.topic
         self._done.messages[topic] = self._done.messages.get(topic, 0) + 1

@@ -335,29 +335,25 @@ _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ENCAPSULATION = 4
 
 
-class Restamper:
-    """Replaces the stamps in messages: of their header, or of their transforms' headers.
+def restamper(wall_of: Callable[[int], int]) -> Callable[[Message], bytes | memoryview]:
+    """What replaces the stamps in messages: of their header, or of their transforms' headers.
 
     Equal stamps stay equal, and zero stays zero.
 
     Args:
         wall_of: Maps recording time to wall-clock time, both in nanoseconds.
+
+    Returns:
+        A function that returns the payload with new stamps; unchanged if it has none. It raises
+        ConversionError if the message is not of the channel's type, or a stamp is out of range.
     """
+    known: dict[int, tuple[Channel, str]] = {}  # what has stamps, by id()
 
-    def __init__(self, wall_of: Callable[[int], int]) -> None:
-        self._wall_of = wall_of
-        self._known: dict[int, tuple[Channel, str]] = {}  # what has stamps, by id()
-
-    def restamped(self, message: Message) -> bytes | memoryview:
-        """The payload with new stamps; unchanged if it has none.
-
-        Raises:
-            ConversionError: The message is not of the channel's type, or a stamp is out of range.
-        """
+    def restamped(message: Message) -> bytes | memoryview:
         channel = message.channel
-        if id(channel) not in self._known:
-            self._known[id(channel)] = channel, _stamped(channel)
-        stamped = self._known[id(channel)][1]
+        if id(channel) not in known:
+            known[id(channel)] = channel, _stamped(channel)
+        stamped = known[id(channel)][1]
         if not stamped:
             return message.data
         is_ros1 = channel.message_encoding == "ros1"
@@ -369,12 +365,14 @@ class Restamper:
             for place in [4] if stamped == HEADER else _of_transforms(made, order, is_ros1):
                 seconds, nanoseconds = stamp.unpack_from(made, place)
                 if seconds or nanoseconds:
-                    time = self._wall_of(seconds * NS + nanoseconds)
+                    time = wall_of(seconds * NS + nanoseconds)
                     stamp.pack_into(made, place, *divmod(time, NS))
         except (struct.error, WireError) as error:
             problem = f"cannot replace the stamp of a message: {error}"
             raise ConversionError(channel.topic, problem) from None
         return memoryview(made)
+
+    return restamped
 
 
 def _stamped(channel: Channel) -> str:
