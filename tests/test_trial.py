@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE
 from mp4ds.messages.layouts import fit
 from mp4ds.packing.options import PackOptions
-from mp4ds.video.codecs import Purpose, lossless_codecs, recipe_for
+from mp4ds.video.codecs import lossless_codecs, recipe_for
 from mp4ds.video.encoder import Coding, VideoEncoder, choose, encode_on_trial
 from pictures import picture
 from pixel_kinds import as_message, rounded
@@ -235,7 +234,7 @@ def test_the_next_codec_where_one_refuses(
     summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(codec=codec))
     (topic,) = (topic for topic in summary.topics if topic.topic == "/cam/image_raw")
     assert topic.frames == topic.messages == 3
-    first, then = asked
+    first, then = (name for name in asked if name != "av1")  # which is the view's
     assert topic.notes == [f"coded as {then}: " + topic.notes[0].split(": ")[1]]
     assert codec in (None, first)
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
@@ -245,47 +244,25 @@ def test_the_next_codec_where_one_refuses(
 # ---------------------------------------------------------------- purposes
 
 
-def test_what_reads_fastest_within_a_budget() -> None:
+@pytest.mark.parametrize("name", ["still", "moving"])
+def test_for_training_there_are_as_many_key_frames_as_cost_little(name: str) -> None:
     samples = scene("mono8", width=320, height=240)
-    usual = chosen(samples, "mono8", gop=10)
-    sizes = []
-    for larger in (0, 15, 40, 900):
-        choice = chosen(samples, "mono8", gop=10, purpose=Purpose("training", larger))
-        assert choice.bytes_per_frame <= (1 + larger / 100) * usual.bytes_per_frame * (1 + 1e-9)
-        sizes.append(choice.bytes_per_frame)
-        if larger == 900:
-            assert choice.gop == 1
-            assert choice.recipe == recipe_for(
-                "gray", lossless=True, codec=choice.recipe.codec, fast=True
-            )
-    assert sizes == sorted(sizes)
+    if name == "still":
+        samples = samples[:1] * len(samples)
+    usual, training = (
+        chosen(samples, "mono8", gop=10, purpose=purpose) for purpose in (None, "training")
+    )
+    assert training.bytes_per_frame <= 1.15 * usual.bytes_per_frame
+    assert (training.gop < 10) == (name == "moving")
 
 
 def test_an_archive_has_the_smallest() -> None:
     samples = scene("mono8", width=320, height=240)
-    archive = chosen(samples, "mono8", purpose=Purpose("archive"))
+    archive = chosen(samples, "mono8", purpose="archive")
     assert archive.bytes_per_frame <= chosen(samples, "mono8").bytes_per_frame
     assert archive.bytes_per_frame == min(
         chosen(samples, "mono8", codec=codec).bytes_per_frame for codec in lossless_codecs("gray")
     )
-
-
-@pytest.mark.one_in(12)
-@pytest.mark.parametrize("encoding", ENCODINGS)
-def test_fast_forms_are_exact(encoding: str, tmp_path: Path) -> None:
-    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene(encoding, frames=7))
-    options = PackOptions(purpose="training=900", window=3)
-    mp4ds.pack(paths, tmp_path / "dataset", options)
-    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
-    assert compare(paths, unpacked(tmp_path, "mcap")) == []
-
-
-def test_a_choice_that_was_made_before_is_made_again() -> None:
-    """The times that it depends on are never the same."""
-    samples, options = scene("mono8"), {"purpose": Purpose("training", 900)}
-    others = {replace(chosen(samples, "mono8", **options), gop=gop).text for gop in (2, 3)}
-    found = {chosen(samples, "mono8", known=[text], **options).text for text in others}
-    assert found == others
 
 
 def test_lossy_videos_for_a_purpose(tmp_path: Path) -> None:
@@ -325,7 +302,7 @@ def test_packing_at_speed(encoding: str, codec: str, tmp_path: Path) -> None:
     assert codec == "ffv1" or found[0]["options"]["preset"] == "ultrafast"
 
 
-@pytest.mark.parametrize("text", ["", "fast", "training=", "training=x", "archive=3"])
+@pytest.mark.parametrize("text", ["fast", "training=15"])
 def test_a_purpose_that_is_none(text: str, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="`purpose`"):
         mp4ds.pack(tmp_path / "no.bag", tmp_path / "dataset", PackOptions(purpose=text))

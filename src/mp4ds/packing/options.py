@@ -26,15 +26,16 @@ from mp4ds.options import (
 )
 from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
 from mp4ds.video.codecs import (
+    ARCHIVE,
     ARCHIVE_GOP,
     LOSSLESS,
     LOSSLESS_GOP,
     LOSSY_GOP,
     LOSSY_TRAINING_GOP,
     MAX_GOP,
-    Purpose,
+    SPEED,
+    TRAINING,
     QualitySetting,
-    parse_purpose,
     parse_quality,
 )
 
@@ -115,13 +116,12 @@ class PackOptions(SliceOptions, TopicOptions):
     transcode: bool = option(
         "Re-encode JPEG images at `quality` instead of copying them.", False, changes=ENCODING
     )
-    purpose: Parsed[Purpose | None] = option(
+    purpose: str | None = option(
         "archive: smallest files. speed: fastest packing, as while recording. training: fastest "
-        "random access, with lossless videos up to 15 % larger; training=N: up to N %.",
+        "random access, with videos up to 15 % larger.",
         None,
         "--for",
-        metavar="PURPOSE",
-        parse=parse_purpose,
+        choices=(ARCHIVE, SPEED, TRAINING),
         changes=ENCODING,
     )
     gop: int | None = option(
@@ -163,7 +163,7 @@ class PackOptions(SliceOptions, TopicOptions):
     @property
     def is_fast(self) -> bool:
         """Whether to encode in the least time, with nothing tried."""
-        return self.purpose is not None and self.purpose.is_speed
+        return self.purpose == SPEED
 
     @property
     def group_frames(self) -> int:
@@ -180,7 +180,7 @@ class PackOptions(SliceOptions, TopicOptions):
                 "`purpose` chooses the key frame interval itself. Give `purpose` or `gop`, not "
                 "both."
             )
-        if not self.purpose.is_training:
+        if self.purpose == ARCHIVE:
             return ARCHIVE_GOP
         return LOSSLESS_GOP if is_lossless else LOSSY_TRAINING_GOP
 

@@ -13,7 +13,6 @@ from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 
 from mp4ds.bags.protocols import BagReader
@@ -522,8 +521,7 @@ def _planned(
         if note is not None:
             folder.check(PlanNote.of(plan), shared=is_shared)
         if not options.join:
-            known = chain.from_iterable(note.decisions) if note else ()
-            plan = surveyed(plan, reader, set(known))
+            plan = surveyed(plan, reader)
     return PartedPack(
         plan, paths, target, options.force, progress, is_new=note is None, is_shared=is_shared
     )

@@ -6,7 +6,7 @@ begin.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -94,7 +94,6 @@ def decide(
     options: PackOptions,
     threads: int,
     rate: float | None,
-    known: Collection[str] = (),
 ) -> Decision:
     """How images are stored, by looking at the first of them.
 
@@ -103,7 +102,6 @@ def decide(
         options: What was asked for.
         threads: Of an encoder.
         rate: Frames per second, where known.
-        known: Texts of plans to prefer, where there is a choice.
 
     Raises:
         ScoringError: A score is asked for that cannot be computed.
@@ -118,7 +116,7 @@ def decide(
         elif options.is_fast:
             plans = [_fast_plan(first.key, options)]
         else:
-            plans = _lossless_plans(samples, options, threads, rate, known)
+            plans = _lossless_plans(samples, options, threads, rate)
         return Decision(first.key, plans)
     except Refused as reason:
         return Decision(first.key, refusal=str(reason))
@@ -199,7 +197,6 @@ def _lossless_plans(
     options: PackOptions,
     threads: int,
     rate: float | None,
-    known: Collection[str] = (),
     note: str = "",
 ) -> list[TrackPlan]:
     encoding = ENCODINGS[samples[0].key.encoding]
@@ -214,7 +211,6 @@ def _lossless_plans(
         gop=options.group_frames,
         threads=threads,
         purpose=options.purpose,
-        known=known,
     )
     codec = options.codec if asked else None  # otherwise they were meant for lossy videos
     try:
@@ -239,13 +235,14 @@ def _lossless_plans(
                 threads=threads,
                 codec=codec,
                 preset=options.preset if codec else None,
+                purpose=options.purpose,
             )
             if both.bytes_per_frame <= _LARGER * best.bytes_per_frame:
                 best, plan = both, TrackPlan(both, view, note=note)
     _refuse_noise(samples, best.bytes_per_frame)
     if codec is None:
         _refuse_few(samples, best.bytes_per_frame)
-    if best.layout.name == encoding.general:
+    if plan.view is None and best.layout.name == encoding.general:
         return [plan]
     return [plan, _general_plan(samples[0].key, options)]
 
@@ -597,7 +594,7 @@ def _independent(reader: BagReader, options: PackOptions) -> list[Channel]:
 # ---------------------------------------------------------------- what all pieces agree on
 
 
-def surveyed(plan: Plan, reader: BagReader, known: Collection[str] = ()) -> Plan:
+def surveyed(plan: Plan, reader: BagReader) -> Plan:
     """The plan with how images are stored in all its pieces.
 
     The images with which pieces begin are looked at.
@@ -605,8 +602,6 @@ def surveyed(plan: Plan, reader: BagReader, known: Collection[str] = ()) -> Plan
     Args:
         plan: Of several pieces.
         reader: The recording.
-        known: Texts of what existing parts were made by. A choice for fast reading depends on
-            measured times: where one of these is among the candidates, it is chosen again.
     """
     if not plan.is_divided:
         return plan
@@ -623,7 +618,7 @@ def surveyed(plan: Plan, reader: BagReader, known: Collection[str] = ()) -> Plan
             if samples and samples[0].key not in found:
                 # one thread: on other cores, a pack that is resumed has to decide the same
                 rate = stats.rate if stats else None
-                decision = decide(samples, plan.options, 1, rate, known)
+                decision = decide(samples, plan.options, 1, rate)
                 found[decision.key] = decision
                 if len(found) == MAX_STREAMS_PER_CHANNEL:
                     break

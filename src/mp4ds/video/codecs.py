@@ -127,7 +127,6 @@ class _Coding:
     options: Mapping[str, str]
     default_preset: str = ""
     tuning: str = ""  # further x264 parameters of the default preset
-    fast: Mapping[str, str] | None = None  # further options by which it decodes in less time
     tried: bool = True  # without being asked for
     codec: str = ""  # name in the registry, where that is another one
     presets: tuple[str, ...] = ()  # of a lossy encoder
@@ -145,9 +144,6 @@ _SAME_HEADERS = "stitchable=1"  # parameter sets that do not depend on the crf
 _CENTRED = "chromaloc=1"
 _FFV1 = MappingProxyType({"level": "3", "slicecrc": "1", "slices": "4"})
 _FFV1_8BIT = MappingProxyType({**_FFV1, "coder": "range_tab", "context": "1"})
-# its Golomb-Rice coder takes 8 bits
-_FFV1_FAST = MappingProxyType({"coder": "rice", "context": "0"})
-_X264_FAST = MappingProxyType({"x264-params": "cabac=0"})
 _YUV = ("yuv420p", "yuv422p", "yuv444p")
 
 
@@ -157,17 +153,17 @@ _TUNING = "ref=3:mixed-refs=1:subme=5:me=dia:weightp=0:scenecut=0"
 
 def _x264_lossless(pixel_format: str) -> _Coding:
     given = {**_X264, "qp": "0"}
-    return _Coding("libx264", pixel_format, given, "veryfast", _TUNING, _X264_FAST)
+    return _Coding("libx264", pixel_format, given, "veryfast", _TUNING)
 
 
 def _ffv1_8bit(pixel_format: str) -> _Coding:
-    return _Coding("ffv1", pixel_format, _FFV1_8BIT, fast=_FFV1_FAST)
+    return _Coding("ffv1", pixel_format, _FFV1_8BIT)
 
 
 def _x264_rgb(pixel_format: str) -> _Coding:
     tuning = f"{_TUNING}:8x8dct=0:partitions=p8x8"
     given = {**_X264, "qp": "0"}
-    return _Coding("libx264rgb", pixel_format, given, "veryfast", tuning, _X264_FAST)
+    return _Coding("libx264rgb", pixel_format, given, "veryfast", tuning)
 
 
 def _x265_lossless(pixel_format: str) -> _Coding:
@@ -329,7 +325,6 @@ def recipe_for(
     crf: int | None = None,
     preset: str | None = None,
     varied: bool = False,
-    fast: bool = False,
 ) -> Recipe:
     """The recipe for pictures of a pixel format.
 
@@ -341,7 +336,6 @@ def recipe_for(
         crf: Constant rate factor of a lossy recipe.
         preset: The encoder's preset, or None for the default; encoders without ignore it.
         varied: Whether videos with several crf will be joined into one.
-        fast: For a lossless recipe, the variant that decodes faster and is larger.
 
     Raises:
         OptionError: The codec is unknown or cannot do it; names those that can.
@@ -368,12 +362,6 @@ def recipe_for(
         options["preset"] = preset or coding.default_preset
     if coding.tuning and preset is None:
         options["x264-params"] = coding.tuning
-    if fast:
-        if coding.fast is None or not lossless:
-            raise OptionError(f"codec {name} has no faster form for {pixel_format} pictures")
-        for key, value in coding.fast.items():
-            known = options.get(key) if key.endswith("-params") else None
-            options[key] = f"{known}:{value}" if known else value
     is_yuv = pixel_format in _YUV
     is_rgb = coding.pixel_format.startswith(("rgb", "bgr", "gbr"))
     return Recipe(
@@ -506,52 +494,7 @@ def parse_quality(value: str | QualitySetting) -> QualitySetting:
 
 
 TRAINING, ARCHIVE, SPEED = "training", "archive", "speed"
-_LARGER = 15  # percent that faster reading may cost
-
-
-@dataclass(frozen=True, slots=True)
-class Purpose:
-    """What a dataset is for.
-
-    Attributes:
-        name: ``archive``, ``training`` or ``speed``.
-        larger: For training, percent by which lossless videos may be larger than the smallest.
-    """
-
-    name: str
-    larger: int = 0
-
-    @property
-    def is_training(self) -> bool:
-        """Whether fast reading matters."""
-        return self.name == TRAINING
-
-    @property
-    def is_speed(self) -> bool:
-        """Whether fast packing matters; what is packed in parts then fits together untried."""
-        return self.name == SPEED
-
-    def __str__(self) -> str:
-        return f"{self.name}={self.larger}" if self.is_training else self.name
-
-
-def parse_purpose(value: str | Purpose) -> Purpose:
-    """Parse ``archive``, ``training``, ``training=PERCENT`` or ``speed``.
-
-    Raises:
-        OptionError: Anything else.
-    """
-    if isinstance(value, Purpose):
-        return value
-    match = re.fullmatch(rf"{ARCHIVE}|{SPEED}|{TRAINING}(?:=([0-9]{{1,4}}))?", value)
-    if not match:
-        raise OptionError(
-            f"{value!r} is not known. Use archive, speed, training, or training=PERCENT: how much "
-            f"larger lossless videos may be, {_LARGER} by default."
-        )
-    if value in (ARCHIVE, SPEED):
-        return Purpose(value)
-    return Purpose(TRAINING, int(match[1] or _LARGER))
+"""What a dataset may be for."""
 
 
 def visual_setting(rate: float | None) -> tuple[int, int]:

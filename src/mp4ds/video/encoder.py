@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,14 @@ from av.error import FFmpegError
 from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages.encodings import MAX_SIDE, Encoding, Picture, Pixels, difference
 from mp4ds.messages.layouts import Layout, fit, layout_for
-from mp4ds.video.codecs import CODECS, Purpose, Recipe, codecs_to_try, recipe_for
+from mp4ds.video.codecs import (
+    ARCHIVE,
+    CODECS,
+    TRAINING,
+    Recipe,
+    codecs_to_try,
+    recipe_for,
+)
 from mp4ds.video.media import TIME_BASE, new_mp4, raise_if_scarce, rate_hint
 from mp4ds.video.pixels import PictureConverter, PictureMaker, picture_to_frame
 
@@ -325,22 +331,14 @@ class Coded:
     Attributes:
         key: Bytes of the key frame.
         other: Mean bytes of the others.
-        key_seconds: CPU time of decoding the key frame; 0 if not measured.
-        other_seconds: Mean CPU time of decoding another one.
     """
 
     key: float
     other: float
-    key_seconds: float = 0.0
-    other_seconds: float = 0.0
 
     def bytes_per_frame(self, gop: int) -> float:
         """Mean bytes per frame of a long video with a key frame every `gop` frames."""
         return (self.key + (gop - 1) * self.other) / gop
-
-    def random_seconds(self, gop: int) -> float:
-        """Mean CPU time until a frame at a random place is decoded."""
-        return self.key_seconds + (gop - 1) / 2 * self.other_seconds
 
 
 class Predictor:
@@ -404,16 +402,11 @@ def predict_on_trial(
     predictor = Predictor(coding, size, bytes(context.extradata or b""))
     data = [*map(bytes, packets), None]
     shown = [pixels for packet in data for pixels in predictor.images(packet)]
-    return Coded(*_key_and_others(_sizes(packets, len(samples)))), shown
+    return _cost(packets, len(samples)), shown
 
 
 def encode_on_trial(
-    pictures: Sequence[Picture],
-    recipe: Recipe,
-    *,
-    picture_format: str,
-    threads: int,
-    timed: bool = False,
+    pictures: Sequence[Picture], recipe: Recipe, *, picture_format: str, threads: int
 ) -> Coded:
     """Measure the cost of pictures.
 
@@ -422,23 +415,19 @@ def encode_on_trial(
         recipe: Codec and options.
         picture_format: Pixel format of the pictures.
         threads: Threads of the encoder.
-        timed: Also measure decoding.
 
     Raises:
         EncoderRefusedError: The codec does not take such pictures.
     """
-    context, packets = _encoded(pictures, recipe, picture_format, threads)
-    seconds = _decoding_seconds(context, packets, CODECS[recipe.codec].ffmpeg) if timed else []
-    sizes = _sizes(packets, len(pictures))
-    return Coded(*_key_and_others(sizes), *(_key_and_others(seconds) if timed else ()))
+    _, packets = _encoded(pictures, recipe, picture_format, threads)
+    return _cost(packets, len(pictures))
 
 
-def _sizes(packets: Sequence[Any], frames: int) -> list[int]:
-    """Bytes of each frame."""
+def _cost(packets: Sequence[Any], frames: int) -> Coded:
     sizes = [0] * frames
     for packet in packets:
         sizes[packet.pts] += packet.size
-    return sizes
+    return Coded(float(sizes[0]), float(np.mean(sizes[1:] or sizes)))
 
 
 def _encoded(
@@ -482,32 +471,10 @@ def _encoded(
     return context, packets
 
 
-def _key_and_others(values: Sequence[float]) -> tuple[float, float]:
-    """The first of some values, and the mean of the others."""
-    return float(values[0]), float(np.mean(values[1:] or values))
-
-
-def _decoding_seconds(encoder: Any, packets: Sequence[Any], codec: str) -> list[float]:
-    """CPU time of decoding each packet, the minimum of several runs."""
-    turns = []
-    for _ in range(_TURNS):
-        decoder: Any = av.CodecContext.create(codec, "r")
-        decoder.thread_count = 1
-        decoder.width, decoder.height = encoder.width, encoder.height
-        decoder.pix_fmt = encoder.pix_fmt
-        if encoder.extradata:
-            decoder.extradata = encoder.extradata
-        seconds = []
-        for packet in packets:
-            begun = time.thread_time()
-            decoder.decode(packet)
-            seconds.append(time.thread_time() - begun)
-        turns.append(seconds)
-    return [min(those) for those in zip(*turns, strict=True)]
-
-
-_TURNS = 3
-_DISTANCES = (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30)  # of key frames, where reading is to be fast
+_DISTANCES = (1, 2, 3, 5)
+"""Of key frames, where reading is to be fast."""
+_FASTER = 1.15
+"""How much larger videos may become by that."""
 
 
 def choose(
@@ -518,8 +485,7 @@ def choose(
     preset: str | None,
     gop: int,
     threads: int,
-    purpose: Purpose | None = None,
-    known: Collection[str] = (),
+    purpose: str | None = None,
     layouts: Sequence[Layout] = (),
 ) -> Coding:
     """The best lossless layout, recipe and distance of key frames, found by trying each.
@@ -529,41 +495,31 @@ def choose(
         encoding: Of the images.
         codec: The only codec to try, or None for all.
         preset: The encoder's preset, or None for the default.
-        gop: Frames from one key frame to the next, unless the purpose sets it.
+        gop: Most frames from one key frame to the next.
         threads: Threads of the encoder.
         purpose: What the video is for.
-        known: Texts of choices made before, for ``training``, for which times are measured: one of
-            these that is allowed is chosen again.
         layouts: The only ones to try; none: all that can hold the samples.
 
     Returns:
         The first, in the order of the encoding's layouts and their codecs, within 2 % of the
-        smallest. For ``archive``, the smallest; for ``training``, the one with the fastest decoding
-        of a random frame, among those not larger than the smallest by more than the purpose allows.
+        smallest; for ``archive``, the smallest. For ``training``, with as many key frames as make
+        it at most 15 % larger.
 
     Raises:
         OptionError: The codec has no form for any layout of the encoding.
         EncoderRefusedError: No codec takes such pictures.
     """
     crops, share = _crops(samples, encoding)
-    is_fast = purpose is not None and purpose.is_training
     tried: list[tuple[Coding, Coded]] = []
     refusals: list[Exception] = []
     for layout in layouts or _candidates(samples, encoding):
         pictures = [layout.to_picture(pixels) for pixels in crops]
         picture_format = layout.pixel_format
-        names = codecs_to_try(picture_format) if codec is None else [codec]
-        for name, fast in product(names, (False, True) if is_fast else (False,)):
+        for name in codecs_to_try(picture_format) if codec is None else [codec]:
             try:
-                recipe = recipe_for(
-                    picture_format, lossless=True, codec=name, preset=preset, fast=fast
-                )
+                recipe = recipe_for(picture_format, lossless=True, codec=name, preset=preset)
                 coded = encode_on_trial(
-                    pictures,
-                    recipe,
-                    picture_format=picture_format,
-                    threads=threads,
-                    timed=is_fast,
+                    pictures, recipe, picture_format=picture_format, threads=threads
                 )
             except (OptionError, EncoderRefusedError) as error:
                 refusals.append(error)
@@ -574,9 +530,12 @@ def choose(
         # that an encoder refuses the size says more than that another has no such format
         raise next((e for e in refusals if isinstance(e, EncoderRefusedError)), refusals[0])
     smallest = min(choice.bytes_per_frame for choice, _ in tried)
-    if purpose is not None and purpose.is_training:
-        return _fastest(tried, share, (1 + purpose.larger / 100) * smallest, known)
-    near = NEAR if purpose is None else 1.0
+    for distance in _DISTANCES if purpose == TRAINING else ():
+        sizes = [(coded.bytes_per_frame(distance) / share, choice) for choice, coded in tried]
+        size, best = min(sizes, key=itemgetter(0))
+        if size <= _FASTER * smallest and distance < gop:
+            return replace(best, gop=distance, bytes_per_frame=size)
+    near = 1.0 if purpose == ARCHIVE else NEAR
     return next(choice for choice, _ in tried if choice.bytes_per_frame <= near * smallest)
 
 
@@ -606,27 +565,6 @@ def choose_predicted(
     best = choose(differences, encoding, layouts=layouts, **options)
     size = best.bytes_per_frame + coded.bytes_per_frame(view.gop)
     return replace(best, bytes_per_frame=size / share)
-
-
-def _fastest(
-    tried: Sequence[tuple[Coding, Coded]], share: float, most: float, known: Collection[str]
-) -> Coding:
-    """The choice, with its best distance of key frames, whose random frames decode fastest.
-
-    Args:
-        tried: All candidates, with their cost.
-        share: Share of the images' pixels that were tried.
-        most: Maximum bytes per frame; at least one candidate meets it.
-        known: Texts of choices to make again.
-    """
-    found = [
-        (coded.random_seconds(gop), replace(choice, bytes_per_frame=size, gop=gop))
-        for choice, coded in tried
-        for gop in {*_DISTANCES, choice.gop}
-        if (size := coded.bytes_per_frame(gop) / share) <= most
-    ]
-    again = [pair for pair in found if pair[1].text in known]
-    return min(again or found, key=lambda pair: (pair[0], pair[1].bytes_per_frame))[1]
 
 
 def _candidates(samples: Sequence[Pixels], encoding: Encoding) -> list[Layout]:
