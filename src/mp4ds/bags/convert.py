@@ -21,21 +21,21 @@ from mp4ds.bags.types import (
     BUILTIN,
     HEADER,
     MAX_TAIL,
-    RosVersion,
+    SCHEMA_ENCODINGS,
     by_library,
     closure,
     fields_of,
     has_empty_items,
     incomprehensible,
     make_store,
-    ros1_version,
-    ros2_version,
+    ros1_types,
+    ros2_types,
     same_wire,
     shapes_of,
     sizes_of,
+    standard_of,
     translate,
     types_of,
-    version_of,
 )
 from mp4ds.errors import ConversionError, OptionError, Refused
 from mp4ds.messages.serializations import decoder_of_schema
@@ -112,16 +112,12 @@ class Converter:
 
     # standard types take a while to load, and most recordings are in their target already
     @cached_property
-    def _ros1(self) -> RosVersion:
-        return ros1_version()
+    def _ros1(self) -> Typesdict:
+        return ros1_types()
 
     @cached_property
-    def _ros2(self) -> RosVersion:
-        return ros2_version()
-
-    @property
-    def _source(self) -> RosVersion:
-        return self._ros1 if self._to == "ros2" else self._ros2
+    def _ros2(self) -> Typesdict:
+        return ros2_types()
 
     @property
     def omitted(self) -> Mapping[str, int]:
@@ -172,7 +168,7 @@ class Converter:
         except Refused:
             return channel
         if not schema.data:
-            schema = Schema(schema.name, self._ros1.schema_encoding, definition.encode())
+            schema = Schema(schema.name, SCHEMA_ENCODINGS["ros1"], definition.encode())
         return replace(channel, schema=schema, metadata={"md5sum": digest, **channel.metadata})
 
     def _is_done(self, channel: Channel) -> bool:
@@ -180,7 +176,7 @@ class Converter:
 
     def _plan(self, channel: Channel) -> _Plan:
         schema = channel.schema
-        if channel.message_encoding != self._source.encoding:
+        if channel.message_encoding not in ENCODINGS.values():  # it is not that of the target
             encoding = channel.message_encoding or "in an unknown encoding"
             problem = f"its messages are {encoding}, which has no equivalent in ROS"
             raise ConversionError(channel.topic, problem, _REMEDY)
@@ -194,13 +190,14 @@ class Converter:
         return self._plans[schema]
 
     def _make_plan(self, schema: Schema) -> _Plan:
-        target = self._ros2 if self._to == "ros2" else self._ros1
+        to_ros2 = self._to == "ros2"
+        source, target = (self._ros1, self._ros2) if to_ros2 else (self._ros2, self._ros1)
         problem = incomprehensible(schema.name)
-        types = types_of(schema, self._source)
+        types = types_of(schema, source)
         name = normalize_msgtype(schema.name)
-        new_name = _RENAMED.get(name, name) if target is self._ros2 else name
+        new_name = _RENAMED.get(name, name) if to_ros2 else name
         made = make_store(translate(types, name, new_name, target), target)
-        if target is self._ros2:
+        if to_ros2:
             definition, _ = by_library(problem, made.generate_msgdef, new_name, 2)
             digest = by_library(problem, made.hash_rihs01, new_name)
         else:
@@ -208,7 +205,8 @@ class Converter:
             new_name = by_library(problem, denormalize_msgtype, new_name)
         store = make_store(types, self._ros2)
         store.get_msgdef(name)  # compiled now, to fail before any message
-        made_schema = Schema(new_name, target.schema_encoding, definition.encode())
+        encoding = SCHEMA_ENCODINGS["cdr" if to_ros2 else "ros1"]
+        made_schema = Schema(new_name, encoding, definition.encode())
         times = where_times_are(types, name)
         no_message = f"a message cannot be parsed as {schema.name}"
         return _Plan(name, types, store, made_schema, digest, times, no_message)
@@ -252,7 +250,7 @@ class Converter:
         }
         name, definition = known.pop("type", ""), known.pop("message_definition", None)
         encoded = known.pop("message_definition;base64", None)
-        encoding = "" if definition is None and encoded is None else self._ros1.schema_encoding
+        encoding = "" if definition is None and encoded is None else SCHEMA_ENCODINGS["ros1"]
         try:
             data = base64.b64decode(encoded) if encoded else (definition or "").encode()
         except ValueError:
@@ -398,12 +396,12 @@ def _ros(channel: Channel) -> Decoder:
     if schema is None or not schema.name:
         raise _undecodable(channel, "its message type is not known")
     is_ros1 = channel.message_encoding == "ros1"
-    version = version_of(channel.message_encoding)
+    standard = standard_of(channel.message_encoding)
     try:
-        types = types_of(schema, version)
+        types = types_of(schema, standard)
         if has_empty_items(types, sizes_of(types)):
             raise _undecodable(channel, f"{schema.name} has arrays of a type without fields")
-        store = make_store(types, version)
+        store = make_store(types, standard)
         # compiled now, to fail before any message
         definition = store.get_msgdef(normalize_msgtype(schema.name))
     except Refused as reason:

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,61 +91,6 @@ class Fields(dict[bytes, bytes]):
     def op(self) -> int:
         """The record's kind."""
         return self.number(b"op", 1)
-
-
-class _BagFile:
-    """A bag being read record by record.
-
-    Args:
-        path: The file.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.stream: BinaryIO = open_source(path)
-        self.size = path.stat().st_size
-
-    def seek(self, place: int) -> None:
-        """Seek to a byte.
-
-        Raises:
-            DamageError: The file ends before.
-        """
-        if place > self.size:
-            raise DamageError(f"it has no byte {place}")
-        self.stream.seek(place)
-
-    def tell(self) -> int:
-        """The position of the next byte to read."""
-        return self.stream.tell()
-
-    def take(self, size: int) -> bytes:
-        """The next bytes.
-
-        Raises:
-            DamageError: There are fewer.
-        """
-        data = self.stream.read(size) if size <= self.size else b""
-        if len(data) != size:
-            raise DamageError("a record is cut short")
-        return data
-
-    def length(self) -> int:
-        """The length of what follows."""
-        return int.from_bytes(self.take(4), "little")
-
-    def header(self, op: Op | None = None) -> Fields:
-        """The header of the next record.
-
-        Args:
-            op: Expected kind; None for any.
-
-        Raises:
-            DamageError: It is of another kind, or cut short.
-        """
-        fields = Fields(split_header(self.take(self.length())))
-        if op is not None and fields.op != op:
-            raise DamageError(f"a record of kind {fields.op} is where {op.name} should be")
-        return fields
 
 
 def _number(data: bytes | memoryview, offset: int) -> int:
@@ -367,7 +312,8 @@ class Ros1Reader(BagReader):
     def __init__(self, path: Path) -> None:
         self.path = path
         self.files = [path]
-        self._file = _BagFile(path)
+        self._stream = open_source(path)
+        self._size = path.stat().st_size
         self._channels: dict[int, Channel] = {}  # by connection, in the order of the index
         self._chunks: list[_Chunk] = []
         self._unpacked: OrderedDict[int, memoryview] = OrderedDict()
@@ -383,18 +329,61 @@ class Ros1Reader(BagReader):
             self.close()
             raise
 
+    # ------------------------------------------------------------ the file
+
+    def _seek(self, place: int) -> None:
+        """Seek to a byte.
+
+        Raises:
+            DamageError: The file ends before.
+        """
+        if place > self._size:
+            raise DamageError(f"it has no byte {place}")
+        self._stream.seek(place)
+
+    def _take(self, size: int) -> bytes:
+        """The next bytes.
+
+        Raises:
+            DamageError: There are fewer.
+        """
+        data = self._stream.read(size) if size <= self._size else b""
+        if len(data) != size:
+            raise DamageError("a record is cut short")
+        return data
+
+    def _length(self) -> int:
+        """The length of what follows."""
+        return int.from_bytes(self._take(4), "little")
+
+    def _header(self, op: Op | None = None) -> Fields:
+        """The header of the next record.
+
+        Args:
+            op: Expected kind; None for any.
+
+        Raises:
+            DamageError: It is of another kind, or cut short.
+        """
+        fields = Fields(split_header(self._take(self._length())))
+        if op is not None and fields.op != op:
+            raise DamageError(f"a record of kind {fields.op} is where {op.name} should be")
+        return fields
+
+    # ------------------------------------------------------------ the index
+
     def _read_header(self) -> Fields:
         """The bag's header, if its index can be where that says.
 
         Raises:
             SourceError: It is not a bag, an old or encrypted one, or not indexed.
         """
-        path, file = self.path, self._file
-        start = file.stream.read(32)
+        path = self.path
+        start = self._stream.read(32)
         if not start.startswith(MAGIC):
             raise other_format(path, start)
-        file.seek(len(MAGIC))
-        header = file.header(Op.BAG)
+        self._seek(len(MAGIC))
+        header = self._header(Op.BAG)
         index = header.number(b"index_pos", 8)
         if header.get(b"encryptor"):
             raise SourceError(path, "is encrypted", "Decrypt it with `rosbag decrypt` first.")
@@ -404,24 +393,23 @@ class Ros1Reader(BagReader):
                 "is not indexed: the recording was cut short",
                 f"Run `rosbag reindex` on it first, or {SALVAGE}",
             )
-        if index > file.size:
+        if index > self._size:
             problem = f"is cut short: its index should begin at byte {index}, and it has "
-            raise SourceError(path, f"{problem}{file.size} bytes", _COPY_AGAIN)
+            raise SourceError(path, f"{problem}{self._size} bytes", _COPY_AGAIN)
         return header
 
     def _read_index(self, header: Fields) -> dict[int, _Index]:
         """The messages of each connection, from the index at the end and those of the chunks."""
-        file = self._file
-        first = file.length() + file.tell()
+        first = self._length() + self._stream.tell()
         index = header.number(b"index_pos", 8)
-        file.seek(index)
+        self._seek(index)
         for _ in range(header.number(b"conn_count")):
             self._read_connection()
-        start = file.tell()
+        start = self._stream.tell()
         listed = [self._read_chunk_info() for _ in range(header.number(b"chunk_count"))]
         if self._goes_on():
             raise DamageError("its header declares fewer chunks than its index lists")
-        expect(file.stream, _index_ranges(listed, start))
+        expect(self._stream, _index_ranges(listed, start))
         # By connection: raw index entries; number of a chunk and of its entries, alternating.
         entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         runs: defaultdict[int, array[int]] = defaultdict(partial(array, "I"))
@@ -432,7 +420,7 @@ class Ros1Reader(BagReader):
                 connection, found = self._read_entries(chunk)
                 entries[connection] += found
                 runs[connection].extend((number, len(found) // INDEX_ENTRY.itemsize))
-            ends[chunk.start] = file.tell()
+            ends[chunk.start] = self._stream.tell()
         if len(ends) < len(listed):
             raise DamageError("its index lists a chunk twice")
         # messages that the index does not list would be lost silently
@@ -440,7 +428,7 @@ class Ros1Reader(BagReader):
             self._check_between(first, chunk_start)
             first = ends[chunk_start]
         # a bag without chunks is read to its end: there is no other way to find its index
-        self._check_between(first, index if listed else file.size)
+        self._check_between(first, index if listed else self._size)
         return {
             key: _sorted_index(entries.pop(key, b""), runs.pop(key, [])) for key in self._channels
         }
@@ -448,40 +436,39 @@ class Ros1Reader(BagReader):
     def _goes_on(self) -> bool:
         """Whether a record follows the last one of the index that was read."""
         try:
-            return b"op" in self._file.header()
+            return b"op" in self._header()
         except _DAMAGE:
             return False
 
     def _read_connection(self) -> None:
-        record = self._file.header()
+        record = self._header()
         if record.get(b"op") != bytes([Op.CONNECTION]):
             raise DamageError("a connection record is missing")
-        channel = connection_of(record, self._file.take(self._file.length()))
+        channel = connection_of(record, self._take(self._length()))
         self._channels.setdefault(channel.id, channel)  # the first counts, as in ROS
 
     def _read_chunk_info(self) -> _Chunk:
-        header = self._file.header(Op.CHUNK_INFO)
+        header = self._header(Op.CHUNK_INFO)
         _check_version(header)
-        self._file.length()
-        counts = self._file.take(8 * header.number(b"count"))
+        self._length()
+        counts = self._take(8 * header.number(b"count"))
         return _Chunk(header.number(b"chunk_pos", 8), dict(CHUNK_COUNT.iter_unpack(counts)))
 
     def _read_chunk(self, chunk: _Chunk) -> _Chunk:
         """A chunk with its header's fields; it will be decompressed to that size."""
-        file = self._file
-        file.seek(chunk.start)
-        header = file.header(Op.CHUNK)
+        self._seek(chunk.start)
+        header = self._header(Op.CHUNK)
         compression = header.get(b"compression", b"").decode(errors="replace")
-        packed, place = file.length(), file.tell()
-        file.seek(place + packed)
+        packed, place = self._length(), self._stream.tell()
+        self._seek(place + packed)
         return _Chunk(chunk.start, chunk.counts, compression, header.number(b"size"), place, packed)
 
     def _read_entries(self, chunk: _Chunk) -> tuple[int, bytes]:
         """A connection, and its messages in a chunk, of which the next index is."""
-        header = self._file.header(Op.INDEX)
+        header = self._header(Op.INDEX)
         _check_version(header)
         number, count = header.number(b"conn"), header.number(b"count")
-        entries = self._file.take(self._file.length())
+        entries = self._take(self._length())
         if (
             chunk.counts.get(number) != count
             or len(entries) != count * INDEX_ENTRY.itemsize
@@ -493,12 +480,13 @@ class Ros1Reader(BagReader):
 
     def _check_between(self, place: int, end: int) -> None:
         """Refuse messages in a range of bytes where the index lists none."""
-        file = self._file
         while place < end:
-            file.seek(place)
-            if file.header().op in (Op.CHUNK, Op.MESSAGE):
+            self._seek(place)
+            if self._header().op in (Op.CHUNK, Op.MESSAGE):
                 raise DamageError(f"its index does not list what it holds at byte {place}")
-            place = file.length() + file.tell()
+            place = self._length() + self._stream.tell()
+
+    # ------------------------------------------------------------ messages
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Messages in log-time order, from the chunks that hold them."""
@@ -509,7 +497,7 @@ class Ros1Reader(BagReader):
                 visited.add(chunk)
                 self.position += self._chunks[chunk].packed
             yield self._message(channel, time, chunk, offset)
-        self.position = self._file.size
+        self.position = self._size
 
     def _entries(self, excerpt: Excerpt) -> Iterator[tuple[Channel, int, int, int]]:
         """Per message: channel, log time, chunk number, offset."""
@@ -522,7 +510,7 @@ class Ros1Reader(BagReader):
         order = np.lexsort((offsets, chunks, times))
         first_seen = np.sort(np.unique(chunks[order], return_index=True)[1])
         needed = (self._chunks[number] for number in chunks[order][first_seen].tolist())
-        expect(self._file.stream, ((one.place, one.place + one.packed) for one in needed))
+        expect(self._stream, ((one.place, one.place + one.packed) for one in needed))
         for start in range(0, len(order), 4096):
             rows = order[start : start + 4096]
             columns = (column[rows].tolist() for column in (owners, times, chunks, offsets))
@@ -552,8 +540,8 @@ class Ros1Reader(BagReader):
             len(self._unpacked) >= CACHED_CHUNKS or size > CACHED_BYTES
         ):
             size -= len(self._unpacked.popitem(last=False)[1])
-        self._file.seek(chunk.place)
-        data = self._file.take(chunk.packed)
+        self._seek(chunk.place)
+        data = self._take(chunk.packed)
         if chunk.compression != "none":
             data = unpack(chunk.compression, data, chunk.size)
         elif len(data) != chunk.size:
@@ -572,7 +560,7 @@ class Ros1Reader(BagReader):
     def close(self) -> None:
         """Close the file."""
         self._unpacked.clear()
-        self._file.stream.close()
+        self._stream.close()
 
 
 def _index_ranges(chunks: Sequence[_Chunk], end: int) -> Iterator[tuple[int, int]]:

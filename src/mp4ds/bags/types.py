@@ -264,40 +264,27 @@ _BYTES = {"byte": "uint8", "char": "uint8", "octet": "uint8"}
 _RULER = "=" * 80
 
 
-@dataclass(frozen=True, slots=True)
-class RosVersion:
-    """ROS 1 or ROS 2.
-
-    Attributes:
-        encoding: Message encoding of its channels.
-        schema_encoding: Encoding of the definitions generated for it.
-        standard: Its standard types.
-    """
-
-    encoding: str
-    schema_encoding: str
-    standard: Typesdict
+SCHEMA_ENCODINGS = {"ros1": "ros1msg", "cdr": "ros2msg"}
+"""Encoding of messages -> that of the definitions generated for them."""
 
 
-def ros1_version() -> RosVersion:
-    """ROS 1 with the types of Noetic; rosbags has all except tf2's."""
+def ros1_types() -> Typesdict:
+    """The standard types of ROS 1 Noetic; rosbags has all except tf2's."""
     tf2 = "tf2_msgs/msg/TFMessage"
     standard = {tf2: get_typestore(Stores.ROS2_HUMBLE).fielddefs[tf2]}
-    standard.update(get_typestore(Stores.ROS1_NOETIC).fielddefs)
-    return RosVersion("ros1", "ros1msg", standard)
+    return {**standard, **get_typestore(Stores.ROS1_NOETIC).fielddefs}
 
 
-def ros2_version(distribution: str = "humble") -> RosVersion:
-    """ROS 2 with the types of a distribution, for definitions that were not recorded."""
+def ros2_types(distribution: str = "humble") -> Typesdict:
+    """The standard types of a distribution of ROS 2, for definitions that were not recorded."""
     # including later types: a recording without definitions may have them
     latest = get_typestore(Stores.LATEST).fielddefs
-    standard = {**latest, **get_typestore(Stores(f"ros2_{distribution}")).fielddefs}
-    return RosVersion("cdr", "ros2msg", standard)
+    return {**latest, **get_typestore(Stores(f"ros2_{distribution}")).fielddefs}
 
 
-def version_of(message_encoding: str) -> RosVersion:
-    """The ROS whose messages have an encoding, ``ros1`` or ``cdr``."""
-    return ros1_version() if message_encoding == "ros1" else ros2_version()
+def standard_of(message_encoding: str) -> Typesdict:
+    """The standard types of the ROS whose messages have an encoding, ``ros1`` or ``cdr``."""
+    return ros1_types() if message_encoding == "ros1" else ros2_types()
 
 
 def name_of(schema: Schema) -> str:
@@ -306,7 +293,7 @@ def name_of(schema: Schema) -> str:
     return name
 
 
-def types_of(schema: Schema, version: RosVersion) -> Typesdict:
+def types_of(schema: Schema, standard: Typesdict) -> Typesdict:
     """The type of a schema and everything it refers to; missing ones are taken from the standard.
 
     Raises:
@@ -316,14 +303,14 @@ def types_of(schema: Schema, version: RosVersion) -> Typesdict:
     problem = incomprehensible(schema.name)
     name = by_library(problem, normalize_msgtype, schema.name)
     found = _parse(schema, name, problem)
-    if not fields_of(found, name) and name in version.standard:
+    if not fields_of(found, name) and name in standard:
         found.pop(name, None)  # the definition is empty, but perhaps not the type
     # Time, duration and header are each ROS's own, whatever their definitions are called.
     for builtin in (*BUILTIN, HEADER):
         found.pop(builtin, None)
-    if name not in found and name not in version.standard:
+    if name not in found and name not in standard:
         raise Refused(f"no definition of type {schema.name} is known")
-    types = closure(found, name, version.standard)
+    types = closure(found, name, standard)
     sizes_of(types)  # refuses definitions that no message can match
     return types
 
@@ -384,20 +371,20 @@ def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str
     )
 
 
-def translate(types: Typesdict, root: str, new_root: str, version: RosVersion) -> Typesdict:
+def translate(types: Typesdict, root: str, new_root: str, standard: Typesdict) -> Typesdict:
     """Definitions for the other ROS; standard ones where they serialise identically.
 
     Args:
         types: The definitions, complete.
         root: The type to translate.
         new_root: Its name in the other ROS.
-        version: The other ROS.
+        standard: The standard types of the other ROS.
     """
     chosen: Typesdict = {}
     for name in types:
         new_name = new_root if name == root else name
-        if new_name in version.standard and same_wire(types, name, version.standard, new_name):
-            chosen.update(closure({}, new_name, version.standard))
+        if new_name in standard and same_wire(types, name, standard, new_name):
+            chosen.update(closure({}, new_name, standard))
         else:
             constants, fields = types[name]
             # Bounds are not on the wire. ROS 1 cannot write them, its definitions have none.
@@ -416,7 +403,7 @@ def _unbounded(desc: Any) -> Any:
     return (desc[0], (_unbounded(part), count if desc[0] == Nodetype.ARRAY else 0))
 
 
-def make_store(types: Typesdict, version: RosVersion) -> Typestore:
-    """A type store of definitions with the header of a ROS."""
+def make_store(types: Typesdict, standard: Typesdict) -> Typestore:
+    """A type store of definitions with the header of the ROS of these standard types."""
     own = {name: found for name, found in types.items() if name not in (*BUILTIN, HEADER)}
-    return BoundedStore({HEADER: version.standard[HEADER], **own})
+    return BoundedStore({HEADER: standard[HEADER], **own})

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.convert import ENCODINGS, Converter
-from mp4ds.bags.types import make_store, types_of, version_of
+from mp4ds.bags.types import SCHEMA_ENCODINGS, make_store, standard_of, types_of
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import ChannelGroup, MessageSource, Part
 from mp4ds.dataset.rebuild import CalibrationMessages, message_at
@@ -505,17 +505,17 @@ class Types:
 
     def _defined(self, encoding: str) -> tuple[Schema, str]:
         """The type's definition, and its md5sum or hash."""
-        kind, version = KINDS[self._kind], version_of(encoding)
+        kind, standard = KINDS[self._kind], standard_of(encoding)
         text = kind.definitions.get(encoding, "")
-        schema = Schema(kind.type_name, version.schema_encoding if text else "", text.encode())
-        store = make_store(types_of(schema, version), version)
+        schema = Schema(kind.type_name, SCHEMA_ENCODINGS[encoding] if text else "", text.encode())
+        store = make_store(types_of(schema, standard), standard)
         if encoding == "ros1":
             text, digest = store.generate_msgdef(schema.name, 1)
             name = kind.ros1_type
         else:
             text, digest = store.generate_msgdef(schema.name, 2)[0], store.hash_rihs01(schema.name)
             name = schema.name
-        return Schema(name, version.schema_encoding, text.encode()), digest
+        return Schema(name, SCHEMA_ENCODINGS[encoding], text.encode()), digest
 
     def message(
         self,

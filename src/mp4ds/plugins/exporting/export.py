@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -90,7 +91,7 @@ def export(
             staged(
                 target,
                 force=chosen.force,
-                owned=_export_names,
+                owned=partial(listed_names, listing=NOTE_NAME),
                 sources=[dataset.path for dataset in opened],
             )
         )
@@ -151,7 +152,3 @@ def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
             "one by one."
         )
     options.check_for(to)
-
-
-def _export_names(path: Path) -> set[str] | None:
-    return listed_names(path, NOTE_NAME)

@@ -137,7 +137,7 @@ def write(*jobs: ExportJob) -> None:
         _write_table(path / episode.path("data", "parquet"), _frames_table(episode, fps))
         episodes.append(episode)
         first += len(episode.times)
-    _write_table(path / "meta/tasks.parquet", _tasks_table([task]))
+    _write_table(path / "meta/tasks.parquet", _tasks_table(task))
     rows = [_episode_row(episode, task, fps) for episode in episodes]
     table = pa.table({name: [row[name] for row in rows] for name in rows[0]})
     _write_table(path / _EPISODES_PATH, table)
@@ -349,9 +349,9 @@ def _frames_table(episode: Episode, fps: int) -> Any:
     return pa.table(columns)
 
 
-def _tasks_table(tasks: Sequence[str]) -> Any:
+def _tasks_table(task: str) -> Any:
     """The table of tasks, which pandas reads with the task as its index."""
-    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": [*tasks]})
+    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [task]})
     kinds = [("task_index", "int64", "int64"), ("task", "unicode", "object")]
     described = {
         "index_columns": ["task"],

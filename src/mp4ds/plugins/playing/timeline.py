@@ -19,8 +19,8 @@ from mp4ds.bags.types import (
     field_shape,
     fields_of,
     name_of,
+    standard_of,
     types_of,
-    version_of,
 )
 from mp4ds.dataset.dataset import Ahead, Dataset
 from mp4ds.errors import ConversionError, OptionError, Refused
@@ -384,7 +384,7 @@ def _stamped(channel: Channel) -> str:
     if name in _TRANSFORMS:
         return name
     try:
-        fields = fields_of(types_of(schema, version_of(channel.message_encoding)), name)
+        fields = fields_of(types_of(schema, standard_of(channel.message_encoding)), name)
         is_first = fields and field_shape(fields[0][1]) == FieldShape("", HEADER, 0, None, None)
         return HEADER if is_first else ""
     except Refused:

@@ -149,9 +149,7 @@ class Wanted:
     """
 
     def __init__(self, topics: Sequence[str], options: RecordOptions) -> None:
-        self._all_topics = options.all or options.all_topics
-        self._all_services = options.all or options.all_services
-        is_all = self._all_topics or self._all_services
+        is_all = options.all or options.all_topics or options.all_services
         if not (topics or is_all or options.regex or options.topic_types):
             raise OptionError("Name topics, or give `all`, `regex` or `topic_types`.")
         names = options.names
@@ -164,23 +162,22 @@ class Wanted:
                     f"{first} and {asked} are the same topic after remapping: name one of them."
                 )
         self._named = Selection([*self._recorded]) if topics else None
-        self._types = {*options.topic_types}
-        self._regex = options.regex
         self._left_out = Selection((), [names.resolved(topic.strip()) for topic in options.exclude])
-        self._exclude_types = {*options.exclude_topic_types}
-        self._exclude_regex = options.exclude_regex
+        self._options = options
 
     def __call__(self, topic: str, type_name: str = "") -> bool:
         """Whether a topic is recorded."""
-        if not self._left_out(topic) or type_name in self._exclude_types:
+        options = self._options
+        if not self._left_out(topic) or type_name in options.exclude_topic_types:
             return False
-        if self._exclude_regex and self._exclude_regex.search(topic):
+        if options.exclude_regex and options.exclude_regex.search(topic):
             return False
-        if self._all_services if topic.endswith(SERVICE_EVENTS) else self._all_topics:
+        is_service = topic.endswith(SERVICE_EVENTS)
+        if options.all or (options.all_services if is_service else options.all_topics):
             return True
         is_named = self._named is not None and self._named(topic)
-        is_found = self._regex is not None and self._regex.search(topic) is not None
-        return is_named or is_found or type_name in self._types
+        is_found = options.regex is not None and options.regex.search(topic) is not None
+        return is_named or is_found or type_name in options.topic_types
 
     def recorded_as(self, topic: str) -> str:
         """The name under which a topic is recorded."""

@@ -325,7 +325,6 @@ class DdsNode(Ros2Node):
         self._found: dict[str, _Found] = {}
         self._describing: dict[Any, list[str]] = defaultdict(list)  # nodes, by participant
         self._readers: list[tuple[Any, Callable[[Any], None]]] = []
-        self._services: list[_Server] = []
 
     @property
     def address(self) -> str:
@@ -464,11 +463,10 @@ class DdsNode(Ros2Node):
                 self.lost[topic] = lost
 
     def serve(self, services: Sequence[Service]) -> None:
-        """Offer services to clients that use rmw_cyclonedds."""
+        """Offer services to clients that use rmw_cyclonedds; answers come on the node's thread."""
         for number, service in enumerate(services, 1):
-            server = _Server(self._participant, f"/{self._name}/{service.name}", service, number)
-            self._services.append(server)
-            self._hear(server.reader, server.on_request)
+            name = f"/{self._name}/{service.name}"
+            self._hear(*_offered(self._participant, name, service, number))
 
     # ------------------------------------------------------------ the end
 
@@ -486,7 +484,6 @@ class DdsNode(Ros2Node):
         self._count_lost()
         self._readers.clear()
         self._received.clear()
-        self._services.clear()
         self._publications = self._subscriptions = self._participant = None
 
 
@@ -503,50 +500,59 @@ _POLL_S = 0.01
 _CLIENT = re.compile(rb"(?:^|;)clientid=([^;]*);")
 
 
-class _Server:
-    """Offers a service; requests are answered on the node's thread."""
+def _offered(
+    participant: Any, name: str, service: Service, number: int
+) -> tuple[Any, Callable[[Any], None]]:
+    """Offer a service.
 
-    def __init__(self, participant: Any, name: str, service: Service, number: int) -> None:
-        self._service = service
-        kind = f"rosbag2_interfaces/srv/{service.kind}"
-        types, request_hash = service_types(f"{kind}_Request", service.request)
-        request = make_struct(types, f"{kind}_Request", has_fields=True)
-        types, reply_hash = service_types(f"{kind}_Response", service.response)
-        self._reply = make_struct(types, f"{kind}_Response", has_fields=True)
-        # a unique id lets clients match the reader and the writer of a service
-        unique = participant.guid.bytes[:12] + number.to_bytes(4, "big")
-        own = f"serviceid={'.'.join(f'{byte:x}' for byte in unique)};"
-        self.reader = DataReader(
-            participant,
-            Topic(participant, f"rq{name}Request", request),
-            qos=_dds_qos(Qos(), own + _told(request_hash)),
-        )
-        self._writer = DataWriter(
-            participant,
-            Topic(participant, f"rr{name}Reply", self._reply),
-            qos=_dds_qos(Qos(), own + _told(reply_hash)),
-        )
+    Args:
+        participant: The DDS participant.
+        name: Of the service.
+        service: What it does.
+        number: Unique among the services of the participant.
 
-    def on_request(self, request: Any) -> None:
-        fields = dict(self._service.answer(request))
-        reply = self._reply(
+    Returns:
+        The reader of requests, and what answers one.
+    """
+    kind = f"rosbag2_interfaces/srv/{service.kind}"
+    types, request_hash = service_types(f"{kind}_Request", service.request)
+    request_kind = make_struct(types, f"{kind}_Request", has_fields=True)
+    types, reply_hash = service_types(f"{kind}_Response", service.response)
+    reply_kind = make_struct(types, f"{kind}_Response", has_fields=True)
+    # a unique id lets clients match the reader and the writer of a service
+    unique = participant.guid.bytes[:12] + number.to_bytes(4, "big")
+    own = f"serviceid={'.'.join(f'{byte:x}' for byte in unique)};"
+    reader = DataReader(
+        participant,
+        Topic(participant, f"rq{name}Request", request_kind),
+        qos=_dds_qos(Qos(), own + _told(request_hash)),
+    )
+    writer = DataWriter(
+        participant,
+        Topic(participant, f"rr{name}Reply", reply_kind),
+        qos=_dds_qos(Qos(), own + _told(reply_hash)),
+    )
+
+    def connected() -> set[str]:
+        data = writer.get_matched_subscription_data
+        return {_user_data(data(one), _CLIENT) for one in writer.get_matched_subscriptions()}
+
+    def on_request(request: Any) -> None:
+        fields = dict(service.answer(request))
+        reply = reply_kind(
             client_guid=request.client_guid,
             sequence_number=request.sequence_number,
             **(fields or {FILLER: 0}),
         )
-        self._wait_for_reader(request.sample_info.publication_handle)
-        self._writer.write(reply)
-
-    def _wait_for_reader(self, writer: int) -> None:
-        """Wait until the client's reader is connected, so that it gets the reply."""
-        client = _user_data(self.reader.get_matched_publication_data(writer), _CLIENT)
+        # the client's reader gets the reply only once it is connected
+        handle = request.sample_info.publication_handle
+        client = _user_data(reader.get_matched_publication_data(handle), _CLIENT)
         end = time.monotonic() + _READER_PATIENCE_S
-        while client and client not in self._connected() and time.monotonic() < end:
+        while client and client not in connected() and time.monotonic() < end:
             time.sleep(_POLL_S)
+        writer.write(reply)
 
-    def _connected(self) -> set[str]:
-        data = self._writer.get_matched_subscription_data
-        return {_user_data(data(one), _CLIENT) for one in self._writer.get_matched_subscriptions()}
+    return reader, on_request
 
 
 # ---------------------------------------------------------------- descriptions of types

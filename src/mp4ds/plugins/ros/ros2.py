@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mp4ds.bags.types import (
-    RosVersion,
     by_library,
     incomprehensible,
     make_store,
-    ros2_version,
+    ros2_types,
     types_of,
 )
 from mp4ds.errors import ConversionError, OptionError, Refused
@@ -251,9 +250,9 @@ _HASH = re.compile(r"RIHS01_[0-9a-f]{64}")
 
 
 @cache
-def standard_types() -> RosVersion:
+def standard_types() -> dict[str, Any]:
     """The types of a recent ROS 2, for publishers and recordings that do not define them."""
-    return ros2_version("jazzy")
+    return ros2_types("jazzy")
 
 
 def full_name(name: str) -> str:
@@ -270,7 +269,7 @@ def types_in(schema: Schema | None) -> dict[str, Any]:
     """
     if schema is None:
         raise Refused("there is no definition")
-    filler = standard_types().standard["std_msgs/msg/Empty"][1][0]
+    filler = standard_types()["std_msgs/msg/Empty"][1][0]
     return {
         name: (constants, fields or [filler])
         for name, (constants, fields) in types_of(schema, standard_types()).items()
@@ -310,7 +309,7 @@ def standard_definition(type_name: str, type_hash: str) -> str:
         type_name: Such as ``sensor_msgs/msg/Image``.
         type_hash: As announced by the publisher; empty if it announced none.
     """
-    if type_name not in standard_types().standard:
+    if type_name not in standard_types():
         return ""
     return _proven(Schema(type_name, _ENCODING, b""), type_hash)
 
