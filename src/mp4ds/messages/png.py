@@ -482,6 +482,19 @@ def rebuild(pixels: Pixels, recipe: PngRecipe) -> bytes:
     return b"".join((SIGNATURE, _chunk(header), before, *chunks, after))
 
 
+_NOISE = PngRecipe("0", 1, _RLE, 9, 15, "7801", 0, "", "AAAAAElFTkSuQmCC")
+"""Huffman codes alone: no filter, and no search for repetitions, makes noise any smaller."""
+
+
+def noise_file(pixels: Pixels) -> bytes:
+    """A PNG of pixels that hardly depend on their neighbours.
+
+    Args:
+        pixels: As for `rebuild`.
+    """
+    return rebuild(pixels, _NOISE)
+
+
 def _deflate(rows: NDArray[np.uint8], recipe: PngRecipe) -> bytes:
     """Deflate rows, without the two bytes of zlib's header."""
     compressor = zlib.compressobj(

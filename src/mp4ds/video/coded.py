@@ -309,6 +309,13 @@ class Jpeg(StreamParser):
         return self._link(len(data), begins=True, key=key)
 
 
+class Png(StreamParser):
+    """PNG files: all are key frames."""
+
+    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        return self._link(len(data), begins=True, key=key)
+
+
 # ---------------------------------------------------------------- FFV1
 
 _FFV1_KEY = 0x7F80

@@ -16,6 +16,7 @@ import numpy as np
 from av.error import FFmpegError
 
 from mp4ds.errors import EncoderRefusedError, OptionError
+from mp4ds.messages import png
 from mp4ds.messages.encodings import MAX_SIDE, Encoding, Picture, Pixels, difference
 from mp4ds.messages.layouts import Layout, fit, layout_for
 from mp4ds.video.codecs import (
@@ -26,8 +27,9 @@ from mp4ds.video.codecs import (
     codecs_to_try,
     recipe_for,
 )
+from mp4ds.video.colour import samples
 from mp4ds.video.media import TIME_BASE, new_mp4, raise_if_scarce, rate_hint
-from mp4ds.video.pixels import PictureConverter, PictureMaker, picture_to_frame
+from mp4ds.video.pixels import PictureConverter, PictureMaker, picture_to_frame, plain_frame
 
 _THREADS = Path("/proc/self/task")
 
@@ -129,6 +131,11 @@ class VideoEncoder:
             ) from None
 
     def _open_stream(self, threads: int, rate: float | None) -> None:
+        if self.recipe.codec == "png":
+            size = {"width": self.width, "height": self.height}
+            self._stream = self._container.add_mux_stream("png", rate=rate_hint(rate), **size)
+            self._stream.time_base = TIME_BASE
+            return
         stream: Any = self._container.add_stream(
             self.recipe.encoder,
             rate=rate_hint(rate),  # a last frame of no ticks would be cut off
@@ -170,6 +177,8 @@ class VideoEncoder:
             self._container.mux(packet)
 
     def _encoded(self, frame: av.VideoFrame | None) -> Sequence[Any]:
+        if self.recipe.codec == "png":
+            return [_png_packet(frame, self._stream)] if frame else []
         try:
             packets: Sequence[Any] = self._stream.encode(frame)
         except FFmpegError as error:
@@ -208,6 +217,16 @@ class VideoEncoder:
             self.close()
         else:
             self.abandon()
+
+
+def _png_packet(frame: av.VideoFrame, stream: Any = None) -> Any:
+    """The PNG file of a frame: ffmpeg's encoder would look for repetitions in the noise."""
+    packet: Any = av.Packet(png.noise_file(samples(frame)))
+    packet.pts = packet.dts = frame.pts
+    packet.is_keyframe = True
+    if stream is not None:
+        packet.stream, packet.time_base = stream, TIME_BASE
+    return packet
 
 
 def coded_size(recipe: Recipe, width: int, height: int) -> tuple[int, int]:
@@ -441,6 +460,12 @@ def _encoded(
     rows, columns = pictures[0][0].shape[:2]
     width, height = coded_size(recipe, columns, rows)
     converter = PictureConverter(source_full_range=recipe.full_range, full_range=recipe.full_range)
+    if recipe.codec == "png":
+        frames = (plain_frame(picture, picture_format) for picture in pictures)
+        files = list(map(_png_packet, frames))
+        for number, packet in enumerate(files):
+            packet.pts = number
+        return None, files
     context: Any = av.CodecContext.create(recipe.encoder, "w")
     context.options = {**recipe.options, "g": str(len(pictures))}
     context.time_base = Fraction(1, 30)
@@ -487,6 +512,7 @@ def choose(
     threads: int,
     purpose: str | None = None,
     layouts: Sequence[Layout] = (),
+    is_noise: bool = False,
 ) -> Coding:
     """The best lossless layout, recipe and distance of key frames, found by trying each.
 
@@ -499,6 +525,7 @@ def choose(
         threads: Threads of the encoder.
         purpose: What the video is for.
         layouts: The only ones to try; none: all that can hold the samples.
+        is_noise: See `codecs_to_try`.
 
     Returns:
         The first, in the order of the encoding's layouts and their codecs, within 2 % of the
@@ -515,7 +542,8 @@ def choose(
     for layout in layouts or _candidates(samples, encoding):
         pictures = [layout.to_picture(pixels) for pixels in crops]
         picture_format = layout.pixel_format
-        for name in codecs_to_try(picture_format) if codec is None else [codec]:
+        usual = codecs_to_try(picture_format, is_noise=is_noise)
+        for name in usual if codec is None else [codec]:
             try:
                 recipe = recipe_for(picture_format, lossless=True, codec=name, preset=preset)
                 coded = encode_on_trial(
@@ -562,7 +590,7 @@ def choose_predicted(
     bits = view.layout.used_bits
     differences = [difference(*pair, bits) for pair in zip(crops, shown, strict=True)]
     layouts = [layout_for(encoding, lossless=True)]
-    best = choose(differences, encoding, layouts=layouts, **options)
+    best = choose(differences, encoding, layouts=layouts, is_noise=True, **options)
     size = best.bytes_per_frame + coded.bytes_per_frame(view.gop)
     return replace(best, bytes_per_frame=size / share)
 
