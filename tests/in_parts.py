@@ -82,8 +82,8 @@ def facts(dataset: Path) -> dict[str, Any]:
     for entry in manifest.streams:
         sidecar = load_stream(dataset / entry.sidecar)
         values = sidecar.model_dump()
-        for fact in ("size", "sha256"):
-            del values["video"][fact]
+        for video in filter(None, (values["video"], values["view"])):
+            del video["size"], video["sha256"]
         found["streams"][entry.sidecar] = values
     return found
 

@@ -73,7 +73,7 @@ def test_an_error_of_a_frame_beyond_the_sidecar(packed: tuple[Path, Path]) -> No
 
 
 def file_of(dataset: Path, name: str) -> Path:
-    """A file of a dataset by the beginning of its name, and its suffix."""
+    """A file of a dataset by the beginning of its name, and its suffixes."""
     stem, _, suffix = name.partition(".")
     return min(dataset.glob(f"{stem}*.{suffix}"), key=lambda path: len(path.suffixes))
 
@@ -90,6 +90,13 @@ def truncate(path: Path, place: float) -> None:
     path.write_bytes(data[: int(place * len(data))])
 
 
+def break_index(path: Path) -> None:
+    """Nothing tells any more where frames are."""
+    data = path.read_bytes()
+    assert b"stsz" in data
+    path.write_bytes(data.replace(b"stsz", b"free"))
+
+
 def messages(path: Path) -> Counter[Key]:
     return Counter(all_messages(pieces_of(path)))
 
@@ -103,9 +110,12 @@ def topics(found: Counter[Key]) -> set[str]:
 
 DAMAGES: dict[str, Callable[[Path], None]] = {
     "video-flip": lambda folder: flip(file_of(folder, "left.mp4"), 0.5),
-    "video-header": lambda folder: flip(file_of(folder, "left.mp4"), 0.99),
+    "video-header": lambda folder: break_index(file_of(folder, "left.mp4")),
     "video-cut": lambda folder: truncate(file_of(folder, "left.mp4"), 0.7),
     "video-missing": lambda folder: file_of(folder, "left.mp4").unlink(),
+    "video-exact-flip": lambda folder: flip(file_of(folder, "left.exact.mp4"), 0.5),
+    "video-exact-header": lambda folder: break_index(file_of(folder, "left.exact.mp4")),
+    "video-exact-cut": lambda folder: truncate(file_of(folder, "left.exact.mp4"), 0.7),
     "sidecar-flip": lambda folder: flip(file_of(folder, "left.yaml"), 0.5),
     "sidecar-zero": lambda folder: zero(file_of(folder, "left.yaml"), 0, 10**9),
     "sidecar-missing": lambda folder: file_of(folder, "left.yaml").unlink(),
@@ -197,7 +207,10 @@ def check_salvage(dataset: Path, original: Path, out: Path) -> Sequence[Loss]:
     return summary.losses
 
 
-PARTS = ["left.mp4", "right.mp4", "front.mp4", "left.yaml", "messages.mcap", "dataset.yaml"]
+PARTS = [
+    *("left.mp4", "left.exact.mp4", "right.mp4", "right.exact.mp4", "front.mp4"),
+    *("left.yaml", "messages.mcap", "dataset.yaml"),
+]
 
 
 @pytest.mark.one_in(2)
@@ -258,11 +271,16 @@ def test_what_is_there_comes_back(
         assert whole == found
 
 
+@pytest.mark.parametrize(("name", "has_later_key_frames"), [("left", False), ("left.exact", True)])
 def test_frames_of_a_damaged_video(
-    dataset: Path, packed: tuple[Path, Path], tmp_path: Path
+    name: str,
+    has_later_key_frames: bool,
+    dataset: Path,
+    packed: tuple[Path, Path],
+    tmp_path: Path,
 ) -> None:
     """Only those up to the next key frame are lost; the error and `validate` name them, too."""
-    video = file_of(dataset, "left.mp4")
+    video = file_of(dataset, f"{name}.mp4")
     data = video.read_bytes()
     start = data.index(b"mdat") + 4
     end = data.index(b"moov") - 4
@@ -271,7 +289,8 @@ def test_frames_of_a_damaged_video(
     lost = [loss for loss in losses if loss.frames]
     assert lost
     assert all(loss.topics == ("/left/image_raw",) for loss in lost)
-    assert max(loss.frames[1] for loss in lost if loss.frames) < FRAMES - 1
+    last = max(loss.frames[1] for loss in lost if loss.frames)
+    assert (last < FRAMES - 1) == has_later_key_frames
     first = min(loss.frames[0] for loss in lost if loss.frames)
     stamps = mp4ds.open(dataset)["/left/image_raw"].stamps
     stamp = f"{stamps[first] // 10**9}.{stamps[first] % 10**9:09d}"
@@ -335,17 +354,26 @@ def test_a_lossy_video_has_no_digests(packed: tuple[Path, Path], tmp_path: Path)
     assert any("have no digests: some may be altered" in loss.problem for loss in summary.losses)
 
 
-def test_a_pair_on_its_own(dataset: Path, packed: tuple[Path, Path], tmp_path: Path) -> None:
-    video = file_of(dataset, "left.mp4")
+@pytest.mark.parametrize("damaged", ["left.mp4", "left.exact.mp4"])
+def test_a_pair_on_its_own(
+    damaged: str, dataset: Path, packed: tuple[Path, Path], tmp_path: Path
+) -> None:
     pair = tmp_path / "pair"
     pair.mkdir()
-    for path in (video, video.with_suffix(".yaml")):
-        shutil.copy(path, pair)
-    flip(pair / video.name, 0.3)
-    summary = mp4ds.unpack(pair / video.name, "bag", tmp_path / "out.bag", SALVAGE)
+    for name in ("left.mp4", "left.exact.mp4", "left.yaml"):
+        shutil.copy(file_of(dataset, name), pair)
+    flip(file_of(pair, damaged), 0.3)
+    video = file_of(pair, "left.mp4")
+    summary = mp4ds.unpack(video, "bag", tmp_path / "out.bag", SALVAGE)
     assert 0 < summary.messages["/left/image_raw"] < FRAMES
     assert summary.messages["/left/camera_info"] == FRAMES
     assert not messages(tmp_path / "out.bag") - messages(packed[0])
+    file_of(pair, "left.exact.mp4").unlink()
+    with pytest.raises(SourceError, match=r"has views only .* give `quality` visual to go on"):
+        mp4ds.unpack(video, "bag", tmp_path / "no.bag", SALVAGE)
+    seen = mp4ds.unpack(video, "bag", tmp_path / "seen.bag", replace(SALVAGE, quality="visual"))
+    assert bool(seen.losses) == (damaged == "left.mp4")
+    assert seen.messages["/left/camera_info"] == FRAMES
 
 
 def test_nothing_is_left(dataset: Path, tmp_path: Path) -> None:

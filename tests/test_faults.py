@@ -391,6 +391,7 @@ def test_a_work_folder_that_is_removed_meanwhile(pack: Pack, tmp_path: Path) -> 
         (f"{PARTS[1]}/dataset.yaml", PARTS[1:]),
         (f"{PARTS[1]}/messages.mcap", PARTS[1:]),
         (f"{PARTS[1]}/cam_image_raw.mp4", PARTS[1:]),
+        (f"{PARTS[1]}/cam_image_raw.exact.mp4", PARTS[1:]),
     ],
 )
 def test_what_is_removed_before_the_joining(
@@ -406,7 +407,10 @@ def test_what_is_removed_before_the_joining(
     assert pack.goes_on() == again
 
 
-@pytest.mark.parametrize("name", ["messages.mcap", "cam_image_raw.yaml", "cam_image_raw.mp4"])
+@pytest.mark.parametrize(
+    "name",
+    ["messages.mcap", "cam_image_raw.yaml", "cam_image_raw.mp4", "cam_image_raw.exact.mp4"],
+)
 def test_what_rots_before_the_joining_is_made_again(name: str, pack: Pack, tmp_path: Path) -> None:
     def rot(told: mp4ds.PackProgress) -> None:
         path = tmp_path / WORK / PARTS[0] / name

@@ -28,7 +28,7 @@ from mp4ds.plugins.info import info, intrinsics
 from mp4ds.records import Message
 from remote_servers import Request, Server, web_server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores, web
-from round_trips import own_target, unpacked
+from round_trips import own_target, packed, unpacked
 from sources import SOURCES, Scene, scene, write_bag, write_mcap
 
 __all__ = ["folder_url", "put", "s3", "s3_running", "stores", "web"]
@@ -344,6 +344,18 @@ def test_a_dataset_is_used_there_as_here(
     mp4ds.unpack(url, "bag", tmp_path / "again.bag")
     mp4ds.unpack(here, "bag", tmp_path / "local.bag")
     assert compare([tmp_path / "again.bag"], tmp_path / "local.bag") == []
+
+
+def test_what_makes_frames_exact_is_looked_for_once(tmp_path: Path) -> None:
+    dataset = packed(tmp_path, scene("rgb8"))
+    with web_server(tmp_path) as web:
+        for layer, due in (("view", 0), ("exact", 1), (None, 1)):
+            web.forget()
+            with mp4ds.open(f"{web.url}/{dataset.name}", layer=layer) as there:
+                assert len(there[TOPIC].read([0, 5])) == 2
+            looks = [method for method, path, _ in web.requests if path.endswith(".exact.mp4")]
+            assert looks.count("HEAD") == due
+            assert bool(looks) == bool(due)
 
 
 def test_an_unpack_without_a_name_comes_here(

@@ -14,7 +14,7 @@ import pytest
 import mp4ds
 from coded_scenes import CODED
 from compare import compare
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, SourceError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import PackOptions
@@ -125,6 +125,20 @@ def test_a_lossy_one_stays_as_it_was_asked_for(recording: Path, tmp_path: Path) 
         assert (eye[topic].read(numbers) == fast[topic].read(numbers)).all()
     found = info(tmp_path / "fast")
     assert "repacked from eye (visual), kept (lossless)" in found.notes
+
+
+def test_views_are_not_taken_for_what_was_recorded(recording: Path, tmp_path: Path) -> None:
+    mp4ds.pack(recording, tmp_path / "exact")
+    (video,) = (tmp_path / "exact").glob("*.exact.mp4")
+    video.unlink()
+    for options in ({}, {"codec": "ffv1"}, {"quality": "crf=30"}, {"quality": "psnr=40"}):
+        with pytest.raises(SourceError, match=r"has views only .* give `quality` visual to go on"):
+            mp4ds.pack(tmp_path / "exact", tmp_path / "again", PackOptions(**options))
+        assert not (tmp_path / "again").exists()
+    mp4ds.pack(tmp_path / "exact", tmp_path / "again", PackOptions(quality="visual"))
+    assert manifest(tmp_path / "again").profile == "visual"
+    mp4ds.pack(tmp_path / "exact", tmp_path / "rest", PackOptions(exclude=["/cam/*"]))
+    assert manifest(tmp_path / "rest").profile == "lossless"
 
 
 def test_a_quality_that_says_nothing_of_another_codec(recording: Path, tmp_path: Path) -> None:

@@ -189,7 +189,7 @@ def copy_part(
         profile=old.profile,
         sha256=digest_file(dataset.path / MANIFEST_NAME)[1],
     )
-    is_view = any(stream.layer == "view" for stream in dataset.streams)
+    is_view = any(one.layer == "view" and selected(one.topic) for one in dataset.streams)
     changes = {
         "profile": VISUAL if is_view else old.profile,
         "about": about or old.about,

@@ -42,6 +42,7 @@ class Stream(Images):
         sidecar: The contents of its sidecar, or what it says of the view.
         exact_path: The video that makes the images exact, where there is a view; else None.
         layer: Which frames are read: exact ones as well, where there is no view.
+        videos: Its video, and the view that predicts it if there is one.
         sound: Which frames are read of a damaged video: those that `damages` does not name, shape
             (frames,). None: all, and damage is an error.
 
@@ -76,7 +77,10 @@ class Stream(Images):
         self.sidecar = whole.seen if self.layer == "view" else whole
         self.channel = self.sidecar.channel.to_record(0)
         self.topic = self.channel.topic
-        self.video_path = path.parent / self.sidecar.video.file
+        self.videos = [(path.parent / video.file, video) for video in self.sidecar.videos]
+        if self.exact_path and self.sidecar is whole:  # what a store said of it is kept
+            self.videos[0] = self.exact_path, whole.video
+        self.video_path = self.videos[0][0]
         image = self.sidecar.image
         self.encoding, self.image_size = image.encoding, (image.width, image.height)
         is_packet = self.sidecar.body == "packet"
@@ -385,11 +389,6 @@ class Stream(Images):
             frames=self.sidecar.frames,
             coded_size=(video.width, video.height),
         )
-
-    @property
-    def videos(self) -> list[tuple[Path, VideoModel]]:
-        """Its video, and the view that predicts it if there is one."""
-        return [(self.path.parent / video.file, video) for video in self.sidecar.videos]
 
     @property
     def files(self) -> list[Path]:

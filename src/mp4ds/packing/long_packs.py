@@ -232,7 +232,7 @@ class PartedPack:
             with _redone_if_damaged(places):
                 for place in places:
                     _add_facts(whole, place)
-                parts = [stack.enter_context(Dataset(place)) for place in places]
+                parts = [stack.enter_context(Dataset(place, layer="exact")) for place in places]
                 for source in plan.sources:
                     source.check()
                 for manifest in (part.manifest for part in parts):

@@ -443,7 +443,7 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
         return options
     quality = options.quality or parse_quality(_quality_of(paths))
     for folder in filter(None, map(dataset_at, paths)):
-        if quality.lossless:
+        if quality.name != VISUAL:  # a score would be one of the views
             Dataset(folder).require_exact(options.selected)
     if options.transcode and quality.lossless:
         raise OptionError(
@@ -549,10 +549,12 @@ def _processes_for(plan: Plan) -> int:
 
 
 def _bytes_a_pixel(plan: TrackPlan) -> int:
-    """About what an encoder takes; SVT-AV1 looks ahead with many pictures, x264 qp 0 with none."""
+    """About what encoders take; SVT-AV1 looks ahead with many pictures, x264 qp 0 with none."""
     if plan.coding is None:
         return 0
-    return 60 if plan.coding.recipe.lossless else 300
+    own = 60 if plan.coding.recipe.lossless else 350
+    # with a view, its encoder and decoder, and some 80 images that wait for it
+    return own + (450 + 80 * plan.view.layout.encoding.pixel_bytes if plan.view else 0)
 
 
 def _executor(
