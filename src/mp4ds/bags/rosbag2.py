@@ -435,13 +435,11 @@ class Rosbag2Writer(BagWriter):
         elif record.name == TABLES_RECORD:
             self._take_distro(record.metadata)
         else:
-            self._add_other_metadata(record)
-
-    def _add_other_metadata(self, record: MetadataRecord) -> None:
-        if record.name == MCAP_RECORD and not self._source_is_whole:
-            self._source = _parsed(record.metadata.get("serialized_metadata", "")) or self._source
-        self._source_has_record |= record.name == MCAP_RECORD
-        self._writer.add_metadata(record)
+            if record.name == MCAP_RECORD and not self._source_is_whole:
+                text = record.metadata.get("serialized_metadata", "")
+                self._source = _parsed(text) or self._source
+            self._source_has_record |= record.name == MCAP_RECORD
+            self._writer.add_metadata(record)
 
     def _take_source(self, content: Mapping[str, str]) -> None:
         self._take_distro(content)

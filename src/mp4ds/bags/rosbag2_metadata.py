@@ -149,7 +149,10 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
     Raises:
         SourceError: It cannot be understood.
     """
-    document = _load(text, path)
+    try:
+        document = yamlio.build(text, _scalar)
+    except ValueError as error:
+        raise SourceError(path, f"is not valid YAML: {error}", SALVAGE_REMEDY) from None
     info = document.get(_TOP_KEY, document) if isinstance(document, dict) else None
     if not isinstance(info, dict) or "version" not in info:
         problem = f"is not rosbag2 metadata: it has no {_TOP_KEY}"
@@ -183,13 +186,6 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
             raise
         problem = f"is not rosbag2 metadata as expected: {error!r}"
         raise SourceError(path, problem, SALVAGE_REMEDY) from None
-
-
-def _load(text: str, path: Path) -> Any:
-    try:
-        return yamlio.build(text, _scalar)
-    except ValueError as error:
-        raise SourceError(path, f"is not valid YAML: {error}", SALVAGE_REMEDY) from None
 
 
 def _scalar(event: Any) -> Any:

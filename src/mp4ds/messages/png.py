@@ -168,7 +168,8 @@ def filter_rows(pixels: Bytes, pixel_bytes: int, rule: Rule) -> Bytes:
             out[start:stop, 1:] = _filtered(band, shifted, pixel_bytes, kinds[0])
             continue
         tried = np.stack([_filtered(band, shifted, pixel_bytes, kind) for kind in kinds])
-        chosen = np.argmin(_sums(tried) + rule.weight * np.array(kinds)[:, None], axis=0)
+        sums = np.minimum(tried, -tried).sum(axis=2, dtype=np.int64)
+        chosen = np.argmin(sums + rule.weight * np.array(kinds)[:, None], axis=0)
         out[start:stop, 0] = np.array(kinds, np.uint8)[chosen]
         out[start:stop, 1:] = tried[chosen, np.arange(stop - start)]
     if rule.first is not None:
@@ -246,11 +247,6 @@ def _moved(rows: Bytes, pixel_bytes: int) -> Bytes:
     moved = np.zeros_like(rows)
     moved[:, pixel_bytes:] = rows[:, :-pixel_bytes]
     return moved
-
-
-def _sums(tried: Bytes) -> NDArray[np.int64]:
-    sums: NDArray[np.int64] = np.minimum(tried, -tried).sum(axis=2, dtype=np.int64)
-    return sums
 
 
 # ---------------------------------------------------------------- png

@@ -111,17 +111,13 @@ def _record(path: Path, seconds: float) -> int:
     messages = sorted(_messages(seconds), key=lambda item: item[:2])
     # rosbag2 does not compress, either
     with path.open("wb") as file, Writer(file, compression=CompressionType.NONE) as writer:
-        schemas = {
-            topic: _declared(writer, ros2_channel(number, topic, type_name, _qos_of(topic)))
-            for number, (topic, (type_name, _)) in enumerate(_TOPICS.items())
-        }
+        schemas = {}
+        for number, (topic, (type_name, _)) in enumerate(_TOPICS.items()):
+            qos = LATCHED_QOS if topic == _LATCHED else DEFAULT_QOS
+            schemas[topic] = _declared(writer, ros2_channel(number, topic, type_name, qos))
         for time, topic, seq, make in messages:
             writer.write_message(topic, schemas[topic], make(), time, time, seq)
     return len(messages)
-
-
-def _qos_of(topic: str) -> str:
-    return LATCHED_QOS if topic == _LATCHED else DEFAULT_QOS
 
 
 def _copy(original: Path, path: Path, kind: str, name: str) -> None:

@@ -48,10 +48,10 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
         raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
     with reading(folder):
         reader = ImagesReader(folder)
-        if _is_euroc(folder):
+        if any((sensor / "data").is_dir() for sensor in _sensors(folder)):
             options.check_for("euroc")
             _add_euroc(reader)
-        elif _is_tum(folder):
+        elif any((folder / f"{name}.txt").is_file() for name in _CAMERAS):
             options.check_for("tum")
             _add_tum(reader, options)
         else:
@@ -97,10 +97,6 @@ def _root(folder: Path) -> Path:
 def _sensors(folder: Path) -> list[Path]:
     """The folders of the sensors: those with a list."""
     return sorted(path.parent for path in _root(folder).glob(f"*/{_LIST}"))
-
-
-def _is_euroc(folder: Path) -> bool:
-    return any((sensor / "data").is_dir() for sensor in _sensors(folder))
 
 
 def _add_euroc(reader: ImagesReader) -> None:
@@ -156,10 +152,6 @@ _TABLES = {
     "accelerometer": ("accelerometer", 3, "accelerometer"),
     "groundtruth": ("pose", 7, _WORLD),
 }
-
-
-def _is_tum(folder: Path) -> bool:
-    return any((folder / f"{name}.txt").is_file() for name in _CAMERAS)
 
 
 def _add_tum(reader: ImagesReader, options: ImageFolder) -> None:
