@@ -40,7 +40,9 @@ TREE = [
 
 
 def parse_transforms(channel: Channel, data: bytes | memoryview) -> list[Transform]:
-    return transform_parser(channel)(memoryview(data))
+    parse = transform_parser(channel)
+    assert parse is not None
+    return parse(memoryview(data))
 
 
 # ---------------------------------------------------------------- writers of messages
@@ -216,8 +218,7 @@ def test_fields_are_found_by_the_recorded_descriptor() -> None:
     ],
 )
 def test_not_a_transform(own: Channel) -> None:
-    with pytest.raises(WireError):
-        transform_parser(own)
+    assert transform_parser(own) is None
 
 
 def test_descriptors_that_are_not_whole() -> None:
@@ -233,8 +234,7 @@ def test_descriptors_that_are_not_whole() -> None:
     for number in range(1, 5000):
         chain.file.add(name=str(number), dependency=[str(number - 1)])
     for schema in (without, circle, chain):
-        with pytest.raises(WireError, match="schema does not declare"):
-            transform_parser(channel("protobuf", ONE, schema.SerializeToString()))
+        assert transform_parser(channel("protobuf", ONE, schema.SerializeToString())) is None
 
 
 @pytest.mark.parametrize(
@@ -259,9 +259,8 @@ def test_json_of_another_shape(text: str) -> None:
 
 def test_a_message_beyond_all_measure() -> None:
     for own, write in MANY_KINDS.values():
-        parse = transform_parser(own)
         with pytest.raises(WireError, match="bytes"):
-            parse(memoryview(write(TREE) + bytes(1 << 20)))
+            parse_transforms(own, write(TREE) + bytes(1 << 20))
 
 
 @settings(deadline=None, max_examples=60)

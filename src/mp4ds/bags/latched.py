@@ -10,7 +10,7 @@ from typing import Any
 
 from mp4ds.bags.protocols import BagReader, RecordingSlice, in_span, stats_of, with_own_payload
 from mp4ds.bags.rosbag2_metadata import native_qos
-from mp4ds.errors import Refused, SourceError
+from mp4ds.errors import SourceError
 from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.transforms import transform_parser
 from mp4ds.messages.wire import WireError
@@ -144,11 +144,8 @@ def _uncovered(rows: list[_Row]) -> list[_Row]:
 
 def _parser(channel: Channel) -> Callable[[bytes | memoryview], frozenset[str] | None] | None:
     """A function that returns the child frames of a /tf_static message; None for other channels."""
-    if not _is_tf_static(channel):
-        return None
-    try:
-        parse = transform_parser(channel)
-    except (WireError, Refused):
+    parse = transform_parser(channel) if _is_tf_static(channel) else None
+    if parse is None:
         return None
 
     def children(payload: bytes | memoryview) -> frozenset[str] | None:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -67,7 +69,7 @@ class Transform:
 Parser = Callable[[memoryview], list[Transform]]
 
 
-def transform_parser(channel: Channel) -> Parser:
+def transform_parser(channel: Channel) -> Parser | None:
     """A parser of the transforms in a channel's messages, usable or not.
 
     Supports tf2_msgs/TFMessage, tf/tfMessage and the ROS types of foxglove_msgs in ROS 1 and CDR;
@@ -78,33 +80,32 @@ def transform_parser(channel: Channel) -> Parser:
     It raises `WireError` for a message that does not parse, or is unreasonably large (more than
     1 MiB).
 
-    Raises:
-        WireError: The type is not one of transforms, or its descriptor does not parse.
+    Returns:
+        None if the type is not one of transforms, or its descriptor does not parse.
     """
-    parse = _parser(channel)
+    encoding, name, schema = channel.message_encoding, _ros_name(channel), channel.schema
+    many = channel.type_name.endswith("s")
+    read: Parser
+    if encoding in ("ros1", "cdr") and name in _ROS_TYPES:
+        read = partial(_parse_ros, encoding, name)
+    elif schema is None or channel.type_name not in _FOXGLOVE_TYPES:
+        return None
+    elif encoding == "json":
+        read = partial(_read_nodes, _parse_json, many)
+    elif encoding == "protobuf" and len(schema.data) <= _MAX_SCHEMA:
+        try:
+            read = partial(_read_nodes, decoder_of_schema(schema.name, schema.data), many)
+        except WireError:
+            return None
+    else:
+        return None
 
-    def bounded(data: memoryview) -> list[Transform]:
+    def parse(data: memoryview) -> list[Transform]:
         if len(data) > _MAX_MESSAGE:
             raise WireError(f"it has {len(data)} bytes")
-        return parse(data)
+        return read(data)
 
-    return bounded
-
-
-def _parser(channel: Channel) -> Parser:
-    encoding, name = channel.message_encoding, _ros_name(channel)
-    if encoding in ("ros1", "cdr") and name in _ROS_TYPES:
-        return lambda data: _parse_ros(encoding, name, data)
-    if channel.schema and channel.type_name in _FOXGLOVE_TYPES:
-        many = channel.type_name.endswith("s")
-        if encoding == "json":
-            return lambda data: _read_nodes(_parse_json(data), many)
-        if encoding == "protobuf":
-            if len(channel.schema.data) > _MAX_SCHEMA:
-                raise WireError(f"its schema has {len(channel.schema.data)} bytes")
-            decode = decoder_of_schema(channel.schema.name, channel.schema.data)
-            return lambda data: _read_nodes(decode(data), many)
-    raise WireError(f"type {channel.type_name!r} in {encoding!r} is no transform")
+    return parse
 
 
 def _ros_name(channel: Channel) -> str:
@@ -150,8 +151,11 @@ def _parse_json(data: memoryview) -> Any:
         raise WireError(f"it is not JSON: {error}") from None
 
 
-def _read_nodes(message: Any, many: bool) -> list[Transform]:
-    """The transforms of a decoded message: JSON, or an object of protobuf."""
+def _read_nodes(
+    decode: Callable[[memoryview], Any], many: bool, data: memoryview
+) -> list[Transform]:
+    """The transforms of a message, which decodes to JSON or an object of protobuf."""
+    message = decode(data)
     try:
         nodes = _value(message, "transforms", []) if many else [message]
         if len(nodes) > _MAX_IN_MESSAGE:
@@ -246,12 +250,12 @@ class TransformCollector:
         """Take a message, if it is one of static transforms."""
         if not self.takes(channel):
             return
-        parser = self._parser(channel)
-        try:
-            found = parser(memoryview(data)) if parser else []
-        except WireError:
-            return
-        self._take(found)
+        key = (channel.message_encoding, channel.schema)
+        if key not in self._parsers:
+            self._parsers[key] = transform_parser(channel)
+        parse = self._parsers[key]
+        with suppress(WireError):
+            self._take(parse(memoryview(data)) if parse else [])
 
     def _take(self, transforms: Iterable[Transform]) -> None:
         for transform in transforms:
@@ -259,15 +263,6 @@ class TransformCollector:
             has_room = child in self._latest or len(self._latest) < MAX_TRANSFORMS
             if transform.is_usable and has_room:
                 self._latest[child] = transform
-
-    def _parser(self, channel: Channel) -> Parser | None:
-        key = (channel.message_encoding, channel.schema)
-        if key not in self._parsers:
-            try:
-                self._parsers[key] = transform_parser(channel)
-            except WireError:
-                self._parsers[key] = None
-        return self._parsers[key]
 
     @property
     def transforms(self) -> list[Transform]:
