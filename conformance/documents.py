@@ -15,7 +15,7 @@ import jsonschema
 import xxhash
 import yaml
 
-KNOWN = ("1.0", "1.1")
+KNOWN = ("1.0", "1.1", "2.0")
 SCHEMAS = Path(__file__).resolve().parents[1] / "schemas"
 
 
@@ -84,12 +84,13 @@ def load(path, kind):
     if not isinstance(document, dict):
         raise RefusedError("yaml-invalid", path)
     version = document.get("mp4ds")
-    if not isinstance(version, str) or not re.fullmatch(r"1\.(0|[1-9]\d*)", version):
+    if version not in KNOWN and not re.fullmatch(r"2\.[1-9]\d*", str(version)):
         raise RefusedError("version-unsupported", path)
     if document.get("kind") != kind:
         raise RefusedError("kind-unknown", path)
     if not schema(kind, version).is_valid(document):
-        raise RefusedError("schema-invalid", path)
+        is_newer = version in KNOWN[:-1] and schema(kind, KNOWN[-1]).is_valid(document)
+        raise RefusedError("migration-failed" if is_newer else "schema-invalid", path)
     return without_nulls(document)
 
 

@@ -70,6 +70,8 @@ def read_video(path, told):
     if told.get("pixel_format", "").startswith("gray"):  # some decoders make up the chroma
         pictures = [(told["pixel_format"], planes[:1]) for _, planes in pictures]
     names = {name for name, _ in pictures}
+    if told.get("pixel_format", "").startswith("yuv") and names - {told["pixel_format"], "gray"}:
+        raise RefusedError("codec-mismatch", path)
     return packets, names.pop() if len(names) == 1 else "", [planes for _, planes in pictures]
 
 
@@ -109,6 +111,8 @@ def pixels(image, video, planes):
     is_colour = places == ["colour"] or not {*"".join(places)} - {*"rgba"}
     if is_colour and "color" in video and len(planes) == 3 and planes[1].shape != planes[0].shape:
         planes = as_gbr(planes, video)
+    elif video.get("pixel_format") == "yuv420p10le":
+        planes = as_bytes(planes, is_full=video["color"]["range"] == "full")
     patterns = np.dtype(f"u{samples.itemsize}")
     count = 3 if values == "opaque" else channels
     placed = _placed(places, parameters, encoding, (width, height), planes, count)
@@ -227,6 +231,16 @@ def as_gbr(planes, video):
         light + _product(v, red),
     )
     return [np.clip(values >> 5, 0, 255).astype(np.uint8) for values in found]
+
+
+def as_bytes(planes, *, is_full):
+    """Planes of 10 bits in 8."""
+    found = []
+    for plane, middle in zip(planes, (0, 128, 128), strict=False):
+        values = plane.astype(np.int64) - 4 * middle
+        narrow = np.rint(values * 255 / 1023 if is_full else values / 4)  # ties to even
+        found.append(np.clip(narrow + middle, 0, 255).astype(np.uint8))
+    return found
 
 
 def _product(a, k):

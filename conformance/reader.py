@@ -15,6 +15,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import xxhash
 
 from documents import RefusedError, columns, load
@@ -38,27 +39,28 @@ def as_texts(found):
 def stream(path):
     """What is told of a stream, and the channel that it belongs to."""
     side = load(path, "stream")
-    video, image, channel = side["video"], side["image"], side["channel"]
-    file = path.parent / video["file"]
-    if not file.is_file():
-        raise RefusedError("file-missing", file)
-    if side["frames"] > file.stat().st_size:
-        raise RefusedError("frame-count", path)
+    if "view" in side and not (path.parent / side["video"]["file"]).exists():
+        side = seen(side)
+    video, view, image, channel = side["video"], side.get("view"), side["image"], side["channel"]
+    for file in (path.parent / one["file"] for one in (video, view) if one):
+        if not file.is_file():
+            raise RefusedError("file-missing", file)
+        if side["frames"] > file.stat().st_size:
+            raise RefusedError("frame-count", path)
     found = columns(path, side["columns"], side["frames"], len(side["headers"]))
     digests = side.get("digests", {"values": "0" * 16 * side["frames"]})["values"]
     if not re.fullmatch(rf"([0-9a-f]{{16}}){{{side['frames']}}}", "".join(digests.split())):
         raise RefusedError("column-invalid", path)
     info = camera_info(path, side.get("camera_info"), found["log_time"])
-    packets, name, pictures = read_video(file, video)
-    if len(packets) != side["frames"]:
-        raise RefusedError("frame-count", file)
-    if video["codec"] != "mjpeg" and len(pictures) != side["frames"]:
-        raise RefusedError("decode-failed", file)
-    hashes, payloads = messages(path, side, found, packets, pictures)
-    planes = {"pixel_format": name, "sha256": [sha256(*map(bytes, one)) for one in pictures]}
+    own, packets, pictures = decoded(path, side, video)
+    of_view, predicted = {}, None
+    if view:
+        of_view, _, shown = decoded(path, side, view)
+        predicted = [pixels(image, view, picture) for picture in shown]
+        of_view = {"view": {**of_view, "pixels": hashes_of(predicted)}}
+    hashes, payloads = messages(path, side, found, packets, pictures, predicted)
     return channel, {
         "sidecar": path.name,
-        "video": video["file"],
         "topic": channel["topic"],
         "type": channel.get("schema", {}).get("name", ""),
         "message_encoding": channel["message_encoding"],
@@ -69,21 +71,51 @@ def stream(path):
         "image": {
             key: image[key] for key in ("encoding", "width", "height", "step", "is_bigendian")
         },
-        "layout": video["layout"],
-        "codec": video["codec"],
-        "coded_size": [video["width"], video["height"]],
         "frames": side["frames"],
         "columns": as_texts(found),
         "frame_id": [side["headers"][number]["frame_id"] for number in found["variant"]],
-        "packets": [sha256(packet) for packet in packets],
-        "planes": None if video["codec"] == "mjpeg" else planes,
+        **own,
         "pixels": hashes,
         "payloads": payloads,
+        **of_view,
         "camera_info": info,
     }
 
 
-def messages(path, side, found, packets, pictures):
+def seen(side):
+    """What is left of a stream without the video that its view predicts."""
+    kept = {key: value for key, value in side.items() if key not in ("view", "digests")}
+    body = side.get("body", "pixels")
+    body = "jpeg" if body == "packet" else body
+    return {**kept, "profile": "visual", "video": side["view"], "body": body}
+
+
+def decoded(path, side, video):
+    """What is told of a video, its packets, and its pictures."""
+    file = path.parent / video["file"]
+    packets, name, pictures = read_video(file, video)
+    if len(packets) != side["frames"]:
+        raise RefusedError("frame-count", file)
+    if video["codec"] != "mjpeg" and len(pictures) != side["frames"]:
+        raise RefusedError("decode-failed", file)
+    planes = {"pixel_format": name, "sha256": [sha256(*map(bytes, one)) for one in pictures]}
+    found = {
+        "video": video["file"],
+        "layout": video["layout"],
+        "codec": video["codec"],
+        "coded_size": [video["width"], video["height"]],
+        "packets": [sha256(packet) for packet in packets],
+        "planes": None if video["codec"] == "mjpeg" else planes,
+    }
+    return found, packets, pictures
+
+
+def hashes_of(images):
+    """Of the pixels of images, little-endian."""
+    return [sha256(one.astype(one.dtype.newbyteorder("<")).tobytes()) for one in images]
+
+
+def messages(path, side, found, packets, pictures, predicted):
     """Hashes of the pixels, and of the messages unless the stream is lossy."""
     kind, image, video = side.get("body", "pixels"), side["image"], side["video"]
     hashes, payloads = [], []
@@ -93,7 +125,9 @@ def messages(path, side, found, packets, pictures):
             body = packet_body(video["codec"], packets[n], header.get("framing", ""))
         else:
             patterns = pixels(image, video, pictures[n])
-            hashes.append(sha256(patterns.astype(patterns.dtype.newbyteorder("<")).tobytes()))
+            if predicted:
+                patterns = patterns + predicted[n] - np.uint8(128)  # modulo 256
+            hashes += hashes_of([patterns])
             if kind == "pixels":
                 big_endian = bool(image["is_bigendian"])
                 body = rows(patterns, image["step"], header.get("padding"), big_endian=big_endian)

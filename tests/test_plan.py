@@ -109,7 +109,8 @@ Topics = (
     st.text(max_size=30)
     | st.lists(
         st.sampled_from(["a", "A", "-2", "-3", "_", ".", "/", "con", "aux.x", "dataset", "..",
-                         "messages", "topic", "image_raw", "\u00e4", " ", "\\", ":", "x" * 60]),
+                         "messages", "topic", "image_raw", "\u00e4", " ", "\\", ":", ".exact",
+                         "x" * 60]),
         max_size=6,
     ).map("".join)
     | st.text("aB", min_size=95, max_size=250)
@@ -122,6 +123,8 @@ def stem_by_the_spec(topic: str, taken: set[str]) -> str:
     stem = stem or "topic"
     if len(stem) > 100:
         stem = stem[:83] + "-" + xxhash.xxh64(topic.encode("utf-8")).hexdigest()
+    if stem.lower().endswith(".exact"):
+        stem += "_"
     if stem.split(".")[0].lower() in DEVICES | {"dataset", "messages"}:
         stem = "topic_" + stem
     name = stem
@@ -141,6 +144,9 @@ def stem_by_the_spec(topic: str, taken: set[str]) -> str:
 @example(["dataset", "messages", "Messages.MCAP", "dataset.yaml"])
 @example(["../../etc/passwd", "..", ".", "/", "", "\0", "C:\\x", "~/x", "-rf"])
 @example(["x" * 101, "x" * 101 + "y", "X" * 101])
+@example(
+    ["cam", "cam.exact", "CAM.Exact", "cam.exact_", "x" * 94 + ".exact", ".exact", "con.exact"]
+)
 def test_names_are_plain_and_never_collide(topics: list[str]) -> None:
     names, taken = FileNames(), set[str]()
     pattern = TypeAdapter(FileName)
@@ -149,7 +155,7 @@ def test_names_are_plain_and_never_collide(topics: list[str]) -> None:
         stem = names.name_for(topic)
         assert stem == stem_by_the_spec(topic, taken)
         assert stem.lower().split(".")[0] not in DEVICES
-        for file in (f"{stem}.mp4", f"{stem}.yaml"):
+        for file in (f"{stem}.mp4", f"{stem}.exact.mp4", f"{stem}.yaml"):
             pattern.validate_python(file)
             assert file.casefold() not in files
             files.add(file.casefold())

@@ -18,6 +18,7 @@ from compare import compare
 from in_parts import InlineExecutor, use
 from mp4ds import yamlio
 from mp4ds.bags.formats import open_reader
+from mp4ds.format.fields import FORMAT_VERSION
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
 from round_trips import unpacked
@@ -146,7 +147,7 @@ def test_padding_is_no_key_of_version_1_0(tmp_path: Path) -> None:
     mp4ds.pack(paths, tmp_path / "dataset")
     path = tmp_path / "dataset" / "odd_image.yaml"
     document = yamlio.load(path.read_bytes(), "it")
-    assert document["mp4ds"] == "1.1"
+    assert document["mp4ds"] == FORMAT_VERSION
     path.write_bytes(yamlio.dump({**document, "mp4ds": "1.0"}))
     (problem,) = mp4ds.validate(path)
     assert problem.code == "migration-failed"

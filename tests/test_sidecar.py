@@ -146,6 +146,19 @@ def packet() -> Document:
     return document
 
 
+def seen() -> Document:
+    """A sidecar of images that a view predicts."""
+    document = stream()
+    document["view"] = document["video"]
+    document["view"] |= {"codec": "av1", "pixel_format": "yuv420p", "options": {"crf": "18"}}
+    document["view"]["color"]["matrix"] = "bt709"
+    document["view"]["references"] = {"structures": ["k 1 2", "k"], "groups": column()}
+    kept = ("layout", "codec", "pixel_format", "width", "height", "size", "sha256")
+    document["video"] = {key: stream()["video"][key] for key in kept}
+    document["video"]["file"] = "cam_image_raw.exact.mp4"
+    return document
+
+
 def png() -> Document:
     """A sidecar of depth images in PNG files."""
     document = stream()
@@ -246,7 +259,13 @@ def dataset() -> Document:
         "topics_left_out": ["/other"],
         "time_range": {"start": -5, "end": 2**64 - 1},
         "streams": [
-            {"topic": "/cam/image_raw", "sidecar": "c.yaml", "video": "c.mp4", "frames": 3}
+            {
+                "topic": "/cam/image_raw",
+                "sidecar": "c.yaml",
+                "video": "c.exact.mp4",
+                "view": "c.mp4",
+                "frames": 3,
+            }
         ],
         "transforms": [
             {
@@ -265,6 +284,7 @@ def dataset() -> Document:
 WHOLE: dict[str, Callable[[], Document]] = {
     "stream": stream,
     "packet": packet,
+    "seen": seen,
     "png": png,
     "scored": scored,
     "dataset": dataset,
@@ -383,6 +403,7 @@ def test_optional_keys_may_be_absent(kind: str, tmp_path: Path) -> None:
         assert validator.is_valid(document)
         if key == "digests":
             document["profile"] = "visual"
+            document.pop("view", None)
         if key != "body":  # what belongs to PNG files, or to packets, then has no place
             assert document_of(load(write(tmp_path, document), kind)) == document
 
@@ -436,6 +457,7 @@ SHAPES: dict[str, dict[str, list[Any]]] = {
         "surprise columns.stamp.surprise camera_info.calibrations.0.roi.surprise": [1],
     },
     "packet": {"video.references.structures": [[], "k", ["k"] * 257, None, ...]},
+    "seen": {"view.file": BAD_NAMES, "view.surprise": [1], "view.layout": [None, 5, ...]},
     "scored": {"video.quality.surprise": [1]},
     "png": {"headers.0.png.window_bits": [8, 16, -15, 31, None, ...]},
     "dataset": {
@@ -464,6 +486,22 @@ RULES: dict[str, dict[str, list[Any]]] = {
         "video.pixel_format": ["yuvj420p", "", "gray"],
         "body": ["pixels", "png", "rvl", "jpeg", ...],
         "video.parameters": [{"bits": 12, "shift": 0}],
+    },
+    "seen": {
+        "profile": ["visual", "crf=22"],
+        "body": ["rvl", "jpeg"],
+        "image.encoding": ["mono8", "bayer_rggb8"],
+        "video.file": ["cam_image_raw.mp4", "cam.exact.mp4", "cam_image_raw.exact.MP4"],
+        "video.color": [stream()["video"]["color"]],
+        "view.file": ["cam.mp4", "cam_image_raw", "cam_image_raw.MP4", "cam_image_raw.exact.mp4"],
+        "view.layout": ["bgr24", "gray8", "demosaic8", ""],
+        "view.codec": ["vp9", "mjpeg", "ffv1", ""],
+        "view.pixel_format": ["yuv444p", "yuvj420p", "gray", "rgb24", ...],
+        "view.width": [7],
+        "view.height": [5],
+        "view.color": [...],
+        "view.color.matrix": ["gbr", "bt2020nc", ""],
+        "view.quality": [scored()["video"]["quality"]],
     },
     "scored": {
         "profile": ["lossless", "visual", "vmaf=99", "psnr=99.5"],
@@ -565,17 +603,17 @@ def test_a_missing_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", WHOLE)
 def test_a_newer_minor_version_is_read_with_a_warning(kind: str, tmp_path: Path) -> None:
-    document = edited(WHOLE[kind](), "mp4ds", "1.7")
+    document = edited(WHOLE[kind](), "mp4ds", "2.7")
     document["surprise"] = {"a": [1]}
     first = "streams.0.new" if kind == "dataset" else "camera_info.calibrations.0.new"
     path = write(tmp_path, edited(document, first, "news"))
-    with pytest.warns(UserWarning, match="1.7") as caught:
+    with pytest.warns(UserWarning, match="2.7") as caught:
         model = load(path, kind)
     assert "surprise" in str(caught[0].message)
     assert first in str(caught[0].message)
-    assert document_of(model) == edited(WHOLE[kind](), "mp4ds", "1.7")
+    assert document_of(model) == edited(WHOLE[kind](), "mp4ds", "2.7")
     # what this version knows is read as strictly
-    with pytest.warns(UserWarning, match="1.7"), pytest.raises(FormatError):
+    with pytest.warns(UserWarning, match="2.7"), pytest.raises(FormatError):
         load(write(tmp_path, edited(document, "profile", "best")), kind)
 
 

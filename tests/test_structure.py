@@ -182,11 +182,13 @@ def test_the_examples_agree_and_decode(tmp_path: Path) -> None:
     manifest = load_manifest(tmp_path / "dataset.yaml")
     assert stream.mp4ds == manifest.mp4ds == FORMAT_VERSION
     entry = manifest.streams[0]
-    assert (entry.topic, entry.video) == (stream.channel.topic, stream.video.file)
+    assert (entry.topic, entry.sidecar) == (stream.channel.topic, "left_image_raw.yaml")
+    assert [entry.video, entry.view] == [video.file for video in stream.videos]
     assert entry.frames == stream.frames
     listed = {file.name: (file.size, file.sha256) for file in manifest.files}
-    assert listed[stream.video.file] == (stream.video.size, stream.video.sha256)
-    assert set(listed) == {entry.video, entry.sidecar, "messages.mcap"}
+    for video in stream.videos:
+        assert listed[video.file] == (video.size, video.sha256)
+    assert set(listed) == {*entry.files, "messages.mcap"}
     span, infos, digests = manifest.time_range, stream.camera_info, stream.digests
     assert span is not None
     assert infos is not None

@@ -30,6 +30,7 @@ from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME, DecodedColumns
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import MANIFEST_NAME, THE_TOP
+from mp4ds.messages.encodings import Picture
 from mp4ds.records import Attachment, Message, MetadataRecord
 from mp4ds.video.packets import PacketReader
 
@@ -121,10 +122,11 @@ def _stream(stream: Stream) -> Values:
     sidecar = stream.sidecar
     columns = stream.columns
     channel = sidecar.channel
-    video = sidecar.video
+    own = _video(stream)
+    pixels, payloads = _made(stream)
     return {
         "sidecar": stream.path.name,
-        "video": video.file,
+        "video": own.pop("video"),
         "topic": channel.topic,
         "type": channel.schema_.name if channel.schema_ else "",
         "message_encoding": channel.message_encoding,
@@ -133,13 +135,14 @@ def _stream(stream: Stream) -> Values:
         "stamps": sidecar.stamps,
         "body": sidecar.body,
         "image": sidecar.image.model_dump(),
-        "layout": video.layout,
-        "codec": video.codec,
-        "coded_size": [video.width, video.height],
+        **{key: own.pop(key) for key in ("layout", "codec", "coded_size")},
         "frames": sidecar.frames,
         "columns": _columns(columns),
         "frame_id": [sidecar.headers[number].frame_id for number in columns.variant.tolist()],
-        **_decoded(stream),
+        **own,
+        "pixels": pixels,
+        "payloads": payloads,
+        **({"view": _view(stream.in_layer("view"))} if sidecar.view else {}),
         "camera_info": _camera_info(stream),
     }
 
@@ -160,32 +163,37 @@ def _columns(columns: DecodedColumns) -> Values:
     return {name: _texts(values.tolist()) for name, values in found.items()}
 
 
-def _decoded(stream: Stream) -> Values:
+def _video(stream: Stream) -> Values:
     """Hashes of each frame's packet in the video, and of what is decoded from it."""
-    sidecar = stream.sidecar
-    is_lossless = sidecar.profile == "lossless"
-    is_packet = sidecar.body == "packet"
-    made = list(_of_packets(stream) if is_packet else _of_pictures(stream))
+    video = stream.sidecar.video
     return {
+        "video": video.file,
+        "layout": video.layout,
+        "codec": video.codec,
+        "coded_size": [video.width, video.height],
         "packets": _packets(stream),
         "planes": _planes(stream),
-        "pixels": None if is_packet else [item[0] for item in made],
-        "payloads": [item[1] for item in made] if is_lossless else None,
     }
 
 
-def _of_pictures(stream: Stream) -> Iterator[tuple[str, str]]:
-    """SHA-256 of the pixels and of the payload of each frame."""
+def _view(stream: Stream) -> Values:
+    return {**_video(stream), "pixels": [_pixels(stream, one) for _, one in stream.pictures()]}
+
+
+def _made(stream: Stream) -> tuple[list[str] | None, list[str] | None]:
+    """SHA-256 of the pixels and of the payload of each frame; None for what is not defined."""
+    if stream.sidecar.body == "packet":
+        return None, [_sha256(payload) for _, payload in stream.payloads()]
+    pixels, payloads = [], []
     for index, picture in stream.pictures():
-        pixels = stream.recorded_pixels(picture)
-        little_endian = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
-        payload = stream.rebuilder.payload(index, picture)
-        yield _sha256(little_endian.tobytes()), _sha256(payload)
+        pixels.append(_pixels(stream, picture))
+        payloads.append(_sha256(stream.rebuilder.payload(index, picture)))
+    return pixels, payloads if stream.sidecar.profile == "lossless" else None
 
 
-def _of_packets(stream: Stream) -> Iterator[tuple[str, str]]:
-    for _, payload in stream.payloads():
-        yield "", _sha256(payload)
+def _pixels(stream: Stream, picture: Picture) -> str:
+    pixels = stream.recorded_pixels(picture)
+    return _sha256(pixels.astype(pixels.dtype.newbyteorder("<"), copy=False).tobytes())
 
 
 def _packets(stream: Stream) -> list[str]:

@@ -33,6 +33,7 @@ from mp4ds.format.sidecars import (
     load_document,
     model_problems,
     schema_text,
+    sidecar_of,
     verify_file,
 )
 from mp4ds.records import Message, Record
@@ -102,7 +103,7 @@ def _problems(path: Path, deep: bool, report: _Report) -> list[Problem]:
             for number, folder in enumerate(folders)
             for problem in _validate_dataset(folder, deep, _scaled(report, number, len(folders)))
         ]
-    sidecar = path.with_suffix(".yaml") if path.suffix == ".mp4" else path
+    sidecar = sidecar_of(path) if path.suffix == ".mp4" else path
     if sidecar.suffix not in (".yaml", ".yml"):
         raise SourceError(
             path,

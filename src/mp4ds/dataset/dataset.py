@@ -41,7 +41,7 @@ from mp4ds.files.sources import HOW_TO_OPEN, is_folder, refuse_unfinished, video
 from mp4ds.files.urls import RemotePath, location
 from mp4ds.format.fields import MESSAGES_NAME, Choice, everything, within
 from mp4ds.format.manifest import Manifest
-from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, verify_file
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, sidecar_of, verify_file
 from mp4ds.messages.serializations import is_camera
 from mp4ds.records import Channel, Excerpt, Message, Record
 from mp4ds.times import Sync, synchronize
@@ -113,7 +113,7 @@ class Dataset:
             self.manifest = load_manifest(self.path / MANIFEST_NAME)
             sidecars = [self.path / entry.sidecar for entry in self.manifest.streams]
         else:
-            sidecar = self.path.with_suffix(".yaml") if self.path.suffix == ".mp4" else self.path
+            sidecar = sidecar_of(self.path) if self.path.suffix == ".mp4" else self.path
             if sidecar != self.path and self.path.exists() and not sidecar.exists():
                 problem = f"is a video without its sidecar, {sidecar.name}"
                 raise FormatError("file-missing", self.path, problem)
@@ -599,7 +599,7 @@ def open_dataset(
     """
     place = location(path)
     if place.suffix.lower() in _VIDEOS and place.is_file():
-        beside = (place.with_suffix(".yaml"), place.parent / MANIFEST_NAME)
+        beside = (sidecar_of(place), place.parent / MANIFEST_NAME)
         if not any(path.exists() for path in beside):
             return Dataset.of(place, None, [], MessagesFile(None), VideoImages(place, track))
     dataset = Dataset(place, layer=layer)

@@ -42,7 +42,15 @@ from mp4ds.messages.serializations import WIRES
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
-from mp4ds.video.codecs import CODECS, PACKET_CODECS, TOLERANCES, VISUAL, QualityTarget
+from mp4ds.video.codecs import (
+    CODECS,
+    LEAST_CRF,
+    PACKET_CODECS,
+    TOLERANCES,
+    VISUAL,
+    QualityTarget,
+)
+from mp4ds.video.colour import MATRICES
 from mp4ds.video.pixels import shows_colours
 from mp4ds.video.references import (
     MAX_CHARS,
@@ -240,6 +248,7 @@ PIXEL_FORMATS = (
     *("gbrap10le", "gbrap12le", "gbrap14le", "gbrap16le"),
     *("yuv420p", "yuv422p", "yuv444p", "yuv420p10le"),
 )
+_VIEW_FORMATS = ("yuv420p", "yuv420p10le")
 
 
 class SchemaModel(Model):
@@ -555,10 +564,12 @@ class StreamSidecar(Model):
             raise ValueError("a lossless stream must have digests")
         quality = self.video.quality
         if quality and self.profile != str(QualityTarget(quality.metric, quality.target)):
-            raise ValueError(f"video.quality does not match the profile {self.profile}")
+            raise ValueError(
+                f"the quality of {self.video.file} does not match the profile {self.profile}"
+            )
         width, height = self.layout.picture_size(self.image.width, self.image.height)
         if self.video.width < width or self.video.height < height:
-            raise ValueError(f"the video is smaller than its pictures of {width}x{height}")
+            raise ValueError(f"{self.video.file} is smaller than its pictures of {width}x{height}")
         self._check_body()
         if self.view is not None:
             self._check_view(self.view)
@@ -567,13 +578,21 @@ class StreamSidecar(Model):
     def _check_view(self, view: VideoModel) -> None:
         if self.profile != "lossless" or self.body not in ("pixels", "png", "packet"):
             raise ValueError(f"a {self.profile} stream with the body {self.body} has no view")
-        if self.video.file != exact_name(view.file):
+        if not view.file.endswith(".mp4") or self.video.file != exact_name(view.file):
             raise ValueError(f"the video beside {view.file} must be {exact_name(view.file)}")
+        if self.video.color is not None:
+            raise ValueError("video.color must be absent beside a view")
         due = ENCODINGS[self.image.encoding].lossy
         if view.layout != due:
             raise ValueError(f"the view has the layout {view.layout}, not {due}")
-        if view.pixel_format is None:
-            raise ValueError("view.pixel_format must be present")
+        # else decoders would differ in what it predicts
+        for what, value, known in (
+            ("codec", view.codec, LEAST_CRF),
+            ("pixel format", view.pixel_format, _VIEW_FORMATS),
+            ("matrix", view.color and view.color.matrix, MATRICES),
+        ):
+            if value not in known:
+                raise ValueError(f"the view has the {what} {value}, not {' or '.join(known)}")
         self.seen  # noqa: B018 - checks its pictures
 
     def _check_body(self) -> None:

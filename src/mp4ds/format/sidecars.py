@@ -20,7 +20,7 @@ from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
 from mp4ds.format.fields import FORMAT_VERSION, Model, document_of, parse_version
 from mp4ds.format.manifest import About, FileEntry, Manifest
-from mp4ds.format.models import StreamSidecar
+from mp4ds.format.models import EXACT_SUFFIX, StreamSidecar
 from mp4ds.times import encode_column
 
 Document = dict[str, Any]
@@ -190,6 +190,14 @@ def names_dataset(path: Path) -> bool:
     if path.is_dir() and (path / MANIFEST_NAME).is_file():
         return True
     return path.suffix in (".yaml", ".yml", ".mp4") and path.exists()
+
+
+def sidecar_of(video: Path) -> Path:
+    """Where the sidecar of a video is."""
+    beside = video.with_suffix(".yaml")
+    if video.name.endswith(EXACT_SUFFIX) and not beside.exists():
+        return video.with_name(f"{video.name.removesuffix(EXACT_SUFFIX)}.yaml")
+    return beside
 
 
 def dump_document(model: StreamSidecar | Manifest) -> bytes:

@@ -58,12 +58,16 @@ def widened(frame: av.VideoFrame, *, full_range: bool) -> av.VideoFrame:
     return made
 
 
-def narrowed(frame: av.VideoFrame) -> av.VideoFrame:
-    """A 4:2:0 picture of 10 bits, rounded to 8; its tag states the range."""
+def narrowed(frame: av.VideoFrame, *, full_range: bool) -> av.VideoFrame:
+    """A 4:2:0 picture of 10 bits, rounded to 8.
+
+    Args:
+        frame: Of ``yuv420p10le``.
+        full_range: Whether its samples use their full range.
+    """
     made = av.VideoFrame(frame.width, frame.height, PLANES_FORMAT)
-    is_full = frame.color_range == _FULL_RANGE
     for index in range(3):
-        table = _NARROWER[is_full][_LUMA if index == 0 else _CHROMA]
+        table = _NARROWER[full_range][_LUMA if index == 0 else _CHROMA]
         samples(made, index)[...] = table[samples(frame, index)]
     made.colorspace, made.color_range = frame.colorspace, frame.color_range
     return made
@@ -357,6 +361,7 @@ class PictureMaker:
         self.coded_size = coded_size
         self._picture_format = picture_format
         self._picture_size = picture_size
+        self._is_tagged, self._full_range = matrix is None, full_range
         self._converter = PictureConverter(matrix, source_full_range=full_range)
 
     def make(
@@ -391,7 +396,10 @@ class PictureMaker:
             )
         if scale is not None:
             return (self._converter.scale(frame, scale, out),)
-        if self._picture_format.startswith("bayer_"):
+        is_mosaic = self._picture_format.startswith("bayer_")
+        if is_mosaic or self._picture_format in _PACKED:
+            self._check_colours(frame.format)
+        if is_mosaic:
             return (self._mosaic(samples(self._converter.convert(frame, "rgb24"))),)
         if self._picture_format in _PACKED:
             width, height = self._picture_size
@@ -399,10 +407,16 @@ class PictureMaker:
             return (colours[:height, :width],)
         return self._planes(frame)
 
+    def _check_colours(self, found: av.VideoFormat) -> None:
+        """Refuse what the format does not define: libswscale's colours depend on its version."""
+        if not (self._is_tagged or found.is_rgb or found.name in colour.BITS):
+            problem = f"decodes to {found.name}, not {PLANES_FORMAT} or {TEN_BITS}"
+            raise VideoError("codec-mismatch", self._path, problem)
+
     def _planes(self, frame: av.VideoFrame) -> Picture:
         wanted, (width, height) = self._picture_format, self._picture_size
         if frame.format.name == TEN_BITS and wanted in ("gray", *CHROMA_SHIFTS):
-            frame = narrowed(frame)
+            frame = narrowed(frame, full_range=self._full_range)
         expected = _DECODED_AS.get(wanted, (wanted,))
         if frame.format.name not in expected:
             problem = f"decodes to {frame.format.name}, not {' or '.join(expected)}"
@@ -489,7 +503,7 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
         media.track.thread_count = 1
         for frame in media.container.decode(media.track):
             if frame.format.name == TEN_BITS:
-                frame = narrowed(frame)
+                frame = narrowed(frame, full_range=frame.color_range == _FULL_RANGE)
             if frame.format.name not in (PLANES_FORMAT, f"yuvj{PLANES_FORMAT[3:]}"):
                 raise VideoError(
                     "codec-mismatch", path, f"decodes to {frame.format.name}, not {PLANES_FORMAT}"
