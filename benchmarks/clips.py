@@ -265,7 +265,7 @@ def _sample_rggb(rgb: Signal) -> Signal:
 
 
 def demosaic_bilinear(mosaic: Pixels) -> Pixels:
-    """An rggb mosaic of even size, up to 12 bits, as rgb; samples that are there stay."""
+    """An rggb mosaic of even size, up to 12 bits, as rgb, with the edges of OpenCV."""
     height, width = mosaic.shape
     padded = np.pad(mosaic.astype(np.uint16), 1, mode="reflect")  # keeps the pattern's phase
     rgb = np.empty((height, width, 3), mosaic.dtype)
@@ -282,6 +282,8 @@ def demosaic_bilinear(mosaic: Pixels) -> Pixels:
             rows = plane[:-2] + 2 * plane[1:-1] + plane[2:]
             total = rows[:, :-2] + 2 * rows[:, 1:-1] + rows[:, 2:]
         rgb[..., color] = (total + 2) // 4
+    rgb[:, 0], rgb[:, -1] = rgb[:, 1], rgb[:, -2]
+    rgb[0], rgb[-1] = rgb[1], rgb[-2]
     return rgb
 
 

@@ -114,8 +114,12 @@ def pixels(image, video, planes):
     elif video.get("pixel_format") == "yuv420p10le":
         planes = as_bytes(planes, is_full=video["color"]["range"] == "full")
     patterns = np.dtype(f"u{samples.itemsize}")
+    if values == "converted":
+        return _named(_converted(planes, parameters["rule"], (width, height)), encoding)
     count = 3 if values == "opaque" else channels
     placed = _placed(places, parameters, encoding, (width, height), planes, count)
+    if values == "demosaiced":
+        return _named(_demosaiced(placed[..., 0].astype(int), parameters["mosaic"]), encoding)
     if values == "whole":
         top = 1 << (8 * samples.itemsize - 1) if samples.kind == "i" else 0
         return placed.astype(patterns) ^ patterns.type(top)
@@ -135,6 +139,56 @@ def pixels(image, video, planes):
         return known[placed]
     alpha = np.full((*placed.shape[:2], 1), parameters["alpha"], placed.dtype)
     return np.concatenate((placed, alpha), axis=2)  # of "opaque"
+
+
+def _named(rgb, encoding):
+    """Colours in the order of an encoding."""
+    return (rgb if encoding.startswith("rgb") else rgb[..., ::-1]).astype(np.uint8)
+
+
+def _demosaiced(mosaic, block):
+    """R, G and B, shape (rows, columns, 3)."""
+    if min(mosaic.shape) < 3:
+        return np.zeros((*mosaic.shape, 3))
+    y, x = np.mgrid[: mosaic.shape[0], : mosaic.shape[1]]
+    y, x = (np.clip(place, 1, place.max() - 1) for place in (y, x))
+    color = np.array(["rgb".index(name) for name in block]).reshape(2, 2)[y % 2, x % 2]
+    beside = np.array(["rgb".index(name) for name in block]).reshape(2, 2)[y % 2, (x + 1) % 2]
+    left, right, above, below = (
+        mosaic[y, x - 1],
+        mosaic[y, x + 1],
+        mosaic[y - 1, x],
+        mosaic[y + 1, x],
+    )
+    corners = sum(mosaic[y + down, x + across] for down in (-1, 1) for across in (-1, 1))
+    is_green = color == 1
+    found = np.empty((*mosaic.shape, 3), int)
+    for name in range(3):
+        mean = np.where(beside == name, (left + right + 1) >> 1, (above + below + 1) >> 1)
+        around = (left + right + above + below + 2) >> 2 if name == 1 else (corners + 2) >> 2
+        other = np.where(is_green, mean, around)
+        found[..., name] = np.where(color == name, mosaic[y, x], other)
+    return found
+
+
+def _converted(planes, rule, size):
+    """R, G and B, shape (rows, columns, 3), of Y, U and V."""
+    across, down = (round(a / b) for a, b in zip(planes[0].shape, planes[1].shape, strict=True))
+    rows, columns = np.mgrid[: size[1], : size[0]]
+    luma = planes[0][rows, columns].astype(int) - 16
+    u, v = (plane[rows // across, columns // down].astype(int) - 128 for plane in planes[1:])
+    if rule == "opencv":
+        z = 1220542 * np.maximum(luma, 0) + 2**19
+        r, g, b = z + 1673527 * v, z - 409993 * u - 852492 * v, z + 2116026 * u
+        r, g, b = r >> 20, g >> 20, b >> 20
+    elif rule == "librealsense":
+        y = 298 * luma >> 8
+        r, g, b = y + (409 * v >> 8), y - (100 * u >> 8) - (208 * v >> 8), y + (516 * u >> 8)
+    else:
+        y = 9539 * luma >> 13
+        r, b = y + (13075 * v >> 13), y + (16525 * u >> 13)
+        g = y + (-3209 * u >> 13) + (-6660 * v >> 13)
+    return np.clip(np.stack((r, g, b), axis=2), 0, 255)
 
 
 def _placed(places, parameters, encoding, size, planes, channels):

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import images
 from mp4ds.messages.encodings import ENCODINGS, Encoding, pixel_view
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit
+from mp4ds.messages.sources import CONVERSIONS, MOSAICS
 
 Pixels = NDArray[Any]
 
@@ -88,6 +90,28 @@ def bits_of(pixels: Pixels) -> bytes:
     return pixels.astype(pixels.dtype.newbyteorder("<")).tobytes()
 
 
+def made_of(source: str, encoding: Encoding, width: int, height: int, seed: int) -> Pixels:
+    """Colours of a random ``mosaic``, ``yuv420`` or ``yuv422``, as the spec's reader has them.
+
+    A quarter of the colours of YUV are cut off at 0 or 255.
+    """
+    rng = np.random.default_rng([seed, width, height])
+    if source == "mosaic":
+        mosaic = rng.integers(0, 256, (height, width), np.uint8)
+        planes = list(bind("mosaic8", ENCODINGS["bayer_rggb8"]).to_picture(mosaic))
+        name, parameters = "from_mosaic8", {"mosaic": MOSAICS[seed % len(MOSAICS)]}
+    else:
+        halved = (height // 2 if source == "yuv420" else height, width // 2)
+        planes = [
+            rng.integers(0, 256, (height, width), np.uint8),
+            *(rng.integers(100, 156, halved, np.uint8) for _ in range(2)),
+        ]
+        name, parameters = f"from_{source}", {"rule": [*CONVERSIONS][seed % len(CONVERSIONS)]}
+    image = {"encoding": encoding.name, "width": width, "height": height}
+    found: Pixels = images.pixels(image, {"layout": name, "parameters": parameters}, planes)
+    return found
+
+
 def suited(name: str, encoding: Encoding, width: int, height: int, seed: int = 0) -> Pixels:
     """Pixels that a layout with parameters does not refuse, and that use what it has."""
     rng = np.random.default_rng([seed, width, height])
@@ -96,6 +120,8 @@ def suited(name: str, encoding: Encoding, width: int, height: int, seed: int = 0
         pixels = rng.integers(0, 256, shape, np.uint8)
         pixels[..., 3] = seed * 80 % 256
         return pixels
+    if name.startswith("from_"):
+        return made_of(name.removeprefix("from_").rstrip("8"), encoding, width, height, seed)
     if name.endswith("fold") and name != "metres_fold" and seed == 3:
         return values(encoding, "random", width, height, seed)
     if name.endswith("_bits") or name in ("fold", "mosaic_fold"):

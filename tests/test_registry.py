@@ -124,6 +124,8 @@ PARAMETERS: dict[frozenset[str], list[dict[str, Any]]] = {
     frozenset({"table"}): [{"table": (3, 5)}, {"table": tuple(range(0, 900, 3))}],
     frozenset({"hole", "scale"}): [{"hole": 0, "scale": scale} for scale in SCALES],
     frozenset({"alpha"}): [{"alpha": 255}],
+    frozenset({"mosaic"}): [{"mosaic": "grbg"}],
+    frozenset({"rule"}): [{"rule": "opencv"}],
 }
 
 

@@ -412,6 +412,12 @@ class LayoutParameters(Model):
     alpha: Annotated[int, Field(ge=0, le=255)] | None = Field(
         None, description="Alpha of every pixel."
     )
+    mosaic: str | None = Field(
+        None, description="Colours of its 2 x 2 block, by rows: rggb, bggr, gbrg or grbg."
+    )
+    rule: str | None = Field(
+        None, description="How colours were made of YUV (registry, Colours of YUV)."
+    )
 
 
 class VideoModel(Model):

@@ -106,6 +106,7 @@ _MORE = {
     "gbr16": ("gbr_bits",),
     "gbra16": ("gbra_bits",),
 }
+_SOURCES = ("from_mosaic8", "from_yuv420", "from_yuv422")
 _METRES = ("metres16", "metres_fold", "table", "palette")
 
 
@@ -138,8 +139,8 @@ def _encodings() -> list[Encoding]:
     return [
         _of_samples("mono8", 1, "u1", "gray8"),
         _of_samples("mono16", 1, "u2"),
-        Encoding("rgb8", 3, "u1", "rgb24", ("rgb24",), "rgb24"),
-        Encoding("bgr8", 3, "u1", "bgr24", ("bgr24",), "bgr24"),
+        Encoding("rgb8", 3, "u1", "rgb24", (*_SOURCES, "rgb24"), "rgb24"),
+        Encoding("bgr8", 3, "u1", "bgr24", (*_SOURCES, "bgr24"), "bgr24"),
         Encoding("rgba8", 4, "u1", "rgba", ("rgba", "opaque")),
         Encoding("bgra8", 4, "u1", "bgra", ("bgra", "opaque")),
         *(_of_samples(f"{order}16", len(order), "u2") for order in ("rgb", "bgr", "rgba", "bgra")),
@@ -303,6 +304,8 @@ class Parameters:
         hole: Bit pattern of the float that stands for no measurement.
         scale: One of `mp4ds.messages.numbers.SCALES`.
         alpha: Bit pattern of every pixel's alpha.
+        mosaic: What an image was made of, by the colours of its 2 x 2 block, such as ``rggb``.
+        rule: How colours were made of YUV, one of `mp4ds.messages.sources.CONVERSIONS`.
     """
 
     bits: int | None = None
@@ -313,6 +316,8 @@ class Parameters:
     hole: int | None = None
     scale: str | None = None
     alpha: int | None = None
+    mosaic: str | None = None
+    rule: str | None = None
 
     @property
     def names(self) -> frozenset[str]:

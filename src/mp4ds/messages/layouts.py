@@ -33,6 +33,7 @@ from mp4ds.messages.encodings import (
     patterns,
 )
 from mp4ds.messages.numbers import Few, Metres, Palette, PatternTable
+from mp4ds.messages.sources import Converted, ConvertedTall, Demosaiced
 
 # ---------------------------------------------------------------- arrangements
 
@@ -267,6 +268,17 @@ CHROMA_SHIFTS = {"yuv420p": (1, 1), "yuv422p": (1, 0), "yuv444p": (0, 0)}
 """Planar pixel formats: how often width and height of the chroma planes are halved."""
 
 
+def _even(width: int, height: int, *, across: bool, down: bool) -> tuple[int, int]:
+    """A size, if chroma may be halved so.
+
+    Raises:
+        ValueError: A side is odd.
+    """
+    if (across and width % 2) or (down and height % 2):
+        raise ValueError(f"{width}x{height} pixels, where chroma needs even sides")
+    return width, height
+
+
 @dataclass(frozen=True, slots=True)
 class Packed422(Arrangement):
     """Planes Y, U and V, from two-byte pixels that share U and V with a neighbour.
@@ -280,6 +292,10 @@ class Packed422(Arrangement):
     def pixel_format(self, bits: int) -> str:
         """Chroma of half the width."""
         return "yuv422p"
+
+    def picture_size(self, width: int, height: int) -> tuple[int, int]:
+        """The same, which must be even."""
+        return _even(width, height, across=True, down=False)
 
     def luma_rows(self, samples: Samples) -> int:
         """Rows of the image."""
@@ -311,6 +327,10 @@ class SemiPlanar(Arrangement):
     def pixel_format(self, bits: int) -> str:
         """By the chroma's size."""
         return "yuv420p" if self.halved else "yuv444p"
+
+    def picture_size(self, width: int, height: int) -> tuple[int, int]:
+        """The same, which must be even."""
+        return _even(width, height, across=self.halved, down=self.halved)
 
     def arrange(self, samples: Samples) -> Picture:
         """Views if rows are contiguous."""
@@ -471,6 +491,9 @@ LAYOUTS: dict[str, LayoutKind] = {
         LayoutKind("mosaic16", Whole, lambda e, p: Mosaic()),
         LayoutKind("mosaic_bits", Narrow, lambda e, p: Mosaic()),
         LayoutKind("mosaic_fold", NarrowFolded, lambda e, p: _fold(p, Mosaic())),
+        LayoutKind("from_mosaic8", Demosaiced, lambda e, p: Mosaic()),
+        _shown("from_yuv420", lambda e, p: SemiPlanar(halved=True, first="u"), ConvertedTall),
+        _shown("from_yuv422", lambda e, p: Packed422(0), Converted),
         # demosaicing is done by the video's converter; resampling restores the mosaic
         _shown("demosaic8", lambda e, p: Packed(f"bayer_{e.mosaic}8"), exact=False),
         _shown("planar422", lambda e, p: _yuv(e)),

@@ -1,0 +1,542 @@
+"""Colours that a driver made of a mosaic, or of YUV, by a fixed rule: back to what it had."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.messages.encodings import (
+    Encoding,
+    Parameters,
+    Pixels,
+    Samples,
+    Values,
+    native,
+    patterns,
+)
+
+_BANDS = 6  # places of an image that are looked at first
+
+
+def _colours(pixels: Pixels, encoding: Encoding) -> Pixels:
+    """A view with R, G and B in this order."""
+    return pixels if encoding.name.startswith("rgb") else pixels[..., ::-1]
+
+
+def _band_rows(rows: int) -> Iterator[slice]:
+    """A few places of an image, each of six rows from an even one."""
+    for top in {rows * n // _BANDS // 2 * 2 for n in range(_BANDS)}:
+        yield slice(top, top + 6)
+
+
+# ---------------------------------------------------------------- mosaics
+
+MOSAICS = ("rggb", "bggr", "gbrg", "grbg")
+"""The colours of the 2 x 2 block, by rows."""
+
+_FEWEST = 3  # rows and columns of an image that has an inside
+
+
+def _demosaic(mosaic: Samples, block: str, rgb: Pixels) -> None:
+    """Write the colours of a mosaic, bilinearly; at the edges, those of the pixel inside."""
+    if min(mosaic.shape) < _FEWEST:
+        rgb[...] = 0
+        return
+    wide: Samples = mosaic.astype(np.uint16 if mosaic.itemsize == 1 else np.uint32)
+    inside = rgb[1:-1, 1:-1]
+    across, down = wide[1:-1, :-2] + wide[1:-1, 2:], wide[:-2, 1:-1] + wide[2:, 1:-1]
+    rows = wide[:, :-2] + wide[:, 2:]
+    around, corners = (across + down + 2) >> 2, (rows[:-2] + rows[2:] + 2) >> 2
+    across, down = (across + 1) >> 1, (down + 1) >> 1
+    for y, x in product((0, 1), (0, 1)):
+        place = np.s_[1 - y :: 2, 1 - x :: 2]
+        color = "rgb".index(block[2 * y + x])
+        target = inside[place]
+        target[..., color] = wide[1:-1, 1:-1][place]
+        if color == 1:
+            beside = "rgb".index(block[2 * y + 1 - x])
+            target[..., beside], target[..., 2 - beside] = across[place], down[place]
+        else:
+            target[..., 1], target[..., 2 - color] = around[place], corners[place]
+    rgb[1:-1, 0], rgb[1:-1, -1] = rgb[1:-1, 1], rgb[1:-1, -2]
+    rgb[0], rgb[-1] = rgb[1], rgb[-2]
+
+
+def _mosaic(rgb: Pixels, block: str) -> Samples:
+    """The mosaic whose colours an image may be."""
+    height, width = rgb.shape[:2]
+    mosaic = np.empty((height, width), rgb.dtype)
+    sites = np.empty((height, width), np.uint8)
+    for y, x in product((0, 1), (0, 1)):
+        color = "rgb".index(block[2 * y + x])
+        sites[y::2, x::2] = color
+        mosaic[y::2, x::2] = rgb[y::2, x::2, color]
+    if min(height, width) <= _FEWEST:
+        return mosaic
+    for turns in range(4):
+        _find_edge(*(np.rot90(plane, turns) for plane in (mosaic, sites, rgb)))
+    for turns in range(4):
+        _find_corner(*(np.rot90(plane, turns) for plane in (mosaic, sites, rgb)))
+    return mosaic
+
+
+def _find_edge(mosaic: Samples, sites: Samples, rgb: Pixels) -> None:
+    """Find the first row of a mosaic, of which only the second row of its colours tells.
+
+    There, green pixels have the mean of two rows, so that the site above is one of two values. The
+    pixels between have a mean of four sites, which says what values go together.
+    """
+    top = int(np.iinfo(mosaic.dtype).max)
+    rows, columns = mosaic[:3].astype(np.int64), np.arange(1, mosaic.shape[1] - 1)
+    is_green = sites[1, 1:-1] == 1
+    greens, others = columns[is_green], columns[~is_green]
+    rest = rows[2, others] + rows[1, others - 1] + rows[1, others + 1]
+    least = 4 * rgb[1, others, 1].astype(np.int64) - 2 - rest
+    mosaic[0, others] = np.clip(np.clip(rows[2, others], least, least + 3), 0, top)
+    if not len(greens):
+        return
+    color = sites[0, greens[0]]
+    least = 2 * rgb[1, greens, color].astype(np.int64) - 1 - rows[2, greens]
+    between = greens[:-1] + 1
+    due = 4 * rgb[1, between, color].astype(np.int64) - 2
+    due -= rows[2, between - 1] + rows[2, between + 1] + least[:-1] + least[1:]
+    options = (least >= 0) + 2 * (least < top)
+    # in the corners, a sample at the end of the range leaves room for the one beside both edges
+    ends = int(least[0] > top // 2), int(least[-1] > top // 2)
+    added = _chain(options.tolist(), np.clip(due, -4, 3).tolist(), ends)
+    mosaic[0, greens] = np.clip(least + added, 0, top)
+
+
+def _find_corner(mosaic: Samples, sites: Samples, rgb: Pixels) -> None:
+    """Find the first sample of a mosaic, which the pixel inside may have a mean of."""
+    if sites[1, 1] != 1:
+        rest = int(mosaic[0, 2]) + int(mosaic[2, 0]) + int(mosaic[2, 2])
+        sample = 4 * int(rgb[1, 1, sites[0, 0]]) - 1 - rest
+        mosaic[0, 0] = min(max(sample, 0), int(np.iinfo(mosaic.dtype).max))
+
+
+def _chain(options: list[int], least: list[int], ends: tuple[int, int]) -> list[int]:
+    """Numbers 0 or 1, each sum of two neighbours being the least given, or up to 3 more.
+
+    Args:
+        options: For each number, 1 if it may be 0, plus 2 if it may be 1.
+        least: For each sum.
+        ends: The first and the last number, if they may be these.
+    """
+    first, last = (1 << end for end in ends)
+    for mask in (options[0] & first, options[0]):
+        reached = [mask]
+        for option, bound in zip(options[1:], least, strict=True):
+            reached.append(option & _beside(reached[-1], bound))
+        if reached[-1]:
+            break
+    found = [(reached[-1] & last or reached[-1]) >> 1]
+    for mask, bound in zip(reached[-2::-1], least[::-1], strict=True):
+        found.append((mask & _beside(1 << found[-1], bound)) >> 1)
+    return found[::-1]
+
+
+@cache
+def _beside(options: int, least: int) -> int:
+    """The options of a number beside one with options."""
+    return sum(
+        1 << number
+        for number in (0, 1)
+        if any(options >> other & 1 and least <= number + other <= least + 3 for other in (0, 1))
+    )
+
+
+class Demosaiced(Values):
+    """The mosaic of colours that were made of it by bilinear interpolation.
+
+    Attributes:
+        mosaic: One of `MOSAICS`.
+    """
+
+    parameters = frozenset({"mosaic"})
+
+    def __init__(self, encoding: Encoding, mosaic: str) -> None:
+        self._encoding = encoding
+        self.mosaic = mosaic
+        self.bits = 8 * encoding.bytes_per_sample
+
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+        """For that mosaic."""
+        if parameters.mosaic not in MOSAICS:
+            raise ValueError(f"mosaic {parameters.mosaic!r} is not one of {', '.join(MOSAICS)}")
+        return cls(encoding, parameters.mosaic)
+
+    def shape(self, pixels: Pixels) -> tuple[int, ...]:
+        """One sample a pixel."""
+        return pixels.shape[:2]
+
+    def encode(self, pixels: Pixels) -> Samples:
+        """New samples."""
+        return _mosaic(_colours(native(pixels), self._encoding), self.mosaic)
+
+    def decode(self, samples: Samples, out: Pixels) -> None:
+        """Write the pixels."""
+        _demosaic(samples, self.mosaic, _colours(patterns(out), self._encoding))
+
+    def refuses(self, pixels: Pixels) -> str | None:
+        """A colour that interpolation does not give."""
+        made = np.empty(pixels.shape, native(pixels).dtype)
+        self.decode(self.encode(pixels), made)
+        if np.array_equal(made, native(pixels)):
+            return None
+        return f"it was not made of a mosaic ({self.mosaic})"
+
+    @classmethod
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+        """The only mosaic that explains the inside of a few places, if it explains all images."""
+        found = [name for name in MOSAICS if cls(encoding, name)._may_have_made(samples[0])]
+        if len(found) != 1 or any(map(cls(encoding, found[0]).refuses, samples)):
+            return None
+        return Parameters(mosaic=found[0])
+
+    def _may_have_made(self, pixels: Pixels) -> bool:
+        for rows in _band_rows(len(pixels)):
+            rgb = _colours(native(pixels[rows]), self._encoding)
+            made = np.empty(rgb.shape, rgb.dtype)
+            _demosaic(_mosaic(rgb, self.mosaic), self.mosaic, made)
+            if not np.array_equal(made[2:-2, 2:-2], rgb[2:-2, 2:-2]):
+                return False
+        return True
+
+
+# ---------------------------------------------------------------- YUV
+
+_NEUTRAL = 128 << 8 | 128
+_SPAN = 511  # values of the difference of two samples
+_WALK = 260  # steps that reach every chroma
+_FEWEST_CHROMAS = 8  # that tell a rule from the others
+_HARD = 8  # places for which all chromas are tried
+_REACH = 12  # around an estimate of the chroma, where it has two unknowns
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """YUV to RGB, in integers: sums of terms that each depend on one sample.
+
+    Attributes:
+        factors: Of Y - 16; then of V - 128 in red, of U - 128 and V - 128 in green, and of U - 128
+            in blue.
+        early: Bits by which each term is shifted to the right.
+        late: Bits by which their sum is, rounded.
+        is_black_cut: Whether Y below 16 counts as 16.
+        is_green_subtracted: Whether the terms of green are shifted before their sign changes.
+    """
+
+    factors: tuple[int, int, int, int, int]
+    early: int = 0
+    late: int = 0
+    is_black_cut: bool = False
+    is_green_subtracted: bool = False
+
+    def _term(self, factor: int, numbers: NDArray[np.int64]) -> Samples:
+        if factor < 0 and self.is_green_subtracted:
+            return -self._term(-factor, numbers)
+        term: Samples = (factor * numbers >> self.early).astype(np.int32)
+        return term
+
+    @cached_property
+    def luma(self) -> Samples:
+        """The term of each Y, and what rounds the sum."""
+        numbers = np.arange(256) - 16
+        if self.is_black_cut:
+            numbers = np.maximum(numbers, 0)
+        return self._term(self.factors[0], numbers) + (1 << self.late >> 1)
+
+    @cached_property
+    def chroma(self) -> Samples:
+        """The terms of R, G and B for each U and V, shape (3, 65536), at 256 U + V."""
+        centred = np.arange(256) - 128
+        red, green_u, green_v, blue = (self._term(f, centred) for f in self.factors[1:])
+        zeros = np.zeros_like(red)
+        by_u, by_v = np.stack([zeros, green_u, blue]), np.stack([red, green_v, zeros])
+        terms: Samples = (by_u[:, :, None] + by_v[:, None, :]).reshape(3, -1)
+        return terms
+
+    def _fractions(self, *colours: int) -> Iterator[Samples]:
+        """Terms of Y, apart from whole steps, that give all differences of colours there are."""
+        yield np.zeros_like(self.chroma[0])
+        if self.late:
+            for color in colours:
+                yield -self.chroma[color] % (1 << self.late)
+
+    def _difference(self, fraction: Samples, one: int, other: int) -> Samples:
+        chroma = self.chroma
+        first, second = chroma[one] + fraction, chroma[other] + fraction
+        found: Samples = (first >> self.late) - (second >> self.late)
+        return found
+
+    @cached_property
+    def known(self) -> Samples:
+        """256 U + V of a pixel without 0 and 255, at 511 (R - G) + B - G, from -255; or -1.
+
+        No difference occurs with two of them.
+        """
+        found = np.full(_SPAN * _SPAN, -1, np.int32)
+        for fraction in self._fractions(0, 1, 2):
+            red, blue = (self._difference(fraction, color, 1) + 255 for color in (0, 2))
+            is_near = (red >= 0) & (red < _SPAN) & (blue >= 0) & (blue < _SPAN)
+            found[(_SPAN * red + blue)[is_near]] = np.flatnonzero(is_near)
+        return found
+
+    @cached_property
+    def lines(self) -> Sequence[tuple[int, int, bool, Samples]]:
+        """How the chroma of a pixel is found where red, green or blue is cut off, in this order.
+
+        Two other colours; whether U, otherwise V, is tried; and 256 U + V, or -1, for the
+        difference of these colours, from -255, and what is tried.
+        """
+        found = []
+        for one, other, is_u in ((2, 1, False), (2, 0, False), (0, 1, True)):
+            table = np.full((_SPAN, 256), -1, np.int32)
+            tried = np.arange(65536) >> 8 if is_u else np.arange(65536) & 255
+            for fraction in self._fractions(one, other):
+                difference = self._difference(fraction, one, other) + 255
+                is_near = (difference >= 0) & (difference < _SPAN)
+                table[difference[is_near], tried[is_near]] = np.flatnonzero(is_near)
+            found.append((one, other, is_u, table))
+        return found
+
+    def least_luma(self, colours: Samples, offsets: Samples) -> Samples:
+        """The least Y for which colours reach these values, if any does."""
+        due = (colours << self.late) - offsets - (1 << self.late >> 1)
+        return 16 - ((-due << self.early) // self.factors[0])
+
+    def colours(self, luma: Samples, chroma: Samples) -> Iterator[Samples]:
+        """R, G and B, before they are limited to 0 to 255."""
+        light = self.luma[luma]
+        for terms in self.chroma:
+            yield (light + terms[chroma]) >> self.late
+
+
+CONVERSIONS = {
+    "opencv": Conversion((1220542, 1673527, -409993, -852492, 2116026), late=20, is_black_cut=True),
+    "librealsense": Conversion((298, 409, -100, -208, 516), early=8, is_green_subtracted=True),
+    "swscale": Conversion((9539, 13075, -3209, -6660, 16525), early=13),
+}
+"""The rules of the registry."""
+
+
+@dataclass
+class _Solution:
+    """The YUV of pixels that share chroma, as far as it was found.
+
+    Attributes:
+        rule: The conversion.
+        colours: R, G and B, shape (3, pixels that share chroma, N), int32.
+        luma: Y, shape (pixels, N).
+        chroma: 256 U + V, shape (N,).
+        is_open: Where there is no solution yet, shape (N,).
+    """
+
+    rule: Conversion
+    colours: Samples
+    luma: Samples
+    chroma: Samples
+    is_open: Samples
+
+    @classmethod
+    def of(cls, rule: Conversion, colours: Samples) -> _Solution:
+        """For colours of which the first pixel has neither 0 nor 255."""
+        red, green, blue = colours[:, 0]
+        chroma = rule.known[(red - green) * _SPAN + (blue - green) + 255 * (_SPAN + 1)]
+        chroma[chroma < 0] = _NEUTRAL
+        luma = np.clip(rule.least_luma(colours[1], rule.chroma[1][chroma]), 0, 255)
+        is_right = np.ones(len(chroma), bool)
+        for made, color in zip(rule.colours(luma, chroma), colours, strict=True):
+            is_right &= (made == color).all(axis=0)
+        return cls(rule, colours, luma, chroma, ~is_right)
+
+    @property
+    def is_refuted(self) -> bool:
+        """Whether there is none for some pixels without 0 and 255."""
+        left = self.colours[:, :, self.is_open]
+        return bool(((left > 0) & (left < 255)).all(axis=(0, 1)).any())
+
+    def complete(self) -> None:
+        """Find the rest, where colours are cut off at 0 or 255."""
+        where = np.flatnonzero(self.is_open)
+        if not len(where):
+            return
+        colours = self.colours[:, :, where]
+        is_cut = (colours == 0) | (colours == 255)
+        place = np.arange(len(where))
+        best = is_cut.sum(axis=0).argmin(axis=0)  # the pixel with most colours as they were
+        pixel, cut = colours[:, best, place], is_cut[:, best, place]
+        count, estimate = cut.sum(axis=0), _estimate(pixel)
+        red, green, blue = pixel
+        known = self.rule.known[(red - green) * _SPAN + (blue - green) + 255 * (_SPAN + 1)]
+        self._try(where[count == 0], known[count == 0])
+        self._try(where[count == 3], np.full((count == 3).sum(), _NEUTRAL, np.int32))
+        for color, line in enumerate(self.rule.lines):
+            one, other, is_u, table = line
+            picked = np.flatnonzero((count == 1) & cut[color])
+            # beyond the estimate, which is for a colour at the limit
+            is_up = (pixel[color, picked] == 255) != (color == 1)
+            step = np.where(is_up, 1, -1)
+            tried = estimate[1 - is_u, picked] - 2 * step
+            difference = pixel[one, picked] - pixel[other, picked] + 255
+            for _ in range(_WALK):
+                left = self.is_open[where[picked]] & (tried > -4) & (tried < 260)
+                picked, tried, step, difference = (
+                    array[left] for array in (picked, tried, step, difference)
+                )
+                if not len(picked):
+                    break
+                found = table[difference, np.clip(tried, 0, 255)]
+                self._try(where[picked], np.where((tried < 0) | (tried > 255), -1, found))
+                tried = tried + step
+        several = np.flatnonzero(count >= 2)
+        middle = np.mean([_estimate(colours[:, n]) for n in range(colours.shape[1])], axis=0)
+        for centre in (middle.astype(np.int32), estimate):
+            for offset in _AROUND:
+                several = several[self.is_open[where[several]]]
+                if not len(several):
+                    break
+                u, v = centre[:, several] + offset
+                is_inside = (np.minimum(u, v) >= 0) & (np.maximum(u, v) < 256)
+                self._try(where[several], np.where(is_inside, 256 * u + v, -1))
+        every = np.arange(65536)
+        for place in np.flatnonzero(self.is_open)[:_HARD]:
+            self._try(np.full(len(every), place), every)
+
+    def _try(self, places: Samples, chroma: Samples) -> None:
+        """Take a chroma where it is the solution; -1 is none."""
+        places, chroma = places[chroma >= 0], chroma[chroma >= 0]
+        colours = self.colours[:, :, places]
+        is_black = (colours == 0).all(axis=0)
+        due = np.where(is_black, 1, colours)
+        least = np.stack(
+            [
+                self.rule.least_luma(color, terms[chroma])
+                for color, terms in zip(due, self.rule.chroma, strict=True)
+            ]
+        )
+        most = np.where(due > 0, least, -256).max(axis=0)
+        luma = np.clip(np.where(is_black, least.min(axis=0) - 1, most), 0, 255)
+        is_right = np.ones(len(chroma), bool)
+        for made, color in zip(self.rule.colours(luma, chroma), colours, strict=True):
+            is_right &= (np.clip(made, 0, 255) == color).all(axis=0)
+        done = places[is_right]
+        self.luma[:, done], self.chroma[done] = luma[:, is_right], chroma[is_right]
+        self.is_open[done] = False
+
+
+_AROUND = sorted(
+    (np.array([[u], [v]]) for u, v in product(range(-_REACH, _REACH + 1), repeat=2)),
+    key=lambda offset: int(abs(offset).max()),
+)
+
+
+def _estimate(colours: Samples) -> Samples:
+    """About U and V of colours, shape (2, N)."""
+    red, green, blue = colours
+    u = (-38 * red - 74 * green + 112 * blue >> 8) + 128
+    v = (112 * red - 94 * green - 18 * blue >> 8) + 128
+    return np.stack([u, v])
+
+
+class Converted(Values):
+    """The YUV, chroma halved, of colours that were made of it.
+
+    Attributes:
+        rule: One of `CONVERSIONS`.
+    """
+
+    parameters = frozenset({"rule"})
+    bits = 8
+    is_tall = False  # whether chroma is halved in height, too
+
+    def __init__(self, encoding: Encoding, rule: str) -> None:
+        self._encoding = encoding
+        self.rule = rule
+
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+        """For that rule."""
+        if parameters.rule not in CONVERSIONS:
+            raise ValueError(f"rule {parameters.rule!r} is not one of {', '.join(CONVERSIONS)}")
+        return cls(encoding, parameters.rule)
+
+    def shape(self, pixels: Pixels) -> tuple[int, ...]:
+        """As YUYV or NV12 have it."""
+        height, width = pixels.shape[:2]
+        return (height * 3 // 2, width) if self.is_tall else (height, width, 2)
+
+    def _solved(self, pixels: Pixels) -> _Solution:
+        height, width = pixels.shape[:2]
+        down = 1 + self.is_tall
+        blocks = _colours(pixels, self._encoding).reshape(height // down, down, width // 2, 2, 3)
+        colours = blocks.transpose(4, 1, 3, 0, 2).reshape(3, 2 * down, -1).astype(np.int32)
+        return _Solution.of(CONVERSIONS[self.rule], colours)
+
+    def _planes(self, samples: Samples) -> tuple[Samples, Samples, Samples]:
+        """Views of Y, U and V."""
+        if not self.is_tall:
+            return samples[..., 0], samples[:, 0::2, 1], samples[:, 1::2, 1]
+        rows = len(samples) * 2 // 3
+        return samples[:rows], samples[rows:, 0::2], samples[rows:, 1::2]
+
+    def encode(self, pixels: Pixels) -> Samples:
+        """New samples."""
+        solution = self._solved(pixels)
+        solution.complete()
+        samples = np.empty(self.shape(pixels), np.uint8)
+        luma, u, v = self._planes(samples)
+        down = 1 + self.is_tall
+        placed = solution.luma.reshape(down, 2, *u.shape).transpose(2, 0, 3, 1)
+        luma[...] = placed.reshape(luma.shape)
+        chroma = solution.chroma.reshape(u.shape)
+        u[...], v[...] = chroma >> 8, chroma & 255
+        return samples
+
+    def decode(self, samples: Samples, out: Pixels) -> None:
+        """Write the pixels."""
+        luma, u, v = self._planes(samples)
+        down = 1 + self.is_tall
+        blocks = luma.reshape(len(u), down, -1, 2)
+        chroma = (256 * u.astype(np.int32) + v)[:, None, :, None]
+        target = _colours(out, self._encoding)
+        for color, made in enumerate(CONVERSIONS[self.rule].colours(blocks, chroma)):
+            target[..., color] = np.clip(made, 0, 255).reshape(luma.shape)
+
+    def refuses(self, pixels: Pixels) -> str | None:
+        """A colour that no YUV gives."""
+        if pixels.shape[1] % 2 or (self.is_tall and pixels.shape[0] % 2):
+            return "it has an odd side"
+        solution = self._solved(pixels)
+        if not solution.is_refuted:
+            solution.complete()
+        return f"it was not made of YUV ({self.rule})" if solution.is_open.any() else None
+
+    @classmethod
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+        """The rule that explains a few places with several chromas, and all images."""
+        height, width = samples[0].shape[:2]
+        if width % 2 or (cls.is_tall and height % 2):
+            return None
+        places = np.concatenate([samples[0][rows] for rows in _band_rows(height)])
+        for name in CONVERSIONS:
+            tried = cls(encoding, name)
+            solution = tried._solved(places)
+            if solution.is_refuted or len(np.unique(solution.chroma)) < _FEWEST_CHROMAS:
+                continue
+            if not any(map(tried.refuses, samples)):
+                return Parameters(rule=name)
+        return None
+
+
+class ConvertedTall(Converted):
+    """That whose chroma is halved in height, too."""
+
+    is_tall = True
