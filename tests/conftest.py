@@ -13,6 +13,7 @@ import pytest
 
 import mp4ds
 from mp4ds.packing.options import PackOptions
+from mp4ds.plugins.demo import demo
 from mp4ds.video.encoder import ordinary_scheduling
 from sources import SOURCES, scene
 
@@ -120,4 +121,14 @@ def packed_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = folder / "source"
     paths = SOURCES["bag-none"](source, scene("bayer_rggb8"))
     mp4ds.pack(paths, folder / "dataset", PackOptions(codec="h264"))
+    return folder / "dataset"
+
+
+@pytest.fixture(scope="session")
+def with_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A lossless dataset of the demo, whose Bayer and RGB cameras have views; not to be changed."""
+    folder = tmp_path_factory.mktemp("viewed")
+    demo(folder / "demo.mcap", seconds=1)
+    mp4ds.pack(folder / "demo.mcap", folder / "dataset")
+    assert len([*folder.glob("dataset/*.exact.mp4")]) == 2
     return folder / "dataset"

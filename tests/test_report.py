@@ -1,4 +1,4 @@
-"""The report: its figures and columns, its proxies, and what it may replace."""
+"""The report: its figures and columns, its stills, and what it may replace."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from commands import call, start
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.format.models import Calibration
 from mp4ds.plugins.reporting.cameras import axis_of, overlay_of, pack_column
-from mp4ds.plugins.reporting.proxies import Look, proxy_size
 from mp4ds.plugins.reporting.report import ReportOptions, as_script, report
 from mp4ds.plugins.reporting.server import ReportServer
+from mp4ds.plugins.reporting.stills import Look
 from mp4ds.times import lost_frames
 from report_scenes import (
     COLOUR,
@@ -199,7 +199,7 @@ def test_a_grid_of_impossible_numbers_is_bounded(value: float) -> None:
 def test_the_report_of_a_dataset(copy: Path) -> None:
     before = digests(copy)
     summary = report(copy)
-    assert [(c.topic, c.plays) for c in summary.cameras] == [(DEPTH, "proxy"), (COLOUR, "video")]
+    assert [(c.topic, c.plays) for c in summary.cameras] == [(DEPTH, "stills"), (COLOUR, "video")]
     assert "ffv1" in summary.cameras[0].note
     assert summary.problems == []
     assert summary.index == copy / "index.html"
@@ -248,24 +248,6 @@ def test_topics_and_their_sizes(copy: Path) -> None:
     assert rows["/front/camera_info"]["stored"] == "in front_image_raw.yaml"
 
 
-def test_a_second_report_takes_the_proxies_of_the_first(copy: Path) -> None:
-    report(copy)
-    (proxy,) = (copy / "report" / "proxies").iterdir()
-    first = proxy.stat()
-    again = report(copy)
-    assert (proxy.stat().st_ino, proxy.stat().st_mtime_ns) == (first.st_ino, first.st_mtime_ns)
-    assert again.cameras[0].plays == "proxy"
-    assert "in false colour" in data_of(copy)["cameras"][0]["caption"]
-    report(copy, ReportOptions(proxy_width=64))
-    assert not proxy.exists()
-    (proxy,) = (copy / "report" / "proxies").iterdir()
-    with mp4ds.open(proxy) as opened:
-        assert next(iter(opened)).image_size == (64, 44)
-    none = report(copy, ReportOptions(proxies="none"))
-    assert [camera.plays for camera in none.cameras] == ["nothing", "video"]
-    assert not proxy.exists()
-
-
 def test_a_report_elsewhere_plays_the_videos_where_they_are(copy: Path, tmp_path: Path) -> None:
     odd = tmp_path / "a #1 100% ü?"
     odd.mkdir()
@@ -274,9 +256,9 @@ def test_a_report_elsewhere_plays_the_videos_where_they_are(copy: Path, tmp_path
     assert digests(copy) == before
     assert not (copy / "report").exists()
     assert summary.index == odd / "page" / "index.html"
-    urls = [camera["video"] for camera in data_of(odd / "page")["cameras"]]
-    assert re.fullmatch(r"report/proxies/depth_image_raw-\w{16}\.mp4", urls[0])
-    assert urls[1:] == ["../../drive/front_image_raw.mp4"]
+    depth, colour = data_of(odd / "page")["cameras"]
+    assert depth["stills"][0] == {"frame": 0, "file": "report/stills/depth_image_raw-0.jpg"}
+    assert colour["video"] == "../../drive/front_image_raw.mp4"
     back = report(odd / "page" / ".." / ".." / "drive", ReportOptions(output=tmp_path / "x"))
     assert back.start == "/x/index.html"
     moved = shutil.move(copy, odd / "dri:ve")
@@ -292,19 +274,33 @@ def test_a_pair_alone_needs_a_place(copy: Path, tmp_path: Path) -> None:
     assert [camera.topic for camera in summary.cameras] == [COLOUR]
 
 
-def test_tiles_are_played_where_no_proxies_are_wanted(packed_bag: Path, tmp_path: Path) -> None:
-    output = tmp_path / "page"
-    summary = report(packed_bag, ReportOptions(output=output, proxies="none"))
-    (camera,) = summary.cameras
-    assert (camera.plays, camera.note) == (
-        "video",
-        "the video stores bayer_rggb8 and does not look like the image",
-    )
-    (facts,) = data_of(output)["cameras"]
-    assert (
-        facts["calibrations"][0]["overlay"]["problem"]
-        == "the video that is played does not show the image"
-    )
+def test_lossless_cameras_play_their_views(with_views: Path, tmp_path: Path) -> None:
+    """With both videos and with the views alone; what is said of sizes is of the files here."""
+    dataset, stored = Path(shutil.copytree(with_views, tmp_path / "drive")), []
+    for _ in range(2):
+        summary = report(dataset)
+        assert [(camera.plays, camera.note) for camera in summary.cameras] == [("video", "")] * 2
+        assert not any("exact" in name for name in summary.files)
+        data = data_of(dataset)
+        names = [camera["video"] for camera in data["cameras"]]
+        assert names == ["left_image_raw.mp4", "right_image_raw.mp4"]
+        files = [path for path in dataset.glob("*.*") if path.stem not in ("dataset", "index")]
+        own = sum(path.stat().st_size for path in files)
+        assert data["summary"]["bytes"] == own
+        stored.append([camera["stored"] for camera in data["cameras"]])
+        for path in dataset.glob("*.exact.mp4"):
+            path.unlink()
+    assert stored == [["av1 visual, h264 lossless"] * 2, ["av1 visual"] * 2]
+    assert "exact layer not here" in "".join(data["notes"])
+
+
+def test_an_old_mosaic_has_stills_and_is_told_of_views(packed_bag: Path, tmp_path: Path) -> None:
+    """Its video shows four planes: nobody wants to see them."""
+    (camera,) = report(packed_bag, ReportOptions(output=tmp_path / "page")).cameras
+    assert camera.plays == "stills"
+    assert "does not look like the image; `mp4ds pack DATASET -o NEW --view`" in camera.note
+    (facts,) = data_of(tmp_path / "page")["cameras"]
+    assert facts["calibrations"][0]["overlay"]["lines"]
     assert facts["shown"] == [1, 1]
 
 
@@ -371,7 +367,7 @@ def test_no_code_of_the_page_makes_elements_of_text() -> None:
     assert not re.search(r"https?://", everything)
 
 
-# ---------------------------------------------------------------- proxies
+# ---------------------------------------------------------------- stills
 
 SOME = {*COMMON, "rgb16", "yuyv", "nv12", "8UC2", "32FC1", "64FC3", "bgra8", "bayer_gbrg16"}
 
@@ -388,46 +384,30 @@ CODED_KINDS = [
     [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in ENCODINGS]
     + CODED_KINDS,
 )
-def test_every_kind_of_image_gets_a_proxy(kind: str, tmp_path: Path) -> None:
+def test_every_kind_of_image_is_seen(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stills look like the images of their frames, and are spread over all of them."""
+    monkeypatch.setattr("mp4ds.plugins.reporting.report.why_not_played", lambda _: "not asked to")
     if kind in CODED:
         made = CODED[kind](frames=8, width=96, height=66)
     else:
         made = scene(kind, frames=5, width=80, height=50, with_info=False)
     dataset = pack_cameras(tmp_path, made, quality="lossless")
-    report(dataset, ReportOptions(proxies="all", proxy_width=64))
-    assert_proxy_shows(dataset, 64)
-
-
-def assert_proxy_shows(dataset: Path, width: int) -> None:
-    """The proxy has every frame at its time, and looks like it."""
-    with mp4ds.open(dataset) as opened:
+    report(dataset)
+    (facts,) = data_of(dataset)["cameras"]
+    with mp4ds.open(dataset, layer="view") as opened:
         (stream,) = opened.streams
-        (proxy,) = (dataset / "report" / "proxies").glob(f"{stream.path.stem}-*.mp4")
-        size = proxy_size(stream.image_size, width)
-        with mp4ds.open(proxy) as video, av.open(str(stream.video_path)) as container:
-            (shown,) = video
-            ticks = [p.pts for p in container.demux(video=0) if p.pts is not None]
-            assert (shown.stamps // 1000).tolist() == ticks
-            assert shown.image_size == size
-            look = Look(opened[stream.topic], size)
-            for index, picture in stream.pictures(is_strict=False):
-                if picture is not None:
-                    expected = blocks(look.picture(stream.recorded_pixels(picture)))
-                    assert np.abs(blocks(shown[index].data) - expected).mean() < 8
-
-
-@pytest.mark.parametrize(
-    ("image", "width", "size"),
-    [
-        ((1920, 1080), 640, (640, 360)),
-        ((64, 48), 640, (64, 48)),
-        ((65, 49), 640, (64, 48)),
-        ((2, 2), 640, (32, 32)),
-        ((16384, 1), 640, (640, 32)),
-    ],
-)
-def test_sizes_of_proxies(image: tuple[int, int], width: int, size: tuple[int, int]) -> None:
-    assert proxy_size(image, width) == size
+        look = Look(opened[stream.topic], stream.image_size)
+        pictures = dict(stream.pictures(is_strict=False))
+        seen = [number for number, picture in pictures.items() if picture is not None]
+    assert [still["frame"] for still in facts["stills"]] == seen
+    with mp4ds.open(dataset, layer="view") as opened:
+        for still in facts["stills"]:
+            shown = cv2.imread(str(dataset / still["file"]))[..., ::-1]
+            (stream,) = opened.streams
+            expected = look.picture(opened[stream.topic][still["frame"]].data)
+            assert np.abs(blocks(shown) - blocks(expected)).mean() < 8
 
 
 # ---------------------------------------------------------------- scores
@@ -569,8 +549,8 @@ def test_odd_requests_print_nothing(
 
 def test_the_command(copy: Path) -> None:
     done = call("report", copy)
-    assert f"{COLOUR}: plays its own video" in done.out
-    assert f"{DEPTH}: plays a proxy: no browser plays ffv1" in done.out
+    assert f"{COLOUR}: plays its video" in done.out
+    assert f"{DEPTH}: shows stills: no browser plays ffv1" in done.out
     assert str(copy / "index.html") in done.out
     (copy / "front_image_raw.mp4").unlink()
     told = call("report", copy, "--json")

@@ -14,8 +14,8 @@ import mp4ds
 from commands import call
 from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
 from mp4ds.options import parse_time
-from mp4ds.plugins.reporting.proxies import Look
 from mp4ds.plugins.reporting.stills import (
+    Look,
     StillOptions,
     frames,
     number_at,

@@ -53,12 +53,12 @@ def camera(topic: str, encoding: str, seed: int, lost: int | None = None) -> Sce
     return Scene([dataclasses.replace(m, topic=topic) for n, m in enumerate(images) if n != lost])
 
 
-def packed(folder: Path, *cameras: Scene) -> Path:
+def packed(folder: Path, *cameras: Scene, quality: str = "visual") -> Path:
     """A dataset of cameras."""
     folder.mkdir()
     messages = sorted((m for made in cameras for m in made.messages), key=lambda m: m.log_time)
     sources = SOURCES["mcap-ros2-none"](folder, Scene(messages))
-    mp4ds.pack(sources, folder / "drive", PackOptions(codec="h264", gop=GOP))
+    mp4ds.pack(sources, folder / "drive", PackOptions(codec="h264", gop=GOP, quality=quality))
     return folder / "drive"
 
 
@@ -300,6 +300,7 @@ def test_nothing_matches(tmp_path: Path) -> None:
         ({"format": {"/up": "rgb"}}, "format is given for '/up'"),
         ({"dtype": "float16"}, "dtype is 'float16'"),
         ({"backend": "other"}, "backend is 'other'"),
+        ({"layer": "best"}, "layer is 'best', not one of exact, view"),
         ({"device": "cuda"}, "needs backend='torchcodec'"),
         ({"backend": "torchcodec", "format": "gray"}, "gives format='rgb' without resize"),
         ({"cache_files": 0}, "cache_files is 0"),
@@ -330,6 +331,37 @@ def test_not_a_path(drives: list[Path]) -> None:
         for several in (dataset, [dataset]):
             with pytest.raises(TypeError, match=r"is no path: give a str"):
                 FrameDataset(several)  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------- layers
+
+
+@pytest.mark.parametrize("kind", [FrameDataset, FrameStream])
+def test_the_view_of_a_lossless_camera_is_read_unless_the_exact_frames_are_asked_for(
+    kind: Any, with_views: Path
+) -> None:
+    options: dict[str, Any] = {"topics": ["/left/image_raw"], "channels_first": False}
+    if kind is FrameStream:
+        options["shuffle"] = False
+    for given, layer in (({}, "view"), ({"layer": "view"}, "view"), ({"layer": "exact"}, "exact")):
+        with mp4ds.open(with_views) as dataset:
+            frames = dataset["/left/image_raw"]
+            expected = frames.read(range(len(frames)), layer=layer)
+            other = frames.read([0], layer="exact" if layer == "view" else "view")
+        samples = list(kind(with_views, **options, **given))
+        assert len(samples) == len(expected)
+        for sample, pixels in zip(samples, expected, strict=True):
+            np.testing.assert_array_equal(sample["/left/image_raw"].numpy(), pixels)
+        assert (samples[0]["/left/image_raw"].numpy() != other[0]).any()
+
+
+def test_exact_frames_that_are_not_here_are_told_at_once(with_views: Path, tmp_path: Path) -> None:
+    drive = Path(shutil.copytree(with_views, tmp_path / "drive"))
+    (drive / "left_image_raw.exact.mp4").unlink()
+    FrameDataset(drive, topics=["/left/image_raw"])[0]
+    FrameDataset(drive, topics=["/right/image_raw"], layer="exact")[0]
+    with pytest.raises(mp4ds.OptionError, match=r"/left/image_raw has no exact frames here"):
+        FrameDataset(drive, topics=["/left/image_raw"], layer="exact")
 
 
 def test_wrong_options_of_streams(drives: list[Path]) -> None:
@@ -568,7 +600,12 @@ def test_windows_begin_with_key_frames(drives: list[Path]) -> None:
     numbers = indices(stream)
     assert sorted(numbers) == list(range(3 * FRAMES))
     starts = [b for a, b in zip([-2, *numbers], numbers, strict=False) if b != a + 1]
-    assert all(start % GOP == 0 for start in starts)
+    for start in starts:
+        with mp4ds.open(drives[start // FRAMES]) as dataset:
+            path = dataset[LEFT].streams[0].video_path
+        with av.open(str(path)) as video:
+            keys = [packet.is_keyframe for packet in video.demux(video=0) if packet.size]
+        assert keys[start % FRAMES]
     assert len(starts) > 3
 
 
@@ -703,8 +740,9 @@ def test_torchcodec_gives_the_same_frames(drives: list[Path]) -> None:
         assert (a["stamp_ns"], a["index"]) == (b["stamp_ns"], b["index"])
         for topic in BOTH:
             assert a[topic].shape == b[topic].shape
-            away = (a[topic].int() - b[topic].int()).abs()
-            assert away.float().mean() < 1
+            # decoders have chroma of half the resolution grow in their ways
+            away = torch.nn.functional.avg_pool2d(a[topic].float() - b[topic].float(), 2)
+            assert away.abs().mean() < 4
 
 
 @pytest.mark.usefixtures("torchcodec")
@@ -729,9 +767,16 @@ def test_torchcodec_gives_lossy_videos_their_contrast_or_nothing(
 
 @pytest.mark.usefixtures("torchcodec")
 def test_torchcodec_refuses_what_it_would_show_wrongly(tmp_path: Path) -> None:
-    drive = packed(tmp_path / "a", camera(LEFT, "bayer_rggb8", 0))
+    drive = packed(tmp_path / "a", camera(LEFT, "bayer_rggb8", 0), quality="lossless")
     with pytest.raises(mp4ds.OptionError, match=r"bayer_rggb8 images .* layout mosaic8"):
         FrameDataset(drive, backend="torchcodec")[0]
+
+
+@pytest.mark.usefixtures("torchcodec")
+def test_torchcodec_never_shows_differences(with_views: Path) -> None:
+    options: dict[str, Any] = {"topics": ["/right/image_raw"], "backend": "torchcodec"}
+    with pytest.raises(mp4ds.OptionError, match="made of two videos"):
+        FrameDataset(with_views, layer="exact", **options)[0]
 
 
 # ---------------------------------------------------------------- example and tutorial

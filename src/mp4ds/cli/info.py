@@ -204,6 +204,7 @@ def _print_speeds(speeds: Sequence[facts.ReadingSpeed]) -> None:
     rows = [
         {
             "topic": item.topic,
+            "layer": item.layer,
             "per frame": size_text(item.bytes_per_frame),
             "ms, random access": number(item.random_ms, 1),
             "ms, in order": number(item.in_order_ms, 1),

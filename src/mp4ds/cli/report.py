@@ -36,7 +36,7 @@ from mp4ds.plugins.reporting.report import (
 from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.plugins.reporting.stills import StillOptions, StillSummary, frames
 
-_PLAYS = {"video": "its own video", "proxy": "a proxy", "nothing": "nothing"}
+_PLAYS = {"video": "plays its video", "stills": "shows stills", "nothing": "shows nothing"}
 
 
 @command()
@@ -108,7 +108,7 @@ def _print_reports(summary: OverviewSummary) -> None:
 def _print_report(summary: ReportSummary) -> None:
     for camera in summary.cameras:
         note = f": {camera.note}" if camera.note else ""
-        say(f"{camera.topic}: plays {_PLAYS[camera.plays]}{note}")
+        say(f"{camera.topic}: {_PLAYS[camera.plays]}{note}")
     for problem in summary.problems:
         say(f"not shown: {problem}")
     say(f"{path_text(summary.index)}: {size_text(summary.bytes)}")

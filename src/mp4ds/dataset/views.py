@@ -215,7 +215,8 @@ def view_of(
     shape, dtype = given.shape(*size), np.dtype(given.dtype)
     in_metres = format == "depth_m"
     made = shown_format(given)
-    can_scale = shows_colours and encoding.name in _OF_VIDEOS and cut == (width, height)
+    is_coloured = encoding.name in _OF_VIDEOS or bool(encoding.mosaic)
+    can_scale = shows_colours and is_coloured and cut == (width, height)
     scale = Scale(made, *size) if can_scale and made in ("rgb24", "bgr24") else None
     if is_whole and given is encoding and not in_metres:
         return View(given, shape, dtype, is_plain=True, scale=scale)

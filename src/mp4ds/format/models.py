@@ -645,7 +645,7 @@ class StreamSidecar(Model):
 
     @property
     def shows_colours(self) -> bool:
-        """Whether a player shows the images as they are: in 8-bit colours, and no mosaic."""
+        """Whether a player shows the images as they are, in 8-bit colours."""
         layout = self.layout
         size = layout.picture_size(self.image.width, self.image.height)
         return shows_colours(layout.pixel_format, size, (self.video.width, self.video.height))

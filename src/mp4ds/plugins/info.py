@@ -124,12 +124,14 @@ class ReadingSpeed:
 
     Attributes:
         topic: The topic.
-        bytes_per_frame: Of its videos.
+        layer: Which of its frames, if there is a view: ``exact`` or ``view``; else empty.
+        bytes_per_frame: Of the videos that are read.
         random_ms: Median time of a random frame, milliseconds.
         in_order_ms: Mean time of a frame when reading in order, milliseconds.
     """
 
     topic: str
+    layer: str
     bytes_per_frame: float
     random_ms: float
     in_order_ms: float
@@ -150,12 +152,11 @@ def reading_speeds(path: Path | str) -> list[ReadingSpeed]:
         FormatError: The dataset breaks a rule of the format.
     """
     with Dataset(path) as dataset:
-        return [_reading_speed(dataset, topic) for topic in dataset.topics]
+        by_topic = [[one for one in dataset.streams if one.topic == it] for it in dataset.topics]
+        return [_reading_speed(layer) for own in by_topic for layer in max(own, key=len).layers]
 
 
-def _reading_speed(dataset: Dataset, topic: str) -> ReadingSpeed:
-    streams = [stream for stream in dataset.streams if stream.topic == topic]
-    stream = max(streams, key=len)
+def _reading_speed(stream: Stream) -> ReadingSpeed:
     frames = Topic([stream])
     numbers = random.Random(0)
     frames.read([0], format="native")
@@ -172,7 +173,9 @@ def _reading_speed(dataset: Dataset, topic: str) -> ReadingSpeed:
     in_order = (time.perf_counter() - begun) / count
     frames.close()
     size = sum(path.stat().st_size for path, _ in stream.videos) / len(stream)
-    return ReadingSpeed(topic, size, 1e3 * statistics.median(times), 1e3 * in_order)
+    median = 1e3 * statistics.median(times)
+    layer = stream.layer if stream.exact_path else ""
+    return ReadingSpeed(stream.topic, layer, size, median, 1e3 * in_order)
 
 
 def _recording_info(reader: BagReader) -> Info:

@@ -13,7 +13,7 @@ from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mp4ds.dataset.dataset import datasets_in, open_dataset
-from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.stream import Layer, Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
@@ -139,12 +139,14 @@ class CameraSource:
         name: Of its file, without extension.
         place: Path or URL of the sidecar, or of a video without one.
         frames: Number of its frames.
+        layer: Which of them are read.
     """
 
     topic: str
     name: str
     place: str
     frames: int
+    layer: Layer
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +177,7 @@ class Recording:
 
 
 def recordings_of(
-    paths: Paths, topics: Sequence[str] | None, tolerance_ns: int
+    paths: Paths, topics: Sequence[str] | None, tolerance_ns: int, layer: Layer
 ) -> tuple[tuple[str, ...], list[Recording]]:
     """The samples of several datasets, one after another.
 
@@ -186,12 +188,13 @@ def recordings_of(
         paths: The datasets, or folders of them.
         topics: Topics or names of streams; None: those of the first dataset. All must have them.
         tolerance_ns: Maximum distance of the header stamps of a match, nanoseconds.
+        layer: Which frames are read of cameras that have a view.
 
     Returns:
         The topics, and the datasets.
 
     Raises:
-        OptionError: A topic does not exist, or there are no samples.
+        OptionError: A topic does not exist, there are no samples, or exact frames are not here.
         FormatError: A manifest or sidecar breaks a rule of the format.
         SourceError: A path is not a dataset.
     """
@@ -204,11 +207,12 @@ def recordings_of(
     if topics is not None and not topics:
         raise OptionError("topics is empty; use None for all cameras of the first dataset.")
     given = datasets_in(paths)
-    known = _sources(given[0])
+    one_of("layer", layer, get_args(Layer))
+    known = _sources(given[0], layer)
     chosen = tuple(topics) if topics is not None else tuple(source.topic for source in known)
     _check_topics(chosen, given[0])
     recordings = [
-        _recording(path, known if number == 0 else _sources(path), chosen, tolerance_ns)
+        _recording(path, known if number == 0 else _sources(path, layer), chosen, tolerance_ns)
         for number, path in enumerate(given)
     ]
     if not any(recording.rows for recording in recordings):
@@ -225,6 +229,8 @@ def _recording(
 ) -> Recording:
     sources = tuple(_choose(known, topic, path) for topic in topics)
     if len(sources) == 1:
+        if sources[0].layer == "exact":
+            open_source(sources[0]).close()  # its frames may not be here
         return Recording(str(path), sources, None, {sources[0].topic: np.empty(0, np.int64)})
     stamps = {}
     for topic, source in zip(topics, sources, strict=True):
@@ -245,11 +251,11 @@ def open_source(source: CameraSource) -> Topic:
     """
     path = location(source.place)
     if path.suffix == ".yaml":
-        return Topic([Stream(path)])
+        return Topic([Stream(path, layer="view").in_layer(source.layer)])
     return Topic(open_dataset(path).parts)
 
 
-def _sources(path: Path | str) -> list[CameraSource]:
+def _sources(path: Path | str, layer: Layer) -> list[CameraSource]:
     """The cameras of a dataset, from its manifest, without reading the sidecars."""
     folder = location(path)
     if folder.name == MANIFEST_NAME:
@@ -258,13 +264,13 @@ def _sources(path: Path | str) -> list[CameraSource]:
         entries = load_manifest(folder / MANIFEST_NAME).streams
         places = [folder / entry.sidecar for entry in entries]
         return [
-            CameraSource(entry.topic, place.stem, spelled(place), entry.frames)
+            CameraSource(entry.topic, place.stem, spelled(place), entry.frames, layer)
             for entry, place in zip(entries, places, strict=True)
         ]
     with open_dataset(path) as dataset:
-        parts = dataset.parts
         return [
-            CameraSource(one.topic, one.path.stem, spelled(one.path), len(one)) for one in parts
+            CameraSource(one.topic, one.path.stem, spelled(one.path), len(one), layer)
+            for one in dataset.parts
         ]
 
 
@@ -399,6 +405,11 @@ def _check_layout(stream: Stream) -> None:
     In lossy videos, 10-bit pictures hold 8-bit images.
     """
     image, video = stream.sidecar.image, stream.sidecar.video
+    if stream.sidecar.is_predicted:
+        raise OptionError(
+            f"topic {stream.topic}: its exact frames are made of two videos, which torchcodec "
+            "cannot do. Use backend='mp4ds', or layer='view'."
+        )
     is_8_bits = video.pixel_format in (None, TEN_BITS) or not video.pixel_format.endswith("le")
     if not LAYOUTS[video.layout].is_shown or not is_8_bits:
         raise OptionError(

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
+from mp4ds.dataset.stream import Layer
 from mp4ds.dataset.views import Crop, Resize
 from mp4ds.errors import OptionError, absent, counted
 from mp4ds.torch.cameras import (
@@ -165,11 +166,13 @@ class FrameDataset(Dataset):
         tolerance_ns: With seconds, how far a stamp may be from its time before it counts as
             padding; None: half the median time between the camera's frames.
         sync_tolerance_ns: Maximum distance of the stamps of different cameras in a sample.
-        format: ``rgb``, ``bgr``, ``gray``; ``native``: the pixels as recorded; ``depth_m``: depths
+        format: ``rgb``, ``bgr``, ``gray``; ``native``: in their ROS encoding; ``depth_m``: depths
             in metres, float32. A mapping by topic gives each camera its own; so do mappings for
             `resize` and `crop`.
         resize: Factor, or width and height in pixels.
         crop: x, y, width, height in pixels; before `resize`.
+        layer: Of lossless cameras, the ``view`` decodes several times faster and has the quality of
+            `quality` visual; ``exact``: the pixels recorded. Cameras without a view have one layer.
         dtype: ``native``: as decoded, uint8 except for cameras of more bits. ``uint8``: the same,
             but refused for those. ``float32``: 0 to 1; native pixels keep their values.
         channels_first: (C, H, W), not (H, W, C).
@@ -200,6 +203,7 @@ class FrameDataset(Dataset):
         format: str | Mapping[str, str] = "rgb",  # noqa: A002 - as of Stream.read
         resize: Resize | Mapping[str, Resize] = None,
         crop: Crop | Mapping[str, Crop] = None,
+        layer: Layer = "view",
         dtype: Dtype = "native",
         channels_first: bool = True,
         transform: Transform | None = None,
@@ -211,7 +215,7 @@ class FrameDataset(Dataset):
         for name in others:  # of other libraries, too
             raise TypeError(absent(self, name))
         self._offsets = Offsets(offsets, offsets_in, tolerance_ns)
-        self.topics, self.recordings = recordings_of(paths, topics, sync_tolerance_ns)
+        self.topics, self.recordings = recordings_of(paths, topics, sync_tolerance_ns, layer)
         starts = np.cumsum([0, *(recording.rows for recording in self.recordings)])
         self._starts: NDArray[np.int64] = starts.astype(np.int64)
         self._transform = transform

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.images import Images
 from mp4ds.dataset.rebuild import form_for
-from mp4ds.dataset.stream import Stream
+from mp4ds.dataset.stream import Layer, Stream
 from mp4ds.dataset.views import View, size_after
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.fields import Choice, DecodedColumns, everything, unbroken
@@ -31,7 +31,7 @@ from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
 from mp4ds.options import WHAT, Parsed, TopicOptions, option, parse_resize
 from mp4ds.times import intervals, usual_interval
-from mp4ds.video.codecs import CODECS
+from mp4ds.video.codecs import CODECS, VISUAL
 from mp4ds.video.images import ImageFile
 
 _NS = 1_000_000_000
@@ -131,6 +131,10 @@ def packet_format(form: ImageForm, sidecar: StreamSidecar, pixel_format: str) ->
 class ReductionOptions(TopicOptions):
     """Which topics, and how to reduce their images: each stream separately."""
 
+    quality: str | None = option(
+        "visual: the images of the views of lossless cameras; default: as recorded.",
+        choices=(VISUAL,),
+    )
     every: int = option(
         "Keep only every Nth frame, starting with the first.", 1, panel=WHAT, metavar="N"
     )
@@ -155,6 +159,11 @@ class ReductionOptions(TopicOptions):
             and 0 < rate <= _NS
         ):
             raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
+
+    @property
+    def layer(self) -> Layer | None:
+        """Which frames are read of cameras that have a view; None: exact ones where they are."""
+        return "view" if self.quality else None
 
     @property
     def leaves_out(self) -> bool:
@@ -407,7 +416,8 @@ class Conversion:
         self._frames: Callable[[Choice, bool], Frames]
         headers = stream.sidecar.headers
         if KINDS[form.kind].family == "video":
-            _check_video(stream, form)
+            self._shown = shown_by_packets(stream)
+            _check_video(self._shown, form)
             self._frames = self._packets
         elif form.size is None and holds_files(stream, form.kind):
             encodings = [encoding_of(stream.sidecar, header) for header in headers]
@@ -432,11 +442,11 @@ class Conversion:
 
     def _packets(self, choice: Choice, verify: bool) -> Frames:
         """The packets of the video, self-contained from each key frame on."""
-        stream = self.stream
-        if verify:
-            stream.verify_pictures()
-        with stream.open_packets() as packets:
-            told = packet_format(self.form, stream.sidecar, packets.pixel_format)
+        stream, shown = self.stream, self._shown
+        if verify:  # without a hash, digests of exact images tell of damage to what predicts them
+            (shown if shown.sidecar.video.sha256 else stream).verify_pictures()
+        with shown.open_packets() as packets:
+            told = packet_format(self.form, shown.sidecar, packets.pixel_format)
             fields = CodedFields(told, *stream.image_size)
             wanted = unbroken(choice(stream.columns), packets.key_numbers, from_key=True)
             for index in stream.sound_of(wanted):
@@ -480,6 +490,13 @@ class Conversion:
                     continue
                 packets = packets or files.enter_context(stream.open_packets())
                 yield index, stream.rebuilder.packet_payload(index, packets.packet(index))
+
+
+def shown_by_packets(stream: Stream) -> Stream:
+    """The layer of a stream whose packets players show: its own if they are those of a video."""
+    sidecar = stream.sidecar
+    is_video = sidecar.body == "packet" and sidecar.video.codec in _VIDEO_CODECS
+    return stream if is_video else stream.in_layer("view")
 
 
 def holds_files(stream: Stream, kind: str) -> bool:

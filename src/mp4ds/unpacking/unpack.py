@@ -17,7 +17,6 @@ from mp4ds.dataset.dataset import Dataset, Paths, datasets_in
 from mp4ds.dataset.messages import recorded_storage
 from mp4ds.dataset.recording import DatasetReader, slice_of, sliced
 from mp4ds.dataset.salvage import examine, open_damaged, open_selected
-from mp4ds.dataset.stream import Layer
 from mp4ds.errors import (
     ConversionError,
     FormatError,
@@ -42,9 +41,8 @@ from mp4ds.records import (
     bounded,
 )
 from mp4ds.unpacking.image_folders import TopicImages, image_names
-from mp4ds.unpacking.pictures import KINDS, ReductionOptions
+from mp4ds.unpacking.pictures import KINDS, ReductionOptions, shown_by_packets
 from mp4ds.unpacking.republish import Republished, Republisher, check_kind
-from mp4ds.video.codecs import VISUAL
 
 SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
 """How the default name of an output ends, by what it is unpacked to."""
@@ -59,10 +57,6 @@ class UnpackOptions(SliceOptions, ReductionOptions):
 
     latched: bool = latched()
     salvage: bool = option("Restore what can be read of a damaged dataset.", False, panel=WHAT)
-    quality: str | None = option(
-        "visual: the images of the views of lossless cameras; default: as recorded.",
-        choices=(VISUAL,),
-    )
     storage: str | None = option(
         "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap.",
         choices=("sqlite3", "mcap"),
@@ -218,7 +212,7 @@ def _unpack_here(
                 latched = (item.channel.topic for item in part.latched)
                 summary.latched.update(Counter(filter(chosen.selected, latched)))
                 summary.latched_left_out.extend(filter(chosen.selected, part.left_out))
-            summary.notes.extend(_notes(whole, chosen.selected))
+            summary.notes.extend(_notes(whole, chosen))
             summary.losses[:] = bounded(summary.losses)
             return summary
         except OSError as error:
@@ -231,8 +225,7 @@ def _opened(
     dataset: Path | str, options: UnpackOptions, *, verify: bool = False
 ) -> tuple[Dataset, list[Loss]]:
     """The dataset, and what is lost of it by files that cannot be read."""
-    selected, quality = options.selected, options.jpeg_quality
-    layer: Layer | None = "view" if options.quality else None
+    selected, quality, layer = options.selected, options.jpeg_quality, options.layer
     losses: list[Loss] = []
     if options.salvage:
         opened, losses = open_damaged(dataset, selected=selected, layer=layer, jpeg_quality=quality)
@@ -266,16 +259,19 @@ def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
     return [topic for topic in dataset.all_topics if not selected(topic)]
 
 
-def _notes(dataset: Dataset, selected: Selection) -> Iterator[str]:
+def _notes(dataset: Dataset, options: UnpackOptions) -> Iterator[str]:
     """What else the output does not have of the recording."""
     if dataset.damage:
         yield dataset.damage
+    has_packets = options.images is not None and KINDS[options.images].family == "video"
     for stream in dataset.streams:
-        if stream.sidecar.digests is None and selected(stream.topic):
-            yield (
-                f"{stream.topic}: its pixels differ from those recorded: it was packed with "
-                f"quality {stream.sidecar.profile}"
-            )
+        shown = shown_by_packets(stream) if has_packets else stream
+        if shown.sidecar.digests is not None or not options.selected(stream.topic):
+            continue
+        why = f"it was packed with quality {shown.sidecar.profile}"
+        if shown.layer == "view":
+            why = "they are those of its view"
+        yield f"{stream.topic}: its pixels differ from those recorded: {why}"
 
 
 def unpack_each(

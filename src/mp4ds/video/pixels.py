@@ -144,8 +144,9 @@ class Scale:
 def shows_colours(
     picture_format: str, picture_size: tuple[int, int], coded_size: tuple[int, int]
 ) -> bool:
-    """Whether pictures are what the video shows: 8-bit colours, no mosaic, same size."""
-    return picture_format in _PACKED and picture_size == coded_size
+    """Whether the video shows the images in colours of 8 bits, or what their mosaic saw of them."""
+    is_coloured = picture_format in _PACKED or picture_format.startswith("bayer_")
+    return is_coloured and picture_size == coded_size
 
 
 def scaling(size: tuple[int, int], made: tuple[int, int]) -> int:

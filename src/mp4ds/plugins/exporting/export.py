@@ -84,9 +84,19 @@ def export(
     name, write = _FORMATS[to]
     with ExitStack() as stack, advising(HOW_TO_SALVAGE):
         opened = [
-            stack.enter_context(open_selected(path, chosen.uses, verify_messages=not chosen.slice))
+            stack.enter_context(
+                open_selected(
+                    path,
+                    chosen.uses,
+                    layer="view" if to == "lerobot" else chosen.layer,
+                    verify_messages=not chosen.slice,
+                )
+            )
             for path in paths
         ]
+        if to != "lerobot" and chosen.layer is None:
+            for one in opened:
+                one.require_exact(chosen.uses)
         path = stack.enter_context(
             staged(
                 target,

@@ -686,10 +686,15 @@ def open_player(
         stack.enter_context(advising(HOW_TO_SALVAGE))
         opened = [
             stack.enter_context(
-                open_selected(place, chosen.wants, jpeg_quality=chosen.jpeg_quality)
+                open_selected(
+                    place, chosen.wants, layer=chosen.layer, jpeg_quality=chosen.jpeg_quality
+                )
             )
             for place in datasets_in(datasets)
         ]
+        for dataset in opened if chosen.layer is None else ():
+            if absence := dataset.absence(chosen.wants):
+                warnings.warn(f"{dataset.path}: {absence}; the views are played", stacklevel=2)
         timeline = Timeline(opened, chosen, world)
         node = node or stack.enter_context(open_node(world, chosen, _NODES[world]))
         follow = chosen.follow_clock

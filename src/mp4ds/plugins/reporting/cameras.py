@@ -1,10 +1,12 @@
-"""What the page shows of a camera: its columns, timing and calibrations."""
+"""What the page shows of a camera: its video or stills, columns, timing and calibrations."""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,82 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import effective, lens_of
-from mp4ds.errors import FormatError
+from mp4ds.errors import FormatError, Refused, VideoError
 from mp4ds.format.models import Calibration
+from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.plugins.info import calibration_changes
-from mp4ds.plugins.reporting.proxies import why_not_seen
 from mp4ds.times import Floats, Integers, differences, intervals
+from mp4ds.video.media import Media, pixel_format_of
+from mp4ds.video.mp4 import read_sample_table
+
+# ---------------------------------------------------------------- videos
+
+_MICROSECONDS = 1_000_000
+_8BIT = frozenset({"yuv420p", "yuv422p", "yuv444p", "gbrp"})
+_PLAYED = {
+    "h264": _8BIT
+    | {"yuvj420p", "yuvj422p", "yuvj444p", "gray"}
+    | {"yuv420p10le", "yuv422p10le", "yuv444p10le", "gray10le"},
+    "av1": frozenset({"yuv420p", "yuvj420p", "gray", "yuv420p10le", "gray10le"}),
+    "vp9": _8BIT,
+}
+"""What Chromium plays directly, by test; other browsers play less."""
+
+_FEW = ("hevc",)  # if the system or the GPU decodes it
+
+
+def why_not_played(stream: Stream) -> str:
+    """Why browsers do not show a stream's images by its video; empty if Chromium-based ones do.
+
+    Raises:
+        VideoError: The video cannot be read.
+    """
+    reason = _why_not_in_browsers(stream.video_path)
+    if not reason and stream.sidecar.body != "packet" and not stream.sidecar.layout.is_shown:
+        reason = f"its video stores {stream.encoding} and does not look like the image"
+    if reason and ENCODINGS[stream.encoding].lossy:
+        reason += "; `mp4ds pack DATASET -o NEW --view` adds a video that does"
+    return reason
+
+
+def _why_not_in_browsers(path: Path) -> str:
+    with closing(Media(path)) as media:
+        context = media.track.codec_context
+        name, pixel_format = context.codec.canonical_name, pixel_format_of(context)
+    if name not in _PLAYED:
+        return f"{'few browsers play' if name in _FEW else 'no browser plays'} {name}"
+    if pixel_format not in _PLAYED[name]:
+        return f"no browser plays {name} in the pixel format {pixel_format}"
+    return ""
+
+
+def presentation_times(stream: Stream) -> NDArray[np.int64]:
+    """When a player shows each frame of a stream's video, microseconds, as its mp4 says.
+
+    Raises:
+        VideoError: It cannot be read, or its number of frames differs from its sidecar.
+    """
+    path = stream.video_path
+    if not path.is_file():
+        raise VideoError("file-missing", path, "does not exist")
+    try:
+        with path.open("rb") as file:
+            table = read_sample_table(file, path.stat().st_size, str(path))
+    except Refused as reason:
+        raise VideoError("video-unreadable", path, f"has no plain index: {reason}") from None
+    except OSError as error:
+        raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
+    ticks = table.presentation[table.order]
+    if len(ticks) != len(stream):
+        raise VideoError(
+            "frame-count", path, f"has {len(ticks)} frames, but its sidecar says {len(stream)}"
+        )
+    whole, part = np.divmod(ticks, table.timescale)
+    times: NDArray[np.int64] = whole * _MICROSECONDS + part * _MICROSECONDS // table.timescale
+    if (np.diff(times) <= 0).any():
+        raise VideoError("video-unreadable", path, "has presentation times that do not increase")
+    return times
+
 
 # ---------------------------------------------------------------- timing
 
@@ -132,7 +205,7 @@ def overlay_of(calibration: Calibration, image_size: tuple[int, int], topic: str
     model, d = ("none", []) if is_rectified else lens_of(calibration)
     problem = _problem(calibration, matrix, model, d, image_size)
     if problem:
-        return _no_overlay(problem)
+        return {"lines": [], "axes": [], "center": [], "problem": problem}
     width, height = image_size
     (fx, _, cx), (_, fy, cy) = matrix[0], matrix[1]
     step = width / fx / _CELLS
@@ -156,10 +229,6 @@ def overlay_of(calibration: Calibration, image_size: tuple[int, int], topic: str
                 lines.append(line)
     center = [round((cx + 0.5) / width, 5), round((cy + 0.5) / height, 5)]
     return {"lines": lines, "axes": axes, "center": center, "problem": ""}
-
-
-def _no_overlay(problem: str) -> dict[str, Any]:
-    return {"lines": [], "axes": [], "center": [], "problem": problem}
 
 
 def _problem(
@@ -252,7 +321,6 @@ _MOST_CALIBRATIONS = 64
 """Calibration changes listed on the page; a self-calibrating camera has more."""
 
 _MOST_OVERLAYS = 8
-_NOT_SEEN = "the video that is played does not show the image"
 
 
 @dataclass
@@ -260,22 +328,29 @@ class ReportedCamera:
     """One stream on the page.
 
     Attributes:
-        stream: The stream.
+        stream: What is shown: the view of the recorded stream if it has one.
+        recorded: What holds the messages, as far as that is here.
         name: Its topic, with its file name if the topic has several streams.
         times: Presentation times of its frames, microseconds; None if the video is damaged.
         video: URL of the video to play, relative to the page; empty: none.
-        is_proxy: Whether that is a proxy.
-        note: Why there is a proxy, or nothing to play.
-        caption: How the pictures differ from the image.
+        stills: URL of a picture by the number of its frame, where no video is played.
+        note: Why none is played.
+        caption: How the stills differ from the image.
     """
 
     stream: Stream
+    recorded: Stream
     name: str
     times: NDArray[np.int64] | None = None
     video: str = ""
-    is_proxy: bool = False
+    stills: dict[int, str] = field(default_factory=dict)
     note: str = ""
     caption: str = ""
+
+    @property
+    def plays(self) -> str:
+        """What the page shows: its ``video``, ``stills`` or ``nothing``."""
+        return "video" if self.video else "stills" if self.stills else "nothing"
 
     def check(self) -> None:
         """Read its columns.
@@ -326,11 +401,10 @@ class ReportedCamera:
             "encoding": sidecar.image.encoding,
             "width": sidecar.image.width,
             "height": sidecar.image.height,
-            "codec": sidecar.video.codec,
-            "profile": sidecar.profile,
+            "stored": self._stored(),
             "file": sidecar.video.file,
             "video": self.video,
-            "proxy": self.is_proxy,
+            "stills": [{"frame": number, "file": url} for number, url in self.stills.items()],
             "note": self.note,
             "caption": self.caption,
             "shown": self._shown(),
@@ -339,15 +413,15 @@ class ReportedCamera:
             **self._calibrations(),
         }
 
-    @property
-    def _is_seen(self) -> bool:
-        """Whether the played video looks like the image."""
-        return self.is_proxy or not why_not_seen(self.stream)
+    def _stored(self) -> str:
+        """Codec and profile, after those of the view if there is one."""
+        layers = dict.fromkeys((self.stream, self.recorded))
+        return ", ".join(f"{one.sidecar.video.codec} {one.sidecar.profile}" for one in layers)
 
     def _shown(self) -> list[float]:
         """The image's fraction of the played video's width and height: a video may be padded."""
         image, video = self.stream.sidecar.image, self.stream.sidecar.video
-        if self.is_proxy or not self._is_seen:
+        if not self.video:
             return [1.0, 1.0]
         return [image.width / video.width, image.height / video.height]
 
@@ -361,12 +435,7 @@ class ReportedCamera:
             if number and log_time is not None:
                 made["from_frame"] = int(np.searchsorted(self.stream.log_times, log_time))
             if number < _MOST_OVERLAYS:
-                size = self.stream.image_size
-                made["overlay"] = (
-                    overlay_of(item, size, self.stream.topic)
-                    if self._is_seen
-                    else _no_overlay(_NOT_SEEN)
-                )
+                made["overlay"] = overlay_of(item, self.stream.image_size, self.stream.topic)
             listed.append(made)
         return {
             "calibrations": listed,

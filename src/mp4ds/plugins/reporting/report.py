@@ -1,7 +1,8 @@
 """``report``: a dataset as an HTML page next to its files, or many datasets as a list of pages.
 
 index.html and a folder ``report`` are added to the dataset, or written elsewhere. The page plays
-the dataset's own videos if browsers can, else small proxies; its columns are exact.
+the dataset's videos, of lossless cameras their views; where browsers cannot, it shows stills. Its
+columns are exact.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import html
 import json
 import os
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
@@ -27,12 +27,14 @@ from mp4ds._version import __version__
 from mp4ds.dataset.dataset import Dataset, Paths, datasets_in
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
+from mp4ds.dataset.views import size_after
 from mp4ds.errors import (
     FormatError,
     Mp4dsError,
     OptionError,
     SourceError,
     TargetExistsError,
+    VideoError,
     counted,
 )
 from mp4ds.files.outputs import (
@@ -49,19 +51,17 @@ from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import WHERE, Options, force, option
 from mp4ds.plugins.info import Brief, brief, notes_of, topics_of
-from mp4ds.plugins.reporting.cameras import ReportedCamera, axis_of, untimed
-from mp4ds.plugins.reporting.proxies import (
-    Look,
-    make_proxy,
+from mp4ds.plugins.reporting.cameras import (
+    ReportedCamera,
+    axis_of,
     presentation_times,
-    proxy_name,
-    proxy_size,
-    why_not_in_browsers,
-    why_not_seen,
+    untimed,
+    why_not_played,
 )
-from mp4ds.plugins.reporting.stills import StillOptions, frames
+from mp4ds.plugins.reporting.stills import Look, StillOptions, frames, spread
 from mp4ds.processes import each
 from mp4ds.records import Message
+from mp4ds.video.images import ImageFile
 
 _PAGE = files("mp4ds.plugins.reporting") / "page"
 """The page's static files."""
@@ -73,8 +73,10 @@ _DATA_SIGN = b"/* made by mp4ds report */\n"
 _MOST_NOTES = 200
 _MOST_READ = 2**30
 """Maximum size of messages.mcap up to which it is read to measure each topic's share."""
-_PROXIES, _PICTURES = "proxies", "pictures"
+_STILLS, _PICTURES = "stills", "pictures"
 _PICTURE_WIDTH = 240
+_MOST_STILLS = 32  # of a camera
+_STILL_WIDTH = 480
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,26 +90,17 @@ class ReportOptions(Options):
         panel=WHERE,
         metavar="FOLDER",
     )
-    proxies: str = option(
-        "Make small videos for cameras browsers cannot play (auto), for all, or for none.",
-        "auto",
-        metavar="WHICH",
-        choices=("auto", "all", "none"),
-    )
-    proxy_width: int = option(
-        "Maximum width of a proxy.", 640, metavar="PIXELS", least=64, most=3840
-    )
     force: bool = force("Replace an index.html that is not a report.")
 
 
 @dataclass(frozen=True)
 class CameraSummary:
-    """What the page plays for a stream.
+    """What the page shows of a stream.
 
     Attributes:
         topic: Its topic.
-        plays: Its own ``video``, a ``proxy``, or ``nothing``.
-        note: Why, if it is not its own video.
+        plays: Its ``video``, ``stills`` or ``nothing``.
+        note: Why, if it is not its video.
     """
 
     topic: str
@@ -145,7 +138,7 @@ def report(
     *,
     progress: Callable[[str], None] | None = None,
 ) -> ReportSummary:
-    """Make the page of a dataset. An existing report is replaced; its proxies are reused.
+    """Make the page of a dataset. An existing report is replaced.
 
     Args:
         dataset: A dataset, or one video with its sidecar, on this machine.
@@ -208,7 +201,7 @@ def _write(
         cameras = []
         for camera in _cameras(dataset, problems):
             try:
-                _give_video(camera, folder, path, options, tell)
+                _give_pictures(camera, folder, path, tell)
             except FormatError as error:
                 camera.note = str(error)
                 problems.append(str(error))
@@ -227,7 +220,7 @@ def _cameras(dataset: Dataset, problems: list[str]) -> Iterator[ReportedCamera]:
     for stream in streams:
         alone = topics[stream.topic] == 1
         name = stream.topic if alone else f"{stream.topic} ({stream.path.stem})"
-        camera = ReportedCamera(stream, name)
+        camera = ReportedCamera(stream.in_layer("view"), stream, name)
         try:
             camera.check()
         except FormatError as error:
@@ -236,66 +229,47 @@ def _cameras(dataset: Dataset, problems: list[str]) -> Iterator[ReportedCamera]:
         yield camera
 
 
-def _give_video(
-    camera: ReportedCamera,
-    folder: Path,
-    made: Path,
-    options: ReportOptions,
-    tell: Callable[[str], None],
+def _give_pictures(
+    camera: ReportedCamera, folder: Path, made: Path, tell: Callable[[str], None]
 ) -> None:
-    """Find or make what the page plays of a camera.
+    """Find the video that the page plays of a camera, or make stills.
 
     Raises:
         FormatError: Its video is damaged.
     """
     stream = camera.stream
     camera.times = presentation_times(stream)
-    unplayable = why_not_in_browsers(stream.video_path)
-    camera.note = unplayable or why_not_seen(stream)
-    if options.proxies == "all" or (camera.note and options.proxies == "auto"):
-        camera.note = camera.note or "requested"
-        size = proxy_size(stream.image_size, options.proxy_width)
-        name = proxy_name(stream, size)
-        (made / _PROXIES).mkdir(exist_ok=True)
-        old, new = folder / _FOLDER / _PROXIES / name, made / _PROXIES / name
-        with closing(Topic([stream])) as topic:
-            look = Look(topic, size)
-        # an old video may have no digest, by which to tell whether it has changed
-        if stream.sidecar.video.sha256 is None or not _taken(old, new):
-            make_proxy(stream, new, look, size=size, times=camera.times, progress=tell)
-        camera.video, camera.caption = f"{_FOLDER}/{_PROXIES}/{quote(name)}", look.caption
-        camera.is_proxy = True
-    elif not unplayable:
+    camera.note = why_not_played(stream)
+    if not camera.note:
         path = os.path.relpath(stream.video_path.resolve(), folder.resolve())
         camera.video = quote(Path(path).as_posix())
-
-
-def _taken(old: Path, new: Path) -> bool:
-    """Whether a proxy of the previous report could be taken: its name says how it was made."""
-    try:
-        os.link(old, new)
-    except OSError:
-        try:
-            shutil.copyfile(old, new)
-        except OSError:
-            new.unlink(missing_ok=True)
-            return False
-    return True
+        return
+    (made / _STILLS).mkdir(exist_ok=True)
+    with closing(Topic([stream])) as topic:
+        scale = min(1.0, _STILL_WIDTH / stream.image_size[0])
+        look = Look(topic, size_after(stream.topic, stream.image_size, scale))
+        for number in spread(len(stream), _MOST_STILLS):
+            tell(f"{stream.topic}: frame {number} of {len(stream)} for the page")
+            name = f"{stream.path.stem}-{number}.jpg"
+            try:
+                picture = look.picture(topic.get([number])[0].data)
+            except VideoError:  # of packets that refer to lost ones
+                if stream.sidecar.body != "packet":
+                    raise
+                continue
+            (made / _STILLS / name).write_bytes(ImageFile("rgb8", "jpeg").encode(picture))
+            camera.stills[number] = f"{_FOLDER}/{_STILLS}/{quote(name)}"
+        camera.caption = look.caption
 
 
 def _summary(folder: Path, cameras: list[ReportedCamera], problems: list[str]) -> ReportSummary:
     own = [folder / _INDEX, *(p for p in (folder / _FOLDER).rglob("*") if p.is_file())]
-    videos = [c.stream.video_path.resolve() for c in cameras if c.video and not c.is_proxy]
+    videos = [c.stream.video_path.resolve() for c in cameras if c.video]
     base = Path(os.path.commonpath([folder.resolve(), *(video.parent for video in videos)]))
     return ReportSummary(
         index=folder / _INDEX,
         files={_place(path, base): path for path in (*own, *videos)},
-        cameras=[
-            CameraSummary(
-                c.name, "proxy" if c.is_proxy else "video" if c.video else "nothing", c.note
-            )
-            for c in cameras
-        ],
+        cameras=[CameraSummary(c.name, c.plays, c.note) for c in cameras],
         bytes=sum(path.stat().st_size for path in own),
         problems=problems,
     )
@@ -312,7 +286,7 @@ def _place(path: Path, base: Path) -> str:
 def _write_folder(
     folder: Path, dataset: Dataset, cameras: list[ReportedCamera], problems: list[str]
 ) -> None:
-    """Write all of the report except index.html and proxies.
+    """Write all of the report except index.html and stills.
 
     Args:
         folder: Where to.
@@ -398,7 +372,7 @@ def _figures(dataset: Dataset, topics: list[dict[str, Any]]) -> dict[str, Any]:
     return summary | {
         "profile": manifest.profile,
         "format": manifest.format,
-        "bytes": sum(entry.size for entry in manifest.files),
+        "bytes": sum(item.size for item in manifest.files if (dataset.path / item.name).exists()),
         "source_bytes": sum(source.size for source in manifest.sources),
         "sources": [source.name for source in manifest.sources][:_MOST_NOTES],
     }

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.views import Resize, size_after
-from mp4ds.errors import FrameNotFoundError, OptionError
+from mp4ds.dataset.views import Resize, size_after, view_of
+from mp4ds.errors import FrameNotFoundError, OptionError, VideoError
 from mp4ds.files.outputs import begins_with, staged
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.options import (
@@ -27,7 +27,6 @@ from mp4ds.options import (
     parse_resize,
     parse_time,
 )
-from mp4ds.plugins.reporting.proxies import Look
 from mp4ds.video.images import ImageFile, Page, encoding_as
 
 _SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
@@ -39,6 +38,122 @@ _PAGE, _INK = (24, 28, 32), (222, 226, 230)
 _BEYOND_NS = 10**9  # how far a time may be before the first frame, or after the last
 _QUALITY = 92
 _NS = 10**9
+
+
+# ---------------------------------------------------------------- looks
+
+Bytes = NDArray[np.uint8]
+
+_SAMPLES = 9  # frames sampled for the range of values
+_LOW, _HIGH = 1.0, 99.0  # percentiles mapped to the ends of the colour scale
+_WHITE = 99.9  # percentile shown as white
+_SIDE = 256  # maximum side of a sampled frame, pixels
+# from near to far: violet, blue, green, yellow; missing values are black
+_COLOURS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+
+
+class Look:
+    """Makes displayable pictures of a stream's images; not to be shared between threads.
+
+    Mosaics are interpolated; 16-bit images are scaled so that the brightest is white; depths and
+    other measurements are shown in false colour, using the first of several channels.
+
+    Args:
+        topic: Its frames are sampled if their range is needed.
+        size: Width and height of the pictures.
+
+    Attributes:
+        caption: How the pictures differ from the image; empty if they do not.
+    """
+
+    def __init__(self, topic: Topic, size: tuple[int, int]) -> None:
+        encoding = ENCODINGS[topic.encoding]
+        self._is_light = encoding_as(encoding, "rgb") is not None
+        self._view = view_of(
+            topic.topic,
+            encoding,
+            topic.image_size,
+            format="rgb" if self._is_light else "native",
+            resize=size,
+            crop=None,
+        )
+        self.caption = ""
+        self._low, self._high = 0.0, 255.0
+        if not self._is_light:
+            self._low, self._high = _range(_sampled(topic), _LOW, _HIGH)
+            first = "the first of its channels, " if encoding.channels > 1 else ""
+            self.caption = f"in false colour: {first}{self._low:.4g} to {self._high:.4g}"
+        elif self._view.dtype != np.uint8:
+            self._high = _range(_sampled(topic), _LOW, _WHITE)[1]
+            self.caption = f"16 bits: white is {self._high:.0f}"
+
+    def picture(self, pixels: Pixels) -> Bytes:
+        """A new picture, shape (H, W, 3).
+
+        Args:
+            pixels: Of an image, as recorded.
+        """
+        seen: Pixels = np.empty(self._view.shape, self._view.dtype)
+        self._view.give(pixels, seen)
+        if self._is_light:
+            return seen if seen.dtype == np.uint8 else self._scaled(seen).astype(np.uint8)
+        numbers = _first(seen)
+        places = self._scaled(numbers).astype(np.uint8)
+        picture: Bytes = _colour_table()[places]
+        picture[~_is_value(numbers)] = 0
+        return picture
+
+    def _scaled(self, values: Pixels) -> NDArray[np.float64]:
+        """Values scaled to 0 to 255, clipped to the range."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            scaled = (values.astype(np.float64) - self._low) * (255 / (self._high - self._low))
+        places: NDArray[np.float64] = np.nan_to_num(np.clip(np.rint(scaled), 0, 255))
+        return places
+
+
+def _sampled(topic: Topic) -> list[Pixels]:
+    """Pixels of a few frames, subsampled."""
+    numbers = sorted(set(np.linspace(0, len(topic) - 1, _SAMPLES).astype(int).tolist()))
+    found = []
+    for number in numbers:
+        try:
+            frame = topic.get([number])[0].data
+        except VideoError:
+            continue
+        steps = [max(1, side // _SIDE) for side in frame.shape[:2]]
+        found.append(_first(frame)[:: steps[0], :: steps[1]])
+    return found
+
+
+def _first(pixels: Pixels) -> Pixels:
+    return pixels if pixels.ndim == 2 else pixels[..., 0]
+
+
+def _is_value(numbers: Pixels) -> NDArray[np.bool_]:
+    """Whether a value is valid: sensors report 0, infinity or NaN if they measured nothing."""
+    is_value: NDArray[np.bool_] = np.isfinite(numbers) & (numbers != 0)
+    return is_value
+
+
+def _range(samples: list[Pixels], low: float, high: float) -> tuple[float, float]:
+    values = [sample[_is_value(sample)].astype(np.float64) for sample in samples]
+    known = np.concatenate(values) if values else np.empty(0)
+    if not len(known):
+        return 0.0, 1.0
+    least, most = (float(value) for value in np.percentile(known, [low, high]))
+    return (least, most) if most - least > 1e-12 * abs(most) else (least - 0.5, least + 0.5)
+
+
+def _colour_table() -> Bytes:
+    places = np.linspace(0, 255, len(_COLOURS))
+    channels = [
+        np.interp(np.arange(256), places, channel) for channel in zip(*_COLOURS, strict=True)
+    ]
+    table: Bytes = np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+    return table
+
+
+# ---------------------------------------------------------------- frames and sheets
 
 
 def _parse_sheet(value: str | tuple[int, int]) -> tuple[int, int]:
@@ -147,8 +262,10 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
     kind = _SUFFIXES.get(target.suffix.lower())
     if kind is None:
         raise OptionError(f"{target} is not a .png or .jpg: give a name with one of these endings.")
-    with Dataset(dataset) as opened:
+    with Dataset(dataset, layer="view") as opened:
         topic = _chosen(opened, options.topic)
+        if options.exact:
+            topic = topic.in_layer("exact")
         if options.at is not None:
             numbers = [number_at(topic, options.at)]
             part, number = topic.place_of(numbers[0])

@@ -34,7 +34,7 @@ var mp4dsPlayer = (() => {
         this.isBroken = true;
         this.busy = false;
         const detail = video.error && video.error.message ? ` (${video.error.message})` : "";
-        this.say(`This browser cannot play ${this.facts.file}${detail}. mp4ds report --proxies all makes videos that play in every browser.`);
+        this.say(`This browser cannot play ${this.facts.file}${detail}. mp4ds pack DATASET -o NEW --view h264 makes one that every browser plays.`);
       });
       if (video.requestVideoFrameCallback) this.watch();
       video.src = this.facts.video;

@@ -20,9 +20,10 @@ var mp4dsReport = (() => {
     const colour = COLOURS[number % COLOURS.length];
     const video = facts.video ? element("video", {preload: "auto", playsinline: "", "aria-label": facts.name}) : null;
     if (video) video.muted = true;
-    const canvas = element("canvas"), notice = element("div", {class: "nothing", text: facts.video ? "" : `No picture: ${facts.note}`});
-    notice.hidden = Boolean(facts.video);
-    const fit = element("div", {class: "fit"}, [...(video ? [video] : []), canvas, notice]);
+    const still = facts.stills.length ? element("img", {alt: facts.name}) : null;
+    const canvas = element("canvas"), notice = element("div", {class: "nothing", text: `No picture: ${facts.note}`});
+    notice.hidden = Boolean(video || still);
+    const fit = element("div", {class: "fit"}, [...(video ? [video] : still ? [still] : []), canvas, notice]);
     fit.style.aspectRatio = `${facts.width / facts.shown[0]} / ${facts.height / facts.shown[1]}`;
     fit.style.setProperty("--ratio", String(facts.width / facts.height));
     const values = {}, readout = element("dl", {class: "readout"});
@@ -33,15 +34,17 @@ var mp4dsReport = (() => {
     const dot = element("span", {class: "dot"});
     dot.style.background = colour;
     const head = element("header", {title: "Step by this camera's frames"}, [dot, element("h3", {text: facts.name}),
-      element("span", {class: "kind", text: `${facts.encoding} ${facts.width}×${facts.height} · ${facts.codec} ${facts.profile}`})]);
-    if (facts.proxy) head.append(element("span", {class: "badge", text: "proxy", title: facts.note}));
+      element("span", {class: "kind", text: `${facts.encoding} ${facts.width}×${facts.height} · ${facts.stored}`})]);
+    const badge = element("span", {class: "badge"});
+    if (still) head.append(badge);
     const close = element("button", {type: "button", class: "close", text: "×", title: "Hide this camera (h)", "aria-label": `Hide ${facts.name}`});
     head.append(close);
     const stage = element("div", {class: "stage", title: "Enlarge or restore (e)"}, [fit]);
     const panel = element("article", {class: "camera"}, [head, stage, readout]);
     if (facts.caption) panel.append(element("div", {class: "caption", text: `Shown ${facts.caption}`}));
+    if (still) panel.append(element("div", {class: "caption", text: `Stills: ${facts.note}`}));
     find("cameras").append(panel);
-    const camera = new mp4dsPlayer.Camera(facts, number, {video, canvas, notice, panel, stage, close, values, colour, isSeen: true, onShown: told});
+    const camera = new mp4dsPlayer.Camera(facts, number, {video, still, badge, canvas, notice, panel, stage, close, values, colour, isSeen: true, onShown: told});
     head.addEventListener("click", () => lead(camera));
     close.addEventListener("click", event => { event.stopPropagation(); hide(camera, true); });
     stage.addEventListener("click", () => enlarge(camera));
@@ -57,7 +60,15 @@ var mp4dsReport = (() => {
     values.log.textContent = mp4dsTables.stampText(camera.logTime[n]);
     values.log.title = mp4dsTables.dateText(camera.logTime[n]);
     values.delay.textContent = camera.facts.untimed || `${mp4dsPlots.numberText(Number(camera.logTime[n] - camera.stamp[n]) / 1e6)} ms`;
+    if (camera.still) showStill(camera, n);
     drawGrid(camera);
+  }
+
+  /** Show the still that is nearest to a frame. */
+  function showStill(camera, n) {
+    const nearest = camera.facts.stills.reduce((best, each) => Math.abs(each.frame - n) < Math.abs(best.frame - n) ? each : best);
+    if (camera.still.getAttribute("src") !== nearest.file) camera.still.src = nearest.file;
+    camera.badge.textContent = `still: frame ${nearest.frame}`;
   }
 
   function drawGrid(camera) {
