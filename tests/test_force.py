@@ -11,7 +11,7 @@ import pytest
 import mp4ds
 from commands import call, refused, unchanged
 from mp4ds.packing.options import PackOptions
-from mp4ds.plugins.reporting.report import ReportOptions, report
+from mp4ds.plugins.reporting.report import report
 from sources import SOURCES, scene
 
 FOLDERS: dict[str, tuple[str, ...]] = {
@@ -148,13 +148,13 @@ def test_a_link_is_kept(kind: str, made: Path, tmp_path: Path) -> None:
 def test_a_report_goes_with_its_dataset(made: Path, tmp_path: Path) -> None:
     dataset = tmp_path / "drive"
     shutil.copytree(made / "drive", dataset)
-    report(dataset, ReportOptions(proxies="none"))
-    report(dataset, ReportOptions(proxies="none"))
+    report(dataset)
+    report(dataset)
     (dataset / "report" / "mine.txt").write_text("years of work")
     command = ("pack", made / "drive.bag", "-o", dataset, "--codec", "h264", "--force")
     with unchanged(tmp_path):
         refused(call(*command), 2, "(report/mine.txt)")
-        refused(call("report", dataset, "--proxies", "none"), 2, "(mine.txt)")
+        refused(call("report", dataset), 2, "(mine.txt)")
     (dataset / "report" / "mine.txt").unlink()
     (dataset / "index.html").write_text("<h1>mine</h1>")
     with unchanged(tmp_path):

@@ -167,12 +167,12 @@ def test_what_appears_in_it_meanwhile_is_kept(target: Path) -> None:
 def test_a_report_within_is_replaced_with_it(target: Path) -> None:
     make(target, "folder", "old")
     (target / "index.html").write_bytes(b"<!doctype html>" + PAGE_SIGN)
-    (target / "report" / "proxies").mkdir(parents=True)
-    (target / "report" / "proxies" / "left.mp4").touch()
+    (target / "report" / "stills").mkdir(parents=True)
+    (target / "report" / "stills" / "left.jpg").touch()
     write_listing(target / "report")
     check_target(target, force=True, owned=lambda _: {"deep/part"})
-    (target / "report" / "proxies" / "mine.mp4").touch()
-    told = r"\(report/proxies/mine\.mp4\)"
+    (target / "report" / "stills" / "mine.jpg").touch()
+    told = r"\(report/stills/mine\.jpg\)"
     refused(target, told, force=True, owned=lambda _: {"deep/part"})
 
 

@@ -63,7 +63,7 @@ COMMANDS = {
     "validate": "validate DATASET --deep",
     "unpack": "unpack DATASET --to mcap -o OUT.mcap",
     "unpack-images": "unpack DATASET --to images -o OUT",
-    "report": "report DATASET -o OUT --proxies all",
+    "report": "report DATASET -o OUT",
     "export-euroc": "export euroc DATASET -o OUT",
     "export-tum": "export tum DATASET -o OUT",
     "frames": "frames DATASET -t TOPIC --at #1 -o OUT.png",
