@@ -386,6 +386,8 @@ class FrameReader:
                 sample, packet = piece.sample, self._packet(piece.sample)
             data = av.Packet(self._cut(group, piece, packet))
             data.pts = data.dts = sample
+            # else ffmpeg adds a PNG file to the picture before it
+            data.is_keyframe = bool(self.table.sync[sample])
             self._fed.add(number)
             yield from self._context.decode(data)
         # some decoders hold frames back; once they gave them they take nothing more

@@ -692,9 +692,6 @@ def open_player(
             )
             for place in datasets_in(datasets)
         ]
-        for dataset in opened if chosen.layer is None else ():
-            if absence := dataset.absence(chosen.wants):
-                warnings.warn(f"{dataset.path}: {absence}; the views are played", stacklevel=2)
         timeline = Timeline(opened, chosen, world)
         node = node or stack.enter_context(open_node(world, chosen, _NODES[world]))
         follow = chosen.follow_clock

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import struct
 import threading
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
@@ -269,6 +270,8 @@ class _Part:
 
     def __init__(self, dataset: Dataset, options: PlayOptions, world: World) -> None:
         self._dataset = dataset
+        if options.layer is None and (absence := dataset.absence(options.wants)):
+            warnings.warn(f"{dataset.path}: {absence}; the views are played", stacklevel=2)
         self._topics = {item.topic for item in dataset.channels if options.wants(item.topic)}
         self.republisher = Republisher(
             dataset,
