@@ -681,14 +681,12 @@ def open_player(
     """
     chosen = options or PlayOptions()
     world = node.world if node else chosen_world("play", chosen.to)
-    chosen = replace(chosen, names=chosen.names.in_world(world))
+    chosen, quality = replace(chosen, names=chosen.names.in_world(world)), chosen.jpeg_quality
     with ExitStack() as stack:
         stack.enter_context(advising(HOW_TO_SALVAGE))
         opened = [
             stack.enter_context(
-                open_selected(
-                    place, chosen.wants, layer=chosen.layer, jpeg_quality=chosen.jpeg_quality
-                )
+                open_selected(place, chosen.wants, layer=chosen.layer, jpeg_quality=quality)
             )
             for place in datasets_in(datasets)
         ]
