@@ -255,20 +255,8 @@ _LATEST = 2**63 - 1  # more than any time of a bag
 _CHUNK_HEAD, _INDEX_HEAD = 96, 64  # maximum bytes of the records as usually written
 
 
-class _Index(NamedTuple):
-    """One connection's messages by log time, ties in source order."""
-
-    times: NDArray[np.int64]
-    chunks: NDArray[np.int32]
-    offsets: NDArray[np.uint32]
-
-    def within(self, excerpt: Excerpt) -> _Index:
-        """The messages of an excerpt's span."""
-        start, end = (
-            None if time is None else int(np.searchsorted(self.times, min(max(time, 0), _LATEST)))
-            for time in (excerpt.start, excerpt.end)
-        )
-        return _Index(self.times[start:end], self.chunks[start:end], self.offsets[start:end])
+_Index = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.uint32]]
+"""One connection's messages by log time, ties in source order: times, chunk numbers, offsets."""
 
 
 class _Chunk(NamedTuple):
@@ -502,11 +490,11 @@ class Ros1Reader(BagReader):
     def _entries(self, excerpt: Excerpt) -> Iterator[tuple[Channel, int, int, int]]:
         """Per message: channel, log time, chunk number, offset."""
         channels = [channel for channel in self.channels if excerpt.has_topic(channel.topic)]
-        parts = [self._index[channel.id].within(excerpt) for channel in channels]
+        parts = [_within(self._index[channel.id], excerpt) for channel in channels]
         if not parts:
             return
         times, chunks, offsets = (np.concatenate(column) for column in zip(*parts, strict=True))
-        owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.times) for p in parts])
+        owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part[0]) for part in parts])
         order = np.lexsort((offsets, chunks, times))
         first_seen = np.sort(np.unique(chunks[order], return_index=True)[1])
         needed = (self._chunks[number] for number in chunks[order][first_seen].tolist())
@@ -555,7 +543,7 @@ class Ros1Reader(BagReader):
 
     def _times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times from the index."""
-        return {key: index.times for key, index in self._index.items()}
+        return {key: times for key, (times, _, _) in self._index.items()}
 
     def close(self) -> None:
         """Close the file."""
@@ -587,7 +575,17 @@ def _sorted_index(raw: bytes | bytearray, chunk_runs: Sequence[int]) -> _Index:
     if len(np.unique(places)) < len(places):
         raise DamageError("its index lists a message twice")
     order = np.lexsort((entries["offset"], chunks, times))
-    return _Index(times[order], chunks[order], entries["offset"][order])
+    return times[order], chunks[order], entries["offset"][order]
+
+
+def _within(index: _Index, excerpt: Excerpt) -> _Index:
+    """The messages of an excerpt's span."""
+    times, chunks, offsets = index
+    start, end = (
+        None if time is None else int(np.searchsorted(times, min(max(time, 0), _LATEST)))
+        for time in (excerpt.start, excerpt.end)
+    )
+    return times[start:end], chunks[start:end], offsets[start:end]
 
 
 def _check_version(header: Fields) -> None:

@@ -113,52 +113,6 @@ class _Scan(Scan):
 
 
 _SEARCHED = 16 * 2**20
-_OF_INDEX = (Op.CONNECTION, Op.CHUNK_INFO)
-
-
-class BagIndex:
-    """Connections and chunks that the index of a bag lists.
-
-    Attributes:
-        channels: By connection number, in the order of the index.
-        infos: Of each chunk, by the byte where it begins, in this order once it is finished: first
-            and last log time in ns, and messages by connection.
-        due: Byte where the index should begin according to the bag's header; None if unknown.
-        offset: Byte where the index was found.
-        later: Returns the earliest log time in the chunks after a byte; None after the last.
-    """
-
-    def __init__(self) -> None:
-        self.channels: dict[int, Channel] = {}
-        self.infos: dict[int, tuple[tuple[int, int], dict[int, int]]] = {}
-        self.due: int | None = None
-        self.offset: int | None = None
-
-    def add(self, frame: RecordFrame, body: bytes) -> None:
-        """Add a record of the index."""
-        fields = frame.fields
-        if frame.kind == Op.CHUNK_INFO:
-            span = fields.time(b"start_time"), fields.time(b"end_time")
-            counts = body[: len(body) // CHUNK_COUNT.size * CHUNK_COUNT.size]
-            self.infos[fields.number(b"chunk_pos", 8)] = span, dict(CHUNK_COUNT.iter_unpack(counts))
-        elif channel := _connection(frame, body):
-            self.channels.setdefault(channel.id, channel)
-
-    def finish(self, *, chunks: int | None) -> bool:
-        """Finish after everything was added; an incomplete list of chunks is dropped.
-
-        Args:
-            chunks: Their number according to the bag's header; None if unknown.
-
-        Returns:
-            Whether all chunks are listed.
-        """
-        is_whole = chunks == len(self.infos) and self.offset is not None
-        self.infos = dict(sorted(self.infos.items())) if is_whole else {}
-        starts = {place: span[0] for place, (span, counts) in self.infos.items() if counts}
-        places = np.array(list(starts), np.uint64)
-        self.later = later_starts(places, np.array(list(starts.values()), np.uint64))
-        return is_whole
 
 
 def _connection(frame: RecordFrame, body: bytes) -> Channel | None:
@@ -167,57 +121,6 @@ def _connection(frame: RecordFrame, body: bytes) -> Channel | None:
         return connection_of(frame.fields, body)
     except DamageError:
         return None
-
-
-def read_index(path: Path) -> BagIndex:
-    """The index of a bag: all of it, or at least the connections found at the end of the file.
-
-    Raises:
-        SourceError: The bag is encrypted, or cannot be read.
-    """
-    index = BagIndex()
-    with Window.of_file(path) as window:
-        window.skip(len(MAGIC))
-        header = _Scan(window).here()
-        size = window.size or 0
-    chunks = None
-    if header and header.kind == Op.BAG:
-        if header.fields.get(b"encryptor"):
-            raise SourceError(path, "is encrypted", "Decrypt it with `rosbag decrypt` first.")
-        index.due = header.fields.number(b"index_pos", 8)
-        chunks = int.from_bytes(header.fields.get(b"chunk_count", b""), "little")
-        if len(MAGIC) + header.size <= index.due < size:
-            _read_records(path, index.due, index)
-    if not index.finish(chunks=chunks) and index.due != 0:
-        _search_connections(path, max(len(MAGIC), size - _SEARCHED), index)
-    return index
-
-
-def _read_records(path: Path, offset: int, index: BagIndex) -> None:
-    """Read an index at its expected place."""
-    with Window.of_file(path, offset) as window:
-        scan = _Scan(window)
-        if scan.here() is None:
-            return
-        index.offset = offset
-        while frame := scan.next():
-            if frame.kind not in _OF_INDEX:
-                return
-            body = scan.body(frame)
-            if body is not None:
-                index.add(frame, body)
-
-
-def _search_connections(path: Path, offset: int, index: BagIndex) -> None:
-    """Search for connections from a byte on, if the index is not at its expected place."""
-    with Window.of_file(path, offset) as window:
-        scan = _Scan(window)
-        if offset > len(MAGIC):
-            scan.resync(offset, "", passed=0)
-        while frame := scan.next():
-            body = scan.body(frame)
-            if body is not None and frame.kind == Op.CONNECTION:
-                index.add(frame, body)
 
 
 # ---------------------------------------------------------------- the reader
@@ -241,20 +144,86 @@ class Ros1Salvage(FileSalvage):
             start = stream.read(32)
         if re.match(rb"#ROS(BAG|RECORD|LOG) V1\.\d\n", start):
             raise other_format(path, start)
-        self._index = read_index(path)
-        self._index_offset = self._index.offset
-        self._is_timed = bool(self._index.infos)
-        self._channels: dict[int, Channel] = dict(self._index.channels)
+        self._channels: dict[int, Channel] = {}  # by connection, in the order of the index
+        # chunks that the index lists, by the byte where each begins, in this order: first and last
+        # log time in ns, and messages by connection
+        self._infos: dict[int, tuple[tuple[int, int], dict[int, int]]] = {}
+        self._due: int | None = None  # where the index should begin, if the bag's header tells
+        self._read_index()
+        self._is_timed = bool(self._infos)
 
     def _scan_of(self, window: Window, lose: Lose) -> Scan:
         return _Scan(window, lose)
 
+    def _read_index(self) -> None:
+        """Read the index: all of it, or at least the connections found at the end of the file.
+
+        An incomplete list of chunks is dropped.
+
+        Raises:
+            SourceError: The bag is encrypted, or cannot be read.
+        """
+        with Window.of_file(self.path) as window:
+            window.skip(len(MAGIC))
+            header, size = _Scan(window).here(), window.size
+        chunks = None
+        if header and header.kind == Op.BAG:
+            if header.fields.get(b"encryptor"):
+                problem, remedy = "is encrypted", "Decrypt it with `rosbag decrypt` first."
+                raise SourceError(self.path, problem, remedy)
+            self._due = header.fields.number(b"index_pos", 8)
+            chunks = int.from_bytes(header.fields.get(b"chunk_count", b""), "little")
+            if len(MAGIC) + header.size <= self._due < size:
+                self._read_listed(self._due)
+        is_whole = chunks == len(self._infos) and self._index_offset is not None
+        self._infos = dict(sorted(self._infos.items())) if is_whole else {}
+        starts = {place: span[0] for place, (span, counts) in self._infos.items() if counts}
+        places = np.array(list(starts), np.uint64)
+        self._later = later_starts(places, np.array(list(starts.values()), np.uint64))
+        if not is_whole and self._due != 0:
+            self._search_connections(max(len(MAGIC), size - _SEARCHED))
+
+    def _read_listed(self, offset: int) -> None:
+        """Read the index at its expected place."""
+        with Window.of_file(self.path, offset) as window:
+            scan = _Scan(window)
+            if scan.here() is None:
+                return
+            self._index_offset = offset
+            while (frame := scan.next()) and frame.kind in (Op.CONNECTION, Op.CHUNK_INFO):
+                body = scan.body(frame)
+                if body is None:
+                    continue
+                if frame.kind == Op.CHUNK_INFO:
+                    span = frame.fields.time(b"start_time"), frame.fields.time(b"end_time")
+                    counts = body[: len(body) // CHUNK_COUNT.size * CHUNK_COUNT.size]
+                    place = frame.fields.number(b"chunk_pos", 8)
+                    self._infos[place] = span, dict(CHUNK_COUNT.iter_unpack(counts))
+                else:
+                    self._declare(frame, body)
+
+    def _search_connections(self, offset: int) -> None:
+        """Search for connections from a byte on, if the index is not at its expected place."""
+        with Window.of_file(self.path, offset) as window:
+            scan = _Scan(window)
+            if offset > len(MAGIC):
+                scan.resync(offset, "", passed=0)
+            while frame := scan.next():
+                body = scan.body(frame)
+                if body is not None and frame.kind == Op.CONNECTION:
+                    self._declare(frame, body)
+
+    def _declare(self, frame: RecordFrame, body: bytes) -> None:
+        """Take a connection of the index, unless it is damaged; the first of a number counts."""
+        if channel := _connection(frame, body):
+            self._channels.setdefault(channel.id, channel)
+
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the bag's index, including lost messages; otherwise empty."""
-        if not self._index.infos:
+        if not self._infos:
             return {}
         total = {connection: ChannelStats(0, 0, 0) for connection in self._channels}
-        for span, counts in self._index.infos.values():
+        for span, counts in self._infos.values():
             for connection, count in counts.items():
                 if connection in total and count:
                     total[connection] = total[connection].plus(ChannelStats(count, *span))
@@ -262,7 +231,7 @@ class Ros1Salvage(FileSalvage):
 
     def _scanned(self) -> Iterator[Record | None]:
         """All messages, in the order of the file; None at each chunk."""
-        self._listed_ahead = list(reversed(self._index.infos))
+        self._listed_ahead = list(reversed(self._infos))
         self._contradicted: set[int] = set()
         self._others: dict[tuple[object, ...], Channel] = {}
         self._begins()
@@ -272,10 +241,8 @@ class Ros1Salvage(FileSalvage):
                 yield from self._tally.settle()
             yield from self._record(frame)
         yield from self._tally.settle()
-        if (self._index.due or 0) > self._window.offset:
-            problem = (
-                f"the file ends before its index, which should begin at byte {self._index.due}"
-            )
+        if (self._due or 0) > self._window.offset:
+            problem = f"the file ends before its index, which should begin at byte {self._due}"
             self._tally.lost(self._window.offset, None, problem)
         self._tally.close()
 
@@ -374,17 +341,17 @@ class Ros1Salvage(FileSalvage):
         self._pass_listed(offset)
         if self._listed_ahead and self._listed_ahead[-1] == offset:
             self._listed_ahead.pop()
-        span, counts = self._index.infos.get(offset, (None, None))
+        span, counts = self._infos.get(offset, (None, None))
         self._tally.open(counts, end, span)
-        self._earliest = self._index.later(offset - 1)
+        self._earliest = self._later(offset - 1)
 
     def _pass_listed(self, end: int) -> None:
         """Record as lost the chunks that the index lists before a byte but that were not found."""
         while self._listed_ahead and self._listed_ahead[-1] < end:
-            _, counts = self._index.infos[self._listed_ahead.pop()]
+            _, counts = self._infos[self._listed_ahead.pop()]
             self._tally.extend(counts)
 
     def _lose(self, offset: int, size: int, problem: str) -> None:
         super()._lose(offset, size, problem)
-        if self._index.offset is None or offset < self._index.offset:
+        if self._index_offset is None or offset < self._index_offset:
             self._pass_listed(offset + size)
