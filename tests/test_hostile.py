@@ -232,7 +232,7 @@ TEXTS: dict[str, bytes] = {
 @pytest.mark.parametrize("to", ["sidecar", "manifest"])
 def test_yaml_beyond_the_subset(to: str, name: str, dataset: Path) -> None:
     path = dataset / (f"{STEM}.yaml" if to == "sidecar" else "dataset.yaml")
-    head = b'mp4ds: "1.1"\nkind: stream\n' if TEXTS[name].startswith(b"a:") else b""
+    head = b'mp4ds: "2.0"\nkind: stream\n' if TEXTS[name].startswith(b"a:") else b""
     path.write_bytes(head + TEXTS[name])
     refused(path if to == "sidecar" else dataset, "yaml-invalid")
     assert not list(dataset.glob("pwned"))
@@ -252,7 +252,7 @@ def test_many_unknown_keys(pair: Path) -> None:
 # ---------------------------------------------------------------- versions
 
 
-@pytest.mark.parametrize("version", ["2.0", "2.7", "10.0", "99999999999.0"])
+@pytest.mark.parametrize("version", ["3.0", "3.7", "10.0", "99999999999.0"])
 def test_a_newer_major_version_is_refused(version: str, pair: Path) -> None:
     changed(pair, put("mp4ds", value=version))
     text = refused(pair, "version-unsupported")
@@ -268,13 +268,13 @@ def test_a_newer_major_version_is_refused(version: str, pair: Path) -> None:
      b"null", b"[1]", b"{}", b"true", b'"' + b"9" * 5000 + b'.0"'],
 )  # fmt: skip
 def test_not_a_version(version: bytes, pair: Path) -> None:
-    edited(pair, b'mp4ds: "1.1"', b"mp4ds: " + version)
+    edited(pair, b'mp4ds: "2.0"', b"mp4ds: " + version)
     refused(pair, "version-unsupported")
 
 
 def test_a_newer_minor_version_with_many_keys(pair: Path) -> None:
     keys = b"".join(b"\nk%d: 1" % n for n in range(20_000))
-    edited(pair, b'mp4ds: "1.1"', b'mp4ds: "1.7"' + keys)
+    edited(pair, b'mp4ds: "2.0"', b'mp4ds: "2.7"' + keys)
     outcome = jail.validate(pair)
     assert not outcome.error, outcome.text
     assert sum(map(len, outcome.warned)) < 10_000
@@ -608,16 +608,16 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
             lossy = {"quality": "visual", "transcode": True} if kind == "transcoded" else {}
             options = mp4ds.PackOptions(**lossy)
             mp4ds.pack(write(folder, recorded), folder / "dataset", options)
-            (video,) = (folder / "dataset").glob("*.mp4")
-            made[kind] = video.with_suffix(".yaml")
+            with mp4ds.open(folder / "dataset") as dataset:
+                (made[kind],) = (stream.path for stream in dataset.streams)
         return made[kind]
 
     return make
 
 
 def copied(sidecar: Path, folder: Path) -> Path:
-    for suffix in (".mp4", ".yaml"):
-        shutil.copy(sidecar.with_suffix(suffix), folder)
+    for path in sidecar.parent.glob(f"{sidecar.stem}.*"):
+        shutil.copy(path, folder)
     return folder / sidecar.name
 
 

@@ -51,10 +51,14 @@ with mp4ds.open("{HOME}/first") as dataset:
 """
     remote = run(hub, "-c", code, folder=tmp_path)
     assert remote == run(hub, "-c", code.replace(HOME, str(drives)), folder=tmp_path)
-    video = "first/left_image_raw.mp4"
+    view, video = "first/left_image_raw.mp4", "first/left_image_raw.exact.mp4"
     fetched = sum(count for name, count in hub.sent if name == video)
     assert 0 < fetched < (drives / video).stat().st_size
-    assert "first/right_image_raw.mp4" not in [name for name, _ in hub.sent]
+    videos = {name for name, _ in hub.sent if name.endswith(".mp4")}
+    assert videos == {view, video}
+    hub.sent.clear()
+    run(hub, "-c", code.replace('first")', 'first", layer="view")'), folder=tmp_path)
+    assert {name for name, _ in hub.sent if name.endswith(".mp4")} == {view}
 
 
 def test_commands_take_it(hub: Hub, drives: Path, tmp_path: Path) -> None:

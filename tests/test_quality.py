@@ -47,7 +47,7 @@ needs_vmaf = pytest.mark.skipif(
 def executor(monkeypatch: pytest.MonkeyPatch) -> InlineExecutor:
     inline = InlineExecutor()
     use(monkeypatch, inline)
-    monkeypatch.setattr("mp4ds.packing.tracks._FRAMES", WINDOW)
+    monkeypatch.setattr("mp4ds.packing.windows._FRAMES", WINDOW)
     return inline
 
 

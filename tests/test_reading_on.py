@@ -87,15 +87,17 @@ def test_only_messages_from_a_time_on(tmp_path: Path) -> None:
 
 
 def without_packets(long: Path, folder: Path, first: int, end: int) -> Path:
-    """The dataset with zeros for some packets, which do not decode."""
+    """The dataset with zeros for some packets, which do not decode: in whole groups of pictures."""
     shutil.copytree(long, folder)
-    (video,) = folder.glob("*.mp4")
-    data = bytearray(video.read_bytes())
-    with video.open("rb") as file:
-        table = read_sample_table(file, len(data), "")
-    for place, size in zip(table.places[first:end], table.sizes[first:end], strict=True):
-        data[place : place + size] = bytes(size)
-    video.write_bytes(data)
+    for video in folder.glob("*.mp4"):
+        data = bytearray(video.read_bytes())
+        with video.open("rb") as file:
+            table = read_sample_table(file, len(data), "")
+        keys = [key for key in np.flatnonzero(table.sync).tolist() if first <= key <= end]
+        groups = slice(keys[0], keys[-1])
+        for place, size in zip(table.places[groups], table.sizes[groups], strict=True):
+            data[place : place + size] = bytes(size)
+        video.write_bytes(data)
     return folder
 
 

@@ -418,7 +418,8 @@ def _write(
                 raise
             with _damage_told(target, "cannot be completed"):
                 container.close()
-        _check(target, codec, written, entry)
+        place = segments[0] if len(segments) == 1 else target  # what the user knows of
+        _check(target, codec, written, entry, place)
     except BaseException:
         target.unlink(missing_ok=True)
         raise
@@ -443,19 +444,23 @@ class _Written:
         return found == (self.ticks, self.sizes, self.keyframes)
 
 
-def _check(path: Path, codec: str, written: _Written, entry: SampleEntry) -> None:
-    """Compare a file with what was written, and with the segments' description."""
+def _check(path: Path, codec: str, written: _Written, entry: SampleEntry, place: Path) -> None:
+    """Compare a file with what was written, and with the segments' description.
+
+    Raises:
+        VideoError: It differs; the place is what is to blame.
+    """
     try:
         with PacketReader(path, codec=codec, frames=len(written.ticks)) as reader:
             is_whole = written.is_in(reader)
     except VideoError:
         is_whole = False  # the muxer continues after some damages, and the index is wrong then
     if not is_whole:
-        problem = "would not hold the packets unchanged: one is damaged"
-        raise VideoError("decode-failed", path, problem)
+        problem = "could not be copied unchanged: a packet is damaged"
+        raise VideoError("decode-failed", place, problem)
     if difference := entry.differences(read_sample_entry(path)):
         problem = f"differs from the segments it was made of in {difference}"
-        raise VideoError("decode-failed", path, problem)
+        raise VideoError("decode-failed", place, problem)
 
 
 def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
