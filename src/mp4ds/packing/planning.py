@@ -43,7 +43,11 @@ from mp4ds.video.codecs import (
     AV1,
     DEFAULT_LOSSY,
     LOSSY_GOP,
+    LOSSY_TRAINING_GOP,
     PURPOSE_PRESET,
+    TRAINING,
+    VIEW_CRF,
+    VIEW_PRESET,
     fastest_preset,
     lossless_codecs,
     recipe_for,
@@ -116,7 +120,7 @@ def decide(
         elif options.is_fast:
             plans = [_fast_plan(first.key, options)]
         else:
-            plans = _lossless_plans(samples, options, threads, rate)
+            plans = _lossless_plans(samples, options, threads)
         return Decision(first.key, plans)
     except Refused as reason:
         return Decision(first.key, refusal=str(reason))
@@ -177,7 +181,7 @@ def _lossy_plans(
     except Refused as reason:
         if is_jpeg:  # which is smaller than any lossless video of its pixels
             raise
-        return _lossless_plans(samples, options, threads, rate, note=f"kept lossless: {reason}")
+        return _lossless_plans(samples, options, threads, note=f"kept lossless: {reason}")
     # for images that cannot reach it
     return [plan] if is_jpeg else [plan, _general_plan(key, options)]
 
@@ -196,7 +200,6 @@ def _lossless_plans(
     samples: Sequence[CameraMessage],
     options: PackOptions,
     threads: int,
-    rate: float | None,
     note: str = "",
 ) -> list[TrackPlan]:
     encoding = ENCODINGS[samples[0].key.encoding]
@@ -224,13 +227,14 @@ def _lossless_plans(
     except EncoderRefusedError as error:
         raise Refused(str(error)) from None
     plan = TrackPlan(best, note=note)
-    view = _view_coding(encoding, options, rate)
+    view = _view_coding(encoding, options)
     if view is not None:
         with suppress(OptionError, EncoderRefusedError):
             both = choose_predicted(
                 pixels,
                 encoding,
                 view,
+                best.bytes_per_frame,
                 gop=options.group_frames,
                 threads=threads,
                 codec=codec,
@@ -247,14 +251,15 @@ def _lossless_plans(
     return [plan, _general_plan(samples[0].key, options)]
 
 
-def _view_coding(encoding: Encoding, options: PackOptions, rate: float | None) -> Coding | None:
-    """How the view of lossless images is encoded: as `visual` ones are; None without a view."""
+def _view_coding(encoding: Encoding, options: PackOptions) -> Coding | None:
+    """How the view of lossless images is encoded; None without a view."""
     if encoding.lossy is None:
         return None
-    crf, preset = visual_setting(rate)
     layout = layout_for(encoding, lossless=False)
-    recipe = recipe_for(layout.pixel_format, lossless=False, crf=crf, preset=str(preset))
-    return Coding(layout, recipe, LOSSY_GOP)
+    preset = PURPOSE_PRESET if options.purpose else VIEW_PRESET
+    recipe = recipe_for(layout.pixel_format, lossless=False, crf=VIEW_CRF, preset=preset)
+    gop = LOSSY_TRAINING_GOP if options.purpose == TRAINING else LOSSY_GOP
+    return Coding(layout, recipe, gop)
 
 
 def _fast_plan(key: StreamKey, options: PackOptions) -> TrackPlan:

@@ -177,3 +177,78 @@ def _interpolated(plane: NDArray[Any], rows: NDArray[np.int64], bits: int) -> ND
             for far, weight in _TAPS
         )
     return whole.reshape(len(rows), -1)
+
+
+# ---------------------------------------------------------------- planes of a mosaic
+
+
+_MIDDLE = 128  # luma that leaves room for most chroma, so that the latter shows what it adds
+
+
+def _padded(mosaic: NDArray[Any], *sides: tuple[int, int]) -> NDArray[Any]:
+    """With more rows and columns, which continue the colours; those of a tiny image repeat."""
+    is_tiny = min(mosaic.shape) <= max(max(side) for side in sides)
+    return np.pad(mosaic, sides, mode="edge" if is_tiny else "reflect")
+
+
+def mosaic_planes(mosaic: NDArray[np.uint8], pattern: str) -> tuple[NDArray[np.uint8], ...]:
+    """Luma and chroma in which each site of a mosaic has its own colour again.
+
+    Chroma is made of what red and blue differ from green at their sites, where green is
+    interpolated with the gradient of the site's own colour (Malvar, He, Cutler, 2004). Luma is what
+    `rgb` then needs to give the site's colour. Bilinear demosaicing would blur it.
+
+    Args:
+        mosaic: Shape (rows, columns), of any size.
+        pattern: Colours of its upper left 2 x 2 sites, such as ``rggb``.
+
+    Returns:
+        Y, U and V, BT.709 in full range, of even size and half of that.
+    """
+    whole = _padded(mosaic, (0, mosaic.shape[0] % 2), (0, mosaic.shape[1] % 2))
+    height, width = whole.shape
+    wide: NDArray[np.int16] = _padded(whole.astype(np.int16), (2, 2), (2, 2))
+
+    def beyond_green(colour: str) -> NDArray[np.float32]:
+        """What a colour differs from green, in the middle of each 2 x 2 sites."""
+        y, x = divmod(pattern.index(colour), 2)
+
+        def at(down: int, right: int) -> NDArray[np.int16]:
+            top, left = 2 + y + down, 2 + x + right
+            return wide[top : top + height - 1 : 2, left : left + width - 1 : 2]
+
+        near = at(-1, 0) + at(1, 0) + at(0, -1) + at(0, 1)
+        far = at(-2, 0) + at(2, 0) + at(0, -2) + at(0, 2)
+        eighths: NDArray[np.int16] = 4 * at(0, 0) + far - 2 * near
+        own = np.pad(eighths, 1, mode="edge")
+        rows, columns = height // 2, width // 2
+        down, right = 2 - 2 * y, 2 - 2 * x
+
+        def part(top: int, left: int) -> NDArray[np.int16]:
+            return own[top : top + rows, left : left + columns]
+
+        beside = part(down, 1) + part(1, right)
+        found: NDArray[np.float32] = (
+            np.float32(9 / 128) * part(1, 1)
+            + np.float32(3 / 128) * beside
+            + np.float32(1 / 128) * part(down, right)
+        )
+        return found
+
+    red, blue = beyond_green("r"), beyond_green("b")
+    of_red, of_blue = MATRICES["bt709"]
+    frame = av.VideoFrame(width, height, "yuv420p")
+    luma, *planes = (samples(frame, index) for index in range(3))
+    for plane, own, share, other, its_share in (
+        (planes[0], blue, of_blue, red, of_red),
+        (planes[1], red, of_red, blue, of_blue),
+    ):
+        other = other * np.float32(its_share / (2 * (1 - share)))
+        np.clip(np.rint(own / 2 - other) + 128, 0, 255, out=plane, casting="unsafe")
+    luma[...] = _MIDDLE
+    colours = rgb(frame, "bt709", full_range=True)
+    for site, colour in enumerate(pattern):
+        y, x = divmod(site, 2)
+        added = colours[y::2, x::2, "rgb".index(colour)].astype(np.int16) - _MIDDLE
+        np.clip(whole[y::2, x::2] - added, 0, 255, out=luma[y::2, x::2], casting="unsafe")
+    return luma, *planes

@@ -25,6 +25,7 @@ from mp4ds.video.codecs import (
     TRAINING,
     Recipe,
     codecs_to_try,
+    lossless_codecs,
     recipe_for,
 )
 from mp4ds.video.colour import samples
@@ -400,6 +401,9 @@ class Predictor:
             yield pixels
 
 
+_UNFILTERED = "enable-tf=0"  # SVT-AV1's option against temporal filtering
+
+
 def predict_on_trial(
     samples: Sequence[Pixels], coding: Coding, threads: int
 ) -> tuple[Coded, list[Pixels]]:
@@ -414,6 +418,11 @@ def predict_on_trial(
         EncoderRefusedError: The codec does not take such pictures.
     """
     layout, recipe = coding.layout, coding.recipe
+    if recipe.encoder == "libsvtav1":
+        # which would make one picture of so few frames, and cost less than it does in a long video
+        given = recipe.options.get("svtav1-params")
+        parameters = f"{given}:{_UNFILTERED}" if given else _UNFILTERED
+        recipe = replace(recipe, options={**recipe.options, "svtav1-params": parameters})
     pictures = list(map(layout.to_picture, samples))
     context, packets = _encoded(pictures, recipe, layout.pixel_format, threads)
     rows, columns = samples[0].shape[:2]
@@ -525,7 +534,7 @@ def choose(
         threads: Threads of the encoder.
         purpose: What the video is for.
         layouts: The only ones to try; none: all that can hold the samples.
-        is_noise: See `codecs_to_try`.
+        is_noise: Whether the images are differences to those of a view.
 
     Returns:
         The first, in the order of the encoding's layouts and their codecs, within 2 % of the
@@ -542,10 +551,11 @@ def choose(
     for layout in layouts or _candidates(samples, encoding):
         pictures = [layout.to_picture(pixels) for pixels in crops]
         picture_format = layout.pixel_format
-        usual = codecs_to_try(picture_format, is_noise=is_noise)
-        for name in usual if codec is None else [codec]:
+        for name in codecs_to_try(picture_format) if codec is None else [codec]:
             try:
-                recipe = recipe_for(picture_format, lossless=True, codec=name, preset=preset)
+                recipe = recipe_for(
+                    picture_format, lossless=True, codec=name, preset=preset, is_noise=is_noise
+                )
                 coded = encode_on_trial(
                     pictures, recipe, picture_format=picture_format, threads=threads
                 )
@@ -568,14 +578,18 @@ def choose(
 
 
 def choose_predicted(
-    samples: Sequence[Pixels], encoding: Encoding, view: Coding, **options: Any
+    samples: Sequence[Pixels], encoding: Encoding, view: Coding, most: float, **options: Any
 ) -> Coding:
     """The best coding of the differences of images to what a view shows.
+
+    They are mostly noise. PNG files, in which nothing is predicted, are about as small as any other
+    codec makes it, and decode in a tenth of the time.
 
     Args:
         samples: As for `choose`.
         encoding: Of the images.
         view: How the view is encoded.
+        most: Bytes of an image, with its view, that PNG files may take though others take fewer.
         **options: As for `choose`.
 
     Returns:
@@ -590,9 +604,22 @@ def choose_predicted(
     bits = view.layout.used_bits
     differences = [difference(*pair, bits) for pair in zip(crops, shown, strict=True)]
     layouts = [layout_for(encoding, lossless=True)]
-    best = choose(differences, encoding, layouts=layouts, is_noise=True, **options)
-    size = best.bytes_per_frame + coded.bytes_per_frame(view.gop)
-    return replace(best, bytes_per_frame=size / share)
+    of_view = coded.bytes_per_frame(view.gop)
+
+    def tried(**changes: Any) -> Coding:
+        asked = {**options, **changes}
+        found = choose(differences, encoding, layouts=layouts, is_noise=True, **asked)
+        return replace(found, bytes_per_frame=(found.bytes_per_frame + of_view) / share)
+
+    if options["codec"] is not None or "png" not in lossless_codecs(layouts[0].pixel_format):
+        return tried()
+    is_archive = options["purpose"] == ARCHIVE
+    simple = tried(codec="png")
+    if not is_archive and simple.bytes_per_frame <= most:
+        return simple
+    best = tried()
+    near = 1.0 if is_archive else NEAR
+    return simple if simple.bytes_per_frame <= near * best.bytes_per_frame else best
 
 
 def _candidates(samples: Sequence[Pixels], encoding: Encoding) -> list[Layout]:

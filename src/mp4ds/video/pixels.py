@@ -284,6 +284,9 @@ def picture_to_frame(
         converter: The stream's own.
         full_range: Whether the samples of the video use their full range.
     """
+    if picture_format.startswith("bayer_") and pixel_format in ("yuv420p", TEN_BITS):
+        pattern = picture_format.removeprefix("bayer_")[:4]
+        picture, picture_format = colour.mosaic_planes(picture[0], pattern), "yuv420p"
     if pixel_format == TEN_BITS and (picture_format == "gray" or picture_format in CHROMA_SHIFTS):
         frame = picture_to_frame(picture, picture_format, "yuv420p", converter)
         return widened(frame, full_range=full_range)
@@ -292,8 +295,6 @@ def picture_to_frame(
     if pixel_format in ("yuv420p", TEN_BITS) and picture_format not in CHROMA_SHIFTS:
         picture = (_pad_to_even(picture[0]),)
     frame = plain_frame(picture, picture_format)
-    if picture_format.startswith("bayer_"):
-        frame = converter.convert(frame, "rgb24")
     if picture_format != pixel_format:
         frame = converter.convert(frame, pixel_format)
     return frame
