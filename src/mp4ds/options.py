@@ -44,6 +44,7 @@ class Declared:
         parse: Makes the value of text; passes on what is a value.
         changes: `CONTENT`, `ENCODING`, or empty.
         only: The formats, layouts or ROS versions that it works with; empty for all.
+        alone: The choice that it means without a value; empty where it has to have one.
     """
 
     help: str
@@ -56,6 +57,7 @@ class Declared:
     parse: Callable[[Any], Any] | None = None
     changes: str = ""
     only: tuple[str, ...] = ()
+    alone: str = ""
 
 
 class Parsed(Generic[_T]):

@@ -367,7 +367,12 @@ class Stream(Images):
             FormatError: A frame cannot be read, or a message does not match its digest.
         """
         rebuilder = self.rebuilder
-        if self.sidecar.body == "packet":
+        if self.sidecar.replaces_packets:
+            raise OptionError(
+                f"The packets of {self.topic} are not here, only a view in another codec. Unpack "
+                "it with `quality` visual, or with `images` raw, jpeg or compressed-video."
+            )
+        if self.sidecar.keeps_packets:
             with self.naming_frames(), self.open_packets() as reader:
                 for index in self.sound_of(unbroken(choice(self.columns), reader.key_numbers)):
                     yield index, rebuilder.packet_payload(index, reader.packet(index))
@@ -446,7 +451,7 @@ class Stream(Images):
             yield self.named(row[0], row[2]), *row[1:]
 
     def _damaged_frames(self, report: Callable[[int], None]) -> Iterator[FormatError]:
-        is_packet = self.sidecar.body == "packet"
+        is_packet, makes = self.sidecar.keeps_packets, self.sidecar.body != "packet"
         try:
             rebuilder = self.rebuilder
             with ExitStack() as files:
@@ -463,7 +468,7 @@ class Stream(Images):
                             rebuilder.packet_payload(index, reader.packet(index))
                         elif picture is None:
                             raise self._undecodable(index)
-                        else:
+                        elif makes:
                             rebuilder.payload(index, picture)
                     except FormatError as error:
                         yield error

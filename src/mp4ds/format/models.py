@@ -639,9 +639,24 @@ class StreamSidecar(Model):
         """The stream of the view alone; the stream itself if it has none."""
         if self.view is None:
             return self
-        body = "jpeg" if self.body == "packet" else self.body
-        alone = {"view": None, "video": self.view, "profile": VISUAL, "digests": None}
+        video, body = self.view, self.body
+        if body == "packet":
+            if self.video.codec == "mjpeg":
+                body = "jpeg"
+            else:
+                video = video.model_copy(update={"pixel_format": None})
+        alone = {"view": None, "video": video, "profile": VISUAL, "digests": None}
         return self.model_validate({**dict(self), **alone, "body": body})
+
+    @property
+    def keeps_packets(self) -> bool:
+        """Whether messages hold the packets of the video, as they were recorded."""
+        return self.body == "packet" and self.digests is not None
+
+    @property
+    def replaces_packets(self) -> bool:
+        """Whether the video has packets of another codec than those recorded: a view's."""
+        return self.body == "packet" and self.digests is None
 
     @property
     def shows_colours(self) -> bool:

@@ -28,6 +28,7 @@ from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
 from mp4ds.video.codecs import (
     ARCHIVE,
     ARCHIVE_GOP,
+    DEFAULT_LOSSY,
     LOSSLESS,
     LOSSLESS_GOP,
     LOSSY_GOP,
@@ -40,6 +41,10 @@ from mp4ds.video.codecs import (
 )
 
 _PLAIN = ("plain",)
+NO_VIEW = "none"
+"""The choice of a view that is none."""
+VIEWS = (DEFAULT_LOSSY, "h264", NO_VIEW)
+"""Codecs of views that may be asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +121,15 @@ class PackOptions(SliceOptions, TopicOptions):
     transcode: bool = option(
         "Re-encode JPEG images at `quality` instead of copying them.", False, changes=ENCODING
     )
+    view: str | None = option(
+        "Beside exact images, what any player shows: also of JPEG files and video packets, and "
+        "where a single video would be smaller. h264 for players without AV1; none for no view at "
+        "all; default: of raw images and PNG files, where both videos together are small.",
+        metavar="[av1|h264|none]",
+        choices=VIEWS,
+        alone=DEFAULT_LOSSY,
+        changes=ENCODING,
+    )
     purpose: str | None = option(
         "archive: smallest files. speed: fastest packing, as while recording. training: fastest "
         "random access, with videos up to 15 % larger.",
@@ -159,6 +173,11 @@ class PackOptions(SliceOptions, TopicOptions):
     def goal(self) -> QualitySetting:
         """The quality, lossless by default."""
         return self.quality or parse_quality(LOSSLESS)
+
+    @property
+    def asks_for_views(self) -> bool:
+        """Whether every stream that can have a view is to have one."""
+        return self.view not in (None, NO_VIEW)
 
     @property
     def is_fast(self) -> bool:

@@ -19,6 +19,7 @@ from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.recording import copy_part, dataset_at, slice_of
+from mp4ds.dataset.stream import Stream
 from mp4ds.errors import (
     FormatError,
     OptionError,
@@ -39,7 +40,7 @@ from mp4ds.files.sources import (
 )
 from mp4ds.files.uploads import local_path, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
-from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest, load_stream
+from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import ENCODING
 from mp4ds.packing.long_packs import PartedPack, Report, pack_parts
@@ -66,6 +67,7 @@ from mp4ds.processes import ProcessExecutor, available_cores, memory_bytes
 from mp4ds.video.codecs import (
     LOSSLESS,
     VISUAL,
+    QualitySetting,
     check_codec,
     parse_quality,
 )
@@ -224,9 +226,20 @@ def _copied(
         return _copy(paths[0], target, options)
     except Refused as reason:
         quality = options.quality or parse_quality(_quality_of(paths))
-        encoded = replace(options, quality=quality, transcode=_has_transcoded(paths))
+        encoded = replace(
+            options,
+            quality=quality,
+            transcode=options.transcode or _has_transcoded(paths),
+            view=_view_of_packets(paths[0]) if quality.lossless else None,
+        )
         summary = _encoded(paths, target, _checked(encoded, paths, may_copy=False), progress)
         return replace(summary, not_copied=str(reason))
+
+
+def _view_of_packets(path: Path) -> str | None:
+    """The codec of the views that packets of a dataset have; None if they have none."""
+    sidecars = (stream.sidecar for stream in _streams_of(path))
+    return next((one.view.codec for one in sidecars if one.body == "packet" and one.view), None)
 
 
 def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
@@ -247,12 +260,17 @@ def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
     about = load_about(options.about) if options.about is not None else None
     with (
         advising(COPY_AGAIN),
-        Dataset(path, layer="view" if options.quality else None) as dataset,
+        Dataset(path) as dataset,
         staged(target, force=options.force, owned=dataset_files, sources=[path]) as folder,
     ):
         selected = options.selected
         if options.quality is None:
             dataset.require_exact(selected)
+        else:
+            dataset.streams = [
+                stream.in_layer("view") if _is_encoded(stream, options) else stream
+                for stream in dataset.streams
+            ]
         selected.check(channel.topic for channel in dataset.channels)
         folder.mkdir()
         part = slice_of(dataset, options.slice, selected)
@@ -404,24 +422,30 @@ def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
 
 def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
     """Whether it is one dataset, and no option asks for encoding its videos."""
-    kept = replace(options, quality=None)
+    is_visual = options.quality is not None and options.quality.name == VISUAL
+    kept = replace(options, quality=None, transcode=options.transcode and not is_visual)
     if kept.changing(ENCODING) != PackOptions().changing(ENCODING):
         return False
     is_divided = options.join or options.cluster is not None
     folder = dataset_at(paths[0]) if len(paths) == 1 and not is_divided else None
     if folder is None or options.quality is None:
         return folder is not None
-    return options.quality.name == VISUAL and _has_views(folder)
+    own = [stream for stream in _streams_of(folder) if _is_encoded(stream, options)]
+    has_views = all(one.exact_path or one.sidecar.profile == VISUAL for one in own)
+    return is_visual and has_views and any(one.exact_path for one in own)
 
 
-def _has_views(folder: Path) -> bool:
-    """Whether every lossless stream of a dataset that could be of less quality has a view."""
-    sidecars = [
-        load_stream(folder / entry.sidecar)
-        for entry in load_manifest(folder / MANIFEST_NAME).streams
-    ]
-    own = [one for one in sidecars if one.body != "packet" and ENCODINGS[one.image.encoding].lossy]
-    return any(one.view for one in own) and all(one.view or one.profile == VISUAL for one in own)
+def _streams_of(folder: Path) -> list[Stream]:
+    """The streams of a dataset."""
+    entries = load_manifest(folder / MANIFEST_NAME).streams
+    return [Stream(folder / entry.sidecar) for entry in entries]
+
+
+def _is_encoded(stream: Stream, options: PackOptions) -> bool:
+    """Whether images of a stream become lossy ones where a lossy quality is asked for."""
+    sidecar = stream.sidecar
+    is_kept = sidecar.keeps_packets and not (options.transcode and stream.are_jpeg_files)
+    return not is_kept and ENCODINGS[sidecar.image.encoding].lossy is not None
 
 
 def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = True) -> PackOptions:
@@ -450,6 +474,8 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
             "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
             "any lossless video of its pixels."
         )
+    if options.asks_for_views:
+        _check_views(quality, options)
     codec = check_codec(
         options.codec,
         options.preset,
@@ -463,6 +489,24 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
     chosen = replace(options, quality=quality, codec=codec, transcode=transcode, images=images)
     chosen.group_frames  # noqa: B018 - refuses a contradiction
     return chosen
+
+
+def _check_views(quality: QualitySetting, options: PackOptions) -> None:
+    """Refuse views where there are none.
+
+    Raises:
+        OptionError: Says why.
+    """
+    if not quality.lossless:
+        raise OptionError(
+            f"`view` is for lossless packing: with `quality` {quality}, the videos are what a view "
+            "would be."
+        )
+    if options.is_fast:
+        raise OptionError(
+            "`purpose` speed encodes nothing twice. Pack without `view`, and add views later: "
+            "mp4ds pack DATASET -o NEW --view"
+        )
 
 
 def _quality_of(paths: Sequence[Path]) -> str:
@@ -489,9 +533,7 @@ def _has_transcoded(paths: Sequence[Path]) -> bool:
     """Whether the source datasets have re-encoded JPEG files."""
     folders = [folder for path in paths if (folder := dataset_at(path))]
     return any(
-        load_stream(folder / entry.sidecar).body == "jpeg"
-        for folder in folders
-        for entry in load_manifest(folder / MANIFEST_NAME).streams
+        stream.sidecar.body == "jpeg" for folder in folders for stream in _streams_of(folder)
     )
 
 
@@ -550,11 +592,12 @@ def _processes_for(plan: Plan) -> int:
 
 def _bytes_a_pixel(plan: TrackPlan) -> int:
     """About what encoders take; SVT-AV1 looks ahead with many pictures, x264 qp 0 with none."""
-    if plan.coding is None:
-        return 0
-    own = 60 if plan.coding.recipe.lossless else 350
-    # with a view, its encoder and decoder, and some 80 images that wait for it
-    return own + (450 + 80 * plan.view.layout.encoding.pixel_bytes if plan.view else 0)
+    own = 0
+    if plan.coding is not None:
+        own = 60 if plan.coding.recipe.lossless else 350
+    if plan.view is not None:  # its encoder and decoder, and some 80 images that wait for it
+        own += 450 + (80 * plan.view.layout.encoding.pixel_bytes if plan.coding else 0)
+    return own
 
 
 def _executor(

@@ -34,7 +34,7 @@ from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.calibrations import find_pairs
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey, depends_on_others
 from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools
-from mp4ds.packing.options import ImageFolder, PackOptions
+from mp4ds.packing.options import NO_VIEW, ImageFolder, PackOptions
 from mp4ds.packing.tracks import TrackPlan
 from mp4ds.packing.windows import WindowCoder
 from mp4ds.processes import available_cores
@@ -54,6 +54,7 @@ from mp4ds.video.codecs import (
     visual_setting,
 )
 from mp4ds.video.encoder import Coding, choose, choose_predicted
+from mp4ds.video.packets import packet_format
 
 # ---------------------------------------------------------------- one kind of images
 
@@ -65,6 +66,8 @@ MAX_STREAMS_PER_CHANNEL = 16
 
 _MAX_LOOKS = 64
 _KEPT_JPEG = "JPEG files are kept as they are; --transcode re-encodes them"
+_PLAYED = ("yuv420p", "yuvj420p")
+"""Pixel formats that any player of a codec shows."""
 _MANY = 6  # files, after which any number may follow
 _STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
 _LARGER = 1.05
@@ -113,8 +116,7 @@ def decide(
     first = samples[0]
     try:
         if first.pixels is None:
-            can_shrink = first.key.codec == "mjpeg" and not options.goal.lossless
-            plans = [TrackPlan(note=_KEPT_JPEG if can_shrink else "")]
+            plans = _packet_plans(first, options)
         elif not _is_lossless(first.key, options):
             plans = _lossy_plans(samples, options, threads, rate)
         elif options.is_fast:
@@ -136,6 +138,22 @@ def needs_trial(seen: CameraMessage, options: PackOptions) -> bool:
 
 def _is_lossless(key: StreamKey, options: PackOptions) -> bool:
     return options.goal.lossless or ENCODINGS[key.encoding].lossy is None
+
+
+def _packet_plans(seen: CameraMessage, options: PackOptions) -> list[TrackPlan]:
+    """Of what is kept as it came: with a view if one is asked for."""
+    codec = seen.key.codec
+    if not options.asks_for_views:
+        can_shrink = codec == "mjpeg" and not options.goal.lossless
+        return [TrackPlan(note=_KEPT_JPEG if can_shrink else "")]
+    view = _view_coding(ENCODINGS[seen.key.encoding], options)
+    if view is None:
+        return [TrackPlan()]
+    name = view.recipe.codec
+    if codec == name and packet_format(codec, seen.parameters, seen.parts.body) in _PLAYED:
+        return [TrackPlan(note=f"its own packets are {name} that plays: it needs no view")]
+    # the second for pictures that the view's encoder does not take
+    return [TrackPlan(view=view), TrackPlan(note=f"without a view: {name} cannot encode its size")]
 
 
 # ---------------------------------------------------------------- lossy
@@ -226,7 +244,7 @@ def _lossless_plans(
             note = "; ".join(filter(None, (note, f"coded as {best.recipe.codec}: {error}")))
     except EncoderRefusedError as error:
         raise Refused(str(error)) from None
-    plan = TrackPlan(best, note=note)
+    plan, least = TrackPlan(best, note=note), best.bytes_per_frame
     view = _view_coding(encoding, options)
     if view is not None:
         with suppress(OptionError, EncoderRefusedError):
@@ -238,14 +256,17 @@ def _lossless_plans(
                 gop=options.group_frames,
                 threads=threads,
                 codec=codec,
-                preset=options.preset if codec else None,
+                preset=options.preset if asked else None,
                 purpose=options.purpose,
             )
-            if both.bytes_per_frame <= _LARGER * best.bytes_per_frame:
+            is_small = both.bytes_per_frame <= _LARGER * least
+            if is_small or options.asks_for_views:
                 best, plan = both, TrackPlan(both, view, note=note)
-    _refuse_noise(samples, best.bytes_per_frame)
+                if is_small:
+                    least = both.bytes_per_frame
+    _refuse_noise(samples, least)
     if codec is None:
-        _refuse_few(samples, best.bytes_per_frame)
+        _refuse_few(samples, least)
     if plan.view is None and best.layout.name == encoding.general:
         return [plan]
     return [plan, _general_plan(samples[0].key, options)]
@@ -253,11 +274,17 @@ def _lossless_plans(
 
 def _view_coding(encoding: Encoding, options: PackOptions) -> Coding | None:
     """How the view of lossless images is encoded; None without a view."""
-    if encoding.lossy is None:
+    if encoding.lossy is None or options.view == NO_VIEW:
         return None
-    layout = layout_for(encoding, lossless=False)
+    layout, codec = layout_for(encoding, lossless=False), options.view or DEFAULT_LOSSY
     preset = PURPOSE_PRESET if options.purpose else VIEW_PRESET
-    recipe = recipe_for(layout.pixel_format, lossless=False, crf=VIEW_CRF, preset=preset)
+    recipe = recipe_for(
+        layout.pixel_format,
+        lossless=False,
+        codec=codec,
+        crf=VIEW_CRF,
+        preset=preset if codec in AV1 else None,
+    )
     gop = LOSSY_TRAINING_GOP if options.purpose == TRAINING else LOSSY_GOP
     return Coding(layout, recipe, gop)
 

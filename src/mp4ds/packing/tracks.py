@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import EncoderRefusedError, Refused
 from mp4ds.format.models import Color, LayoutParameters
 from mp4ds.format.models import Quality as Measured
-from mp4ds.messages.encodings import ENCODINGS, Pixels, difference, native
+from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, difference, native
 from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage
 from mp4ds.packing.windows import WindowCoder, out_of_reach, window_frames
@@ -32,8 +32,11 @@ from mp4ds.video.codecs import (
     lossless_codecs,
     recipe_for,
 )
+from mp4ds.video.decoder import PacketPictures
 from mp4ds.video.encoder import Coding, Predictor, VideoEncoder
 from mp4ds.video.packets import PacketWriter, join_segments
+
+_GREY = 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +45,8 @@ class TrackPlan:
 
     Attributes:
         coding: How its pictures are encoded; None to copy packets.
-        view: How those of a view are, whose images the pictures are the differences to; None
-            without a view.
+        view: How those of a view are, whose images the pictures are the differences to, or which
+            shows what the packets do; None without a view.
         profile: The profile in its sidecar.
         target: The score that its pictures have to reach, if there is one.
         note: What the user should know about it; empty if nothing.
@@ -134,8 +137,10 @@ def open_track(
     Raises:
         Refused: The encoder does not support such pictures.
     """
-    if plan.coding is None:
+    if plan.coding is None and plan.view is None:
         return _CopiedTrack(path, seen, rate, plan.note)
+    if plan.coding is None:
+        return _ViewedTrack(path, view_path, plan, seen, threads, rate)
     size = seen.key.width, seen.key.height
     if plan.view is not None:
         return _PredictedTrack(path, view_path, plan, seen, threads, rate)
@@ -357,6 +362,71 @@ class _PredictedTrack(Track):
 
     def describe(self) -> dict[str, Any]:
         return {**self._own.describe(), "color": None}
+
+
+class _ViewedTrack(Track):
+    """Packets as they came, and a view of what they show.
+
+    Each has a frame there. One that cannot be decoded is shown as the picture before it, or grey.
+    """
+
+    view: _EncodedTrack
+
+    def __init__(
+        self,
+        path: Path,
+        view_path: Path,
+        plan: TrackPlan,
+        seen: CameraMessage,
+        threads: int,
+        rate: float | None,
+    ) -> None:
+        if plan.view is None:
+            raise ValueError("a plan without a view")
+        key, layout = seen.key, plan.view.layout
+        size = key.width, key.height
+        self.view = _EncodedTrack(view_path, plan.view, size, threads, rate, "")
+        self._own = _CopiedTrack(path, seen, rate, plan.note)
+        self.note = plan.note
+        self._pictures = PacketPictures(key.codec, layout.pixel_format, size)
+        encoding = layout.encoding
+        self._shown: Pixels = np.full(encoding.shape(*size), _GREY, encoding.dtype)
+        self._due: deque[int] = deque()  # ticks of frames that are not in the view yet
+        self._done = 0
+
+    def refuses(self, seen: CameraMessage) -> str | None:
+        return self._own.refuses(seen)
+
+    def write(self, seen: CameraMessage, tick: int) -> None:
+        self._own.write(seen, tick)
+        self._due.append(tick)
+        parameters = seen.parameters if seen.keyframe else b""
+        self._show(self._pictures.of(seen.parts.body, parameters))
+
+    def _show(self, pictures: Iterator[tuple[int, Picture]]) -> None:
+        for number, (pixels,) in pictures:
+            self._encode(number - self._done)  # no pictures came of these
+            self._shown = pixels
+            self._encode(1)
+
+    def _encode(self, frames: int) -> None:
+        """Encode the last picture as the next so many frames."""
+        for _ in range(frames):
+            self.view.encode(self._shown, self._due.popleft())
+            self._done += 1
+
+    def close(self) -> None:
+        self._show(self._pictures.rest())
+        self._encode(len(self._due))
+        self.view.close()
+        self._own.close()
+
+    def abandon(self) -> None:
+        self.view.abandon()
+        self._own.abandon()
+
+    def describe(self) -> dict[str, Any]:
+        return self._own.describe()
 
 
 def _recipes(coding: Coding) -> Iterator[Recipe]:

@@ -56,7 +56,7 @@ class _Files:
             if file is None:
                 yield from files_of(part, marked(self.is_kept))
                 return
-            is_strict = part.sidecar.body != "packet"
+            is_strict = not part.sidecar.keeps_packets
             choice, scale = marked(self.is_kept), self.view.scale
             for index, picture in part.pictures(choice, scale, is_strict=is_strict):
                 made = None

@@ -482,7 +482,7 @@ class Conversion:
             stream.verify_pictures()
         with ExitStack() as files:
             packets = None
-            is_strict = stream.sidecar.body != "packet"
+            is_strict = not stream.sidecar.keeps_packets
             for index, picture in stream.pictures(choice, scale, is_strict=is_strict):
                 if picture is not None:
                     view, make = self._makers[stream.columns.variant[index]]

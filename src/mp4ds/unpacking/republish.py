@@ -90,6 +90,7 @@ def _resized(
 # ---------------------------------------------------------------- republisher
 
 _NOT_DECODED = "its picture cannot be decoded"
+_OTHER_FORMS = "Use `images` raw, jpeg or png."
 _REFERS = "video packets depend on each other, so none can be left out; use another form"
 
 
@@ -265,14 +266,15 @@ class Republisher:
 
     def _plan(self, stream: Stream) -> _Plan:
         size = self._reduction.size_of(stream)
-        kind = self._kind or (_kind_of(stream) if size else "")
+        is_replaced = stream.sidecar.replaces_packets
+        kind = self._kind or (_kind_of(stream, self._reduction) if size or is_replaced else "")
         is_kept = None
         if self._reduction.leaves_out:
             is_kept = self._reduction.kept(stream.columns)
         if kind:
             is_done = self._is_done(stream, kind)
             try:
-                if not is_done or size:
+                if not is_done or size or is_replaced:
                     world = self._world
                     if is_done and stream.channel.message_encoding != ENCODINGS[world]:
                         world = "ros2" if world == "ros1" else "ros1"
@@ -281,6 +283,9 @@ class Republisher:
                 if is_kept is None:
                     raise Refused(f"they are already {KINDS[kind].noun}")
             except Refused as reason:
+                if is_replaced:
+                    problem = f"its view has no such form: {reason}"
+                    raise ConversionError(stream.topic, problem, _OTHER_FORMS) from None
                 self.as_recorded[stream.topic][str(reason)] += stream.count(is_kept)
         if is_kept is not None and _refers(stream):
             self.as_recorded[stream.topic][_REFERS] += stream.count()
@@ -420,21 +425,23 @@ def check_kind(kind: str | None, options: ReductionOptions) -> None:
         )
 
 
-def _kind_of(stream: Stream) -> str:
-    """The kind of a stream's images, or what they become if that kind cannot be resized."""
+def _kind_of(stream: Stream, reduction: ReductionOptions) -> str:
+    """The kind of a stream's images, or what they become if that kind cannot be reduced."""
     sidecar = stream.sidecar
     if sidecar.body == "jpeg" or stream.are_jpeg_files:
         return "jpeg"
     if sidecar.body in ("png", "rvl"):
         is_metres = any(is_inverse_depth(sidecar, header) for header in sidecar.headers)
         return "raw" if is_metres else "png"
-    is_png = sidecar.body == "packet" and sidecar.video.codec == "png"
-    return "png" if is_png else "raw"
+    if sidecar.replaces_packets and not reduction.reduces:
+        name = stream.channel.type_name.replace(".", "/").rpartition("/")[2]
+        return next(kind for kind, own in KINDS.items() if own.type_name.endswith(f"/{name}"))
+    return "raw"
 
 
 def _refers(stream: Stream) -> bool:
     """Whether a stream has messages that are useless without earlier ones."""
-    if stream.sidecar.body != "packet":
+    if not stream.sidecar.keeps_packets:
         return False
     with stream.open_packets() as reader:
         return not all(reader.keyframes)

@@ -197,7 +197,7 @@ def _unpack_here(
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
             part = slice_of(whole, chosen.slice, chosen.selected)
-            if to == "images" or chosen.images or chosen.reduces:
+            if to == "images" or chosen.images or chosen.reduces or _has_replaced(whole, chosen):
                 # whose frames are counted from the slice's first one
                 with sliced(whole, part, path.parent, chosen.selected) as opened:
                     if to == "images":
@@ -236,6 +236,12 @@ def _opened(
     if layer is None:
         opened.require_exact(selected)
     return opened, losses
+
+
+def _has_replaced(dataset: Dataset, options: UnpackOptions) -> bool:
+    """Whether some selected messages hold packets of a view instead of those recorded."""
+    chosen = (stream for stream in dataset.streams if options.selected(stream.topic))
+    return any(stream.sidecar.replaces_packets for stream in chosen)
 
 
 def _needs_messages(dataset: Dataset, options: UnpackOptions) -> bool:

@@ -20,7 +20,7 @@ from mp4ds.files.ranges import expect
 from mp4ds.messages.encodings import Picture, Pixels
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded import StreamParser, UnknownStructure
-from mp4ds.video.decoder import JpegDecoder, VideoDecoder, VideoFile
+from mp4ds.video.decoder import JpegDecoder, VideoDecoder, VideoFile, open_packet_decoder
 from mp4ds.video.media import raise_if_scarce
 from mp4ds.video.mp4 import SampleTable, read_sample_table
 from mp4ds.video.pixels import PictureMaker, Scale
@@ -422,21 +422,16 @@ class FrameReader:
         return chain
 
     def _new_context(self) -> Any:
+        entry = self.table.entry
+        size = entry.width, entry.height
         if self._codec == "mjpeg":
             return JpegDecoder(self._maker.coded_size)
-        context: Any = av.CodecContext.create(CODECS[self._codec].decoder, "r")
-        entry = self.table.entry
-        if entry.configuration:
-            context.extradata = entry.configuration
-        context.width, context.height = entry.width, entry.height
+        context = open_packet_decoder(self._codec, size, entry.configuration)
         if entry.colour:
             entry.colour.apply(context)
-        context.thread_count = 1
-        context.thread_type = "SLICE"
-        # concealed damage would depend on which frames were decoded before
-        context.options = {"err_detect": "explode"}
-        if self._codec == "av1":
-            context.options = {"max_frame_delay": "1"}
+        if self._codec != "av1":
+            # concealed damage would depend on which frames were decoded before
+            context.options = {"err_detect": "explode"}
         return context
 
     def _announce(self, samples: Iterable[int]) -> None:

@@ -7,7 +7,7 @@ import io
 import os
 import struct
 from collections.abc import Iterable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -87,6 +87,80 @@ class JpegDecoder:
 
     def flush_buffers(self) -> None:
         """There is nothing to forget."""
+
+
+def open_packet_decoder(codec: str, size: tuple[int, int], configuration: bytes = b"") -> Any:
+    """A decoder that is given packets one by one, on one thread.
+
+    Args:
+        codec: Name in the registry.
+        size: Width and height of the frames.
+        configuration: What it needs besides the packets.
+    """
+    if codec == "mjpeg":
+        return JpegDecoder(size)
+    context: Any = av.CodecContext.create(CODECS[codec].decoder, "r")
+    context.width, context.height = size
+    context.thread_count = 1
+    context.thread_type = "SLICE"
+    if configuration:
+        context.extradata = configuration
+    if codec == "av1":
+        context.options = {"max_frame_delay": "1"}
+    return context
+
+
+class PacketPictures:
+    """Pictures of packets that come one by one, as messages hold them.
+
+    Args:
+        codec: Name in the registry.
+        picture_format: Pixel format of the pictures wanted.
+        size: Their width and height.
+    """
+
+    def __init__(self, codec: str, picture_format: str, size: tuple[int, int]) -> None:
+        self._parser = CODECS[codec].parser
+        self._decoder = open_packet_decoder(codec, size)
+        self._maker = PictureMaker(
+            Path(),
+            coded_size=size,
+            picture_format=picture_format,
+            picture_size=size,
+            matrix=None,
+        )
+        self._count = 0
+
+    def of(self, body: bytes | memoryview, parameters: bytes) -> Iterator[tuple[int, Picture]]:
+        """The pictures that are complete with one more packet, each with its number.
+
+        Of one that cannot be decoded there is none. The numbers increase.
+
+        Args:
+            body: As the message holds it.
+            parameters: What decoding needs first, of a key frame; see `StreamParser.parameters`.
+        """
+        data = self._parser.plain(body)
+        if not self._parser.has_parameters(data):
+            data = parameters + data
+        packet: Any = av.Packet(data)
+        packet.pts = self._count
+        self._count += 1
+        return self._decoded(packet)
+
+    def rest(self) -> Iterator[tuple[int, Picture]]:
+        """The pictures that are complete with the end."""
+        return self._decoded(None)
+
+    def _decoded(self, packet: Any) -> Iterator[tuple[int, Picture]]:
+        try:
+            frames = self._decoder.decode(packet)
+        except FFmpegError as error:
+            raise_if_scarce(error)
+            return
+        for frame in frames:
+            with suppress(VideoError):  # marked as corrupt, or of another size
+                yield frame.pts, self._maker.make(frame, frame.pts)
 
 
 # ---------------------------------------------------------------- decoder

@@ -21,7 +21,6 @@ from mp4ds.messages.encodings import MAX_SIDE, Encoding, Picture, Pixels, differ
 from mp4ds.messages.layouts import Layout, fit, layout_for
 from mp4ds.video.codecs import (
     ARCHIVE,
-    CODECS,
     TRAINING,
     Recipe,
     codecs_to_try,
@@ -29,6 +28,7 @@ from mp4ds.video.codecs import (
     recipe_for,
 )
 from mp4ds.video.colour import samples
+from mp4ds.video.decoder import open_packet_decoder
 from mp4ds.video.media import TIME_BASE, new_mp4, raise_if_scarce, rate_hint
 from mp4ds.video.pixels import PictureConverter, PictureMaker, picture_to_frame, plain_frame
 
@@ -384,18 +384,11 @@ class Predictor:
         )
         encoding = self._layout.encoding
         self._shape, self._type = encoding.shape(*size), encoding.dtype
-        context: Any = av.CodecContext.create(CODECS[recipe.codec].decoder, "r")
-        context.width, context.height = width, height
-        context.thread_count = 1
-        if configuration:
-            context.extradata = configuration
-        if recipe.codec == "av1":
-            context.options = {"max_frame_delay": "1"}
-        self._context = context
+        self._decoder = open_packet_decoder(recipe.codec, (width, height), configuration)
 
     def images(self, packet: bytes | None) -> Iterator[Pixels]:
         """The images that are complete with one more packet; None: those still due at the end."""
-        for frame in self._context.decode(av.Packet(packet) if packet is not None else None):
+        for frame in self._decoder.decode(av.Packet(packet) if packet is not None else None):
             pixels: Pixels = np.empty(self._shape, self._type)
             self._layout.to_pixels(self._maker.make(frame, 0), pixels)
             yield pixels

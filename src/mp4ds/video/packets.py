@@ -182,6 +182,21 @@ def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
     return probe
 
 
+def packet_format(codec: str, parameters: bytes, body: bytes | memoryview) -> str:
+    """The pixel format of what packets show, by ffmpeg's name; empty if that is unknown.
+
+    Args:
+        codec: As for `PacketWriter`.
+        parameters: As for `PacketWriter`.
+        body: The first message's packet, a key frame.
+    """
+    try:
+        with _probe(codec, parameters, CODECS[codec].parser.plain(body)) as probe:
+            return pixel_format_of(probe.streams.video[0].codec_context)
+    except Refused:
+        return ""
+
+
 class PacketReader:
     """The packets of an mp4's video track. A context manager.
 

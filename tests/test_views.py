@@ -1,0 +1,309 @@
+"""Views of streams: which ones get one, what it shows, and what is left without the exact video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+import mp4ds
+from coded_scenes import CODED, FRAMES, ODD
+from commands import call, refused, unchanged
+from compare import compare
+from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
+from in_parts import InlineExecutor, use
+from mp4ds.errors import Mp4dsError, OptionError
+from mp4ds.format.models import StreamSidecar
+from mp4ds.packing.options import PackOptions
+from mp4ds.unpacking.unpack import UnpackOptions
+from round_trips import journey, unpacked
+from sources import SOURCES, scene
+
+ROS2 = "mcap-ros2-zstd"
+RAW = "/cam/image_raw"
+VISUAL = UnpackOptions(quality="visual")
+
+
+@pytest.fixture(autouse=True)
+def executor(monkeypatch: pytest.MonkeyPatch) -> InlineExecutor:
+    return use(monkeypatch, InlineExecutor())
+
+
+def sidecars(dataset: Path) -> list[StreamSidecar]:
+    with mp4ds.open(dataset) as opened:
+        return [stream.sidecar for stream in opened.streams]
+
+
+def codecs(dataset: Path) -> list[str | None]:
+    """The codec of each stream's view."""
+    return [one.view and one.view.codec for one in sidecars(dataset)]
+
+
+def remove_exact(dataset: Path) -> int:
+    """Leave the views; returns how many files are gone."""
+    found = list(dataset.glob("*.exact.mp4"))
+    for path in found:
+        path.unlink()
+    return len(found)
+
+
+def distances(dataset: Path) -> Iterator[float]:
+    """How much the view of each frame that can be decoded differs from it, on average."""
+    with mp4ds.open(dataset) as opened:
+        for stream in opened.streams:
+            exact = dict(pixels_of(stream))
+            shown = dict(pixels_of(stream.in_layer("view")))
+            assert [*shown] == [*range(len(stream))]
+            for index, pixels in exact.items():
+                yield float(np.abs(pixels.astype(float) - shown[index]).mean())
+
+
+def pixels_of(stream: Any) -> Iterator[tuple[int, Any]]:
+    for index, picture in stream.pictures(is_strict=False):
+        if picture is not None:
+            yield index, stream.recorded_pixels(picture)
+
+
+# ---------------------------------------------------------------- which streams get one
+
+VIEWED = [
+    *("jpeg-rgb", "jpeg-gray", "jpeg-420", "jpeg-422", "jpeg-444", "jpeg-progressive"),
+    *("jpeg-no-huffman-tables", "jpeg-mixed-sizes", "jpeg-exif-trailing", "jpeg-corrupt-one"),
+    *("video-h265", "video-vp9", "video-h264-headers-apart", "video-h264-resized"),
+    *("video-h264-mid-gop", "video-h264-lost", "video-av1-lost", "ffmpeg-libx265"),
+    *("ffmpeg-hevc-yuv420p-bgr8-rgb8", "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"),
+]
+
+
+@pytest.mark.one_in(3)
+@pytest.mark.parametrize("view", ["av1", "h264"])
+@pytest.mark.parametrize("kind", VIEWED)
+def test_what_arrives_coded_has_a_view_if_asked(kind: str, view: str, tmp_path: Path) -> None:
+    made = journey(tmp_path, SOURCES[ROS2], CODED[kind](), "mcap", view=view)
+    own = view if not kind.startswith(f"video-{view}") else None
+    assert set(codecs(made.dataset)) == {own}
+    if own:
+        assert len(list(made.dataset.glob("*.exact.mp4"))) == len(codecs(made.dataset))
+        assert max(distances(made.dataset)) < 12
+    remade = tmp_path / "without"
+    mp4ds.pack(made.sources, remade, PackOptions())
+    assert set(codecs(remade)) == {None}
+    exact = {path.name: path.read_bytes() for path in remade.glob("*.mp4")}
+    kept = made.dataset.glob("*.exact.mp4" if own else "*.mp4")
+    # the packets are those without a view
+    assert {path.name.replace(".exact", ""): path.read_bytes() for path in kept} == exact
+
+
+def without_tables(data: bytes) -> bytes:
+    """A JPEG whose Huffman tables have more codes than there can be."""
+    start = data.index(b"\xff\xc4") + 5
+    return data[:start] + b"\xff" * 16 + data[start + 16 :]
+
+
+@pytest.mark.parametrize("odd", [0, ODD])
+def test_what_cannot_be_decoded_shows_the_picture_before(odd: int, tmp_path: Path) -> None:
+    recorded = CODED["jpeg-gray"]()
+    own = [record for record in recorded.messages if record.topic == f"{RAW}/compressed"]
+    own[odd].values["data"] = without_tables(own[odd].values["data"])
+    made = journey(tmp_path, SOURCES[ROS2], recorded, "mcap", view="h264")
+    with mp4ds.open(made.dataset, layer="view") as opened:
+        frames = opened[f"{RAW}/compressed"].read(range(FRAMES)).astype(float)
+    before = frames[odd - 1] if odd else 128
+    assert np.abs(frames[odd] - before).mean() < 3
+    assert np.abs(frames[odd] - frames[odd + 1]).mean() > 5
+
+
+@pytest.mark.parametrize(
+    ("kind", "view"),
+    [
+        ("video-av1", "av1"),
+        ("video-av1-no-delimiter", "av1"),
+        ("ffmpeg-libsvtav1", "av1"),
+        ("video-h264", "h264"),
+        ("ffmpeg-libx264", "h264"),
+    ],
+)
+def test_packets_that_play_need_no_view(kind: str, view: str, tmp_path: Path) -> None:
+    made = journey(tmp_path, SOURCES[ROS2], CODED[kind](), "mcap", view=view)
+    assert codecs(made.dataset) == [None]
+    notes = [note for topic in made.summary.topics for note in topic.notes]
+    assert notes == [f"its own packets are {view} that plays: it needs no view"]
+
+
+@pytest.mark.parametrize("kind", ["jpeg-rgb", "video-h265", "video-av1"])
+@pytest.mark.parametrize("source", FOXGLOVE_SOURCES)
+def test_foxglove(kind: str, source: str, tmp_path: Path) -> None:
+    made = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE[kind](), "mcap", view="h264")
+    assert codecs(made.dataset) == ["h264"]
+
+
+SINGLE: dict[str, Any] = {"view": "none"}
+CAMERAS = {
+    "asked": (scene("mono8"), {"view": "av1"}, "av1"),
+    "h264": (scene("bgr8"), {"view": "h264"}, "h264"),
+    "its codec is of the exact video": (scene("mono8"), {"view": "av1", "codec": "ffv1"}, "av1"),
+    "larger": (scene("rgb8", noisy=False), {"view": "av1"}, "av1"),
+    "none": (scene("bayer_rggb8"), SINGLE, None),
+    "a measurement": (scene("16UC1"), {"view": "av1"}, None),
+    "png": (CODED["png-gray-pillow"](), {"view": "av1"}, "av1"),
+}
+
+
+@pytest.mark.parametrize("case", CAMERAS)
+def test_pixels_have_a_view_if_asked(case: str, tmp_path: Path) -> None:
+    recorded, options, view = CAMERAS[case]
+    made = journey(tmp_path, SOURCES[ROS2], recorded, "mcap", **options)
+    assert codecs(made.dataset) == [view]
+    (sidecar,) = sidecars(made.dataset)
+    assert sidecar.video.codec == options.get("codec", sidecar.video.codec)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            {"view": "av1", "quality": "visual"},
+            "`view` is for lossless packing: with `qual",
+        ),
+        ({"view": "h264", "quality": "psnr=40"}, "`quality` psnr=40, the videos are what a view"),
+        ({"view": "av1", "purpose": "speed"}, "`purpose` speed encodes nothing twice"),
+        ({"view": "vp9"}, "`view` 'vp9' is not known. Use av1, h264, none"),
+    ],
+)
+def test_where_there_are_no_views(options: dict[str, Any], words: str, tmp_path: Path) -> None:
+    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"](frames=2))
+    with unchanged(tmp_path), pytest.raises(OptionError, match=words):
+        mp4ds.pack(source, tmp_path / "dataset", PackOptions(**options))
+
+
+@pytest.mark.parametrize(
+    ("words", "view"),
+    [
+        ((), None),
+        (("--view",), "av1"),
+        (("--view", "h264"), "h264"),
+        (("--view=h264",), "h264"),
+        (("--view", "none"), None),
+        (("--view", "none", "--quality", "visual"), None),
+    ],
+)
+def test_the_command(words: tuple[str, ...], view: str | None, tmp_path: Path) -> None:
+    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"](frames=2))
+    done = call("pack", *words, source, "-o", tmp_path / "dataset")
+    assert done.code == 0, done.err
+    assert codecs(tmp_path / "dataset") == [view]
+
+
+def test_the_command_refuses(tmp_path: Path) -> None:
+    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"](frames=2))
+    pack = ("pack", source, "-o", tmp_path / "x", "--view")
+    refused(call(*pack, "--for", "speed"), 2, "--for speed encodes nothing twice")
+    refused(call(*pack[:-1], "--view=mpeg"), 2, "--view 'mpeg' is not known. Use av1, h264, none")
+
+
+# ---------------------------------------------------------------- without the exact video
+
+ALONE = {
+    "jpeg-rgb": "jpeg",
+    "jpeg-gray": "jpeg",
+    "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8": "jpeg",
+    "video-h265": "packet",
+    "video-h264": "packet",
+    "video-vp9": "packet",
+    "ffmpeg-libx265": "packet",
+    "png-gray-pillow": "png",
+}
+"""Kind -> what the bodies of its messages are where only the view is left."""
+
+
+@pytest.fixture(params=ALONE)
+def alone(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
+    """A dataset of views alone, and its kind."""
+    (source,) = SOURCES[ROS2](tmp_path / "source", CODED[request.param]())
+    mp4ds.pack(source, tmp_path / "dataset", PackOptions(view="av1"))
+    assert remove_exact(tmp_path / "dataset") == 1
+    return tmp_path / "dataset", request.param
+
+
+def test_views_alone_are_a_dataset(alone: tuple[Path, str], tmp_path: Path) -> None:
+    dataset, kind = alone
+    assert mp4ds.validate(dataset, deep=True) == []
+    with mp4ds.open(dataset) as opened:
+        (stream,) = opened.streams
+        assert (stream.layer, stream.sidecar.body) == ("view", ALONE[kind])
+        (topic,) = opened
+        assert topic.read([0, -1]).shape[0] == 2
+        with pytest.raises(OptionError, match=r"missing\. Copy it to .*, or read the layer 'view'"):
+            topic.read([0], layer="exact")
+    for command in (("info", dataset), ("validate", "--deep", dataset), ("report", dataset)):
+        done = call(*command)
+        assert done.code == 0, done.err
+    for command in (("unpack", dataset), ("pack", dataset, "-o", tmp_path / "x")):
+        refused(call(*command), 2, "has views only (exact layer not here: 1 file", "--quality vis")
+
+
+def messages(recording: Path, topic: str) -> list[Any]:
+    with recording.open("rb") as stream:
+        found = make_reader(stream).iter_messages(topics=[topic])
+        return [(schema.name, message.data) for schema, _, message in found]
+
+
+@pytest.mark.parametrize("images", [None, "raw", "jpeg", "png", "compressed-video", "ffmpeg"])
+def test_views_alone_are_unpacked(
+    alone: tuple[Path, str], images: str | None, tmp_path: Path
+) -> None:
+    dataset, kind = alone
+    with mp4ds.open(dataset) as opened:
+        (topic,) = opened.topics
+        channel = opened.streams[0].channel
+        shown = opened[topic].read(range(FRAMES), format="gray").astype(float)
+    output = tmp_path / "again.mcap"
+    options = UnpackOptions(quality="visual", images=images)
+    summary = mp4ds.unpack(dataset, output=output, options=options)
+    made = topic if topic not in summary.republished else summary.republished[topic].topic
+    found = messages(output, made)
+    assert len(found) == FRAMES
+    if images is None:
+        assert {name for name, _ in found} == {channel.type_name}
+        assert not summary.as_recorded
+    mp4ds.pack(output, tmp_path / "once more", PackOptions())
+    with mp4ds.open(tmp_path / "once more") as opened:
+        again = opened[made].read(range(FRAMES), format="gray").astype(float)
+        sidecar = opened.streams[0].sidecar
+    assert np.abs(again - shown).mean() < 2
+    if ALONE[kind] == "packet" and images is None:
+        assert sidecar.video.codec == "av1"
+        assert all("av1" in str(header.format) for header in sidecar.headers)
+        if channel.type_name.endswith("FFMPEGPacket"):
+            assert {header.format for header in sidecar.headers} == {"av1;yuv420p;bgr8;rgb8"}
+
+
+def test_a_slice_of_views_alone(alone: tuple[Path, str], tmp_path: Path) -> None:
+    dataset, kind = alone
+    output = tmp_path / "slice.mcap"
+    options = UnpackOptions(quality="visual", duration="0.15")
+    mp4ds.unpack(dataset, output=output, options=options)
+    with mp4ds.open(dataset) as opened:
+        (topic,) = opened.topics
+    assert 0 < len(messages(output, topic)) < FRAMES
+    later = UnpackOptions(quality="visual", start="0.15")
+    if ALONE[kind] != "packet":
+        mp4ds.unpack(dataset, output=output, options=replace(later, force=True))
+        return
+    words = f"topic {topic}.*first packets of the slice depend.*Use `images` raw, jpeg or png"
+    with unchanged(tmp_path), pytest.raises(Mp4dsError, match=words):
+        mp4ds.unpack(dataset, output=tmp_path / "later.mcap", options=later)
+
+
+def test_putting_the_exact_video_back(alone: tuple[Path, str], tmp_path: Path) -> None:
+    dataset, _ = alone
+    mp4ds.pack(tmp_path / "source" / "drive.mcap", tmp_path / "again", PackOptions(view="av1"))
+    (exact,) = (tmp_path / "again").glob("*.exact.mp4")
+    exact.rename(dataset / exact.name)
+    assert mp4ds.validate(dataset, deep=True) == []
+    assert compare([tmp_path / "source" / "drive.mcap"], unpacked(tmp_path, "mcap")) == []
