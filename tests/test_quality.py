@@ -22,7 +22,7 @@ from in_parts import InlineExecutor, leftovers, use
 from mp4ds import yamlio
 from mp4ds.bags.formats import open_reader
 from mp4ds.errors import ScoringError
-from mp4ds.format.models import Quality
+from mp4ds.format.quality import Quality
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.windows import CrfControl, window_frames
 from mp4ds.plugins.demo import demo

@@ -51,11 +51,11 @@ from mp4ds.format.models import (
     Calibration,
     CameraInfo,
     Header,
-    Quality,
     StreamSidecar,
     exact_name,
     video_facts,
 )
+from mp4ds.format.quality import Quality
 from mp4ds.format.sidecars import MANIFEST_NAME, FileNames, dump_document, verify_file
 from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.records import (

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import EncoderRefusedError, Refused
 from mp4ds.format.models import Color, LayoutParameters
-from mp4ds.format.models import Quality as Measured
+from mp4ds.format.quality import Quality as Measured
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, difference, native
 from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage
