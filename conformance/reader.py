@@ -110,6 +110,12 @@ def decoded(path, side, video):
     return found, packets, pictures
 
 
+def used_bits(view, patterns):
+    """Of the samples of images that a view predicts."""
+    told = view.get("parameters", {})
+    return told["bits"] + told["shift"] if "bits" in told else 8 * patterns.itemsize
+
+
 def hashes_of(images):
     """Of the pixels of images, little-endian."""
     return [sha256(one.astype(one.dtype.newbyteorder("<")).tobytes()) for one in images]
@@ -126,7 +132,9 @@ def messages(path, side, found, packets, pictures, predicted):
         else:
             patterns = pixels(image, video, pictures[n])
             if predicted:
-                patterns = patterns + predicted[n] - np.uint8(128)  # modulo 256
+                bits = used_bits(side["view"], patterns)
+                whole = patterns.astype(np.int64) + predicted[n] - 2 ** (bits - 1)
+                patterns = (whole % 2**bits).astype(patterns.dtype)
             hashes += hashes_of([patterns])
             if kind == "pixels":
                 big_endian = bool(image["is_bigendian"])

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shutil
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 
 import conformance_dump
 import documents
@@ -20,6 +23,7 @@ import run
 from commands import program
 from mp4ds.format.fields import FORMAT_VERSION, Body
 from mp4ds.format.models import VIDEO_CODECS
+from mp4ds.format.sidecars import MIGRATIONS
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.messages.serializations import WIRES
 
@@ -50,6 +54,32 @@ def test_mp4ds_reads_what_is_expected(case: Case) -> None:
         warnings.simplefilter("ignore")  # of newer minor versions
         found = json.loads(conformance_dump.as_json(conformance_dump.dump(CASES / case["path"])))
     assert found == (expected(case) if "expected" in case else {"problems": case["problems"]})
+
+
+DATASETS = [case for case in LISTED["cases"] if case["path"].startswith("datasets/")]
+
+
+@pytest.mark.parametrize("case", DATASETS, ids=lambda case: case["path"])
+def test_datasets_of_all_versions_are_unpacked(case: Case, tmp_path: Path) -> None:
+    """Their files are those of the versions that they say, and are never written again."""
+    options = None if "views-alone" not in case["path"] else mp4ds.UnpackOptions(quality="visual")
+    mp4ds.unpack(CASES / case["path"], "mcap", tmp_path / "again.mcap", options)
+    found = Counter[tuple[str, str]]()
+    with (tmp_path / "again.mcap").open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            found[channel.topic, hashlib.sha256(message.data).hexdigest()] += 1
+    made = expected(case)
+    assert found.total() == int(made["manifest"]["messages"])
+    for stream in made["streams"]:
+        if stream["payloads"] and options is None:
+            due = Counter((stream["topic"], payload) for payload in stream["payloads"])
+            assert due <= found
+
+
+def test_there_are_datasets_of_all_versions() -> None:
+    texts = [(CASES / case["path"] / "dataset.yaml").read_text() for case in DATASETS]
+    found = {re.findall('^mp4ds: "(.*)"$', text, re.MULTILINE)[0] for text in texts}
+    assert found == {*MIGRATIONS, FORMAT_VERSION} - {"0"}  # which had no datasets
 
 
 def test_null_means_absent(tmp_path: Path) -> None:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import itertools
 import json
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 import yaml
@@ -22,11 +26,14 @@ import mp4ds
 import reader
 import run
 from coded_scenes import CODED
+from commands import program
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds import yamlio
 from mp4ds.errors import FormatError
 from mp4ds.messages.encodings import ENCODINGS, Encoding
-from mp4ds.messages.layouts import LAYOUTS, fit
+from mp4ds.messages.layouts import LAYOUTS, fit, layout_for
+from mp4ds.video.colour import MATRICES, samples
+from mp4ds.video.pixels import PictureMaker
 from pixel_kinds import made_of
 from scenes import Scene, odd_scene, scene
 from sources import SOURCES
@@ -144,6 +151,75 @@ def test_every_exact_layout_is_what_the_spec_says(size: tuple[int, int]) -> None
                 assert np.array_equal(found, expected), f"{layout_name} of {name}"
     odd = {f"from_{name}" for name in {"yuv420", "yuv422"} - {*sources_of(*size)}}
     assert seen == {name for name, kind in LAYOUTS.items() if kind.is_exact} - odd
+
+
+LOSSY = [name for name, encoding in ENCODINGS.items() if encoding.lossy]
+SIZES = [(2, 2), (7, 5), (40, 31)]
+
+
+@pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv420p10le"])
+@pytest.mark.parametrize("matrix", MATRICES)
+@pytest.mark.parametrize("color_range", ["full", "limited"])
+def test_every_lossy_layout_is_what_the_spec_says(
+    pixel_format: str, matrix: str, color_range: str
+) -> None:
+    """To the bit, since images may be differences to it: of any samples that decoders may give."""
+    rng = np.random.default_rng(5)
+    for name, (width, height) in itertools.product(LOSSY, SIZES):
+        layout = layout_for(ENCODINGS[name], lossless=False)
+        across, down = layout.encoding.even
+        image = {"width": width + -width % across, "height": height + -height % down}
+        picture_size = layout.picture_size(image["width"], image["height"])
+        coded = [side + side % 2 for side in picture_size]
+        frame = av.VideoFrame(*coded, pixel_format)
+        for index in range(3):
+            plane = samples(frame, index)
+            plane[...] = rng.integers(0, 4 * 256 if plane.itemsize > 1 else 256, plane.shape)
+        maker = PictureMaker(
+            Path(),
+            coded_size=(coded[0], coded[1]),
+            picture_format=layout.pixel_format,
+            picture_size=picture_size,
+            matrix=matrix,
+            full_range=color_range == "full",
+        )
+        own = np.empty(layout.encoding.shape(**image), layout.encoding.dtype)
+        layout.to_pixels(maker.make(frame, 0), own)
+        video = {"layout": layout.name, "parameters": layout.parameters.to_values()}
+        video |= {"pixel_format": pixel_format, "color": {"matrix": matrix, "range": color_range}}
+        told = images.pixels({"encoding": name, **image}, video, images.planes_of(frame)[1])
+        assert np.array_equal(told, own.reshape(told.shape)), f"{layout.name} of {name}"
+
+
+SEEN = [
+    (case["path"], stream["view"])
+    for case in CASES
+    if "expected" in case
+    for stream in json.loads((SUITE / "cases" / case["expected"]).read_text())["streams"]
+    if "view" in stream and stream["view"]["codec"] == "av1"
+]
+
+
+@pytest.mark.parametrize("decoder", ["libaom-av1", "libdav1d"])
+@pytest.mark.parametrize(("path", "view"), SEEN, ids=[view["video"] for _, view in SEEN])
+def test_other_decoders_of_views_give_the_same_samples(
+    path: str, view: dict[str, Any], decoder: str
+) -> None:
+    """And so the same predictions, as the test above shows. Those of the system's ffmpeg."""
+    if not shutil.which("ffmpeg") or decoder not in program("ffmpeg", "-v", "0", "-decoders").out:
+        pytest.skip(f"there is no ffmpeg with {decoder}")
+    folder = SUITE / "cases" / path
+    folder = folder if folder.is_dir() else folder.parent
+    name, due = view["planes"]["pixel_format"], view["planes"]["sha256"]
+    command = ["ffmpeg", "-v", "error", "-c:v", decoder, "-i", str(folder / view["video"])]
+    command += ["-vsync", "passthrough", "-f", "rawvideo", "-pix_fmt", name, "-"]
+    found = subprocess.run(command, capture_output=True, check=True).stdout
+    width, height = view["coded_size"]
+    size = width * height * 3 // 2 * (2 if name.endswith("le") else 1)
+    planes = [found[start : start + size] for start in range(0, len(found), size)]
+    # with some decoders, ffmpeg also shows what an edit list hides
+    hashes = [hashlib.sha256(plane).hexdigest() for plane in planes[-len(due) :]]
+    assert hashes == due
 
 
 # ---------------------------------------------------------------- what is packed today

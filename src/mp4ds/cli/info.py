@@ -14,7 +14,7 @@ import click
 from mp4ds.cli.options import argument, command, datasets_argument, jobs_option, option, takes
 from mp4ds.cli.output import number, print_table, progress_of, say, show
 from mp4ds.dataset.checks import Problem, validate
-from mp4ds.dataset.dataset import datasets_in
+from mp4ds.dataset.dataset import Dataset, datasets_in
 from mp4ds.errors import OptionError, SourceError, counted, path_text, size_text
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
@@ -103,13 +103,23 @@ def validate_command(datasets: Sequence[str], deep: bool, jobs: int | None) -> N
             for path, problems in each(partial(validate, deep=deep), places, jobs):
                 found[path] = problems
                 tell(f"{len(found)} of {len(places)} datasets", len(found) / len(places))
-    result = [{"path": path, "deep": deep, "problems": item} for path, item in found.items()]
+    absent = {path: "" if problems else _absence(path) for path, problems in found.items()}
+    result = [
+        {"path": path, "deep": deep, "problems": problems, "absent": absent[path]}
+        for path, problems in found.items()
+    ]
     show(
         result[0] if len(result) == 1 else result,
-        lambda _: _print_validation(found, deep=deep),
+        lambda _: _print_validation(found, absent, deep=deep),
     )
     if any(found.values()):
         raise click.exceptions.Exit(1)
+
+
+def _absence(path: Path) -> str:
+    """Which files of a valid dataset are not here."""
+    with Dataset(path) as dataset:
+        return dataset.absence()
 
 
 def _found(paths: Sequence[str]) -> list[Path]:
@@ -135,10 +145,15 @@ def _print_checksums(found: Mapping[str, str]) -> None:
         say(f"{sha256}  {name}")
 
 
-def _print_validation(found: Mapping[Path, list[Problem]], *, deep: bool) -> None:
-    """Print all problems of datasets, and how thorough the check was."""
+def _print_validation(
+    found: Mapping[Path, list[Problem]], absent: Mapping[Path, str], *, deep: bool
+) -> None:
+    """Print all problems of datasets, what they lack, and how thorough the check was."""
     for problem in chain.from_iterable(found.values()):
         say(path_text(problem))
+    for path, absence in absent.items():
+        if absence:
+            say(f"{path_text(path)}: {absence}")
     count = sum(map(len, found.values()))
     problems = counted(count, "problem") if count else "no problems"
     if not deep:

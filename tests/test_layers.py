@@ -1,0 +1,266 @@
+"""Cameras in two videos: any exact video may be away, and is back when its file is; views may not.
+
+The dataset is one of the conformance suite, so that nothing is packed here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+import mp4ds
+from commands import call
+from edits import agreed, changed, flip
+from mp4ds import FormatError, SourceError, UnpackOptions
+from mp4ds.dataset.dataset import Dataset
+from mp4ds.messages.encodings import ENCODINGS
+
+CASE = Path(__file__).parents[1] / "conformance" / "cases" / "datasets" / "views"
+EXPECTED: list[dict[str, Any]] = json.loads((CASE / "expected.json").read_text())["streams"]
+STEMS = [stream["sidecar"].removesuffix(".yaml") for stream in EXPECTED]
+TOPICS = [stream["topic"] for stream in EXPECTED]
+ONE = STEMS[0]
+AWAY = [[ONE], STEMS[1:3], STEMS]
+VISUAL = UnpackOptions(quality="visual")
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(CASE, tmp_path / "dataset"))
+
+
+def exact(dataset: Path, stem: str) -> Path:
+    return dataset / f"{stem}.exact.mp4"
+
+
+def view(dataset: Path, stem: str) -> Path:
+    return dataset / f"{stem}.mp4"
+
+
+def unpacked(dataset: Path, options: UnpackOptions | None = None) -> dict[str, list[bytes]]:
+    """The payloads of each topic, by log time."""
+    path = dataset.with_name("again.mcap")
+    path.unlink(missing_ok=True)
+    mp4ds.unpack(dataset, "mcap", path, options)
+    found: dict[str, list[bytes]] = {}
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            found.setdefault(channel.topic, []).append(message.data)
+    return found
+
+
+def hashes(payloads: dict[str, list[bytes]]) -> dict[str, list[str]]:
+    return {
+        topic: [hashlib.sha256(payload).hexdigest() for payload in found]
+        for topic, found in payloads.items()
+    }
+
+
+RECORDED = {stream["topic"]: stream["payloads"] for stream in EXPECTED}
+
+
+# ---------------------------------------------------------------- exact videos that are away
+
+
+@pytest.mark.parametrize("stems", AWAY, ids=len)
+def test_any_exact_videos_may_be_away(stems: Sequence[str], dataset: Path) -> None:
+    size = sum(exact(dataset, stem).stat().st_size for stem in stems)
+    for stem in stems:
+        exact(dataset, stem).rename(dataset.parent / f"{stem}.exact.mp4")
+    absence = f"exact layer not here: {len(stems)} file{'s' * (len(stems) > 1)}, {size / 1000:.1f} "
+    for deep in (False, True):
+        assert mp4ds.validate(dataset, deep=deep) == []
+        assert absence in call("validate", dataset, *(["--deep"] if deep else [])).out
+    assert absence in call("info", dataset).out
+    with pytest.raises(SourceError, match=absence) as caught:
+        mp4ds.unpack(dataset, "mcap", dataset.with_name("refused.mcap"))
+    assert "`quality` visual" in str(caught.value)
+    assert not dataset.with_name("refused.mcap").exists()
+    for stem in stems:
+        (dataset.parent / f"{stem}.exact.mp4").rename(exact(dataset, stem))
+    assert "exact layer" not in call("validate", dataset).out
+    assert hashes(unpacked(dataset)) == RECORDED
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_without_it_a_topic_is_what_its_view_shows(topic: str, dataset: Path) -> None:
+    with mp4ds.open(dataset) as whole:
+        shown = whole[topic].read(range(3), format="native", layer="view")
+        recorded = [frame.data.copy() for frame in whole[topic]]
+    exact(dataset, STEMS[TOPICS.index(topic)]).unlink()
+    with mp4ds.open(dataset) as rest:
+        assert rest.streams[TOPICS.index(topic)].sidecar.profile == "visual"
+        seen = [frame.data.copy() for frame in rest[topic]]
+        assert all(one.layer == "exact" for one in rest.streams if one.topic != topic)
+    assert np.array_equal(seen, shown)
+    assert not np.array_equal(seen, recorded)
+
+
+def test_of_views_everything_but_the_pixels_is_unpacked(dataset: Path) -> None:
+    recorded = unpacked(dataset)
+    seen = unpacked(dataset, VISUAL)
+    for stem in STEMS:
+        exact(dataset, stem).unlink()
+    assert unpacked(dataset, VISUAL) == seen
+    for stream in EXPECTED:
+        image, topic = stream["image"], stream["topic"]
+        body = ENCODINGS[image["encoding"]].size(image["step"], image["height"])
+        for one, other in zip(seen[topic], recorded[topic], strict=True):
+            assert one != other
+            assert one[:-body] == other[:-body]
+            assert len(one) == len(other)
+
+
+def test_topics_whose_exact_videos_are_here_are_unpacked(dataset: Path) -> None:
+    exact(dataset, ONE).unlink()
+    found = unpacked(dataset, UnpackOptions(exclude=(TOPICS[0],)))
+    assert hashes(found) == {topic: RECORDED[topic] for topic in TOPICS[1:]}
+
+
+@pytest.mark.parametrize("given", [view, exact])
+def test_a_pair_is_found_by_either_video(
+    given: Callable[[Path, str], Path], dataset: Path, tmp_path: Path
+) -> None:
+    for path in (*dataset.glob(f"{ONE}.*"),):
+        shutil.copy(path, tmp_path)
+    assert mp4ds.validate(given(tmp_path, ONE), deep=True) == []
+    with mp4ds.open(given(tmp_path, ONE)) as opened:
+        assert [topic.topic for topic in opened] == [TOPICS[0]]
+        assert opened.streams[0].layer == "exact"
+    exact(tmp_path, ONE).unlink()
+    assert mp4ds.validate(view(tmp_path, ONE), deep=True) == []
+    with mp4ds.open(view(tmp_path, ONE)) as opened:
+        assert opened.streams[0].layer == "view"
+
+
+# ---------------------------------------------------------------- damage
+
+Damage = Callable[[Path], None]
+
+
+def lost(dataset: Path) -> None:
+    view(dataset, ONE).unlink()
+
+
+def all_lost(dataset: Path) -> None:
+    view(dataset, ONE).unlink()
+    exact(dataset, ONE).unlink()
+
+
+def altered_view(dataset: Path) -> None:
+    flip(view(dataset, ONE))
+
+
+def altered_exact(dataset: Path) -> None:
+    flip(exact(dataset, ONE))
+
+
+def cut_exact(dataset: Path) -> None:
+    path = exact(dataset, ONE)
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def exchanged(dataset: Path) -> None:
+    own, other = exact(dataset, ONE), exact(dataset, STEMS[1])
+    own.rename(dataset / "other")
+    other.rename(own)
+    (dataset / "other").rename(other)
+
+
+def folder_for_exact(dataset: Path) -> None:
+    exact(dataset, ONE).unlink()
+    exact(dataset, ONE).mkdir()
+
+
+def pipe_for_exact(dataset: Path) -> None:
+    exact(dataset, ONE).unlink()
+    os.mkfifo(exact(dataset, ONE))
+
+
+def view_for_exact(dataset: Path) -> None:
+    shutil.copy(view(dataset, ONE), exact(dataset, ONE))
+
+
+DAMAGES: dict[Damage, tuple[str, str]] = {
+    lost: ("file-missing", ".mp4"),
+    all_lost: ("file-missing", ".mp4"),
+    altered_view: ("hash-mismatch", ".mp4"),
+    altered_exact: ("hash-mismatch", ".exact.mp4"),
+    cut_exact: ("size-mismatch", ".exact.mp4"),
+    exchanged: ("size-mismatch", ".exact.mp4"),
+    folder_for_exact: ("file-missing", ".exact.mp4"),
+    pipe_for_exact: ("file-missing", ".exact.mp4"),
+    view_for_exact: ("size-mismatch", ".exact.mp4"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+def test_damage_is_found_and_never_unpacked(damage: Damage, dataset: Path) -> None:
+    damage(dataset)
+    code, suffix = DAMAGES[damage]
+    problems = mp4ds.validate(dataset, deep=True)
+    assert (code, str(dataset / f"{ONE}{suffix}")) in [(one.code, one.place) for one in problems]
+    out = dataset.with_name("again.mcap")
+    with pytest.raises((FormatError, SourceError)):
+        mp4ds.unpack(dataset, "mcap", out)
+    assert not out.exists()
+    rest = unpacked(dataset, UnpackOptions(exclude=(TOPICS[0], TOPICS[1])))
+    assert hashes(rest) == {topic: RECORDED[topic] for topic in TOPICS[2:]}
+
+
+@pytest.mark.parametrize("damage", [lost, altered_view], ids=lambda damage: damage.__name__)
+def test_a_damaged_view_is_not_unpacked_alone(damage: Damage, dataset: Path) -> None:
+    damage(dataset)
+    exact(dataset, ONE).unlink()
+    assert mp4ds.validate(dataset, deep=True) != []
+    with pytest.raises(FormatError):
+        unpacked(dataset, VISUAL)
+
+
+def test_an_exact_video_of_another_stream_is_found_by_digests(dataset: Path) -> None:
+    """Even if all sizes and hashes of files say that it belongs there."""
+    path = dataset / f"{ONE}.yaml"
+    shutil.copy(view(dataset, ONE), exact(dataset, ONE))
+
+    def change(document: dict[str, Any]) -> None:
+        for key in ("size", "sha256", "references"):
+            document["video"].pop(key, None)
+        document["video"] |= {"codec": "av1", "pixel_format": "yuv420p"}
+        document["video"] |= {key: document["view"][key] for key in ("width", "height")}
+
+    changed(path, change)
+    agreed(dataset)
+    codes = {problem.code for problem in mp4ds.validate(dataset, deep=True)}
+    assert codes <= {"digest-mismatch", "codec-mismatch"}
+    assert codes
+    with pytest.raises(FormatError):
+        unpacked(dataset)
+
+
+def test_a_link_to_nothing_is_no_exact_video(dataset: Path) -> None:
+    exact(dataset, ONE).unlink()
+    exact(dataset, ONE).symlink_to(dataset / "nothing.mp4")
+    assert mp4ds.validate(dataset, deep=True) == []
+    with Dataset(dataset) as opened:
+        assert opened.absence().startswith("exact layer not here: 1 file")
+
+
+@pytest.mark.parametrize("entry", [{"view": "other.mp4"}, {"view": None}, {"video": "x.mp4"}])
+def test_a_manifest_that_tells_other_videos(entry: dict[str, str | None], dataset: Path) -> None:
+    def change(manifest: dict[str, Any]) -> None:
+        manifest["streams"][0].update(entry)
+        manifest["streams"][0] = {k: v for k, v in manifest["streams"][0].items() if v}
+
+    changed(dataset / "dataset.yaml", change)
+    assert {one.code for one in mp4ds.validate(dataset)} == {"manifest-inconsistent"}
+    exact(dataset, ONE).unlink()
+    assert "manifest-inconsistent" in {one.code for one in mp4ds.validate(dataset)}
