@@ -3,8 +3,8 @@
     python benchmarks/groups.py [--frames N] [--size WxH] [--kind K ...] [--clip NAME ...]
 
 Real scenes (clips.py) are packed by `mp4ds.pack` with each ``--for``; then frames at random places
-are read one by one, and all in order. CPU time is of the reading process, opening left out. All
-columns are relative to the default.
+are read one by one, and all in order: the exact ones of lossless images, and those of their view.
+CPU time is of the reading process, opening left out. All columns are relative to the default.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import tempfile
 import time
 from itertools import product
 from pathlib import Path
+from typing import Literal
 
 import clips
 import mp4ds
@@ -28,7 +29,7 @@ KINDS = {
     "rgb8, visual": ("rgb8", "visual"),
 }
 """Encoding and quality."""
-PURPOSES = (None, "training", "training=40", "archive")
+PURPOSES = (None, "training", "archive")
 
 
 def main() -> None:
@@ -57,24 +58,48 @@ def main() -> None:
                 begun = cpu_seconds()
                 mp4ds.pack(source, dataset, PackOptions(quality=quality, purpose=purpose))
                 seconds = cpu_seconds() - begun
-                size, speed = read(dataset, options.reads)
-                found = (size, 1 / speed, in_order(dataset), seconds)
+                found = (
+                    bytes_per_frame(dataset),
+                    at_random(dataset, options.reads, "exact"),
+                    at_random(dataset, options.reads, "view"),
+                    in_order(dataset),
+                    seconds,
+                )
                 base = base or found
                 ratios = [f"{one / other:.2f}" for one, other in zip(found, base, strict=True)]
                 rows.append((scene, kind, purpose or "(default)", form_of(dataset), *ratios))
                 print("-", *rows[-1], flush=True)
-    head = ("clip", "images", "`--for`", "form", "bytes", "CPU at random", "in order", "packing")
+    head = (
+        "clip",
+        "images",
+        "`--for`",
+        "form",
+        "bytes",
+        "at random",
+        "view",
+        "in order",
+        "packing",
+    )
     print_table(head, rows)
 
 
 def form_of(dataset: Path) -> str:
-    """Codec and options of a stream, as far as they differ between purposes."""
+    """Codec and key frames of each video of a stream."""
     with mp4ds.open(dataset) as opened:
-        video = opened.streams[0].sidecar.video
-    options = video.options
-    fast = options.get("coder") == "rice" or "cabac=0" in options.get("x264-params", "")
-    preset = f" preset {options['preset']}" if video.codec == "av1" else ""
-    return f"{video.codec}{preset}{', fast coder' * fast}, key frame every {options['g']}"
+        videos = opened.streams[0].sidecar.videos
+    return " + ".join(
+        f"{video.codec}{' preset ' * (video.codec == 'av1')}"
+        f"{video.options['preset'] if video.codec == 'av1' else ''}, key frame every "
+        f"{video.options['g'] if video.codec != 'png' else 1}"
+        for video in videos
+    )
+
+
+def bytes_per_frame(dataset: Path) -> float:
+    """Of all videos of a stream."""
+    with mp4ds.open(dataset) as opened:
+        (stream,) = opened.streams
+        return sum(path.stat().st_size for path, _ in stream.videos) / len(stream)
 
 
 def in_order(dataset: Path) -> float:
@@ -87,17 +112,16 @@ def in_order(dataset: Path) -> float:
         return (time.process_time() - begun) / len(stream)
 
 
-def read(dataset: Path, reads: int) -> tuple[float, float]:
-    """Bytes of a frame, and frames at random that are read in a second of CPU time."""
+def at_random(dataset: Path, reads: int, layer: Literal["exact", "view"]) -> float:
+    """CPU seconds of a frame at a random place."""
     numbers = random.Random(0)
-    with mp4ds.open(dataset) as opened:
+    with mp4ds.open(dataset, layer=layer) as opened:
         stream = opened[TOPIC]
-        size = stream.streams[0].video_path.stat().st_size / len(stream)
         stream.read([0])
         begun = time.process_time()
         for _ in range(reads):
             stream.read([numbers.randrange(len(stream))], format="native")
-        return size, reads / (time.process_time() - begun)
+        return (time.process_time() - begun) / reads
 
 
 if __name__ == "__main__":
