@@ -16,7 +16,7 @@ from coded_scenes import CODED, FRAMES, ODD
 from commands import call, refused, unchanged
 from compare import compare
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
-from in_parts import InlineExecutor, use
+from in_parts import IN_PARTS, InlineExecutor, use
 from mp4ds.errors import Mp4dsError, OptionError
 from mp4ds.format.models import StreamSidecar
 from mp4ds.packing.options import PackOptions
@@ -307,3 +307,97 @@ def test_putting_the_exact_video_back(alone: tuple[Path, str], tmp_path: Path) -
     exact.rename(dataset / exact.name)
     assert mp4ds.validate(dataset, deep=True) == []
     assert compare([tmp_path / "source" / "drive.mcap"], unpacked(tmp_path, "mcap")) == []
+
+
+# ---------------------------------------------------------------- packed again
+
+LATER: dict[str, tuple[Any, dict[str, Any]]] = {
+    "jpeg": (CODED["jpeg-rgb"], {}),
+    "packets": (CODED["video-h265"], {}),
+    "recorded fast": (lambda: scene("bgr8"), {"purpose": "speed"}),
+    "png": (CODED["png-gray-pillow"], {"view": "none"}),
+}
+
+
+@pytest.mark.parametrize("case", LATER)
+def test_views_come_and_go(case: str, tmp_path: Path) -> None:
+    make, options = LATER[case]
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.mkdir()
+    made = journey(first, SOURCES[ROS2], make(), "mcap", **options)
+    assert codecs(made.dataset) == [None]
+    second.mkdir()
+    mp4ds.pack(made.dataset, second / "dataset", PackOptions(view="h264"))
+    assert codecs(second / "dataset") == ["h264"]
+    assert mp4ds.validate(second / "dataset", deep=True) == []
+    assert compare(made.sources, unpacked(second, "mcap")) == []
+    mp4ds.pack(second / "dataset", tmp_path / "dataset", PackOptions(view="none"))
+    assert codecs(tmp_path / "dataset") == [None]
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(made.sources, unpacked(tmp_path, "mcap")) == []
+
+
+KEPT: dict[str, tuple[dict[str, Any], list[str | None], int]] = {
+    "as it is": ({}, ["av1"], 1),
+    "a slice": ({"start": "0.1", "duration": "0.1"}, ["av1"], 1),
+    "visual": ({"quality": "visual"}, ["av1"], 1),
+    "visual and transcoded": ({"quality": "visual", "transcode": True}, [None], 0),
+}
+"""Options -> views of the dataset that is made, and files with its exact videos."""
+
+
+@pytest.mark.parametrize("case", KEPT)
+def test_copies(case: str, tmp_path: Path) -> None:
+    options, views, exact = KEPT[case]
+    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"]())
+    mp4ds.pack(source, tmp_path / "first", PackOptions(view="av1"))
+    summary = mp4ds.pack(tmp_path / "first", tmp_path / "dataset", PackOptions(**options))
+    assert summary.is_copy
+    assert codecs(tmp_path / "dataset") == views
+    assert len(list((tmp_path / "dataset").glob("*.exact.mp4"))) == exact
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    if exact:
+        assert max(distances(tmp_path / "dataset")) < 12
+
+
+def test_views_alone_are_copied_and_sliced(alone: tuple[Path, str], tmp_path: Path) -> None:
+    dataset, kind = alone
+    for number, times in enumerate(({}, {"duration": "0.1"}, {"start": "0.1"})):
+        made = tmp_path / f"copy {number}"
+        options = PackOptions(quality="visual", **times)
+        assert mp4ds.pack(dataset, made, options).is_copy
+        assert [(one.profile, one.body) for one in sidecars(made)] == [("visual", ALONE[kind])]
+        assert mp4ds.validate(made, deep=True) == []
+
+
+def test_slices_out_of_order_keep_views(tmp_path: Path) -> None:
+    recorded = CODED["jpeg-rgb"]()
+    own = [record for record in recorded.messages if record.topic == f"{RAW}/compressed"]
+    early = replace(own[5], log_time=own[4].log_time - 1)
+    places = [early if record is own[5] else record for record in recorded.messages]
+    sources = SOURCES[ROS2](tmp_path / "source", replace(recorded, messages=places))
+    mp4ds.pack(sources, tmp_path / "first", PackOptions(view="h264"))
+    options = PackOptions(start="0.05")
+    summary = mp4ds.pack(tmp_path / "first", tmp_path / "dataset", options)
+    assert codecs(tmp_path / "dataset") == ["h264"], summary.not_copied
+
+
+@pytest.mark.parametrize("kind", ["jpeg-rgb", "video-h265"])
+def test_long_packs(kind: str, executor: InlineExecutor, tmp_path: Path) -> None:
+    options = replace(IN_PARTS, view="av1", codec=None)
+    sources = SOURCES[ROS2](tmp_path / "source", CODED[kind]())
+    target = tmp_path / "dataset"
+    stopped = InlineExecutor(lambda name: name == "00002")
+    with pytest.MonkeyPatch.context() as patch:
+        use(patch, stopped)
+        if kind.startswith("jpeg"):  # packets of a video are one piece
+            with pytest.raises(Mp4dsError, match="run the same command again"):
+                mp4ds.pack(sources, target, options)
+    mp4ds.pack(sources, target, options)
+    assert "00002" in executor.ran or not kind.startswith("jpeg")
+    assert "00000" not in executor.ran or not kind.startswith("jpeg")
+    assert codecs(target) == ["av1"]
+    assert [one.frames for one in sidecars(target)] == [FRAMES]
+    assert mp4ds.validate(target, deep=True) == []
+    assert max(distances(target)) < 12
+    assert compare(sources, unpacked(tmp_path, "mcap")) == []

@@ -430,9 +430,10 @@ def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
     folder = dataset_at(paths[0]) if len(paths) == 1 and not is_divided else None
     if folder is None or options.quality is None:
         return folder is not None
-    own = [stream for stream in _streams_of(folder) if _is_encoded(stream, options)]
-    has_views = all(one.exact_path or one.sidecar.profile == VISUAL for one in own)
-    return is_visual and has_views and any(one.exact_path for one in own)
+    streams = _streams_of(folder)
+    encoded = [stream for stream in streams if _is_encoded(stream, options)]
+    has_views = all(one.exact_path or one.sidecar.profile == VISUAL for one in encoded)
+    return is_visual and has_views and any(stream.exact_path for stream in streams)
 
 
 def _streams_of(folder: Path) -> list[Stream]:

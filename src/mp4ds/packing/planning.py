@@ -262,8 +262,7 @@ def _lossless_plans(
             is_small = both.bytes_per_frame <= _LARGER * least
             if is_small or options.asks_for_views:
                 best, plan = both, TrackPlan(both, view, note=note)
-                if is_small:
-                    least = both.bytes_per_frame
+                least = min(least, both.bytes_per_frame)
     _refuse_noise(samples, least)
     if codec is None:
         _refuse_few(samples, least)
