@@ -158,7 +158,7 @@ def test_all_that_can_be_opened(
         assert topic.stamps.dtype == np.int64
         assert topic.stamps.tolist() == [m.values["header"]["stamp"] for m in recorded]
         assert topic.log_times.tolist() == [m.log_time for m in recorded]
-        assert topic.streams[0].video_path.samefile(colour[0] / "cam_image_raw.mp4")
+        assert topic.streams[0].path.samefile(colour[0] / "cam_image_raw.yaml")
 
 
 @pytest.mark.parametrize("topic", ["/imu", "/cam", "", "cam/image_raw", "/cam/camera_info"])
@@ -217,11 +217,11 @@ def test_closing_closes_all_files(colour: tuple[Path, Scene]) -> None:
     dataset = mp4ds.open(colour[0])
     stream = dataset[TOPIC]
     assert stream[3].index == 3
-    assert open_files() == [str(stream.streams[0].video_path)]
+    assert open_files() == [str(path) for path, _ in stream.streams[0].videos]
     iterator = iter(stream)
     next(iterator)
     iterator.close()  # type: ignore[attr-defined]
-    assert len(open_files()) == 1
+    assert len(open_files()) == len(stream.streams[0].videos)
     dataset.close()
     assert open_files() == []
     assert len(stream.stamps) == 12  # they are still known, and the video is opened once more
@@ -389,8 +389,8 @@ def test_a_pair_alone(encoding: str, tmp_path: Path) -> None:
     dataset = packed(tmp_path, source)
     alone = tmp_path / "a mail"
     alone.mkdir()
-    for suffix in ("mp4", "yaml"):
-        shutil.copy(dataset / f"cam_image_raw.{suffix}", alone)
+    for path in dataset.glob("cam_image_raw.*"):
+        shutil.copy(path, alone)
     video, sidecar = alone / "cam_image_raw.mp4", alone / "cam_image_raw.yaml"
     for path in (video, sidecar, str(video)):
         assert mp4ds.validate(path, deep=True) == []

@@ -159,7 +159,8 @@ def _print_validation(
     if not deep:
         depth = "; frames were not decoded (--deep does)"
     elif not count:
-        depth = "; every video was decoded, every message with a digest checked"
+        here = " here" if any(absent.values()) else ""
+        depth = f"; every video{here} was decoded, every message with a digest{here} checked"
     else:
         depth = ""  # what is missing or broken was not
     if len(found) == 1:

@@ -434,7 +434,9 @@ def demo_command(output: Path, seconds: float, force: bool) -> None:
 def export_command(to: str, datasets: Sequence[str], output: Path, options: ExportOptions) -> None:
     """Export a dataset to another tool's format, keeping what that format supports.
 
-    What is left out is counted by topic and listed, here and in mp4ds_export.json.
+    Folders of images get the exact pixels, or with --quality visual those of the views of lossless
+    cameras; lerobot's videos are made of the views. What is left out is counted by topic and
+    listed, here and in mp4ds_export.json.
     """
     with progress_of("exporting") as tell:
         summary = export(datasets, to, output, options, progress=tell)

@@ -391,6 +391,9 @@ class ExportJob:
         self._in_colour, self._written = in_colour, 0
         if dataset.damage:
             self.note(dataset.damage)
+        for stream in dataset.streams:
+            if stream.layer == "view" and options.selected(stream.topic):
+                self.note(f"{stream.topic}: its pixels are those of its view")
         options.selected.check(dataset.all_topics)
         dataset.verify_sidecars(options.chosen)
         streams = [stream for stream in dataset.streams if options.selected(stream.topic)]
@@ -467,9 +470,10 @@ class ExportJob:
         known = ENCODINGS[stream.encoding]
         is_native = known.mosaic and self.options.native
         is_converted = not known.is_plain and (self._in_colour or not is_native)
-        if is_converted:
-            kind = "a Bayer mosaic, which --native keeps" if known.mosaic else "YUV"
-            self.note(f"{stream.topic}: its pixels are converted from {kind}")
+        if is_converted and stream.layer == "exact":
+            kind = "a Bayer mosaic" if known.mosaic else "YUV"
+            kept = ", which --native keeps" if known.mosaic and not self._in_colour else ""
+            self.note(f"{stream.topic}: its pixels are converted from {kind}{kept}")
         # depths and other measurements have no colours
         has_colours = encoding_as(known, "rgb") is not None
         colours = "rgb" if has_colours and (self._in_colour or is_converted) else "native"
