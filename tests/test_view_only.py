@@ -97,8 +97,8 @@ def test_validate_counts_what_is_missing(with_views: Path, views: Path) -> None:
     size = sum((with_views / name).stat().st_size for name in EXACT)
     told = json.loads(call("validate", views, "--json").out)
     assert told["problems"] == []
-    assert told["absence"] == f"{ABSENT}{size_text(size)}"
-    assert json.loads(call("validate", with_views, "--json").out)["absence"] == ""
+    assert told["absent"] == f"{ABSENT}{size_text(size)}"
+    assert json.loads(call("validate", with_views, "--json").out)["absent"] == ""
 
 
 def test_frames_and_the_report_show_the_views(views: Path, tmp_path: Path) -> None:
