@@ -85,9 +85,12 @@ def stream(path):
 def seen(side):
     """What is left of a stream without the video that its view predicts."""
     kept = {key: value for key, value in side.items() if key not in ("view", "digests")}
-    body = side.get("body", "pixels")
-    body = "jpeg" if body == "packet" else body
-    return {**kept, "profile": "visual", "video": side["view"], "body": body}
+    video, body = dict(side["view"]), side.get("body", "pixels")
+    if body == "packet" and side["video"]["codec"] == "mjpeg":
+        body = "jpeg"
+    elif body == "packet":
+        del video["pixel_format"]  # packets of another codec than those recorded
+    return {**kept, "profile": "visual", "video": video, "body": body}
 
 
 def decoded(path, side, video):
@@ -127,9 +130,9 @@ def messages(path, side, found, packets, pictures, predicted):
     hashes, payloads = [], []
     for n, variant in enumerate(found["variant"]):
         header = side["headers"][variant]
-        if kind == "packet":
+        if kind == "packet" and side["profile"] == "lossless":
             body = packet_body(video["codec"], packets[n], header.get("framing", ""))
-        else:
+        elif kind != "packet":
             patterns = pixels(image, video, pictures[n])
             if predicted:
                 bits = used_bits(side["view"], patterns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from mcap.reader import make_reader
 
 import mp4ds
+import reader
 from coded_scenes import CODED, FRAMES, ODD
 from commands import call, refused, unchanged
 from compare import compare
@@ -245,6 +247,17 @@ def test_views_alone_are_a_dataset(alone: tuple[Path, str], tmp_path: Path) -> N
         assert done.code == 0, done.err
     for command in (("unpack", dataset), ("pack", dataset, "-o", tmp_path / "x")):
         refused(call(*command), 2, "has views only (exact layer not here: 1 file", "--quality vis")
+
+
+def test_another_reader(alone: tuple[Path, str], tmp_path: Path) -> None:
+    dataset, kind = alone
+    (source,) = (tmp_path / "source").iterdir()
+    mp4ds.pack(source, tmp_path / "whole", PackOptions(view="av1"))
+    (left,), (whole,) = (reader.dataset(path)["streams"] for path in (dataset, tmp_path / "whole"))
+    assert (left["profile"], left["body"], left["payloads"]) == ("visual", ALONE[kind], None)
+    assert left["packets"] == whole["view"]["packets"]
+    made = [message for _, message in messages(source, whole["topic"])]
+    assert whole["payloads"] == [hashlib.sha256(message).hexdigest() for message in made]
 
 
 def messages(recording: Path, topic: str) -> list[Any]:

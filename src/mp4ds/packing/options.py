@@ -131,8 +131,8 @@ class PackOptions(SliceOptions, TopicOptions):
         changes=ENCODING,
     )
     purpose: str | None = option(
-        "archive: smallest files. speed: fastest packing, as while recording. training: fastest "
-        "random access, with videos up to 15 % larger.",
+        "archive: smallest files. speed: fastest packing, as while recording, without views. "
+        "training: fastest random access, with videos up to 15 % larger.",
         None,
         "--for",
         choices=(ARCHIVE, SPEED, TRAINING),
