@@ -108,6 +108,8 @@ def pixels(image, video, planes):
     parameters = video.get("parameters", {})
     row = LAYOUTS[video["layout"]]
     (values,), places = quoted(row[2]), quoted(row[3])
+    if values == "tone":
+        places = ["colour" if "bayer" in encoding else "plain" if channels == 1 else "rgb"]
     is_colour = places == ["colour"] or not {*"".join(places)} - {*"rgba"}
     if is_colour and "color" in video and len(planes) == 3 and planes[1].shape != planes[0].shape:
         planes = as_gbr(planes, video)
@@ -127,7 +129,7 @@ def pixels(image, video, planes):
         bits, shift = parameters["bits"], parameters["shift"]
         half = 1 << (bits + shift - 1) if samples.kind == "i" else 0
         return ((placed.astype(np.int64) * 2**shift - half) % 2**16).astype(patterns)
-    if values == "table":
+    if values in ("table", "tone"):
         table = np.array(parameters["table"], patterns)
         return table[np.minimum(placed, len(table) - 1)]
     if values == "metres":

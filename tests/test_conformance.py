@@ -178,8 +178,9 @@ def test_every_problem_code_has_a_case() -> None:
 
 def test_the_datasets_cover_the_format() -> None:
     seen = list(streams())
-    assert {stream["layout"] for stream in seen} == set(LAYOUTS)
-    assert {stream["codec"] for stream in seen} == set(VIDEO_CODECS)
+    videos = [*seen, *(stream["view"] for stream in seen if "view" in stream)]
+    assert {video["layout"] for video in videos} == set(LAYOUTS)
+    assert {video["codec"] for video in videos} == set(VIDEO_CODECS)
     assert {stream["body"] for stream in seen} == set(Body.__args__)  # type: ignore[attr-defined]
     assert {stream["wire"] for stream in seen} == set(WIRES)
     profiles = {"lossless", "visual", "crf=30", "crf=22", "crf=1", "psnr=41"}

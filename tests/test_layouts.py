@@ -16,10 +16,21 @@ from mp4ds.messages.encodings import (
     MAX_SIDE,
     NO_PARAMETERS,
     Parameters,
+    add_prediction,
+    difference,
     pixel_view,
 )
-from mp4ds.messages.layouts import CHROMA_SHIFTS, LAYOUTS, Layout, bind, fit, layout_for, why_not
+from mp4ds.messages.layouts import (
+    CHROMA_SHIFTS,
+    LAYOUTS,
+    Layout,
+    bind,
+    fit,
+    layout_for,
+    why_not,
+)
 from mp4ds.messages.numbers import MAX_TABLE, SCALES
+from mp4ds.video.encoder import difference_layouts
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, bound, rounded, suited, values
 
 SIZES = [(w, h) for w in (1, 2, 3, 4, 7, 8) for h in (1, 2, 3, 5, 6)]
@@ -216,13 +227,16 @@ def test_layouts_of_encodings() -> None:
         **{f"bayer_{m}8": "demosaic8" for m in ("rggb", "bggr", "gbrg", "grbg")},
         **dict.fromkeys(("yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv24"), "halved420"),
         **dict.fromkeys(("nv12", "nv21"), "planar420"),
+        **dict.fromkeys(("rgba8", "bgra8"), "opaque"),
+        **dict.fromkeys(("mono16", "rgb16", "bgr16"), "tone"),
+        **{f"bayer_{m}16": "tone" for m in ("rggb", "bggr", "gbrg", "grbg")},
     }
     for name, encoding in ENCODINGS.items():
         assert encoding.general in encoding.exact
         assert LAYOUTS[encoding.general].parameters == frozenset()
         assert all(LAYOUTS[layout].is_exact for layout in encoding.exact)
         assert layout_for(encoding, lossless=True).name == encoding.general
-        if encoding.lossy:
+        if encoding.lossy and not LAYOUTS[encoding.lossy].parameters:
             assert layout_for(encoding, lossless=False).name == encoding.lossy
         else:
             with pytest.raises(OptionError, match=name):
@@ -382,6 +396,111 @@ def test_two_marks_of_a_hole_are_one_too_many() -> None:
     assert fit("metres16", ENCODINGS["32FC1"], [pixels]) is None
 
 
+# ---------------------------------------------------------------- tones
+
+TONED = [name for name, encoding in ENCODINGS.items() if encoding.lossy == "tone"]
+
+
+def tone(bits: int, shift: int = 0, table: list[int] | None = None) -> dict[str, Any]:
+    """Parameters, whose levels are the smallest values unless told otherwise."""
+    return {"bits": bits, "shift": shift, "table": [*range(256)] if table is None else table}
+
+
+def ramp(low: int, high: int, shift: int = 0) -> np.ndarray:
+    """A picture in which values up to some are equally frequent."""
+    return (np.linspace(low, high, 96 * 64).astype(np.uint16) << shift).reshape(64, 96)
+
+
+@pytest.mark.parametrize("name", TONED)
+@pytest.mark.parametrize(("bits", "shift"), [(8, 0), (10, 6), (12, 0), (12, 4), (14, 2), (16, 0)])
+def test_a_tone_shows_the_nearest_level(name: str, bits: int, shift: int) -> None:
+    encoding = ENCODINGS[name]
+    plane = ramp(0, 2**bits - 1, shift)
+    pixels = (
+        plane
+        if encoding.channels == 1
+        else np.dstack([plane, plane[::-1], plane.T.reshape(64, 96)])
+    )
+    layout = fit("tone", encoding, [pixels])
+    assert layout is not None
+    assert layout.used_bits == bits + shift
+    table = np.array(layout.parameters.table)
+    assert (table[0], table[-1]) == (0, (2**bits - 1) << shift)
+    for big in (False, True):
+        view = as_message(pixels, encoding, pad=6, is_bigendian=big)
+        assert layout.refuses(view) is None
+        shown = through(layout, view)
+        nearest = np.abs(table - pixels.reshape(-1, 1).astype(int)).min(axis=1)
+        assert np.array_equal(np.abs(shown.astype(int) - pixels).ravel(), nearest)
+    if bits + shift < 16:
+        pixels[3, 5] = 2 ** (bits + shift)
+        assert f"does not fit into {bits} bits" in str(layout.refuses(pixels))
+    if shift:
+        pixels[3, 5] = 1
+        assert f"above {shift} zero bits" in str(layout.refuses(pixels))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "levels"),
+    [
+        (0, 4095, (120, 135)),
+        (0, 100, (15, 30)),  # it may only be dark yet
+        (240, 260, (55, 70)),  # of a sensor whose black is not 0
+        (3900, 4095, (240, 255)),  # or too bright
+        (29000, 31000, (110, 140)),  # temperatures
+        (21700, 22100, (110, 140)),
+    ],
+)
+def test_the_median_is_not_far_from_the_middle(
+    low: int, high: int, levels: tuple[int, int]
+) -> None:
+    """Of all that are possible, and temperatures are told from each other."""
+    pixels = ramp(low, high)
+    layout = fit("tone", ENCODINGS["mono16"], [pixels])
+    assert layout is not None
+    (picture,) = layout.to_picture(pixels)
+    assert levels[0] <= np.median(picture) <= levels[1]
+    if low > 20_000:
+        assert int(picture.max()) - int(picture.min()) > 30
+    table = np.array(layout.parameters.table)
+    assert (table[0], table[-1]) == (0, 2**layout.used_bits - 1)
+
+
+VIEWS = [
+    *((e.name, e.lossy, {}) for e in ENCODINGS.values() if e.lossy in ("gray8", "rgb24", "bgr24")),
+    *((f"{order}a8", "opaque", {"alpha": 200}) for order in ("rgb", "bgr")),
+    *(
+        (name, "tone", tone(bits, shift, [level << shift for level in range(256)]))
+        for name in TONED
+        for bits, shift in ((8, 0), (8, 8), (10, 0), (12, 0), (12, 4), (13, 0), (14, 2), (16, 0))
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "layout", "parameters"), VIEWS)
+def test_all_differences_to_a_view_fit(name: str, layout: str, parameters: dict[str, Any]) -> None:
+    """Whatever it shows, each layout of the video beside it holds them exactly."""
+    encoding = ENCODINGS[name]
+    view = bind(layout, encoding, Parameters.from_values(parameters))
+    mask = 2**view.used_bits - 2 ** parameters.get("shift", 0)
+    pixels, shown = (
+        values(encoding, kind, 40, 30) & np.array(mask, encoding.dtype)
+        for kind in ("random", "extreme")
+    )
+    if layout == "opaque":
+        pixels[..., 3] = shown[..., 3] = 200
+    assert view.refuses(pixels) is view.refuses(shown) is None
+    different = difference(pixels, shown, view.used_bits)
+    found = difference_layouts(view)
+    assert encoding.general in [one.name for one in found]
+    assert len(found) > 1 or parameters.get("bits") not in (10, 12, 14)
+    for one in found:
+        assert one.refuses(different) is None
+        again = through(one, different)
+        add_prediction(again, shown, view.used_bits)
+        assert bits_of(again) == bits_of(pixels)
+
+
 @pytest.mark.parametrize(
     ("encoding", "layout", "parameters", "words"),
     [
@@ -422,6 +541,16 @@ def test_two_marks_of_a_hole_are_one_too_many() -> None:
         ("32FC1", "metres16", {"hole": 2**32, "scale": "product"}, "no pattern of 32 bits"),
         ("32FC1", "metres16", {"hole": 0, "scale": "sum"}, "scale 'sum'"),
         ("32FC1", "metres16", {"hole": 0}, "needs the parameters hole, scale"),
+        ("16UC1", "tone", tone(12), "does not carry 16UC1"),
+        ("mono16", "tone", {"bits": 12, "shift": 0}, "needs the parameters bits, shift, table"),
+        ("mono16", "tone", tone(7), "7 bits above 0"),
+        ("mono16", "tone", tone(17), "17 bits above 0"),
+        ("mono16", "tone", tone(12, shift=5), "12 bits above 5"),
+        ("mono16", "tone", tone(12, table=[*range(255)]), "table of 255 values"),
+        ("mono16", "tone", tone(12, table=[*range(257)]), "table of 257 values"),
+        ("mono16", "tone", tone(12, table=[*range(255), 4096]), "does not fit into 12 bits"),
+        ("mono16", "tone", tone(12, shift=1), "above 1 zero bits"),
+        ("mono16", "tone", tone(12, table=[0, *range(255)]), "does not increase"),
     ],
 )
 def test_layouts_that_cannot_be(

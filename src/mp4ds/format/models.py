@@ -277,7 +277,7 @@ class LayoutParameters(Model):
         None, description="How many of the bits are low ones, folded and stored apart."
     )
     table: Annotated[list[Uint64], Field(max_length=MAX_TABLE)] | None = Field(
-        None, description="The bit patterns that occur, in increasing order."
+        None, description="The bit patterns that occur, or that levels show; increasing."
     )
     entries: Annotated[int, Field(ge=1, le=MAX_TABLE)] | None = Field(
         None, description="Length of the list of values in each picture."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any, ClassVar
@@ -111,7 +111,7 @@ _METRES = ("metres16", "metres_fold", "table", "palette")
 
 
 def _of_samples(name: str, channels: int, dtype: str, lossy: str | None = None) -> Encoding:
-    """One to four channels without a defined meaning, as in OpenCV's matrices."""
+    """One to four channels, without a defined meaning in OpenCV's matrices."""
     general = {"1": _OF_BYTES, "2": _OF_WORDS}.get(dtype[1], {}).get(channels, "bytes")
     more = _METRES if name == "32FC1" else _MORE.get(general, ())
     if name == "8UC4":
@@ -121,7 +121,7 @@ def _of_samples(name: str, channels: int, dtype: str, lossy: str | None = None) 
 
 def _bayer16(mosaic: str) -> Encoding:
     exact = ("mosaic16", "mosaic_bits", "mosaic_fold")
-    return Encoding(f"bayer_{mosaic}16", 1, "u2", "mosaic16", exact, None, mosaic)
+    return Encoding(f"bayer_{mosaic}16", 1, "u2", "mosaic16", exact, "tone", mosaic)
 
 
 def _encodings() -> list[Encoding]:
@@ -138,12 +138,13 @@ def _encodings() -> list[Encoding]:
     lossy = {"8UC1": "gray8", "8UC3": "bgr24"}
     return [
         _of_samples("mono8", 1, "u1", "gray8"),
-        _of_samples("mono16", 1, "u2"),
+        _of_samples("mono16", 1, "u2", "tone"),
         Encoding("rgb8", 3, "u1", "rgb24", (*_SOURCES, "rgb24"), "rgb24"),
         Encoding("bgr8", 3, "u1", "bgr24", (*_SOURCES, "bgr24"), "bgr24"),
-        Encoding("rgba8", 4, "u1", "rgba", ("rgba", "opaque")),
-        Encoding("bgra8", 4, "u1", "bgra", ("bgra", "opaque")),
-        *(_of_samples(f"{order}16", len(order), "u2") for order in ("rgb", "bgr", "rgba", "bgra")),
+        Encoding("rgba8", 4, "u1", "rgba", ("rgba", "opaque"), "opaque"),
+        Encoding("bgra8", 4, "u1", "bgra", ("bgra", "opaque"), "opaque"),
+        *(_of_samples(f"{order}16", 3, "u2", "tone") for order in ("rgb", "bgr")),
+        *(_of_samples(f"{order}16", 4, "u2") for order in ("rgba", "bgra")),
         *(
             Encoding(f"bayer_{mosaic}8", 1, "u1", "mosaic8", ("mosaic8",), "demosaic8", mosaic)
             for mosaic in bayer
@@ -296,10 +297,10 @@ class Parameters:
     """Parameters of a layout for a stream; a layout has exactly the ones it needs.
 
     Attributes:
-        bits: Bits per sample of the picture.
+        bits: Bits per sample of the picture, or in use in those of the image.
         shift: Zero bits below them in each sample of the image.
         low: Number of low bits, folded and stored separately.
-        table: The bit patterns that occur, in increasing order.
+        table: The bit patterns that occur, or that a picture's samples stand for, increasing.
         entries: Length of the list of values in each picture.
         hole: Bit pattern of the float that stands for no measurement.
         scale: One of `mp4ds.messages.numbers.SCALES`.
@@ -323,6 +324,10 @@ class Parameters:
     def names(self) -> frozenset[str]:
         """Names of those that are set."""
         return frozenset(f.name for f in fields(self) if getattr(self, f.name) is not None)
+
+    def only(self, names: Collection[str]) -> Parameters:
+        """Those of some names."""
+        return Parameters(**{name: getattr(self, name) for name in names})
 
     def to_values(self) -> dict[str, Any]:
         """As JSON values, without those that are not set."""
@@ -547,7 +552,8 @@ class NarrowPlanes(Narrow):
 
 
 _MOST_LOW, _MOST_HIGH = 8, 10  # bits that a plane of folded samples may have
-_LOW_BITS = {12: 3, 14: 5, 16: 8}  # by measurement: the bits that are mostly noise
+LOW_BITS = {12: 3, 14: 5, 16: 8}
+"""Bits of samples -> how many of them are mostly noise, by measurement."""
 
 
 class NarrowFolded(Narrow):
@@ -568,7 +574,7 @@ class NarrowFolded(Narrow):
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
         """All bits, or those in use if there are enough of them to separate noise from the rest."""
         found = Narrow.fit(encoding, samples) or Parameters(bits=16, shift=0)
-        low = _LOW_BITS.get(found.bits or 0)
+        low = LOW_BITS.get(found.bits or 0)
         return None if low is None else replace(found, low=low)
 
 

@@ -32,7 +32,7 @@ from mp4ds.messages.encodings import (
     Whole,
     patterns,
 )
-from mp4ds.messages.numbers import Few, Metres, Palette, PatternTable
+from mp4ds.messages.numbers import Few, Metres, Palette, PatternTable, Tone
 from mp4ds.messages.sources import Converted, ConvertedTall, Demosaiced
 
 # ---------------------------------------------------------------- arrangements
@@ -426,6 +426,13 @@ def _yuv(encoding: Encoding) -> Packed422 | SemiPlanar:
     return Packed422(1 if encoding.name in ("yuv422", "uyvy") else 0)
 
 
+def _toned(encoding: Encoding) -> Packed:
+    """As images of 8 bits are shown."""
+    if encoding.mosaic:
+        return Packed(f"bayer_{encoding.mosaic}8")
+    return Packed("gray" if encoding.channels == 1 else f"{_rgb_order(encoding)}24")
+
+
 def _fold(parameters: Parameters, first: Mosaic | Packed = Packed()) -> Fold:
     return Fold(parameters.bits or 16, parameters.low or 8, first)
 
@@ -496,6 +503,7 @@ LAYOUTS: dict[str, LayoutKind] = {
         _shown("from_yuv422", lambda e, p: Packed422(0), Converted),
         # demosaicing is done by the video's converter; resampling restores the mosaic
         _shown("demosaic8", lambda e, p: Packed(f"bayer_{e.mosaic}8"), exact=False),
+        _shown("tone", lambda e, p: _toned(e), Tone, exact=False),
         _shown("planar422", lambda e, p: _yuv(e)),
         _shown("planar420", lambda e, p: _yuv(e)),
         _shown("planar444", lambda e, p: _yuv(e)),
@@ -637,10 +645,10 @@ def layout_for(encoding: Encoding, *, lossless: bool) -> Layout:
     """The layout that carries every image of an encoding, for a lossless or lossy codec.
 
     Raises:
-        OptionError: There is no lossy layout.
+        OptionError: There is no lossy layout, or it depends on the images.
     """
     name = encoding.general if lossless else encoding.lossy
-    if name is None:
+    if name is None or LAYOUTS[name].parameters:
         raise OptionError(f"{encoding.name} images are only stored losslessly")
     return bind(name, encoding)
 

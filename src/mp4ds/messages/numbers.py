@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from mp4ds.messages.encodings import (
     Arrangement,
     Encoding,
+    Narrow,
     Parameters,
     Picture,
     Pixels,
@@ -29,6 +30,24 @@ SCALES = ("product", "quotient")
 """How metres were made from millimetres: ``k * 0.001f`` or ``k / 1000``."""
 
 
+def table_of(encoding: Encoding, parameters: Parameters) -> Samples:
+    """The table of a layout, as patterns of an encoding's samples.
+
+    Raises:
+        ValueError: It is empty or too long, does not increase, or has other values.
+    """
+    table = parameters.table or ()
+    if not 1 <= len(table) <= MAX_TABLE:
+        raise ValueError(f"a table of {len(table)} values, not of 1 to {MAX_TABLE}")
+    top = 256**encoding.bytes_per_sample - 1
+    if not all(is_integer(value, top) for value in table):
+        raise ValueError(f"a table with values beyond 0 to {top}")
+    array = np.array(table, f"u{encoding.bytes_per_sample}")
+    if (array[1:] <= array[:-1]).any():
+        raise ValueError("a table that does not increase")
+    return array
+
+
 class PatternTable(Values):
     """The index of each bit pattern in a list of those that occur, in one or two bytes.
 
@@ -45,16 +64,7 @@ class PatternTable(Values):
     @classmethod
     def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
         """For that table."""
-        table = parameters.table or ()
-        if not 1 <= len(table) <= MAX_TABLE:
-            raise ValueError(f"a table of {len(table)} values, not of 1 to {MAX_TABLE}")
-        top = 256**encoding.bytes_per_sample - 1
-        if not all(is_integer(value, top) for value in table):
-            raise ValueError(f"a table with values beyond 0 to {top}")
-        array = np.array(table, f"u{encoding.bytes_per_sample}")
-        if (array[1:] <= array[:-1]).any():
-            raise ValueError("a table that does not increase")
-        return cls(array)
+        return cls(table_of(encoding, parameters))
 
     def _numbers(self, samples: Samples) -> Samples:
         """For each sample the index of the last pattern that is not greater, or 0."""
@@ -102,6 +112,72 @@ class PatternTable(Values):
         if not encoding.is_float and values[-1] - values[0] + 1 < 2 * len(values):
             return None  # a plain picture has hardly more values
         return Parameters(table=tuple(values))
+
+
+_DARK, _BRIGHT = 16, 239  # levels between which values are shown that are close together
+
+
+class Tone(PatternTable):
+    """Levels of 8 bits that stand for patterns of more bits; a sample gets the nearest: not exact.
+
+    Attributes:
+        table: The patterns of the 256 levels.
+    """
+
+    parameters = frozenset({"bits", "shift", "table"})
+
+    def __init__(self, table: Samples, used: Narrow) -> None:
+        super().__init__(table)
+        self._used = used
+        wide = table.astype(np.uint32)
+        self._between = (wide[:-1] + wide[1:] + 1) // 2
+
+    @classmethod
+    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+        """For so many bits above so many zero bits, and that table."""
+        bits, shift = parameters.bits or 0, parameters.shift
+        if not is_integer(bits, 16) or bits < 8 or not is_integer(shift, 16 - bits):
+            raise ValueError(f"no layout shows {bits} bits above {shift} zero bits")
+        table, used = table_of(encoding, parameters), Narrow(bits, shift or 0, signed=False)
+        if len(table) != 256:
+            raise ValueError(f"a table of {len(table)} values, not of 256")
+        if reason := used.refuses(table):
+            raise ValueError(f"a table in which {reason}")
+        return cls(table, used)
+
+    def _numbers(self, samples: Samples) -> Samples:
+        every = np.arange(65536, dtype=np.uint16)
+        found: Samples = np.searchsorted(self._between, every, side="right").astype(np.uint8)
+        return found[samples]
+
+    def refuses(self, pixels: Pixels) -> str | None:
+        """A bit outside the kept ones."""
+        return self._used.refuses(pixels)
+
+    @classmethod
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+        """The bits in use, and a curve.
+
+        The median is shown in the middle, as far as that is between a linear curve and a quadratic
+        one, whose steps grow with a sensor's noise. Both are from black to white, whatever the
+        samples have, since a camera may start in the dark. Only values that are close together, far
+        from both, as temperatures are, get most of the levels.
+        """
+        used = Narrow.fit(encoding, samples) or Parameters(bits=16, shift=0)
+        bits, shift = used.bits or 16, used.shift or 0
+        values = np.concatenate([native(pixels)[::3, ::3].ravel() for pixels in samples]) >> shift
+        low, middle, high = map(float, np.quantile(values, (0.001, 0.5, 0.999)))
+        top = 2**bits - 1
+        level = np.arange(256)
+        margin = max(high - low, top / 64, 128)
+        if high - low < top / 16 and low > 2 * margin and high + 2 * margin < top:
+            knots = [0, low - margin, high + margin, top]
+            curve = np.interp(level, [0, _DARK, _BRIGHT, 255], knots)
+        else:
+            share = min(max(4 * middle / top - 1, 255 / top), 1)
+            curve = top * (share * level / 255 + (1 - share) * (level / 255) ** 2)
+        table = ((curve + 0.5).astype(int) << shift).tolist()
+        return replace(used, bits=bits, shift=shift, table=tuple(table))
 
 
 _EXPONENT = 0x7F800000  # all ones in NaN and infinity

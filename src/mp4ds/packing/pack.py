@@ -41,6 +41,7 @@ from mp4ds.files.sources import (
 from mp4ds.files.uploads import local_path, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest
+from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import ENCODING
 from mp4ds.packing.long_packs import PartedPack, Report, pack_parts
@@ -444,9 +445,9 @@ def _streams_of(folder: Path) -> list[Stream]:
 
 def _is_encoded(stream: Stream, options: PackOptions) -> bool:
     """Whether images of a stream become lossy ones where a lossy quality is asked for."""
-    sidecar = stream.sidecar
+    sidecar, name = stream.sidecar, stream.sidecar.image.encoding
     is_kept = sidecar.keeps_packets and not (options.transcode and stream.are_jpeg_files)
-    return not is_kept and ENCODINGS[sidecar.image.encoding].lossy is not None
+    return not is_kept and ENCODINGS[name].lossy is not None and name not in DEPTHS
 
 
 def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = True) -> PackOptions:

@@ -28,8 +28,9 @@ from mp4ds.files.sources import SourceState
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.manifest import About
 from mp4ds.format.sidecars import MANIFEST_NAME, load_about
-from mp4ds.messages.encodings import ENCODINGS, Encoding
-from mp4ds.messages.layouts import layout_for
+from mp4ds.messages.depth import DEPTHS
+from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
+from mp4ds.messages.layouts import LAYOUTS, Layout, fit, layout_for
 from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.calibrations import find_pairs
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey, depends_on_others
@@ -116,9 +117,10 @@ def decide(
     first = samples[0]
     try:
         if first.pixels is None:
-            plans = _packet_plans(first, options)
-        elif not _is_lossless(first.key, options):
-            plans = _lossy_plans(samples, options, threads, rate)
+            return Decision(first.key, _packet_plans(first, options))
+        layout = None if options.goal.lossless else _lossy_layout(samples)
+        if layout is not None:
+            plans = _lossy_plans(samples, layout, options, threads, rate)
         elif options.is_fast:
             plans = [_fast_plan(first.key, options)]
         else:
@@ -132,12 +134,24 @@ def needs_trial(seen: CameraMessage, options: PackOptions) -> bool:
     """Whether `decide` benefits from having several messages."""
     if seen.pixels is None or options.is_fast:
         return False
-    is_tried = seen.key.body != "jpeg" and _is_lossless(seen.key, options)
+    lossy = None if options.goal.lossless else ENCODINGS[seen.key.encoding].lossy
+    is_tried = seen.key.body != "jpeg" and (lossy is None or bool(LAYOUTS[lossy].parameters))
     return is_tried or options.goal.target is not None
 
 
-def _is_lossless(key: StreamKey, options: PackOptions) -> bool:
-    return options.goal.lossless or ENCODINGS[key.encoding].lossy is None
+def _lossy_layout(samples: Sequence[CameraMessage]) -> Layout | None:
+    """The layout of images that may lose quality; None for those that may be depths, too."""
+    encoding = ENCODINGS[samples[0].key.encoding]
+    return None if encoding.name in DEPTHS else _shown_layout(encoding, _pixels(samples))
+
+
+def _shown_layout(encoding: Encoding, pixels: Sequence[Pixels]) -> Layout | None:
+    """The layout in which lossy videos show images; None if there is none."""
+    return fit(encoding.lossy, encoding, pixels) if encoding.lossy else None
+
+
+def _pixels(samples: Sequence[CameraMessage]) -> list[Pixels]:
+    return [seen.pixels for seen in samples if seen.pixels is not None]
 
 
 def _packet_plans(seen: CameraMessage, options: PackOptions) -> list[TrackPlan]:
@@ -146,7 +160,7 @@ def _packet_plans(seen: CameraMessage, options: PackOptions) -> list[TrackPlan]:
     if not options.asks_for_views:
         can_shrink = codec == "mjpeg" and not options.goal.lossless
         return [TrackPlan(note=_KEPT_JPEG if can_shrink else "")]
-    view = _view_coding(ENCODINGS[seen.key.encoding], options)
+    view = _view_coding([], ENCODINGS[seen.key.encoding], options)
     if view is None:
         return [TrackPlan()]
     name = view.recipe.codec
@@ -164,11 +178,16 @@ gets less close to a noisy original."""
 
 
 def _lossy_plans(
-    samples: Sequence[CameraMessage], options: PackOptions, threads: int, rate: float | None
+    samples: Sequence[CameraMessage],
+    layout: Layout,
+    options: PackOptions,
+    threads: int,
+    rate: float | None,
 ) -> list[TrackPlan]:
     quality = options.goal
     key, target = samples[0].key, quality.target
-    layout = layout_for(ENCODINGS[key.encoding], lossless=False)
+    bits = layout.parameters.bits
+    note = f"{bits} bits are kept as 8" if bits else ""
     crf, preset = quality.crf, options.preset
     if options.is_fast and target is None:
         preset = preset or fastest_preset(options.codec or DEFAULT_LOSSY)
@@ -187,12 +206,16 @@ def _lossy_plans(
     )
     coding = Coding(layout, recipe, options.group_frames)
     if target is None:
-        return [TrackPlan(coding, profile=str(quality))]
+        plan = TrackPlan(coding, profile=str(quality), note=note)
+        return [plan, *([_general_plan(key, options)] if layout.parameters.names else [])]
     coder = WindowCoder(coding, (key.width, key.height), target, threads, rate)
     is_jpeg = key.body == "jpeg"
     try:
         plan = TrackPlan(
-            coding.with_crf(coder.start_crf(samples)), profile=str(target), target=target
+            coding.with_crf(coder.start_crf(samples)),
+            profile=str(target),
+            target=target,
+            note=note,
         )
     except EncoderRefusedError as error:
         raise Refused(str(error)) from None
@@ -221,7 +244,7 @@ def _lossless_plans(
     note: str = "",
 ) -> list[TrackPlan]:
     encoding = ENCODINGS[samples[0].key.encoding]
-    pixels = [seen.pixels for seen in samples if seen.pixels is not None]
+    pixels = _pixels(samples)
     asked = options.goal.lossless
     if not (asked or note):
         note = f"{encoding.name} is kept lossless"
@@ -245,7 +268,7 @@ def _lossless_plans(
     except EncoderRefusedError as error:
         raise Refused(str(error)) from None
     plan, least = TrackPlan(best, note=note), best.bytes_per_frame
-    view = _view_coding(encoding, options)
+    view = _view_coding(pixels, encoding, options)
     if view is not None:
         with suppress(OptionError, EncoderRefusedError):
             both = choose_predicted(
@@ -271,11 +294,14 @@ def _lossless_plans(
     return [plan, _general_plan(samples[0].key, options)]
 
 
-def _view_coding(encoding: Encoding, options: PackOptions) -> Coding | None:
+def _view_coding(
+    pixels: Sequence[Pixels], encoding: Encoding, options: PackOptions
+) -> Coding | None:
     """How the view of lossless images is encoded; None without a view."""
-    if encoding.lossy is None or options.view == NO_VIEW:
+    layout = None if options.view == NO_VIEW else _shown_layout(encoding, pixels)
+    if layout is None:
         return None
-    layout, codec = layout_for(encoding, lossless=False), options.view or DEFAULT_LOSSY
+    codec = options.view or DEFAULT_LOSSY
     preset = PURPOSE_PRESET if options.purpose else VIEW_PRESET
     recipe = recipe_for(
         layout.pixel_format,

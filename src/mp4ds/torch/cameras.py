@@ -27,9 +27,9 @@ from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
 from mp4ds.files.urls import location, remote, spelled
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.times import nearest, synchronize
-from mp4ds.video.codecs import TEN_BITS
 from mp4ds.video.mp4 import read_sample_table
 
 Dtype = Literal["native", "uint8", "float32"]
@@ -400,18 +400,14 @@ class TorchcodecReader:
 
 
 def _check_layout(stream: Stream) -> None:
-    """Refuse pictures that are not the images, or that have more than 8 bits.
-
-    In lossy videos, 10-bit pictures hold 8-bit images.
-    """
+    """Refuse pictures that are not the images, and images of more than 8 bits."""
     image, video = stream.sidecar.image, stream.sidecar.video
     if stream.sidecar.is_predicted:
         raise OptionError(
             f"topic {stream.topic}: its exact frames are made of two videos, which torchcodec "
             "cannot do. Use backend='mp4ds', or layer='view'."
         )
-    is_8_bits = video.pixel_format in (None, TEN_BITS) or not video.pixel_format.endswith("le")
-    if not LAYOUTS[video.layout].is_shown or not is_8_bits:
+    if not LAYOUTS[video.layout].is_shown or ENCODINGS[image.encoding].bytes_per_sample > 1:
         raise OptionError(
             f"topic {stream.topic}: {image.encoding} images are stored in the layout "
             f"{video.layout}, which torchcodec cannot convert to colour. Use backend='mp4ds'."

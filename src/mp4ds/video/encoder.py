@@ -17,8 +17,16 @@ from av.error import FFmpegError
 
 from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages import png
-from mp4ds.messages.encodings import MAX_SIDE, Encoding, Picture, Pixels, difference
-from mp4ds.messages.layouts import Layout, fit, layout_for
+from mp4ds.messages.encodings import (
+    LOW_BITS,
+    MAX_SIDE,
+    Encoding,
+    Parameters,
+    Picture,
+    Pixels,
+    difference,
+)
+from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit
 from mp4ds.video.codecs import (
     ARCHIVE,
     TRAINING,
@@ -570,6 +578,31 @@ def choose(
     return next(choice for choice, _ in tried if choice.bytes_per_frame <= near * smallest)
 
 
+def difference_layouts(view: Layout) -> list[Layout]:
+    """The layouts that hold all differences of images to those of a view.
+
+    Args:
+        view: Layout of the view.
+
+    Returns:
+        In order of preference, with the general one.
+    """
+    encoding, of = view.encoding, view.parameters
+    known = Parameters(
+        bits=of.bits,
+        shift=of.shift,
+        low=LOW_BITS.get(of.bits or 0),
+        alpha=None if of.alpha is None else 128,  # that of no difference
+    )
+    found = []
+    for name in encoding.exact:
+        needed = LAYOUTS[name].parameters
+        if needed <= known.names:
+            with suppress(ValueError):  # for so many bits
+                found.append(bind(name, encoding, known.only(needed)))
+    return found
+
+
 def choose_predicted(
     samples: Sequence[Pixels], encoding: Encoding, view: Coding, most: float, **options: Any
 ) -> Coding:
@@ -596,7 +629,7 @@ def choose_predicted(
     coded, shown = predict_on_trial(crops, view, options["threads"])
     bits = view.layout.used_bits
     differences = [difference(*pair, bits) for pair in zip(crops, shown, strict=True)]
-    layouts = [layout_for(encoding, lossless=True)]
+    layouts = difference_layouts(view.layout)
     of_view = coded.bytes_per_frame(view.gop)
 
     def tried(**changes: Any) -> Coding:
@@ -604,7 +637,8 @@ def choose_predicted(
         found = choose(differences, encoding, layouts=layouts, is_noise=True, **asked)
         return replace(found, bytes_per_frame=(found.bytes_per_frame + of_view) / share)
 
-    if options["codec"] is not None or "png" not in lossless_codecs(layouts[0].pixel_format):
+    can_be_png = any("png" in lossless_codecs(layout.pixel_format) for layout in layouts)
+    if options["codec"] is not None or not can_be_png:
         return tried()
     is_archive = options["purpose"] == ARCHIVE
     simple = tried(codec="png")

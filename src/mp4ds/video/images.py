@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import OptionError, Refused, SourceError
 from mp4ds.messages import png
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels, check_size
-from mp4ds.messages.layouts import CHROMA_SHIFTS, Layout, bind
+from mp4ds.messages.layouts import CHROMA_SHIFTS, Layout, bind, layout_for
 from mp4ds.video.colour import samples
 from mp4ds.video.pixels import PictureConverter, plain_frame, scaling
 
@@ -325,8 +325,8 @@ def _layout(encoding: Encoding, *, demosaic: bool) -> Layout:
     """A layout whose pictures look like the images, or their mosaic."""
     if not encoding.mosaic:
         return bind(encoding.general, encoding)
-    if demosaic and encoding.lossy:
-        return bind(encoding.lossy, encoding)
+    if demosaic and encoding.bytes_per_sample == 1:
+        return layout_for(encoding, lossless=False)
     plain = ENCODINGS["mono8" if encoding.bytes_per_sample == 1 else "mono16"]
     return bind(plain.general, plain)
 

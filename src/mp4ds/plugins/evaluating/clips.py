@@ -20,7 +20,7 @@ from mp4ds.dataset.topic import Topic
 from mp4ds.errors import Refused
 from mp4ds.format.sidecars import names_dataset
 from mp4ds.messages.encodings import ENCODINGS, Pixels
-from mp4ds.messages.layouts import Layout, layout_for
+from mp4ds.messages.layouts import LAYOUTS, Layout, layout_for
 from mp4ds.messages.serializations import is_camera, kind_of
 from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.inspection import MessageInspector, depends_on_others
@@ -234,10 +234,9 @@ def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
 
 def _layout_of(kind: _Kind) -> Layout:
     name, width, height = kind
-    if ENCODINGS[name].lossy is None:
-        raise Refused(
-            f"has {name} images, which are not 8-bit images: `mp4ds pack` keeps them lossless"
-        )
+    lossy = ENCODINGS[name].lossy
+    if lossy is None or LAYOUTS[lossy].parameters:
+        raise Refused(f"has {name} images; scores are of images of 8 bits without alpha")
     if min(width, height) < SMALLEST:
         raise Refused(f"has images of {width}x{height}, too small to score")
     return layout_for(ENCODINGS[name], lossless=False)
