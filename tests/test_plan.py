@@ -16,7 +16,7 @@ from mp4ds.errors import OptionError
 from mp4ds.format.fields import FileName
 from mp4ds.format.sidecars import FileNames
 from mp4ds.options import Selection
-from mp4ds.packing.planning import cut_times
+from mp4ds.times import cut_times
 from mp4ds.video.codecs import QualitySetting, QualityTarget, parse_quality, visual_setting
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -1,4 +1,4 @@
-"""Integer nanoseconds: columns as text, presentation times, intervals, and matching cameras.
+"""Integer nanoseconds: columns as text, presentation times, intervals, cuts, and matching cameras.
 
 numpy only (spec/index.md, "Columns" and "Presentation times").
 """
@@ -9,6 +9,7 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from operator import index as as_integer
 
 import numpy as np
@@ -481,3 +482,40 @@ class StampIndex:
 
     def _stamp(self, place: int) -> int:
         return int(self._sorted[place])
+
+
+# ---------------------------------------------------------------- cuts
+
+
+def cut_times(times: Sequence[NDArray[np.int64]], frames: int) -> list[int]:
+    """Log times at which to cut a recording, each that of a camera message.
+
+    The busiest camera is cut after that many of its frames; so is any other camera within windows
+    in which it has more than twice as many.
+
+    Args:
+        times: Sorted log times of each camera's messages, ns.
+        frames: Frames of a window.
+
+    Returns:
+        Increasing; each begins a window, and the first window begins before all of them.
+    """
+    cuts: list[int] = []
+    for column in sorted(times, key=len, reverse=True):
+        edges = [0, *np.searchsorted(column, np.array(cuts, np.int64)).tolist(), len(column)]
+        new: list[int] = []
+        for start, end in pairwise(edges):
+            if end - start > (2 * frames if cuts else frames):
+                new.extend(column[start + frames : end : frames].tolist())
+        cuts = sorted({*cuts, *(time for time in new if time > int(column[0]))})
+    return _without_short_end(cuts, times, frames)
+
+
+def _without_short_end(
+    cuts: list[int], times: Sequence[NDArray[np.int64]], frames: int
+) -> list[int]:
+    """Drop a last cut that leaves little after it."""
+    if not cuts:
+        return cuts
+    rest = max((len(column) - np.searchsorted(column, cuts[-1]) for column in times), default=0)
+    return cuts[:-1] if rest < frames // 2 else cuts

@@ -15,9 +15,6 @@ from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.latched import take_slice
 from mp4ds.bags.mcap import compressed_size
@@ -40,6 +37,7 @@ from mp4ds.packing.tracks import TrackPlan
 from mp4ds.packing.windows import WindowCoder
 from mp4ds.processes import available_cores
 from mp4ds.records import EVERYTHING, Channel, Excerpt, Message
+from mp4ds.times import cut_times
 from mp4ds.video.codecs import (
     AV1,
     DEFAULT_LOSSY,
@@ -507,50 +505,13 @@ def _open_whole(paths: Sequence[Path], images: ImageFolder | None, *, salvage: b
     return reader
 
 
-# ---------------------------------------------------------------- cuts
+# ---------------------------------------------------------------- pieces
 
 GOPS_PER_WINDOW = 10
 """Groups of pictures of the busiest camera in a window: a cut costs at most one key frame."""
 
 LEAST_WINDOW = 300
 """Minimum frames of a window, unless the user says otherwise: each part has some overhead."""
-
-
-def cut_times(times: Sequence[NDArray[np.int64]], frames: int) -> list[int]:
-    """Log times at which to cut a recording, each that of a camera message.
-
-    The busiest camera is cut after that many of its frames; so is any other camera within windows
-    in which it has more than twice as many.
-
-    Args:
-        times: Sorted log times of each camera's messages, ns.
-        frames: Frames of a window.
-
-    Returns:
-        Increasing; each begins a window, and the first window begins before all of them.
-    """
-    cuts: list[int] = []
-    for column in sorted(times, key=len, reverse=True):
-        edges = [0, *np.searchsorted(column, np.array(cuts, np.int64)).tolist(), len(column)]
-        new: list[int] = []
-        for start, end in pairwise(edges):
-            if end - start > (2 * frames if cuts else frames):
-                new.extend(column[start + frames : end : frames].tolist())
-        cuts = sorted({*cuts, *(time for time in new if time > int(column[0]))})
-    return _without_short_end(cuts, times, frames)
-
-
-def _without_short_end(
-    cuts: list[int], times: Sequence[NDArray[np.int64]], frames: int
-) -> list[int]:
-    """Drop a last cut that leaves little after it."""
-    if not cuts:
-        return cuts
-    rest = max((len(column) - np.searchsorted(column, cuts[-1]) for column in times), default=0)
-    return cuts[:-1] if rest < frames // 2 else cuts
-
-
-# ---------------------------------------------------------------- pieces
 
 
 def divide(
