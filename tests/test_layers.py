@@ -9,14 +9,20 @@ import hashlib
 import json
 import os
 import shutil
+import struct
+import zlib
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
+import av
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+import jail
 import mp4ds
 from commands import call
 from edits import agreed, changed, flip
@@ -264,3 +270,53 @@ def test_a_manifest_that_tells_other_videos(entry: dict[str, str | None], datase
     assert {one.code for one in mp4ds.validate(dataset)} == {"manifest-inconsistent"}
     exact(dataset, ONE).unlink()
     assert "manifest-inconsistent" in {one.code for one in mp4ds.validate(dataset)}
+
+
+# ---------------------------------------------------------------- larger than it says
+
+
+def png_file(width: int, height: int, color_type: int, depth: int) -> bytes:
+    """A PNG of zeros."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", crc32(name + data))
+
+    row = bytes(1 + width * depth // 8 * {0: 1, 6: 4}[color_type])
+    deflate = zlib.compressobj(1)
+    data = b"".join(deflate.compress(row) for _ in range(height)) + deflate.flush()
+    header = struct.pack(">IIBBBBB", width, height, depth, color_type, 0, 0, 0)
+    chunks = chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunks
+
+
+@pytest.fixture(scope="module")
+def huge() -> bytes:
+    return png_file(16000, 8000, 6, 16)
+
+
+@pytest.mark.parametrize("place", [0, 2])
+def test_a_picture_of_a_gigabyte_is_not_made(place: int, huge: bytes, dataset: Path) -> None:
+    """Neither when ffmpeg opens the video, nor later, though 4 MB are all that it takes."""
+    width, height = EXPECTED[0]["coded_size"]
+    files = [png_file(width, height, 0, 8)] * 3
+    files[place] = huge
+    with av.open(str(exact(dataset, ONE)), "w", format="mp4") as container:
+        stream = container.add_mux_stream("png", rate=30, width=width, height=height)
+        for number, data in enumerate(files):
+            packet = av.Packet(data)
+            packet.pts = packet.dts = number
+            packet.stream, packet.time_base, packet.is_keyframe = stream, Fraction(1, 30), True
+            container.mux(packet)
+
+    def change(document: dict[str, Any]) -> None:
+        document["video"] |= {"codec": "png", "pixel_format": "gray"}
+        for key in ("size", "sha256", "references"):
+            document["video"].pop(key, None)
+
+    changed(dataset / f"{ONE}.yaml", change)
+    agreed(dataset)
+    for path in (dataset, dataset / f"{ONE}.yaml"):
+        found = jail.validate(path)
+        assert set(found.codes) <= {"decode-failed", "digest-mismatch", "geometry-mismatch"}
+        assert found.codes
+        assert jail.read(path).ours

@@ -431,7 +431,7 @@ class FrameReader:
             entry.colour.apply(context)
         if self._codec != "av1":
             # concealed damage would depend on which frames were decoded before
-            context.options = {"err_detect": "explode"}
+            context.options = {**context.options, "err_detect": "explode"}
         return context
 
     def _announce(self, samples: Iterable[int]) -> None:

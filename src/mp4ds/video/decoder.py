@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import Refused, VideoError, reason_of
 from mp4ds.messages.encodings import MAX_SIDE, Picture
 from mp4ds.video.codecs import CODECS
-from mp4ds.video.media import Media, raise_if_scarce
+from mp4ds.video.media import Media, most_pixels, raise_if_scarce
 from mp4ds.video.mp4 import read_sample_table
 from mp4ds.video.pixels import PictureMaker, Scale
 
@@ -105,8 +105,9 @@ def open_packet_decoder(codec: str, size: tuple[int, int], configuration: bytes 
     context.thread_type = "SLICE"
     if configuration:
         context.extradata = configuration
+    context.options = most_pixels(size)
     if codec == "av1":
-        context.options = {"max_frame_delay": "1"}
+        context.options["max_frame_delay"] = "1"
     return context
 
 
@@ -206,7 +207,7 @@ class VideoDecoder:
         self._in_flight = min(os.cpu_count() or 1, _MOST_THREADS) + 1 if sequential else 1
         # the frames that come next, and the number of their first, if a call ended in between
         self._position: tuple[Iterator[av.VideoFrame], int] | None = None
-        self._media = Media(path, file.track if file else None)
+        self._media = Media(path, file.track if file else None, size=maker.coded_size)
         self._container = self._media.container
         try:
             self._media.check(codec, maker.coded_size)

@@ -15,6 +15,7 @@ from av.stream import Disposition
 
 from mp4ds.errors import Mp4dsError, OptionError, RemoteError, VideoError
 from mp4ds.files.urls import remote
+from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.mp4 import why_unreadable
@@ -66,6 +67,7 @@ class Media:
         path: The video.
         track: Which of its video tracks, from 0; None: it has only one.
         advice: What to do where it has several, for errors.
+        size: Width and height of its frames, if they should be known; see `most_pixels`.
 
     Attributes:
         container: PyAV's.
@@ -77,7 +79,13 @@ class Media:
         RemoteError: It is at a URL, and cannot be read there.
     """
 
-    def __init__(self, path: Path, track: int | None = None, advice: str = "") -> None:
+    def __init__(
+        self,
+        path: Path,
+        track: int | None = None,
+        advice: str = "",
+        size: tuple[int, int] | None = None,
+    ) -> None:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
         self._path = path
@@ -85,7 +93,7 @@ class Media:
         try:
             if remote(path):
                 self._file = _Source(path.open("rb"))
-            self.container: Any = open_input(self._file or str(path.absolute()))
+            self.container: Any = open_input(self._file or str(path.absolute()), size=size)
         except (FFmpegError, OSError) as error:
             self._close_file()
             raise_if_scarce(error)
@@ -96,6 +104,7 @@ class Media:
             raise
         try:
             self.track = self._chosen(track, advice)
+            self.track.codec_context.options = most_pixels(size)
         except Mp4dsError:
             self.close()
             raise
@@ -161,17 +170,31 @@ class Media:
             self._file.close()
 
 
-def open_input(source: Any, container: str = "mp4") -> Any:
+def most_pixels(size: tuple[int, int] | None) -> dict[str, str]:
+    """Options by which ffmpeg makes no frame that is much larger, whatever its packet says.
+
+    A PNG file of 2 MB may say that it has 2 GB of pixels, and ffmpeg decodes one to open a video.
+
+    Args:
+        size: Width and height that a sidecar tells; None: those of the largest image.
+    """
+    width, height = size or (MAX_SIDE, MAX_SIDE)
+    slack = 4 if size else 1  # so that the size of a slightly larger one is told
+    return {"max_pixels": str(slack * (width + 64) * (height + 64))}
+
+
+def open_input(source: Any, container: str = "mp4", *, size: tuple[int, int] | None = None) -> Any:
     """Open a video for reading with PyAV.
 
     Args:
         source: Path, absolute: ffmpeg takes a relative name with a colon for an address; or a file.
         container: ffmpeg's name of the demuxer. No other is tried, whatever the bytes look like.
+        size: See `most_pixels`.
 
     Raises:
         FFmpegError, OSError: It cannot be read as that.
     """
-    return av.open(source, "r", format=container, **_ANY_METADATA)
+    return av.open(source, "r", format=container, options=most_pixels(size), **_ANY_METADATA)
 
 
 def pixel_format_of(context: Any) -> str:

@@ -234,7 +234,7 @@ class PacketReader:
     ) -> None:
         self.path = path
         self._codec = codec
-        with closing(Media(path)) as media:
+        with closing(Media(path, size=coded_size)) as media:
             media.check(codec, coded_size)
             context = media.track.codec_context
             self.extradata: bytes = bytes(context.extradata or b"")
