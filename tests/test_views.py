@@ -19,10 +19,11 @@ from commands import call, refused, unchanged
 from compare import compare
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from in_parts import IN_PARTS, InlineExecutor, use
-from mp4ds.errors import Mp4dsError, OptionError
+from mp4ds.errors import FormatError, Mp4dsError, OptionError, SourceError
 from mp4ds.format.models import StreamSidecar
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.unpack import UnpackOptions
+from player_scenes import RecordingPublisher, run
 from round_trips import journey, unpacked
 from sources import SOURCES, scene
 
@@ -296,21 +297,66 @@ def test_views_alone_are_unpacked(
             assert {header.format for header in sidecar.headers} == {"av1;yuv420p;bgr8;rgb8"}
 
 
-def test_a_slice_of_views_alone(alone: tuple[Path, str], tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("ignore:.*exact layer not here")
+def test_views_alone_are_played(alone: tuple[Path, str]) -> None:
     dataset, kind = alone
-    output = tmp_path / "slice.mcap"
-    options = UnpackOptions(quality="visual", duration="0.15")
-    mp4ds.unpack(dataset, output=output, options=options)
+    publisher, _ = run(dataset, RecordingPublisher(world="ros2"), rate=50.0, jpeg_quality=90)
     with mp4ds.open(dataset) as opened:
         (topic,) = opened.topics
-    assert 0 < len(messages(output, topic)) < FRAMES
-    later = UnpackOptions(quality="visual", start="0.15")
-    if ALONE[kind] != "packet":
-        mp4ds.unpack(dataset, output=output, options=replace(later, force=True))
+        channel = opened.streams[0].channel
+    found = [sent for sent in publisher.sent if sent.topic == topic]
+    assert len(found) == FRAMES
+    assert {sent.channel and sent.channel.type_name for sent in found} == {channel.type_name}
+    if ALONE[kind] == "packet":
+        assert all(b"av1" in sent.payload for sent in found)
+
+
+def test_training_on_views(alone: tuple[Path, str]) -> None:
+    training = pytest.importorskip("mp4ds.torch")
+    dataset, _ = alone
+    with mp4ds.open(dataset) as opened:
+        (topic,) = opened.topics
+        shown = opened[topic].read([3])[0]
+    frames = training.FrameDataset(dataset, channels_first=False)
+    assert len(frames) == FRAMES
+    assert np.array_equal(np.asarray(frames[3][topic]), shown)
+
+
+@pytest.mark.parametrize("options", [{"quality": "crf=40"}, {"quality": "psnr=20"}])
+def test_views_alone_are_encoded_again(
+    alone: tuple[Path, str], options: dict[str, Any], tmp_path: Path
+) -> None:
+    dataset, kind = alone
+    copy, again = tmp_path / "copy", tmp_path / "again"
+    with pytest.raises(SourceError, match="has views only"):  # which may be an oversight
+        mp4ds.pack(dataset, again, PackOptions(**options))
+    mp4ds.pack(dataset, copy, PackOptions(quality="visual"))
+    if ALONE[kind] == "packet":
+        with unchanged(tmp_path), pytest.raises(OptionError, match=r"packets of /\S+ are not here"):
+            mp4ds.pack(copy, again, PackOptions(**options))
         return
-    words = f"topic {topic}.*first packets of the slice depend.*Use `images` raw, jpeg or png"
-    with unchanged(tmp_path), pytest.raises(Mp4dsError, match=words):
-        mp4ds.unpack(dataset, output=tmp_path / "later.mcap", options=later)
+    mp4ds.pack(copy, again, PackOptions(**options))
+    assert {one.profile for one in sidecars(again)} == {options["quality"]}
+    assert mp4ds.validate(again, deep=True) == []
+
+
+@pytest.mark.parametrize("view", [False, True])
+def test_both_videos_are_validated(view: bool, tmp_path: Path) -> None:
+    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"]())
+    dataset = tmp_path / "dataset"
+    mp4ds.pack(source, dataset, PackOptions(view="av1"))
+    (video,) = (path for path in dataset.glob("*.mp4") if (".exact" in path.name) is not view)
+    data = bytearray(video.read_bytes())
+    middle = data.index(b"mdat") + len(data) // 3
+    data[middle : middle + 40] = bytes(40)
+    video.write_bytes(data)
+    told = mp4ds.validate(dataset, deep=True)
+    assert {Path(problem.place.split(" ")[0]).name for problem in told} >= {video.name}
+    if view:  # what was recorded is there all the same
+        assert compare([source], unpacked(tmp_path, "mcap")) == []
+    else:
+        with pytest.raises(FormatError, match="differs from what was recorded"):
+            unpacked(tmp_path, "mcap")
 
 
 def test_putting_the_exact_video_back(alone: tuple[Path, str], tmp_path: Path) -> None:

@@ -312,8 +312,10 @@ def _check_deep(stream: Stream, report: _Report) -> Iterator[FormatError]:
         if number % _TELL_EVERY == 0:
             report(f"decoding {name}", number / len(stream))
 
-    for error, *_ in stream.damages(tell):
-        yield error
+    # a view that predicts is decoded with the images; that of packets is not
+    for layer in stream.layers if stream.sidecar.keeps_packets else [stream]:
+        for error, *_ in layer.damages(tell):
+            yield error
 
 
 def _check_messages(dataset: Dataset, manifest: Manifest) -> Iterator[FormatError]:
