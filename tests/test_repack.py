@@ -137,6 +137,9 @@ def test_views_are_not_taken_for_what_was_recorded(recording: Path, tmp_path: Pa
         assert not (tmp_path / "again").exists()
     mp4ds.pack(tmp_path / "exact", tmp_path / "again", PackOptions(quality="visual"))
     assert manifest(tmp_path / "again").profile == "visual"
+    anew = PackOptions(quality="visual", preset="9", window=5)
+    mp4ds.pack(tmp_path / "exact", tmp_path / "anew", anew)
+    assert mp4ds.validate(tmp_path / "anew", deep=True) == []
     mp4ds.pack(tmp_path / "exact", tmp_path / "rest", PackOptions(exclude=["/cam/*"]))
     assert manifest(tmp_path / "rest").profile == "lossless"
 

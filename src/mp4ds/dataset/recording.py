@@ -50,8 +50,9 @@ class DatasetReader(BagReader):
         if manifest := dataset.manifest:
             self.format = manifest.format
             self.library = manifest.library
+            absent = {video.file for one in dataset.streams if (video := one.absent)}
             names = [MANIFEST_NAME, *(entry.name for entry in manifest.files)]
-            self.files = [self.path / name for name in names]
+            self.files = [self.path / name for name in names if name not in absent]
             self._messages = manifest.messages
             self._bytes = sum(entry.size for entry in manifest.files)
         else:

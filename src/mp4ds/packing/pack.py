@@ -596,9 +596,9 @@ def _bytes_a_pixel(plan: TrackPlan) -> int:
     """About what encoders take; SVT-AV1 looks ahead with many pictures, x264 qp 0 with none."""
     own = 0
     if plan.coding is not None:
-        own = 60 if plan.coding.recipe.lossless else 350
-    if plan.view is not None:  # its encoder and decoder, and some 80 images that wait for it
-        own += 450 + (80 * plan.view.layout.encoding.pixel_bytes if plan.coding else 0)
+        own = 60 if plan.coding.recipe.lossless else 250
+    if plan.view is not None:  # its encoder and decoder, and some 45 images that wait for it
+        own += 300 + (45 * plan.view.layout.encoding.pixel_bytes if plan.coding else 0)
     return own
 
 

@@ -290,7 +290,8 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
         # it prints to stderr by itself; errors reach us as return codes
         os.environ.setdefault("SVT_LOG", "0")
         given = context.options.get("svtav1-params")
-        parameters = f"{given}:lp={threads}" if given else f"lp={threads}"
+        # it keeps room, and pictures, for one level more than it uses by itself
+        parameters = ":".join(filter(None, (given, "hierarchical-levels=4", f"lp={threads}")))
         context.options = {**context.options, "svtav1-params": parameters}
     if recipe.encoder == "libx265":
         # it would write its threads and the processor beside the parameter sets
