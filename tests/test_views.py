@@ -340,6 +340,14 @@ def test_views_alone_are_encoded_again(
     assert mp4ds.validate(again, deep=True) == []
 
 
+def test_it_is_told_what_views_add(tmp_path: Path) -> None:
+    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-420"](width=320, height=240))
+    summary = mp4ds.pack(source, tmp_path / "dataset", PackOptions(view="av1"))
+    (path,) = (tmp_path / "dataset").glob("*compressed.mp4")
+    size = f"{path.stat().st_size / 1000:.1f} kB"
+    assert summary.larger == f"views of JPEG files and video packets take {size}"
+
+
 @pytest.mark.parametrize("view", [False, True])
 def test_both_videos_are_validated(view: bool, tmp_path: Path) -> None:
     (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"]())

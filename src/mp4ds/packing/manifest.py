@@ -10,7 +10,7 @@ from typing import Any
 from mp4ds._version import __version__
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.errors import FormatError, SourceError, advising
+from mp4ds.errors import FormatError, SourceError, advising, size_text
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.sources import source_name, source_size
 from mp4ds.files.urls import spelled
@@ -258,6 +258,10 @@ def _why_larger(summary: PackSummary, made: Dataset) -> str:
     source_bytes, dataset_bytes = summary.source_bytes, summary.dataset_bytes
     if dataset_bytes <= _LARGER * source_bytes:
         return ""
+    sidecars = [stream.sidecar for stream in made.streams]
+    views = sum(one.view.size or 0 for one in sidecars if one.view and one.body == "packet")
+    if 2 * views > dataset_bytes - source_bytes:
+        return f"views of JPEG files and video packets take {size_text(views)}"
     if any(one.profile != LOSSLESS for one in earlier):
         return "re-encoding the videos of a lossy dataset does not make them as small as they were"
     if earlier:
