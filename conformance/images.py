@@ -95,13 +95,14 @@ def planes_of(frame):
 # ---------------------------------------------------------------- layouts
 
 
-def pixels(image, video, planes):
+def pixels(image, video, planes, prediction=None):
     """The bit patterns of an image, shape (rows, columns, channels), of the planes of a picture.
 
     Args:
         image: Its `encoding`, `width` and `height`.
         video: Its `layout` and its `parameters`, if it has any; of a lossy one, the `color`.
         planes: Of colours G, B and R, and alpha.
+        prediction: What values of a source differ from, as this function gives it.
     """
     encoding, width, height = image["encoding"], image["width"], image["height"]
     channels, samples = ENCODINGS[encoding]
@@ -116,12 +117,21 @@ def pixels(image, video, planes):
     elif video.get("pixel_format") == "yuv420p10le":
         planes = as_bytes(planes, is_full=video["color"]["range"] == "full")
     patterns = np.dtype(f"u{samples.itemsize}")
+    if values in ("converted", "demosaiced") and prediction is not None:
+        prediction = _named(prediction, encoding).astype(int)
+        if values == "converted":
+            both = zip(planes, _yuv_of(prediction, planes), strict=True)
+            planes = [(plane + own - 128) % 256 for plane, own in both]
     if values == "converted":
         return _named(_converted(planes, parameters["rule"], (width, height)), encoding)
     count = 3 if values == "opaque" else channels
     placed = _placed(places, parameters, encoding, (width, height), planes, count)
     if values == "demosaiced":
-        return _named(_demosaiced(placed[..., 0].astype(int), parameters["mosaic"]), encoding)
+        mosaic, block = placed[..., 0].astype(int), _block(parameters["mosaic"])
+        if prediction is not None:
+            y, x = np.mgrid[:height, :width]
+            mosaic = (mosaic + prediction[y, x, block[y % 2, x % 2]] - 128) % 256
+        return _named(_demosaiced(mosaic, block), encoding)
     if values == "whole":
         top = 1 << (8 * samples.itemsize - 1) if samples.kind == "i" else 0
         return placed.astype(patterns) ^ patterns.type(top)
@@ -148,19 +158,32 @@ def _named(rgb, encoding):
     return (rgb if encoding.startswith("rgb") else rgb[..., ::-1]).astype(np.uint8)
 
 
+def _block(name):
+    """Numbers of the colours of a mosaic."""
+    return np.array(["rgb".index(letter) for letter in name]).reshape(2, 2)
+
+
+def _yuv_of(rgb, planes):
+    """Y, U and V that a prediction stands for, in the sizes of planes."""
+    r, g, b = np.moveaxis(rgb, 2, 0)
+    (tall, wide), (rows, columns) = planes[0].shape, planes[1].shape
+    shape = rows, tall // rows, columns, wide // columns
+    r4, g4, b4 = (color.reshape(shape).sum(axis=(1, 3)) for color in (r, g, b))
+    count = shape[1] * shape[3]
+    u = -38 * r4 - 74 * g4 + 112 * b4 + 0x8080 * count
+    v = 112 * r4 - 94 * g4 - 18 * b4 + 0x8080 * count
+    return (66 * r + 129 * g + 25 * b + 0x1080) >> 8, u // (256 * count), v // (256 * count)
+
+
 def _demosaiced(mosaic, block):
     """R, G and B, shape (rows, columns, 3)."""
     if min(mosaic.shape) < 3:
         return np.zeros((*mosaic.shape, 3))
     y, x = np.mgrid[: mosaic.shape[0], : mosaic.shape[1]]
     y, x = (np.clip(place, 1, place.max() - 1) for place in (y, x))
-    color = np.array(["rgb".index(name) for name in block]).reshape(2, 2)[y % 2, x % 2]
-    beside = np.array(["rgb".index(name) for name in block]).reshape(2, 2)[y % 2, (x + 1) % 2]
+    color, beside = block[y % 2, x % 2], block[y % 2, (x + 1) % 2]
     left, right, above, below = (
-        mosaic[y, x - 1],
-        mosaic[y, x + 1],
-        mosaic[y - 1, x],
-        mosaic[y + 1, x],
+        mosaic[y + down, x + across] for down, across in ((0, -1), (0, 1), (-1, 0), (1, 0))
     )
     corners = sum(mosaic[y + down, x + across] for down in (-1, 1) for across in (-1, 1))
     is_green = color == 1

@@ -133,8 +133,10 @@ def messages(path, side, found, packets, pictures, predicted):
         if kind == "packet" and side["profile"] == "lossless":
             body = packet_body(video["codec"], packets[n], header.get("framing", ""))
         elif kind != "packet":
-            patterns = pixels(image, video, pictures[n])
-            if predicted:
+            is_source = video["layout"].startswith("from_")
+            of_source = predicted[n] if predicted and is_source else None
+            patterns = pixels(image, video, pictures[n], of_source)
+            if predicted and not is_source:
                 bits = used_bits(side["view"], patterns)
                 whole = patterns.astype(np.int64) + predicted[n] - 2 ** (bits - 1)
                 patterns = (whole % 2**bits).astype(patterns.dtype)

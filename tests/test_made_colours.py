@@ -11,6 +11,7 @@ import yaml
 from numpy.typing import NDArray
 
 import mp4ds
+import reader
 from compare import compare
 from mp4ds.messages.encodings import ENCODINGS, Parameters
 from mp4ds.messages.layouts import bind, fit
@@ -147,6 +148,7 @@ def test_an_image_with_a_drawing_goes_into_another_stream(source: str, tmp_path:
     mp4ds.pack(paths, tmp_path / "dataset")
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
+    assert reader.main(tmp_path / "dataset") == 0  # the second one, which compares digests
     layouts = {yaml.safe_load(path.read_bytes())["video"]["layout"] for path in streams(tmp_path)}
     assert layouts == {f"from_{source}".replace("mosaic", "mosaic8"), "rgb24"}
     with mp4ds.open(tmp_path / "dataset") as dataset:

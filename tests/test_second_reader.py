@@ -153,6 +153,26 @@ def test_every_exact_layout_is_what_the_spec_says(size: tuple[int, int]) -> None
     assert seen == {name for name, kind in LAYOUTS.items() if kind.is_exact} - odd
 
 
+@pytest.mark.parametrize("source", sources_of(40, 30))
+@pytest.mark.parametrize("name", ["rgb8", "bgr8"])
+def test_what_a_view_predicts_of_a_source_is_what_the_spec_says(name: str, source: str) -> None:
+    encoding = ENCODINGS[name]
+    image = {"encoding": name, "width": 40, "height": 30}
+    rng = np.random.default_rng(3)
+    prediction = rng.integers(0, 256, (30, 40, 3), np.uint8)
+    pixels = made_of(source, encoding, 40, 30, seed=2)
+    layouts = (fit(layout, encoding, [pixels]) for layout in encoding.exact)
+    layout = next(filter(None, layouts))
+    assert layout.name.removeprefix("from_").rstrip("8") == source
+    picture = layout.to_picture(pixels, (prediction, 8))
+    video = {"layout": layout.name, "parameters": layout.parameters.to_values()}
+    order = "rgba" if name == "rgb8" else "bgra"
+    assert np.array_equal(images.pixels(image, video, planes(picture, order), prediction), pixels)
+    again = np.empty_like(pixels)
+    layout.to_pixels(picture, again, (prediction, 8))
+    assert np.array_equal(again, pixels)
+
+
 LOSSY = [name for name, encoding in ENCODINGS.items() if encoding.lossy]
 SIZES = [(2, 2), (7, 5), (40, 31)]
 

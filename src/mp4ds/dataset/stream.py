@@ -20,7 +20,7 @@ from mp4ds.format.fields import Choice, DecodedColumns, decode_columns, everythi
 from mp4ds.format.models import Calibration, StreamSidecar, VideoModel
 from mp4ds.format.sidecars import load_stream
 from mp4ds.messages import depth
-from mp4ds.messages.encodings import Picture, Pixels, add_prediction
+from mp4ds.messages.encodings import Picture, Pixels
 from mp4ds.messages.layouts import Layout
 from mp4ds.records import Channel, Message
 from mp4ds.video.access import FrameReader
@@ -232,8 +232,8 @@ class Stream(Images):
             self.layout.to_pixels(picture, out)
             return
         *differences, prediction = picture
-        self.layout.to_pixels(tuple(differences), out)
-        add_prediction(out, prediction, self._view.layout.used_bits)
+        bits = self._view.layout.used_bits
+        self.layout.to_pixels(tuple(differences), out, (prediction, bits))
 
     def predicted(self, pictures: NumberedPictures, shown: NumberedPictures) -> NumberedPictures:
         """Pictures of the video, to each of which the view's pixels are added as the last array.

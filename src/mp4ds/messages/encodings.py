@@ -247,6 +247,10 @@ def put_padding(data: bytearray | memoryview, padding: bytes, *, row_bytes: int,
 # ---------------------------------------------------------------- predictions
 
 
+Prediction = tuple[Pixels, int]
+"""Pixels that those of an image are differences to, in native byte order; bits of a difference."""
+
+
 def difference(pixels: Pixels, prediction: Pixels, bits: int) -> Pixels:
     """What an image differs by from its prediction, as an image of the same encoding.
 
@@ -407,6 +411,10 @@ class Values(ABC):
     @abstractmethod
     def encode(self, pixels: Pixels) -> Samples:
         """Samples of accepted pixels; may be a view."""
+
+    def predicted(self, prediction: Pixels) -> Samples:
+        """What stands for the samples of an image, in one that predicts its pixels."""
+        return self.encode(prediction)
 
     @abstractmethod
     def decode(self, samples: Samples, out: Pixels) -> None:

@@ -27,9 +27,12 @@ from mp4ds.messages.encodings import (
     Parameters,
     Picture,
     Pixels,
+    Prediction,
     Samples,
     Values,
     Whole,
+    add_prediction,
+    difference,
     patterns,
 )
 from mp4ds.messages.numbers import Few, Metres, Palette, PatternTable, Tone
@@ -268,17 +271,6 @@ CHROMA_SHIFTS = {"yuv420p": (1, 1), "yuv422p": (1, 0), "yuv444p": (0, 0)}
 """Planar pixel formats: how often width and height of the chroma planes are halved."""
 
 
-def _even(width: int, height: int, *, across: bool, down: bool) -> tuple[int, int]:
-    """A size, if chroma may be halved so.
-
-    Raises:
-        ValueError: A side is odd.
-    """
-    if (across and width % 2) or (down and height % 2):
-        raise ValueError(f"{width}x{height} pixels, where chroma needs even sides")
-    return width, height
-
-
 @dataclass(frozen=True, slots=True)
 class Packed422(Arrangement):
     """Planes Y, U and V, from two-byte pixels that share U and V with a neighbour.
@@ -292,10 +284,6 @@ class Packed422(Arrangement):
     def pixel_format(self, bits: int) -> str:
         """Chroma of half the width."""
         return "yuv422p"
-
-    def picture_size(self, width: int, height: int) -> tuple[int, int]:
-        """The same, which must be even."""
-        return _even(width, height, across=True, down=False)
 
     def luma_rows(self, samples: Samples) -> int:
         """Rows of the image."""
@@ -327,10 +315,6 @@ class SemiPlanar(Arrangement):
     def pixel_format(self, bits: int) -> str:
         """By the chroma's size."""
         return "yuv420p" if self.halved else "yuv444p"
-
-    def picture_size(self, width: int, height: int) -> tuple[int, int]:
-        """The same, which must be even."""
-        return _even(width, height, across=self.halved, down=self.halved)
 
     def arrange(self, samples: Samples) -> Picture:
         """Views if rows are contiguous."""
@@ -447,7 +431,7 @@ class LayoutKind:
     """A layout of the registry.
 
     Attributes:
-        name: Its name in the registry.
+        name: Its name there.
         values: The step on values, which knows its parameters.
         arrangement: Makes their placement.
         is_exact: Whether the pixels are restored if the picture is.
@@ -555,8 +539,20 @@ class Layout:
             return self.parameters.bits + (self.parameters.shift or 0)
         return 8 * self.encoding.bytes_per_sample
 
+    @property
+    def is_source(self) -> bool:
+        """Whether its samples are what the colours of the images were made of."""
+        return isinstance(self._values, Demosaiced | Converted)
+
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of the image -> of the picture."""
+        """Width and height of the image -> of the picture.
+
+        Raises:
+            ValueError: A side is odd, where the layout halves chroma.
+        """
+        across, down = CHROMA_SHIFTS.get(self.pixel_format, (0, 0))
+        if self.is_exact and (width % (1 << across) or height % (1 << down)):
+            raise ValueError(f"{width}x{height} pixels, where chroma needs even sides")
         return self._arrangement.picture_size(width, height)
 
     def refuses(self, pixels: Pixels) -> str | None:
@@ -567,30 +563,43 @@ class Layout:
         """
         return self._values.refuses(pixels)
 
-    def to_picture(self, pixels: Pixels) -> Picture:
+    def to_picture(self, pixels: Pixels, prediction: Prediction | None = None) -> Picture:
         """The picture of accepted pixels; may be a view of them.
 
         Args:
             pixels: As `mp4ds.messages.encodings.pixel_view` gives them.
+            prediction: The picture is of the difference to this.
 
         Returns:
             One array of shape (rows, columns) or (rows, columns, channels), or one per plane.
         """
-        return self._arrangement.arrange(self._values.encode(pixels))
+        if prediction is not None and not self.is_source:
+            pixels = difference(pixels, *prediction)
+        samples = self._values.encode(pixels)
+        if prediction is not None and self.is_source:
+            samples = difference(samples, self._values.predicted(prediction[0]), prediction[1])
+        return self._arrangement.arrange(samples)
 
-    def to_pixels(self, picture: Picture, out: Pixels) -> None:
+    def to_pixels(
+        self, picture: Picture, out: Pixels, prediction: Prediction | None = None
+    ) -> None:
         """Write the pixels of a picture.
 
         Args:
             picture: Of the size and format of this layout.
             out: Shape `Encoding.shape`; its type is the encoding's, in any byte order.
+            prediction: As for `to_picture`.
         """
         if self._values.is_identity:
             self._arrangement.restore(picture, patterns(out))
-            return
-        samples = np.empty(self._values.shape(out), f"u{(self._values.bits + 7) // 8}")
-        self._arrangement.restore(picture, samples)
-        self._values.decode(samples, out)
+        else:
+            samples = np.empty(self._values.shape(out), f"u{(self._values.bits + 7) // 8}")
+            self._arrangement.restore(picture, samples)
+            if prediction is not None and self.is_source:
+                add_prediction(samples, self._values.predicted(prediction[0]), prediction[1])
+            self._values.decode(samples, out)
+        if prediction is not None and not self.is_source:
+            add_prediction(out, *prediction)
 
 
 def bind(name: str, encoding: Encoding, parameters: Parameters = NO_PARAMETERS) -> Layout:

@@ -67,17 +67,20 @@ def _demosaic(mosaic: Samples, block: str, rgb: Pixels) -> None:
     rgb[0], rgb[-1] = rgb[1], rgb[-2]
 
 
+def _sampled(rgb: Pixels, block: str) -> Samples:
+    """The samples that a mosaic would have of these colours."""
+    mosaic = np.empty(rgb.shape[:2], rgb.dtype)
+    for y, x in product((0, 1), (0, 1)):
+        mosaic[y::2, x::2] = rgb[y::2, x::2, "rgb".index(block[2 * y + x])]
+    return mosaic
+
+
 def _mosaic(rgb: Pixels, block: str) -> Samples:
     """The mosaic whose colours an image may be."""
-    height, width = rgb.shape[:2]
-    mosaic = np.empty((height, width), rgb.dtype)
-    sites = np.empty((height, width), np.uint8)
-    for y, x in product((0, 1), (0, 1)):
-        color = "rgb".index(block[2 * y + x])
-        sites[y::2, x::2] = color
-        mosaic[y::2, x::2] = rgb[y::2, x::2, color]
-    if min(height, width) <= _FEWEST:
+    mosaic = _sampled(rgb, block)
+    if min(mosaic.shape) <= _FEWEST:
         return mosaic
+    sites = _sampled(np.broadcast_to(np.arange(3, dtype=np.uint8), rgb.shape), block)
     for turns in range(4):
         _find_edge(*(np.rot90(plane, turns) for plane in (mosaic, sites, rgb)))
     for turns in range(4):
@@ -180,6 +183,10 @@ class Demosaiced(Values):
         """New samples."""
         return _mosaic(_colours(native(pixels), self._encoding), self.mosaic)
 
+    def predicted(self, prediction: Pixels) -> Samples:
+        """The color that the mosaic has at each pixel."""
+        return _sampled(_colours(prediction, self._encoding), self.mosaic)
+
     def decode(self, samples: Samples, out: Pixels) -> None:
         """Write the pixels."""
         _demosaic(samples, self.mosaic, _colours(patterns(out), self._encoding))
@@ -216,6 +223,8 @@ _NEUTRAL = 128 << 8 | 128
 _SPAN = 511  # values of the difference of two samples
 _WALK = 260  # steps that reach every chroma
 _FEWEST_CHROMAS = 8  # that tell a rule from the others
+_ROWS = 32  # at a time, likewise
+_CHUNK = 8192  # places at a time, which a processor's cache holds
 _HARD = 8  # places for which all chromas are tried
 _REACH = 12  # around an estimate of the chroma, where it has two unknowns
 
@@ -348,6 +357,15 @@ class _Solution:
     @classmethod
     def of(cls, rule: Conversion, colours: Samples) -> _Solution:
         """For colours of which the first pixel has neither 0 nor 255."""
+        _, sharing, count = colours.shape
+        luma, chroma = np.empty((sharing, count), np.int32), np.empty(count, np.int32)
+        solution = cls(rule, colours, luma, chroma, np.empty(count, bool))
+        for start in range(0, count, _CHUNK):
+            solution._begin(slice(start, start + _CHUNK))
+        return solution
+
+    def _begin(self, part: slice) -> None:
+        rule, colours = self.rule, self.colours[:, :, part]
         red, green, blue = colours[:, 0]
         chroma = rule.known[(red - green) * _SPAN + (blue - green) + 255 * (_SPAN + 1)]
         chroma[chroma < 0] = _NEUTRAL
@@ -355,7 +373,7 @@ class _Solution:
         is_right = np.ones(len(chroma), bool)
         for made, color in zip(rule.colours(luma, chroma), colours, strict=True):
             is_right &= (made == color).all(axis=0)
-        return cls(rule, colours, luma, chroma, ~is_right)
+        self.luma[:, part], self.chroma[part], self.is_open[part] = luma, chroma, ~is_right
 
     @property
     def is_refuted(self) -> bool:
@@ -476,8 +494,11 @@ class Converted(Values):
     def _solved(self, pixels: Pixels) -> _Solution:
         height, width = pixels.shape[:2]
         down = 1 + self.is_tall
-        blocks = _colours(pixels, self._encoding).reshape(height // down, down, width // 2, 2, 3)
-        colours = blocks.transpose(4, 1, 3, 0, 2).reshape(3, 2 * down, -1).astype(np.int32)
+        rgb = _colours(pixels, self._encoding)
+        colours = np.empty((3, down, 2, height // down, width // 2), np.int32)
+        for color, y, x in product(range(3), range(down), (0, 1)):
+            colours[color, y, x] = rgb[y::down, x::2, color]
+        colours = colours.reshape(3, 2 * down, -1)
         return _Solution.of(CONVERSIONS[self.rule], colours)
 
     def _planes(self, samples: Samples) -> tuple[Samples, Samples, Samples]:
@@ -498,6 +519,28 @@ class Converted(Values):
         luma[...] = placed.reshape(luma.shape)
         chroma = solution.chroma.reshape(u.shape)
         u[...], v[...] = chroma >> 8, chroma & 255
+        return samples
+
+    def predicted(self, prediction: Pixels) -> Samples:
+        """About the YUV of these colours: one rule for all."""
+        samples = np.empty(self.shape(prediction), np.uint8)
+        rgb = _colours(prediction, self._encoding)
+        luma, u, v = self._planes(samples)
+        halvings = 1 + self.is_tall
+        middle = 0x8080 << halvings
+        for top in range(0, len(rgb), _ROWS):
+            colours = [rgb[top : top + _ROWS, :, n].astype(np.uint16) for n in range(3)]
+            weighted = [
+                weight * color for weight, color in zip((66, 129, 25), colours, strict=True)
+            ]
+            luma[top : top + _ROWS] = (sum(weighted) + 0x1080) >> 8
+            sums = [color[:, 0::2] + color[:, 1::2] for color in colours]
+            if self.is_tall:
+                sums = [rows[0::2] + rows[1::2] for rows in sums]
+            red, green, blue = (total.astype(np.int32) for total in sums)
+            place = slice(top >> self.is_tall, (top + _ROWS) >> self.is_tall)
+            u[place] = (-38 * red - 74 * green + 112 * blue + middle) >> (8 + halvings)
+            v[place] = (112 * red - 94 * green - 18 * blue + middle) >> (8 + halvings)
         return samples
 
     def decode(self, samples: Samples, out: Pixels) -> None:

@@ -52,7 +52,7 @@ from mp4ds.video.codecs import (
     recipe_for,
     visual_setting,
 )
-from mp4ds.video.encoder import Coding, choose, choose_predicted
+from mp4ds.video.encoder import Coding, choose, choose_predicted, difference_layouts
 from mp4ds.video.packets import packet_format
 
 # ---------------------------------------------------------------- one kind of images
@@ -268,10 +268,11 @@ def _lossless_plans(
     plan, least = TrackPlan(best, note=note), best.bytes_per_frame
     view = _view_coding(pixels, encoding, options)
     if view is not None:
+        source = [best.layout] if best.layout.is_source else []
         with suppress(OptionError, EncoderRefusedError):
             both = choose_predicted(
                 pixels,
-                encoding,
+                source or difference_layouts(view.layout),
                 view,
                 best.bytes_per_frame,
                 gop=options.group_frames,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import EncoderRefusedError, Refused
 from mp4ds.format.models import Color, LayoutParameters
 from mp4ds.format.quality import Quality as Measured
-from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, difference, native
+from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, Prediction, native
 from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage
 from mp4ds.packing.windows import WindowCoder, out_of_reach, window_frames
@@ -281,9 +281,9 @@ class _EncodedTrack(_PictureTrack):
         if seen.pixels is not None:
             self.encode(seen.pixels, tick)
 
-    def encode(self, pixels: Pixels, tick: int) -> None:
-        """Encode an image."""
-        self._encoder.write(self.coding.layout.to_picture(pixels), tick)
+    def encode(self, pixels: Pixels, tick: int, prediction: Prediction | None = None) -> None:
+        """Encode an image, or its difference to a prediction."""
+        self._encoder.write(self.coding.layout.to_picture(pixels, prediction), tick)
 
     @property
     def configuration(self) -> bytes:
@@ -332,7 +332,8 @@ class _PredictedTrack(Track):
         self._waiting: deque[tuple[Pixels, int]] = deque()
 
     def refuses(self, seen: CameraMessage) -> str | None:
-        return self.view.refuses(seen)
+        of_source = self._own.refuses(seen) if self._own.coding.layout.is_source else None
+        return self.view.refuses(seen) or of_source
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         if seen.pixels is not None:
@@ -343,7 +344,7 @@ class _PredictedTrack(Track):
     def _follow(self, packet: bytes | None) -> None:
         for prediction in self._predictor.images(packet):
             pixels, tick = self._waiting.popleft()
-            self._own.encode(difference(pixels, prediction, self._bits), tick)
+            self._own.encode(pixels, tick, (prediction, self._bits))
 
     def close(self) -> None:
         try:

@@ -24,7 +24,6 @@ from mp4ds.messages.encodings import (
     Parameters,
     Picture,
     Pixels,
-    difference,
 )
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit
 from mp4ds.video.codecs import (
@@ -522,8 +521,7 @@ def choose(
     gop: int,
     threads: int,
     purpose: str | None = None,
-    layouts: Sequence[Layout] = (),
-    is_noise: bool = False,
+    differences: Sequence[tuple[Layout, Sequence[Picture]]] = (),
 ) -> Coding:
     """The best lossless layout, recipe and distance of key frames, found by trying each.
 
@@ -535,8 +533,7 @@ def choose(
         gop: Most frames from one key frame to the next.
         threads: Threads of the encoder.
         purpose: What the video is for.
-        layouts: The only ones to try; none: all that can hold the samples.
-        is_noise: Whether the images are differences to those of a view.
+        differences: To what a view shows of the samples, by their layouts; to be coded instead.
 
     Returns:
         The first, in the order of the encoding's layouts and their codecs, within 2 % of the
@@ -550,13 +547,19 @@ def choose(
     crops, share = _crops(samples, encoding)
     tried: list[tuple[Coding, Coded]] = []
     refusals: list[Exception] = []
-    for layout in layouts or _candidates(samples, encoding):
-        pictures = [layout.to_picture(pixels) for pixels in crops]
+    candidates = differences or (
+        (layout, list(map(layout.to_picture, crops))) for layout in _candidates(samples, encoding)
+    )
+    for layout, pictures in candidates:
         picture_format = layout.pixel_format
         for name in codecs_to_try(picture_format) if codec is None else [codec]:
             try:
                 recipe = recipe_for(
-                    picture_format, lossless=True, codec=name, preset=preset, is_noise=is_noise
+                    picture_format,
+                    lossless=True,
+                    codec=name,
+                    preset=preset,
+                    is_noise=bool(differences),
                 )
                 coded = encode_on_trial(
                     pictures, recipe, picture_format=picture_format, threads=threads
@@ -605,7 +608,7 @@ def difference_layouts(view: Layout) -> list[Layout]:
 
 
 def choose_predicted(
-    samples: Sequence[Pixels], encoding: Encoding, view: Coding, most: float, **options: Any
+    samples: Sequence[Pixels], layouts: Sequence[Layout], view: Coding, most: float, **options: Any
 ) -> Coding:
     """The best coding of the differences of images to what a view shows.
 
@@ -614,7 +617,7 @@ def choose_predicted(
 
     Args:
         samples: As for `choose`.
-        encoding: Of the images.
+        layouts: Of the differences, at least one.
         view: How the view is encoded.
         most: Bytes of an image, with its view, that PNG files may take though others take fewer.
         **options: As for `choose`.
@@ -626,16 +629,19 @@ def choose_predicted(
         OptionError: As for `choose`.
         EncoderRefusedError: No codec takes such pictures.
     """
+    encoding = view.layout.encoding
     crops, share = _crops(samples, encoding)
     coded, shown = predict_on_trial(crops, view, options["threads"])
-    bits = view.layout.used_bits
-    differences = [difference(*pair, bits) for pair in zip(crops, shown, strict=True)]
-    layouts = difference_layouts(view.layout)
+    predictions = [(pixels, view.layout.used_bits) for pixels in shown]
+    differences = [
+        (layout, [layout.to_picture(*pair) for pair in zip(crops, predictions, strict=True)])
+        for layout in layouts
+    ]
     of_view = coded.bytes_per_frame(view.gop)
 
     def tried(**changes: Any) -> Coding:
         asked = {**options, **changes}
-        found = choose(differences, encoding, layouts=layouts, is_noise=True, **asked)
+        found = choose(crops, encoding, differences=differences, **asked)
         return replace(found, bytes_per_frame=(found.bytes_per_frame + of_view) / share)
 
     can_be_png = any("png" in lossless_codecs(layout.pixel_format) for layout in layouts)
@@ -651,9 +657,19 @@ def choose_predicted(
 
 
 def _candidates(samples: Sequence[Pixels], encoding: Encoding) -> list[Layout]:
-    """The layouts that can hold the samples; byte planes only if nothing else can."""
-    fitted = [fit(name, encoding, samples) for name in encoding.exact]
-    found = [layout for layout in fitted if layout and _is_in_bounds(layout, samples[0])]
+    """The layouts that can hold the samples.
+
+    That of what colours were made of, as it has the fewest samples; byte planes only if nothing
+    else can.
+    """
+    found = []
+    for name in encoding.exact:
+        layout = fit(name, encoding, samples)
+        if layout is None or not _is_in_bounds(layout, samples[0]):
+            continue
+        if layout.is_source:
+            return [layout]
+        found.append(layout)
     return [layout for layout in found if layout.name != "bytes"] or found
 
 
