@@ -24,6 +24,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 import mp4ds
 from coded_scenes import CODED
@@ -297,13 +298,21 @@ def test_lossless_cameras_play_their_views(with_views: Path, tmp_path: Path) -> 
 
 
 def test_an_old_mosaic_has_stills_and_is_told_of_views(packed_bag: Path, tmp_path: Path) -> None:
-    """Its video shows four planes: nobody wants to see them."""
+    """Its video shows four planes: nobody wants to see them. What it is told to do helps."""
     (camera,) = report(packed_bag, ReportOptions(output=tmp_path / "page")).cameras
     assert camera.plays == "stills"
     assert "does not look like the image; `mp4ds pack DATASET -o NEW --view`" in camera.note
     (facts,) = data_of(tmp_path / "page")["cameras"]
     assert facts["calibrations"][0]["overlay"]["lines"]
     assert facts["shown"] == [1, 1]
+    assert call("pack", packed_bag, "-o", tmp_path / "new", "--view").code == 0
+    assert [camera.plays for camera in report(tmp_path / "new").cameras] == ["video"]
+    old, new = (
+        mp4ds.unpack(path, "bag", tmp_path / f"{path.name}.bag").output
+        for path in (packed_bag, tmp_path / "new")
+    )
+    with AnyReader([old]) as first, AnyReader([new]) as second:
+        assert [raw for *_, raw in first.messages()] == [raw for *_, raw in second.messages()]
 
 
 def test_a_remote_dataset_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

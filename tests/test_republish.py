@@ -365,6 +365,31 @@ def test_packets_are_those_of_the_view(
         assert all(map(bytes.endswith, found, packets))
 
 
+def test_jpeg_files_with_a_view_become_its_packets(packed: Pack) -> None:
+    """Without one, no packets can be made of them."""
+    made = packed("jpeg-rgb", "mcap-ros2-zstd", PackOptions(view="av1"))
+    summary, messages = made.unpack("mcap", "compressed-video")
+    assert summary.notes == [
+        f"{made.topic}: its pixels differ from those recorded: they are those of its view"
+    ]
+    now = summary.republished[made.topic].topic
+    found = shown([message for message in messages if message.topic == now])
+    for picture, original in zip(found, truth(made.cameras), strict=True):
+        assert psnr(halved(picture), halved(original)) > 31
+    summary, messages = made.unpack("mcap", None)
+    assert [m.payload for m in kept(made, messages)] == [r.payload("cdr") for r in made.cameras]
+
+
+def test_packets_with_a_view_stay_those_recorded(packed: Pack) -> None:
+    """They are a video already: nothing is gained by those of the view."""
+    made = packed("video-h264", "mcap-ros2-zstd", PackOptions(view="av1"))
+    summary, messages = made.unpack("mcap", "ffmpeg")
+    now = summary.republished[made.topic].topic
+    found = shown([message for message in messages if message.topic == now])
+    assert all(map(np.array_equal, found, truth(made.cameras)))
+    assert summary.notes == []
+
+
 # ---------------------------------------------------------------- raw images as files
 
 
