@@ -374,8 +374,8 @@ def test_jpeg_files_with_a_view_become_its_packets(packed: Pack) -> None:
     ]
     now = summary.republished[made.topic].topic
     found = shown([message for message in messages if message.topic == now])
-    for picture, original in zip(found, truth(made.cameras), strict=True):
-        assert psnr(halved(picture), halved(original)) > 31
+    for picture_, original in zip(found, truth(made.cameras), strict=True):
+        assert psnr(halved(picture_), halved(original)) > 31
     summary, messages = made.unpack("mcap", None)
     assert [m.payload for m in kept(made, messages)] == [r.payload("cdr") for r in made.cameras]
 
