@@ -27,11 +27,12 @@ from test_republish import Packed
 
 FRAMES = 20
 TOPIC = "/cam/image_raw/ffmpeg"
+SINGLE = {"codec": "h264", "view": "none"}
 # encoding of the images, options of the pack, what ROS 2 and ROS 1 call it
 CASES: dict[str, tuple[str, dict[str, Any], str, str]] = {
-    "lossless-rgb8": ("rgb8", {"codec": "h264"}, "h264;gbrp;bgr8;rgb8", "libx264"),
-    "lossless-bgr8": ("bgr8", {"codec": "h264"}, "h264;gbrp;bgr8;bgr8", "libx264"),
-    "lossless-mono8": ("mono8", {"codec": "h264"}, "h264;yuv420p;mono8;mono8", "libx264"),
+    "lossless-rgb8": ("rgb8", SINGLE, "h264;gbrp;bgr8;rgb8", "libx264"),
+    "lossless-bgr8": ("bgr8", SINGLE, "h264;gbrp;bgr8;bgr8", "libx264"),
+    "lossless-mono8": ("mono8", SINGLE, "h264;yuv420p;mono8;mono8", "libx264"),
     "lossy-rgb8": (
         "rgb8",
         {"codec": "h265", "quality": "crf=12"},
