@@ -182,13 +182,14 @@ def _view(stream: Stream) -> Values:
 
 def _made(stream: Stream) -> tuple[list[str] | None, list[str] | None]:
     """SHA-256 of the pixels and of the payload of each frame; None for what is not defined."""
+    is_lossless = stream.sidecar.profile == "lossless"
     if stream.sidecar.body == "packet":
-        return None, [_sha256(payload) for _, payload in stream.payloads()]
+        return None, [_sha256(one) for _, one in stream.payloads()] if is_lossless else None
     pixels, payloads = [], []
     for index, picture in stream.pictures():
         pixels.append(_pixels(stream, picture))
         payloads.append(_sha256(stream.rebuilder.payload(index, picture)))
-    return pixels, payloads if stream.sidecar.profile == "lossless" else None
+    return pixels, payloads if is_lossless else None
 
 
 def _pixels(stream: Stream, picture: Picture) -> str:
