@@ -406,9 +406,10 @@ class _ViewedTrack(Track):
 
     def _show(self, pictures: Iterator[tuple[int, Picture]]) -> None:
         for number, (pixels,) in pictures:
-            self._encode(number - self._done)  # no pictures came of these
-            self._shown = pixels
-            self._encode(1)
+            if number >= self._done:  # else it is a second one of a packet
+                self._encode(number - self._done)  # no pictures came of these
+                self._shown = pixels
+                self._encode(1)
 
     def _encode(self, frames: int) -> None:
         """Encode the last picture as the next so many frames."""
