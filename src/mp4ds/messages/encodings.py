@@ -560,8 +560,7 @@ class NarrowPlanes(Narrow):
 
 
 _MOST_LOW, _MOST_HIGH = 8, 10  # bits that a plane of folded samples may have
-LOW_BITS = {12: 3, 14: 5, 16: 8}
-"""Bits of samples -> how many of them are mostly noise, by measurement."""
+_LOW_BITS = {12: 3, 14: 5, 16: 8}  # by measurement: the bits that are mostly noise
 
 
 class NarrowFolded(Narrow):
@@ -582,7 +581,7 @@ class NarrowFolded(Narrow):
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
         """All bits, or those in use if there are enough of them to separate noise from the rest."""
         found = Narrow.fit(encoding, samples) or Parameters(bits=16, shift=0)
-        low = LOW_BITS.get(found.bits or 0)
+        low = _LOW_BITS.get(found.bits or 0)
         return None if low is None else replace(found, low=low)
 
 

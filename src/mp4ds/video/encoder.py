@@ -18,7 +18,6 @@ from av.error import FFmpegError
 from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages import png
 from mp4ds.messages.encodings import (
-    LOW_BITS,
     MAX_SIDE,
     Encoding,
     Parameters,
@@ -595,7 +594,7 @@ def difference_layouts(view: Layout) -> list[Layout]:
     known = Parameters(
         bits=of.bits,
         shift=of.shift,
-        low=LOW_BITS.get(of.bits or 0),
+        low=None if of.bits is None else of.bits - 8,  # two planes of 8 bits, as PNG files have
         alpha=None if of.alpha is None else 128,  # that of no difference
     )
     found = []
