@@ -450,10 +450,9 @@ def test_errors_of_other_commands_say_where_the_damage_is(dataset: Path, tmp_pat
     ):
         player.run()
     assert found.value.frame is not None
-    zero(file_of(dataset, "left.mp4"), 0.3, 2000)
-    frames = mp4ds.open(dataset)["/left/image_raw"]
-    with pytest.raises(FormatError, match=words):
-        frames.get(range(FRAMES))
+    zero(file_of(dataset, "left.exact.mp4"), 0.3, 2000)
+    with mp4ds.open(dataset) as opened, pytest.raises(FormatError, match=words):
+        opened["/left/image_raw"].get(range(FRAMES))
 
 
 def test_an_edited_sidecar_is_not_claimed_to_be_exact(dataset: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import struct
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +20,7 @@ from chromium import Tab, played, video_player
 from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg, superframe
 from coded_tools import encode as encode_packets
 from coded_tools import scene as packet_scene
-from commands import program
+from commands import ROOT, program
 from mp4ds.errors import Mp4dsError, VideoError
 from mp4ds.video.codecs import Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder
@@ -91,7 +92,8 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Segments that another process has encoded."""
     folder = tmp_path_factory.mktemp("elsewhere")
     code = f"import test_join; test_join.make_elsewhere({str(folder)!r})"
-    program("-c", code, cwd=TESTS)
+    path = os.pathsep.join(map(str, (ROOT, TESTS.parent / "conformance")))
+    program("-c", code, cwd=TESTS, env={"PYTHONPATH": path})
     return folder
 
 

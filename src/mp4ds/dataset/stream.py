@@ -118,7 +118,10 @@ class Stream(Images):
                 f"it to {self.path.parent}, or read the layer 'view'."
             )
         quality = self._jpeg_quality
-        return Stream(self.path, sidecar=self._whole, layer=layer, jpeg_quality=quality)
+        other = Stream(self.path, sidecar=self._whole, layer=layer, jpeg_quality=quality)
+        if layer == "view":  # of a damaged one, exact frames are lost as well
+            other.sound = self.sound
+        return other
 
     @cached_property
     def _view(self) -> Stream | None:
