@@ -47,7 +47,8 @@ def why_not_played(stream: Stream) -> str:
     reason = _why_not_in_browsers(stream.video_path)
     if not reason and stream.sidecar.body != "packet" and not stream.sidecar.layout.is_shown:
         reason = f"its video stores {stream.encoding} and does not look like the image"
-    if reason and ENCODINGS[stream.encoding].lossy:
+    encoding = ENCODINGS[stream.encoding]
+    if reason and encoding.lossy and encoding.channels < 4:  # alpha has no view
         reason += "; `mp4ds pack DATASET -o NEW --view` adds a video that does"
     return reason
 
