@@ -27,6 +27,7 @@ from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
 from mp4ds.files.urls import location, remote, spelled
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.times import nearest, synchronize
@@ -251,7 +252,10 @@ def open_source(source: CameraSource) -> Topic:
     """
     path = location(source.place)
     if path.suffix == ".yaml":
-        return Topic([Stream(path, layer="view").in_layer(source.layer)])
+        stream = Stream(path, layer="view")
+        # what may be depths keeps all its levels, if they are here
+        keeps = stream.encoding in DEPTHS and stream.absent is None
+        return Topic([stream.in_layer("exact" if keeps else source.layer)])
     return Topic(open_dataset(path).parts)
 
 

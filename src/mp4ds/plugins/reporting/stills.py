@@ -262,10 +262,11 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
     kind = _SUFFIXES.get(target.suffix.lower())
     if kind is None:
         raise OptionError(f"{target} is not a .png or .jpg: give a name with one of these endings.")
-    with Dataset(dataset, layer="view") as opened:
+    with Dataset(dataset) as opened:
         topic = _chosen(opened, options.topic)
-        if options.exact:
-            topic = topic.in_layer("exact")
+        has_more = any(ENCODINGS[part.encoding].bytes_per_sample > 1 for part in topic.parts)
+        if options.exact or not has_more:  # a view has no more than 8 bits
+            topic = topic.in_layer("exact" if options.exact else "view")
         if options.at is not None:
             numbers = [number_at(topic, options.at)]
             part, number = topic.place_of(numbers[0])
