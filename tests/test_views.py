@@ -427,6 +427,20 @@ def test_copies(case: str, tmp_path: Path) -> None:
         assert max(distances(tmp_path / "dataset")) < 12
 
 
+@pytest.mark.parametrize(
+    ("options", "view"),
+    [({"gop": 5}, "h264"), ({"view": "av1"}, "av1"), ({"purpose": "speed"}, None)],
+)
+def test_a_dataset_packed_again_keeps_its_views(
+    options: dict[str, Any], view: str | None, tmp_path: Path
+) -> None:
+    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"]())
+    mp4ds.pack(source, tmp_path / "first", PackOptions(view="h264"))
+    summary = mp4ds.pack(tmp_path / "first", tmp_path / "dataset", PackOptions(**options))
+    assert not summary.is_copy
+    assert codecs(tmp_path / "dataset") == [view]
+
+
 def test_views_alone_are_copied_and_sliced(alone: tuple[Path, str], tmp_path: Path) -> None:
     dataset, kind = alone
     for number, times in enumerate(({}, {"duration": "0.1"}, {"start": "0.1"})):

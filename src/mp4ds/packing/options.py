@@ -124,7 +124,8 @@ class PackOptions(SliceOptions, TopicOptions):
     view: str | None = option(
         "Beside exact images, what any player shows: also of JPEG files and video packets, and "
         "where a single video would be smaller. h264 for players without AV1; none for no view at "
-        "all; default: of raw images and PNG files, where both videos together are small.",
+        "all; default: of raw images and PNG files, where both videos together are small, or as a "
+        "repacked dataset has them.",
         metavar="[av1|h264|none]",
         choices=VIEWS,
         alone=DEFAULT_LOSSY,

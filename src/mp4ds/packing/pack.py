@@ -227,20 +227,10 @@ def _copied(
         return _copy(paths[0], target, options)
     except Refused as reason:
         quality = options.quality or parse_quality(_quality_of(paths))
-        encoded = replace(
-            options,
-            quality=quality,
-            transcode=options.transcode or _has_transcoded(paths),
-            view=_view_of_packets(paths[0]) if quality.lossless else None,
-        )
+        transcode = options.transcode or _has_transcoded(paths)
+        encoded = replace(options, quality=quality, transcode=transcode)
         summary = _encoded(paths, target, _checked(encoded, paths, may_copy=False), progress)
         return replace(summary, not_copied=str(reason))
-
-
-def _view_of_packets(path: Path) -> str | None:
-    """The codec of the views that packets of a dataset have; None if they have none."""
-    sidecars = (stream.sidecar for stream in _streams_of(path))
-    return next((one.view.codec for one in sidecars if one.body == "packet" and one.view), None)
 
 
 def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
@@ -488,7 +478,12 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         find_ffmpeg()  # fails before anything is read, saying how to get one
     transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))
-    chosen = replace(options, quality=quality, codec=codec, transcode=transcode, images=images)
+    view = options.view
+    if view is None and quality.lossless and not options.is_fast:
+        view = _view_of_packets(paths)
+    chosen = replace(
+        options, quality=quality, codec=codec, view=view, transcode=transcode, images=images
+    )
     chosen.group_frames  # noqa: B018 - refuses a contradiction
     return chosen
 
@@ -529,6 +524,13 @@ def _quality_of(paths: Sequence[Path]) -> str:
         f"There is no default `quality` for what was packed as {', '.join(sorted(found))}. Give "
         "one."
     )
+
+
+def _view_of_packets(paths: Sequence[Path]) -> str | None:
+    """The codec of the views that packets of the source datasets have; None if they have none."""
+    folders = [folder for path in paths if (folder := dataset_at(path))]
+    sidecars = (stream.sidecar for folder in folders for stream in _streams_of(folder))
+    return next((one.view.codec for one in sidecars if one.body == "packet" and one.view), None)
 
 
 def _has_transcoded(paths: Sequence[Path]) -> bool:
