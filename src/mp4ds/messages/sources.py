@@ -221,10 +221,10 @@ class Demosaiced(Values):
 
 _NEUTRAL = 128 << 8 | 128
 _SPAN = 511  # values of the difference of two samples
-_WALK = 260  # steps that reach every chroma
 _FEWEST_CHROMAS = 8  # that tell a rule from the others
 _ROWS = 32  # at a time, likewise
 _CHUNK = 8192  # places at a time, which a processor's cache holds
+_AT_ONCE = 1024  # chromas
 _HARD = 8  # places for which all chromas are tried
 _REACH = 12  # around an estimate of the chroma, where it has two unknowns
 
@@ -394,43 +394,45 @@ class _Solution:
         count, estimate = cut.sum(axis=0), _estimate(pixel)
         red, green, blue = pixel
         known = self.rule.known[(red - green) * _SPAN + (blue - green) + 255 * (_SPAN + 1)]
-        self._try(where[count == 0], known[count == 0])
-        self._try(where[count == 3], np.full((count == 3).sum(), _NEUTRAL, np.int32))
-        for color, line in enumerate(self.rule.lines):
-            one, other, is_u, table = line
+        self._try(where[count == 0], known[count == 0, None])
+        self._try(where[count == 3], np.full(((count == 3).sum(), 1), _NEUTRAL))
+        for color, (one, other, is_u, table) in enumerate(self.rule.lines):
             picked = np.flatnonzero((count == 1) & cut[color])
+            difference = pixel[one, picked] - pixel[other, picked] + 255
             # beyond the estimate, which is for a colour at the limit
             is_up = (pixel[color, picked] == 255) != (color == 1)
             step = np.where(is_up, 1, -1)
-            tried = estimate[1 - is_u, picked] - 2 * step
-            difference = pixel[one, picked] - pixel[other, picked] + 255
-            for _ in range(_WALK):
-                left = self.is_open[where[picked]] & (tried > -4) & (tried < 260)
-                picked, tried, step, difference = (
-                    array[left] for array in (picked, tried, step, difference)
-                )
-                if not len(picked):
-                    break
-                found = table[difference, np.clip(tried, 0, 255)]
-                self._try(where[picked], np.where((tried < 0) | (tried > 255), -1, found))
-                tried = tried + step
+            start = estimate[1 - is_u, picked]
+            for place, number in self._turns(where[picked], len(_STEPS)):
+                tried = start[place, None] + step[place, None] * _STEPS[number]
+                found = table[difference[place, None], np.clip(tried, 0, 255)]
+                is_inside = (tried >= 0) & (tried < 256)
+                self._try(where[picked[place]], np.where(is_inside, found, -1))
         several = np.flatnonzero(count >= 2)
         middle = np.mean([_estimate(colours[:, n]) for n in range(colours.shape[1])], axis=0)
         for centre in (middle.astype(np.int32), estimate):
-            for offset in _AROUND:
-                several = several[self.is_open[where[several]]]
-                if not len(several):
-                    break
-                u, v = centre[:, several] + offset
+            for place, number in self._turns(where[several], len(_AROUND)):
+                u, v = centre[:, several[place], None] + _AROUND[number].T[:, None]
                 is_inside = (np.minimum(u, v) >= 0) & (np.maximum(u, v) < 256)
-                self._try(where[several], np.where(is_inside, 256 * u + v, -1))
-        every = np.arange(65536)
-        for place in np.flatnonzero(self.is_open)[:_HARD]:
-            self._try(np.full(len(every), place), every)
+                self._try(where[several[place]], np.where(is_inside, 256 * u + v, -1))
+        hard = np.flatnonzero(self.is_open)[:_HARD]
+        self._try(hard, np.broadcast_to(np.arange(65536), (len(hard), 65536)))
+
+    def _turns(self, places: Samples, count: int) -> Iterator[tuple[Samples, slice]]:
+        """Which of some places are open, and the numbers to try next, more of them for fewer."""
+        start = 0
+        while start < count and (left := np.flatnonzero(self.is_open[places])).size:
+            end = start + max(1, _AT_ONCE // len(left))
+            yield left, slice(start, end)
+            start = end
 
     def _try(self, places: Samples, chroma: Samples) -> None:
-        """Take a chroma where it is the solution; -1 is none."""
-        places, chroma = places[chroma >= 0], chroma[chroma >= 0]
+        """Take the first chroma that is the solution of each place; -1 is none."""
+        chroma = chroma[:, ::-1]  # so that the first is written last
+        places = np.repeat(places, chroma.shape[1])
+        places, chroma = places[chroma.ravel() >= 0], chroma[chroma >= 0]
+        if not len(places):
+            return
         colours = self.colours[:, :, places]
         is_black = (colours == 0).all(axis=0)
         due = np.where(is_black, 1, colours)
@@ -450,9 +452,9 @@ class _Solution:
         self.is_open[done] = False
 
 
-_AROUND = sorted(
-    (np.array([[u], [v]]) for u, v in product(range(-_REACH, _REACH + 1), repeat=2)),
-    key=lambda offset: int(abs(offset).max()),
+_STEPS = np.array([*range(-1, 260), -2, -3, -4])
+_AROUND = np.array(
+    sorted(product(range(-_REACH, _REACH + 1), repeat=2), key=lambda pair: max(map(abs, pair)))
 )
 
 
