@@ -272,6 +272,28 @@ def test_a_manifest_that_tells_other_videos(entry: dict[str, str | None], datase
     assert "manifest-inconsistent" in {one.code for one in mp4ds.validate(dataset)}
 
 
+def test_files_that_are_one_where_names_ignore_case(dataset: Path) -> None:
+    stem = ONE.capitalize()
+
+    def change(manifest: dict[str, Any]) -> None:
+        manifest["streams"][1] |= {"view": f"{stem}.mp4", "video": f"{stem}.exact.mp4"}
+        for entry in manifest["files"]:
+            if entry["name"].startswith(f"{STEMS[1]}.") and entry["name"].endswith(".mp4"):
+                entry["name"] = entry["name"].replace(STEMS[1], stem)
+
+    def renamed(document: dict[str, Any]) -> None:
+        document["view"]["file"], document["video"]["file"] = f"{stem}.mp4", f"{stem}.exact.mp4"
+
+    for path in (view(dataset, STEMS[1]), exact(dataset, STEMS[1])):
+        path.rename(dataset / path.name.replace(STEMS[1], stem))
+    changed(dataset / f"{STEMS[1]}.yaml", renamed)
+    changed(dataset / "dataset.yaml", change)
+    agreed(dataset)
+    problems = mp4ds.validate(dataset)
+    assert [problem.code for problem in problems] == ["manifest-inconsistent"] * 2
+    assert all("may be one file elsewhere" in problem.message for problem in problems)
+
+
 # ---------------------------------------------------------------- larger than it says
 
 

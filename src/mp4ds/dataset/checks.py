@@ -256,6 +256,12 @@ def _check_listed(folder: Path, manifest: Manifest) -> Iterator[FormatError]:
             yield _inconsistent(folder, f"does not list {name}")
     for name in sorted(listed.difference(own)):
         yield _inconsistent(folder, f"lists {name}, which belongs to no stream")
+    alike: dict[str, str] = {}
+    for name in sorted({*listed, MANIFEST_NAME}):
+        if (other := alike.setdefault(name.casefold(), name)) != name:
+            yield _inconsistent(
+                folder, f"lists {other} and {name}, which may be one file elsewhere"
+            )
     for path in sorted(folder.iterdir()):
         is_known = path.name in listed or path.name == MANIFEST_NAME
         if not is_known and path.suffix in (".mp4", ".yaml", ".mcap"):
