@@ -58,6 +58,8 @@ def stream(path):
         of_view, _, shown = decoded(path, side, view)
         predicted = [pixels(image, view, picture) for picture in shown]
         of_view = {"view": {**of_view, "pixels": hashes_of(predicted)}}
+    if not side.get("predicted", True):
+        predicted = None
     hashes, payloads = messages(path, side, found, packets, pictures, predicted)
     return channel, {
         "sidecar": path.name,
@@ -84,7 +86,8 @@ def stream(path):
 
 def seen(side):
     """What is left of a stream without the video that its view predicts."""
-    kept = {key: value for key, value in side.items() if key not in ("view", "digests")}
+    gone = "view", "predicted", "digests"
+    kept = {key: value for key, value in side.items() if key not in gone}
     video, body = dict(side["view"]), side.get("body", "pixels")
     if body == "packet" and side["video"]["codec"] == "mjpeg":
         body = "jpeg"

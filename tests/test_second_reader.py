@@ -173,7 +173,11 @@ def test_what_a_view_predicts_of_a_source_is_what_the_spec_says(name: str, sourc
     assert np.array_equal(again, pixels)
 
 
-LOSSY = [name for name, encoding in ENCODINGS.items() if encoding.lossy]
+LOSSY = [  # by a curve that follows from the images, it is in the cases of the suite
+    name
+    for name, encoding in ENCODINGS.items()
+    if encoding.lossy and not LAYOUTS[encoding.lossy].parameters
+]
 SIZES = [(2, 2), (7, 5), (40, 31)]
 
 

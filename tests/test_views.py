@@ -482,3 +482,16 @@ def test_long_packs(kind: str, executor: InlineExecutor, tmp_path: Path) -> None
     assert mp4ds.validate(target, deep=True) == []
     assert max(distances(target)) < 12
     assert compare(sources, unpacked(tmp_path, "mcap")) == []
+
+
+def test_a_view_beside_images_that_it_does_not_predict(tmp_path: Path) -> None:
+    case = Path(__file__).parents[1] / "conformance/cases/datasets/views-beside"
+    mp4ds.unpack(case, "mcap", tmp_path / "drive.mcap")
+    mp4ds.pack(tmp_path / "drive.mcap", tmp_path / "dataset", PackOptions(view="av1"))
+    (sidecar,) = sidecars(tmp_path / "dataset")
+    assert (sidecar.predicted, codecs(tmp_path / "dataset")) == (False, ["av1"])
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare(tmp_path / "drive.mcap", unpacked(tmp_path, "mcap")) == []
+    (tmp_path / "dataset" / sidecar.video.file).unlink()
+    with mp4ds.open(tmp_path / "dataset") as opened, mp4ds.open(case, layer="view") as seen:
+        assert np.array_equal(opened[opened.topics[0]].read([2]), seen[seen.topics[0]].read([2]))

@@ -318,8 +318,8 @@ def _check_deep(stream: Stream, report: _Report) -> Iterator[FormatError]:
         if number % _TELL_EVERY == 0:
             report(f"decoding {name}", number / len(stream))
 
-    # a view that predicts is decoded with the images; that of packets is not
-    for layer in stream.layers if stream.sidecar.keeps_packets else [stream]:
+    # a view that predicts is decoded with the images, another one is not
+    for layer in [stream] if stream.sidecar.is_predicted else stream.layers:
         for error, *_ in layer.damages(tell):
             yield error
 

@@ -588,7 +588,13 @@ def _common(sidecar: StreamSidecar) -> tuple[object, ...]:
     return (
         info if info and not info.messages else None,  # nothing tells when one applied
         *(sidecar.profile, sidecar.stamps, sidecar.channel, sidecar.wire, sidecar.body),
-        *(sidecar.image, videos, sidecar.digests is None, sidecar.video.quality is None),
+        *(
+            sidecar.image,
+            videos,
+            sidecar.predicted,
+            sidecar.digests is None,
+            sidecar.video.quality is None,
+        ),
         *(sidecar.columns.seq is None, sidecar.columns.pts is None),
     )
 

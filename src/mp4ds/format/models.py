@@ -434,6 +434,9 @@ class StreamSidecar(Model):
     view: VideoModel | None = Field(
         None, description="Shows the images, and predicts them; absent: the video does."
     )
+    predicted: bool = Field(
+        True, description="Of pixels with a view: whether the video has differences to its images."
+    )
     camera_info: CameraInfo | None = None
     columns: Columns
     digests: Digests | None = Field(None, description="Present in the lossless profile.")
@@ -456,6 +459,8 @@ class StreamSidecar(Model):
         self._check_body()
         if self.view is not None:
             self._check_view(self.view)
+        if not self.predicted and (self.view is None or self.body == "packet"):
+            raise ValueError("predicted must be absent without a view of pixels")
         return self
 
     def _check_view(self, view: VideoModel) -> None:
@@ -463,8 +468,8 @@ class StreamSidecar(Model):
             raise ValueError(f"a {self.profile} stream with the body {self.body} has no view")
         if not view.file.endswith(".mp4") or self.video.file != exact_name(view.file):
             raise ValueError(f"the video beside {view.file} must be {exact_name(view.file)}")
-        if self.video.color is not None:
-            raise ValueError("video.color must be absent beside a view")
+        if self.is_predicted and self.video.color is not None:
+            raise ValueError("video.color must be absent where the view predicts")
         due = ENCODINGS[self.image.encoding].lossy
         if view.layout != due:
             raise ValueError(f"the view has the layout {view.layout}, not {due}")
@@ -509,7 +514,7 @@ class StreamSidecar(Model):
     @property
     def is_predicted(self) -> bool:
         """Whether the video holds the difference of the images to what the view predicts."""
-        return self.view is not None and self.body != "packet"
+        return self.view is not None and self.predicted and self.body != "packet"
 
     @property
     def seen(self) -> StreamSidecar:
@@ -522,8 +527,8 @@ class StreamSidecar(Model):
                 body = "jpeg"
             else:
                 video = video.model_copy(update={"pixel_format": None})
-        alone = {"view": None, "video": video, "profile": VISUAL, "digests": None}
-        return self.model_validate({**dict(self), **alone, "body": body})
+        alone = {"view": None, "predicted": True, "profile": VISUAL, "digests": None}
+        return self.model_validate({**dict(self), **alone, "video": video, "body": body})
 
     @property
     def keeps_packets(self) -> bool:

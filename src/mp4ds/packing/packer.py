@@ -250,6 +250,7 @@ class StreamWriter:
             headers=self._table.headers,
             video=_video_model(self._track, self._path),
             view=_video_model(view, self._view_path) if view else None,
+            predicted=self._plan.is_predicted or self._plan.coding is None or view is None,
             camera_info=self.camera_info,
             columns=self._table.to_model(),
             digests=digests_model(self._digests) if self._plan.is_exact else None,

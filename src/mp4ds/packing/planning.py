@@ -69,8 +69,9 @@ _PLAYED = ("yuv420p", "yuvj420p")
 """Pixel formats that any player of a codec shows."""
 _MANY = 6  # files, after which any number may follow
 _STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
-_LARGER = 1.05
-"""How much larger than without a view images may become by having one."""
+_LARGER, _AS_SMALL = 1.05, 1.01
+"""How much larger than without a view images may become by having one, at all and with PNG files,
+which decode fastest."""
 _NEGLIGIBLE = 1 / 50
 """Share of the raw size below which a video is kept even if zstd would be smaller."""
 
@@ -270,21 +271,22 @@ def _lossless_plans(
     if view is not None:
         source = [best.layout] if best.layout.is_source else []
         with suppress(OptionError, EncoderRefusedError):
-            both = choose_predicted(
+            both, beside = choose_predicted(
                 pixels,
                 source or difference_layouts(view.layout),
                 view,
-                best.bytes_per_frame,
+                _AS_SMALL * least,
                 gop=options.group_frames,
                 threads=threads,
                 codec=codec,
                 preset=options.preset if asked else None,
                 purpose=options.purpose,
             )
-            is_small = both.bytes_per_frame <= _LARGER * least
-            if is_small or options.asks_for_views:
-                best, plan = both, TrackPlan(both, view, note=note)
-                least = min(least, both.bytes_per_frame)
+            is_predicted = both.bytes_per_frame <= least + beside
+            size = min(both.bytes_per_frame, least + beside)
+            if size <= _LARGER * least or options.asks_for_views:
+                best, least = both if is_predicted else best, min(least, size)
+                plan = TrackPlan(best, view, is_predicted, note=note)
     _refuse_noise(samples, least)
     if codec is None:
         _refuse_few(samples, least)

@@ -45,8 +45,8 @@ class TrackPlan:
 
     Attributes:
         coding: How its pictures are encoded; None to copy packets.
-        view: How those of a view are, whose images the pictures are the differences to, or which
-            shows what the packets do; None without a view.
+        view: How those of a view are; None without a view.
+        is_predicted: Whether the pictures are of the differences to the images of the view.
         profile: The profile in its sidecar.
         target: The score that its pictures have to reach, if there is one.
         note: What the user should know about it; empty if nothing.
@@ -54,6 +54,7 @@ class TrackPlan:
 
     coding: Coding | None = None
     view: Coding | None = None
+    is_predicted: bool = False
     profile: str = LOSSLESS
     target: QualityTarget | None = None
     note: str = ""
@@ -67,7 +68,8 @@ class TrackPlan:
     def text(self) -> str:
         """All that decides about the video, in words."""
         own = self.coding.text if self.coding else "copied"
-        return f"{own}, view {self.view.text}" if self.view else own
+        told = f"{own}, view {self.view.text}" if self.view else own
+        return f"{told}, differences" if self.is_predicted else told
 
 
 class Track(ABC):
@@ -143,7 +145,7 @@ def open_track(
         return _ViewedTrack(path, view_path, plan, seen, threads, rate)
     size = seen.key.width, seen.key.height
     if plan.view is not None:
-        return _PredictedTrack(path, view_path, plan, seen, threads, rate)
+        return _LayeredTrack(path, view_path, plan, seen, threads, rate)
     if plan.target is None:
         return _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
     coder = WindowCoder(plan.coding, size, plan.target, threads, rate)
@@ -297,10 +299,11 @@ class _EncodedTrack(_PictureTrack):
         self._encoder.abandon()
 
 
-class _PredictedTrack(Track):
-    """Differences of images to those of a view, which is encoded first.
+class _LayeredTrack(Track):
+    """A view, and the images or their differences to those of the view.
 
-    The images wait for their view: an encoder may look ahead with as many, and holds them too.
+    For differences, images wait for their view: an encoder may look ahead with as many, and holds
+    them too.
     """
 
     view: _EncodedTrack
@@ -318,11 +321,11 @@ class _PredictedTrack(Track):
             raise ValueError("a plan without a view")
         size = seen.key.width, seen.key.height
         self._bits = plan.view.layout.used_bits
+        self._is_predicted = plan.is_predicted
         self._own = _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
+        coded = self._follow if plan.is_predicted else None
         try:
-            self.view = _EncodedTrack(
-                view_path, plan.view, size, threads, rate, "", coded=self._follow
-            )
+            self.view = _EncodedTrack(view_path, plan.view, size, threads, rate, "", coded=coded)
         except BaseException:
             self._own.abandon()
             path.unlink(missing_ok=True)
@@ -332,14 +335,20 @@ class _PredictedTrack(Track):
         self._waiting: deque[tuple[Pixels, int]] = deque()
 
     def refuses(self, seen: CameraMessage) -> str | None:
-        of_source = self._own.refuses(seen) if self._own.coding.layout.is_source else None
-        return self.view.refuses(seen) or of_source
+        # others can hold every difference
+        is_asked = self._own.coding.layout.is_source or not self._is_predicted
+        return self.view.refuses(seen) or (self._own.refuses(seen) if is_asked else None)
 
     def write(self, seen: CameraMessage, tick: int) -> None:
-        if seen.pixels is not None:
-            pixels = native(seen.pixels).copy()  # the message may be gone when its turn comes
-            self._waiting.append((pixels, tick))
-            self.view.encode(pixels, tick)
+        if seen.pixels is None:
+            return
+        if not self._is_predicted:
+            self._own.encode(seen.pixels, tick)
+            self.view.encode(seen.pixels, tick)
+            return
+        pixels = native(seen.pixels).copy()  # the message may be gone when its turn comes
+        self._waiting.append((pixels, tick))
+        self.view.encode(pixels, tick)
 
     def _follow(self, packet: bytes | None) -> None:
         for prediction in self._predictor.images(packet):
@@ -349,7 +358,8 @@ class _PredictedTrack(Track):
     def close(self) -> None:
         try:
             self.view.close()
-            self._follow(None)
+            if self._is_predicted:
+                self._follow(None)
         except BaseException:
             self._own.abandon()
             raise
@@ -362,7 +372,8 @@ class _PredictedTrack(Track):
         self._own.abandon()
 
     def describe(self) -> dict[str, Any]:
-        return {**self._own.describe(), "color": None}
+        made = self._own.describe()
+        return {**made, "color": None} if self._is_predicted else made
 
 
 class _ViewedTrack(Track):

@@ -608,7 +608,7 @@ def difference_layouts(view: Layout) -> list[Layout]:
 
 def choose_predicted(
     samples: Sequence[Pixels], layouts: Sequence[Layout], view: Coding, most: float, **options: Any
-) -> Coding:
+) -> tuple[Coding, float]:
     """The best coding of the differences of images to what a view shows.
 
     They are mostly noise. PNG files, in which nothing is predicted, are about as small as any other
@@ -622,7 +622,7 @@ def choose_predicted(
         **options: As for `choose`.
 
     Returns:
-        As `choose`; `bytes_per_frame` includes the view.
+        As `choose`, where `bytes_per_frame` includes the view; and bytes of a frame of the view.
 
     Raises:
         OptionError: As for `choose`.
@@ -643,16 +643,18 @@ def choose_predicted(
         found = choose(crops, encoding, differences=differences, **asked)
         return replace(found, bytes_per_frame=(found.bytes_per_frame + of_view) / share)
 
+    beside = of_view / share
     can_be_png = any("png" in lossless_codecs(layout.pixel_format) for layout in layouts)
     if options["codec"] is not None or not can_be_png:
-        return tried()
+        return tried(), beside
     is_archive = options["purpose"] == ARCHIVE
     simple = tried(codec="png")
     if not is_archive and simple.bytes_per_frame <= most:
-        return simple
+        return simple, beside
     best = tried()
     near = 1.0 if is_archive else NEAR
-    return simple if simple.bytes_per_frame <= near * best.bytes_per_frame else best
+    is_near = simple.bytes_per_frame <= near * best.bytes_per_frame
+    return (simple if is_near else best), beside
 
 
 def _candidates(samples: Sequence[Pixels], encoding: Encoding) -> list[Layout]:
