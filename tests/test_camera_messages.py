@@ -13,6 +13,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import mp4ds
@@ -231,7 +232,8 @@ def least_psnr(done: Journey, topic: str) -> float:
     """Of all messages of a topic: what came out against what was recorded."""
     recorded, found = (of_topic(path, topic) for path in (done.sources[0], done.output))
     assert len(recorded) == len(found) > 0
-    return min(psnr(image_of(a), image_of(b)) for a, b in zip(recorded, found, strict=True))
+    pairs = [(image_of(a), image_of(b)) for a, b in zip(recorded, found, strict=True)]
+    return min(psnr(a, b, np.iinfo(a.dtype).max) for a, b in pairs)
 
 
 LOSSY: dict[str, float] = {
@@ -240,8 +242,8 @@ LOSSY: dict[str, float] = {
     # colours whose edges are finer than a video's
     **dict.fromkeys(["yuv422", "uyvy", "yuyv", "yuv422_yuy2"], 34),
     "nv24": 30,
-    **dict.fromkeys(["rgb8", "bgr8", "8UC3"], 25),
-    **dict.fromkeys(BAYER, 27),
+    **dict.fromkeys(["rgb8", "bgr8", "8UC3", "rgb16", "bgr16"], 25),
+    **dict.fromkeys([*BAYER, *(f"{name[:-1]}16" for name in BAYER)], 27),
 }
 """Encoding -> dB that lossy videos reach at least, of small pictures full of edges."""
 
