@@ -128,6 +128,22 @@ def test_the_smallest_images(name: str) -> None:
             fit(name, RGB, [np.full((height, width, 3), 7, np.uint8)])
 
 
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [("from_mosaic8", {"mosaic": "rgbg"}), ("from_yuv420", {"rule": "rggb"})],
+)
+def test_unknown_sources_are_refused(name: str, parameters: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="is not one of"):
+        bind(name, RGB, Parameters(**parameters))
+
+
+@pytest.mark.parametrize(("name", "size"), [("from_yuv422", (7, 6)), ("from_yuv420", (6, 7))])
+def test_halved_chroma_needs_even_sides(name: str, size: tuple[int, int]) -> None:
+    layout = bind(name, RGB, Parameters(rule="opencv"))
+    with pytest.raises(ValueError, match="even sides"):
+        layout.picture_size(*size)
+
+
 # ---------------------------------------------------------------- recordings
 
 
