@@ -171,8 +171,8 @@ class FrameDataset(Dataset):
             `resize` and `crop`.
         resize: Factor, or width and height in pixels.
         crop: x, y, width, height in pixels; before `resize`.
-        layer: Of lossless cameras, the ``view`` decodes several times faster and has the quality of
-            `quality` visual, and 256 levels of 16 bits; ``exact``: the pixels recorded. Cameras
+        layer: Of lossless cameras, the ``view`` decodes faster and has the quality of `quality`
+            visual, and 256 levels of 16 bits; ``exact``: the pixels recorded. Cameras
             without a view have one layer; mono16, which may be depths, is exact in both.
         dtype: ``native``: as decoded, uint8 except for cameras of more bits. ``uint8``: the same,
             but refused for those. ``float32``: 0 to 1; native pixels keep their values.
