@@ -164,6 +164,9 @@ def test_pixels_have_a_view_if_asked(case: str, tmp_path: Path) -> None:
     assert codecs(made.dataset) == [view]
     (sidecar,) = sidecars(made.dataset)
     assert sidecar.video.codec == options.get("codec", sidecar.video.codec)
+    if case == "larger":
+        notes = [note for topic in made.summary.topics for note in topic.notes]
+        assert [note[:15] for note in notes] == ["with its view a"]
 
 
 @pytest.mark.parametrize(

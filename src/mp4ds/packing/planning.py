@@ -284,6 +284,9 @@ def _lossless_plans(
             )
             is_predicted = both.bytes_per_frame <= least + beside
             size = min(both.bytes_per_frame, least + beside)
+            if size > _LARGER * least:
+                larger = f"with its view about {size / least:.1f} times as large as without"
+                note = "; ".join(filter(None, (note, larger if options.asks_for_views else "")))
             if size <= _LARGER * least or options.asks_for_views:
                 best, least = both if is_predicted else best, min(least, size)
                 plan = TrackPlan(best, view, is_predicted, note=note)
