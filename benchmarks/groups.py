@@ -1,10 +1,11 @@
-"""What `--for` chooses and costs: bytes, and the time of frames at random and in order.
+"""What `--for` and views cost: bytes, and the time of frames at random and in order.
 
     python benchmarks/groups.py [--frames N] [--size WxH] [--kind K ...] [--clip NAME ...]
 
-Real scenes (clips.py) are packed by `mp4ds.pack` with each ``--for``; then frames at random places
-are read one by one, and all in order: the exact ones of lossless images, and those of their view.
-CPU time is of the reading process, opening left out. All columns are relative to the default.
+Real scenes (clips.py) are packed by `mp4ds.pack`, with each ``--for`` and without a view; then
+frames at random places are read one by one, and all in order: the exact ones of lossless images,
+and those of their view. CPU time is of the reading process, opening left out. All columns are
+relative to the default.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import tempfile
 import time
 from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import clips
 import mp4ds
@@ -29,7 +30,14 @@ KINDS = {
     "rgb8, visual": ("rgb8", "visual"),
 }
 """Encoding and quality."""
-PURPOSES = (None, "training", "archive")
+Layer = Literal["exact", "view"]
+LAYERS: tuple[Layer, Layer] = ("exact", "view")
+CHOICES: dict[str, dict[str, Any]] = {
+    "(default)": {},
+    "--view none": {"view": "none"},
+    "--for training": {"purpose": "training"},
+    "--for archive": {"purpose": "archive"},
+}
 
 
 def main() -> None:
@@ -48,39 +56,28 @@ def main() -> None:
     for scene, kind in product(options.clip, options.kind):
         encoding, quality = KINDS[kind]
         base: tuple[float, ...] = ()
-        with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as name:
-            folder = Path(name)
+        with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as made:
+            folder = Path(made)
             spec = clips.ClipSpec(scene, encoding, "low", options.frames, options.size)
             source = folder / "clip.mcap"
             write_mcap(source, clips.make(spec), encoding, compression="none")
-            for purpose in PURPOSES:
-                dataset = folder / f"{purpose}"
+            for name, given in CHOICES.items():
+                dataset = folder / name
                 begun = cpu_seconds()
-                mp4ds.pack(source, dataset, PackOptions(quality=quality, purpose=purpose))
+                mp4ds.pack(source, dataset, PackOptions(quality=quality, **given))
                 seconds = cpu_seconds() - begun
                 found = (
                     bytes_per_frame(dataset),
-                    at_random(dataset, options.reads, "exact"),
-                    at_random(dataset, options.reads, "view"),
-                    in_order(dataset),
+                    *(at_random(dataset, options.reads, layer) for layer in LAYERS),
+                    *(in_order(dataset, layer) for layer in LAYERS),
                     seconds,
                 )
                 base = base or found
                 ratios = [f"{one / other:.2f}" for one, other in zip(found, base, strict=True)]
-                rows.append((scene, kind, purpose or "(default)", form_of(dataset), *ratios))
+                rows.append((scene, kind, name, form_of(dataset), *ratios))
                 print("-", *rows[-1], flush=True)
-    head = (
-        "clip",
-        "images",
-        "`--for`",
-        "form",
-        "bytes",
-        "at random",
-        "view",
-        "in order",
-        "packing",
-    )
-    print_table(head, rows)
+    head = ("clip", "images", "packed", "form", "bytes", "exact at random", "view at random")
+    print_table((*head, "exact in order", "view in order", "packing"), rows)
 
 
 def form_of(dataset: Path) -> str:
@@ -102,9 +99,9 @@ def bytes_per_frame(dataset: Path) -> float:
         return sum(path.stat().st_size for path, _ in stream.videos) / len(stream)
 
 
-def in_order(dataset: Path) -> float:
+def in_order(dataset: Path, layer: Layer) -> float:
     """CPU seconds of a frame that is read in order."""
-    with mp4ds.open(dataset) as opened:
+    with mp4ds.open(dataset, layer=layer) as opened:
         stream = opened[TOPIC]
         begun = time.process_time()
         for _ in stream:
@@ -112,7 +109,7 @@ def in_order(dataset: Path) -> float:
         return (time.process_time() - begun) / len(stream)
 
 
-def at_random(dataset: Path, reads: int, layer: Literal["exact", "view"]) -> float:
+def at_random(dataset: Path, reads: int, layer: Layer) -> float:
     """CPU seconds of a frame at a random place."""
     numbers = random.Random(0)
     with mp4ds.open(dataset, layer=layer) as opened:
