@@ -364,7 +364,12 @@ def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -
     assert packed["dataset"] == dataset
     assert run("info", dataset)["kind"] == "dataset"
     assert run("info", dataset, "--intrinsics")["path"] == dataset
-    assert run("validate", dataset, "--deep") == {"path": dataset, "deep": True, "problems": []}
+    assert run("validate", dataset, "--deep") == {
+        "path": dataset,
+        "deep": True,
+        "problems": [],
+        "absent": "",
+    }
     again = f"{folder_url}/again.bag"
     assert run("unpack", dataset, "--to", "bag", "-o", again)["output"] == again
     assert run("info", again)["topics"] == run("info", recording)["topics"]
