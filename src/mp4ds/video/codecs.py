@@ -425,7 +425,7 @@ VISUAL_TABLE: tuple[tuple[float, int, int], ...] = (
 )
 """Frame rate in Hz, crf and preset of SVT-AV1 for VMAF 99.5: the paper's rates and crf."""
 
-VIEW_CRF, VIEW_PRESET = 22, "7"
+VIEW_CRF, VIEW_PRESET = 22, "8"
 """Of SVT-AV1 for views: what they lack costs about as much in the other video (spec/notes.md)."""
 
 _UNKNOWN_RATE = 30.0
