@@ -365,7 +365,8 @@ def test_a_pair_on_its_own(
     flip(file_of(pair, damaged), 0.3)
     video = file_of(pair, "left.mp4")
     summary = mp4ds.unpack(video, "bag", tmp_path / "out.bag", SALVAGE)
-    assert 0 < summary.messages["/left/image_raw"] < FRAMES
+    kept = summary.messages.get("/left/image_raw", 0)  # all frames may refer to one of the view
+    assert (0 if damaged == "left.mp4" else 1) <= kept < FRAMES
     assert summary.messages["/left/camera_info"] == FRAMES
     assert not messages(tmp_path / "out.bag") - messages(packed[0])
     file_of(pair, "left.exact.mp4").unlink()

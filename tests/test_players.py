@@ -169,7 +169,8 @@ def case_of(name: str, dataset: Path) -> Case:
     case = CASES[name]
     if len([*dataset.glob("*.mp4")]) == 1:
         return case
-    return CASES[f"{'mono8' if case.kind in CODED else case.kind} visual"]
+    kind = "mono8" if case.kind in CODED else case.kind
+    return CASES.get(f"{kind} visual", CASES["rgb8 visual"])
 
 
 def shown_pictures(dataset: Path, *, centred: bool = False) -> list[NDArray[np.uint8]]:
