@@ -69,7 +69,7 @@ _PLAYED = ("yuv420p", "yuvj420p")
 """Pixel formats that any player of a codec shows."""
 _MANY = 6  # files, after which any number may follow
 _STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
-_LARGER, _AS_SMALL = 1.05, 1.02
+_LARGER, _AS_SMALL = 1.05, 1.04
 """How much larger than without a view images may become by having one, at all and with PNG files,
 which decode fastest."""
 _NEGLIGIBLE = 1 / 50
