@@ -306,3 +306,12 @@ def test_packing_at_speed(encoding: str, codec: str, tmp_path: Path) -> None:
 def test_a_purpose_that_is_none(text: str, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="`purpose`"):
         mp4ds.pack(tmp_path / "no.bag", tmp_path / "dataset", PackOptions(purpose=text))
+
+
+@pytest.mark.parametrize("size", [(70, 20), (20, 70), (320, 16)])
+def test_views_of_narrow_images_end(size: tuple[int, int], tmp_path: Path) -> None:
+    """SVT-AV1 with several threads waits for ever on them."""
+    made = source_scene("mono8", frames=3, width=size[0], height=size[1])
+    paths = SOURCES["mcap-ros2-none"](tmp_path, made)
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(view="av1"))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []

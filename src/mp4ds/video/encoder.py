@@ -79,6 +79,7 @@ def _classes() -> dict[int, int]:
 _MATRICES = {"gbr": 0, "bt709": 1, "smpte170m": 6}  # as H.273 numbers them
 _BT709 = 1  # of primaries and transfer characteristics
 _NARROW = 64  # columns
+_NARROW_AV1 = 64  # rows or columns; seen to hang up to 20, not from 32 on
 _SLICE_BYTES = 10_000_000  # of samples, chroma counted whole; FFV1 takes some 14 million
 _SLICE_COUNTS = sorted({rows * n for rows in range(1, 17) for n in range(rows, 2 * rows + 1)})
 
@@ -288,6 +289,8 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
         # it prints to stderr by itself; errors reach us as return codes
         os.environ.setdefault("SVT_LOG", "0")
         given = context.options.get("svtav1-params")
+        if min(width, height) < _NARROW_AV1:
+            threads = 1  # with several, it never ends on some sizes, such as 70x20
         # it keeps room, and pictures, for one level more than it uses by itself
         parameters = ":".join(filter(None, (given, "hierarchical-levels=4", f"lp={threads}")))
         context.options = {**context.options, "svtav1-params": parameters}
