@@ -252,6 +252,14 @@ def test_an_exact_video_of_another_stream_is_found_by_digests(dataset: Path) -> 
         unpacked(dataset)
 
 
+def test_pictures_of_two_frames_are_not_put_together(dataset: Path) -> None:
+    """Reading compares no digests, so that the numbers have to be the same."""
+    with Dataset(dataset) as opened:
+        stream = opened.streams[0]
+        with pytest.raises(FormatError, match="gives frame 1 where 0 is due"):
+            list(stream.predicted(iter([(0, ())]), iter([(1, ())])))
+
+
 def test_a_link_to_nothing_is_no_exact_video(dataset: Path) -> None:
     exact(dataset, ONE).unlink()
     exact(dataset, ONE).symlink_to(dataset / "nothing.mp4")

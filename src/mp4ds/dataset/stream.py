@@ -247,7 +247,10 @@ class Stream(Images):
         """
         view = self._view or self
         prediction: Pixels | None = None  # one for all: pictures are valid until the next
-        for (_, seen), (index, picture) in zip(shown, pictures, strict=True):
+        for (there, seen), (index, picture) in zip(shown, pictures, strict=True):
+            if there != index:  # reading a frame does not compare its digest
+                what = f"gives frame {there} where {index} is due"
+                raise VideoError("decode-failed", view.video_path, what, frame=index)
             if seen is None or picture is None:
                 yield index, None
                 continue
