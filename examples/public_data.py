@@ -43,7 +43,7 @@ def steps(options: argparse.Namespace) -> Iterator[tuple[str, str]]:
     """What is done, and what it came to."""
     images = None
     if options.kind != "mcap":
-        images = mp4ds.ImageFolder(rate=options.rate)
+        images = mp4ds.ImportOptions(rate=options.rate)
     sizes = {}
     for quality in ("lossless", "visual"):
         target = options.out / quality

@@ -107,7 +107,7 @@ def test_a_source_that_changes_while_it_is_packed(
     if salvage and kind == "images":
         pytest.skip("images are not salvaged")
     path, file = recording(kind, tmp_path / "source")
-    images = mp4ds.ImageFolder() if kind == "images" else None
+    images = mp4ds.ImportOptions() if kind == "images" else None
     options = mp4ds.PackOptions(images=images, codec="ffv1", salvage=salvage)
     progress = changes_once(CHANGES[change], file)
     with pytest.raises(SourceError, match="changed while it was being read"):

@@ -12,6 +12,7 @@ import pytest
 import mp4ds
 from commands import program, typed
 from mp4ds.cli import COMMANDS, commands
+from mp4ds.cli.pack import import_command
 from mp4ds.plugins.demo import demo
 from sources import SOURCES, scene
 from test_tutorials import ROOT, blocks_of
@@ -123,5 +124,6 @@ def test_the_list_of_commands_agrees_with_their_help(name: str) -> None:
 
 def test_every_command_is_in_the_list() -> None:
     text = (ROOT / "docs/commands.md").read_text()
-    for command in {*COMMANDS, "import images", "import ros-mp4"} - {"import", "repack"}:
+    imports = {f"import {name}" for name in import_command.commands}
+    for command in {*COMMANDS, *imports} - {"import", "repack"}:
         assert f"`mp4ds {command}" in text

@@ -367,7 +367,7 @@ def test_calibrations_are_imported_again(model: str, tmp_path: Path) -> None:
     made = with_lens(model, rectified=model != "Brown Conrady")
     source = pack_drive(tmp_path, Scene([m for m in made.messages if m.topic.startswith("/front")]))
     mp4ds.export(source, "euroc", tmp_path / "out")
-    images = mp4ds.PackOptions(images=mp4ds.ImageFolder())
+    images = mp4ds.PackOptions(images=mp4ds.ImportOptions())
     mp4ds.pack(tmp_path / "out", tmp_path / "again", images)
     with mp4ds.open(tmp_path / "again") as dataset:
         found = dataset["/cam0/image_raw"].intrinsics_at(0)
@@ -381,7 +381,7 @@ def test_calibrations_are_imported_again(model: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("to", IMPORTED)
 def test_import_takes_what_export_wrote(to: str, dataset: Path, tmp_path: Path) -> None:
     export(dataset, to, tmp_path / "out", poses=ODOMETRY)
-    images = mp4ds.PackOptions(images=mp4ds.ImageFolder())
+    images = mp4ds.PackOptions(images=mp4ds.ImportOptions())
     mp4ds.pack(tmp_path / "out", tmp_path / "again", images)
     cameras, imu, poses = IMPORTED[to]
     recorded = (COLOUR, DEPTH) if to == "tum" else (COLOUR, GREY, DEPTH)

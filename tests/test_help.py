@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from commands import Result, program, refused
 from mp4ds.cli import COMMANDS, commands
+from mp4ds.cli.pack import import_command
 
 PANELS = ["Arguments", "What", "How", "Where", "Long jobs", "Options"]
 
@@ -19,7 +20,8 @@ def run(*words: str, folder: Path) -> Result:
 
 
 @pytest.mark.parametrize(
-    "command", [*sorted(COMMANDS.keys() - {"import"}), "import images", "import ros-mp4"]
+    "command",
+    [*sorted(COMMANDS.keys() - {"import"}), *(f"import {one}" for one in import_command.commands)],
 )
 def test_options_stand_by_what_they_are_about(command: str) -> None:
     name, *rest = command.split()

@@ -30,7 +30,7 @@ from commands import call, refused
 from in_parts import InlineExecutor, facts, leftovers, use
 from mp4ds.errors import Refused, SourceError
 from mp4ds.format.sidecars import load_manifest
-from mp4ds.packing.options import ImageFolder
+from mp4ds.packing.options import ImportOptions
 from mp4ds.plugins.importing.calibrations import ros_calibration
 from mp4ds.plugins.importing.layouts import open_images
 from mp4ds.plugins.importing.lists import ROUNDED, ListReader, at_rate
@@ -67,7 +67,7 @@ def save(path: Path, pixels: Pixels) -> Path:
 
 
 def folder(**options: Any) -> mp4ds.PackOptions:
-    return mp4ds.PackOptions(images=mp4ds.ImageFolder(**options), codec="ffv1")
+    return mp4ds.PackOptions(images=mp4ds.ImportOptions(**options), codec="ffv1")
 
 
 def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -284,7 +284,7 @@ def test_a_rate_is_not_that_of_several_cameras(names: tuple[str, str], tmp_path:
         for name in names:
             save(tmp_path / name.format(number), image(number, 3 if name.endswith("jpg") else 1))
     with pytest.raises(SourceError, match=r"several cameras.* folder of its own"):
-        open_images(tmp_path, ImageFolder(rate="30"))
+        open_images(tmp_path, ImportOptions(rate="30"))
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_a_rate_is_that_of_one_camera(names: list[str], tmp_path: Path) -> None:
     for name in names:
         pixels = image(1, 3 if name.endswith("jpg") else 1)
         save(tmp_path / name, pixels[:8] if "small" in name else pixels)
-    with open_images(tmp_path, ImageFolder(rate="30")) as reader:
+    with open_images(tmp_path, ImportOptions(rate="30")) as reader:
         assert sum(map(len, reader.times().values())) == len(names)
         assert len(set(np.concatenate(list(reader.times().values())).tolist())) == len(names)
 
@@ -391,7 +391,7 @@ def test_jpeg_files_are_kept_beside_others(tmp_path: Path) -> None:
 
 def test_in_parts_is_as_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = euroc(tmp_path)
-    options = mp4ds.PackOptions(images=mp4ds.ImageFolder(), codec="ffv1", gop=2)
+    options = mp4ds.PackOptions(images=mp4ds.ImportOptions(), codec="ffv1", gop=2)
     mp4ds.pack(place, tmp_path / "whole", options)
     use(monkeypatch, InlineExecutor())
     tasks: list[int] = []
@@ -658,8 +658,8 @@ def test_bad_folders_are_refused_in_a_sentence(case: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--stamps x", "--stamps works with plain, not with euroc"),
-        ("--frame-id x", "--frame-id works with plain, not with euroc"),
+        ("--stamps x", "--stamps works with plain, video, not with euroc"),
+        ("--frame-id x", "--frame-id works with plain, video, not with euroc"),
         ("--calibration x", "--calibration works with plain, tum"),
         ("--quality x", "--quality 'x' is not known"),
     ],

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 NAMES = [
     "ConversionError", "Dataset", "EncoderRefusedError", "EvaluateOptions",
     "Evaluation", "ExportOptions", "ExportSummary", "FormatError", "Frame",
-    "FrameNotFoundError", "ImageFolder", "Mp4dsError", "OptionError", "PackOptions",
+    "FrameNotFoundError", "ImportOptions", "Mp4dsError", "OptionError", "PackOptions",
     "PackSummary", "PartsFailedError", "PathError", "PlayOptions", "PlaySummary", "Problem",
     "RecordOptions", "RecordSummary", "RecordedMessage", "RemoteError", "ReportOptions",
     "ReportSummary", "SampleError", "ScoringError", "SourceError", "SourceNotFoundError",

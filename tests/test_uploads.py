@@ -383,7 +383,7 @@ def test_a_folder_of_images_is_packed_to_a_url(folder_url: str, tmp_path: Path) 
     slope = np.add.outer(np.arange(24), np.arange(32)).astype(np.uint8)
     for number in range(3):
         Image.fromarray(slope + number).save(tmp_path / "images" / f"{number}.png")
-    options = PackOptions(codec="ffv1", images=mp4ds.ImageFolder(rate="2"))
+    options = PackOptions(codec="ffv1", images=mp4ds.ImportOptions(rate="2"))
     mp4ds.pack(tmp_path / "images", f"{folder_url}/ds", options)
     with mp4ds.open(f"{folder_url}/ds") as dataset:
         for number, frame in enumerate(dataset["/camera/image_raw"]):

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from mp4ds.errors import VersionError as VersionError
     from mp4ds.errors import VideoError as VideoError
     from mp4ds.errors import WriteError as WriteError
-    from mp4ds.packing.options import ImageFolder as ImageFolder
+    from mp4ds.packing.options import ImportOptions as ImportOptions
     from mp4ds.packing.options import PackOptions as PackOptions
     from mp4ds.packing.options import PackSummary as PackSummary
     from mp4ds.packing.pack import pack as pack
@@ -92,7 +92,7 @@ _HOMES = {
         "SourceError SourceNotFoundError TargetError TargetExistsError VersionError "
         "VideoError WriteError"
     ),
-    "packing.options": "ImageFolder PackOptions PackSummary",
+    "packing.options": "ImportOptions PackOptions PackSummary",
     "packing.pack": "pack pack_each pack_share",
     "plugins.evaluating.evaluate": "EvaluateOptions evaluate",
     "plugins.evaluating.trials": "Evaluation",

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -33,9 +34,9 @@ from mp4ds.cli.output import (
 )
 from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, counted, path_text, size_text
-from mp4ds.options import HOW, LONG, WHERE, seconds_text
+from mp4ds.options import HOW, LONG, WHERE, declared_in, seconds_text
 from mp4ds.packing.options import (
-    ImageFolder,
+    ImportOptions,
     PackOptions,
     PackProgress,
     PackSummary,
@@ -360,23 +361,46 @@ _force = option("--force", "-f", is_flag=True, panel=WHERE, help="Replace an exi
 
 @click.group("import")
 def import_command() -> None:
-    """Make a dataset from images, or from a video made by the paper's tool."""
+    """Make a dataset from images, or from a video."""
+
+
+def _imports(*kinds: str) -> Callable[[Callable[..., Any]], Any]:
+    """Give a command the options of what it imports, and of packing."""
+    others = [name for name, one in declared_in(ImportOptions) if not {*one.only} & {*kinds}]
+    packing = takes(PackOptions, without=("camera_info", "join", "salvage"))
+    return lambda function: takes(ImportOptions, "images", without=others)(packing(function))
+
+
+def _import(source: str, output: str, images: ImportOptions, options: PackOptions) -> None:
+    with pack_progress() as progress:
+        summary = mp4ds.pack(source, output, replace(options, images=images), progress=progress)
+    show(summary, print_pack)
 
 
 @command("images")
 @argument("folder", "FOLDER", "Folder of images, plain or in a known layout.")
 @output_option("DATASET", "Folder to create.", required=True)
-@takes(ImageFolder, "images")
-@takes(PackOptions, without=("camera_info", "join", "salvage"))
-def images_command(folder: str, output: str, images: ImageFolder, options: PackOptions) -> None:
+@_imports("plain", "euroc", "tum")
+def images_command(folder: str, output: str, images: ImportOptions, options: PackOptions) -> None:
     """Make a dataset from a folder of timestamped images.
 
     EuRoC and TUM RGB-D folders are imported with all their cameras. Lossless by default. To
     resume a long import that was interrupted, run the same command again.
     """
-    with pack_progress() as progress:
-        summary = mp4ds.pack(folder, output, replace(options, images=images), progress=progress)
-    show(summary, print_pack)
+    _import(folder, output, images, options)
+
+
+@command("video")
+@argument("video", "VIDEO", "An mp4, mov, mkv or webm file.")
+@output_option("DATASET", "Folder to create.", required=True)
+@_imports("video")
+def video_command(video: str, output: str, images: ImportOptions, options: PackOptions) -> None:
+    """Make a dataset from a video of any other program.
+
+    Its packets are copied: H.264, H.265, AV1 and VP9 become CompressedVideo, Motion JPEG
+    CompressedImage. Times are those of the video, or of a list.
+    """
+    _import(video, output, images, options)
 
 
 @command("ros-mp4")
@@ -393,6 +417,7 @@ def ros_mp4_command(video: str, sidecar: str, output: str, force: bool) -> None:
 
 
 import_command.add_command(images_command)
+import_command.add_command(video_command)
 import_command.add_command(ros_mp4_command)
 
 

@@ -549,7 +549,7 @@ INFO_NAMES = ("camera_info", "calibration")
 """Last words of calibration topics, in ROS and in Foxglove's examples."""
 
 
-TRANSPORTS = frozenset({"compressed", "compressedDepth", "ffmpeg", "foxglove"})
+TRANSPORTS = frozenset({"compressed", "compressedDepth", "ffmpeg", "foxglove", "compressed_video"})
 """Last words of topics that transport the images of the topic before it."""
 
 

@@ -16,6 +16,7 @@ from mp4ds.options import (
     Options,
     Parsed,
     SliceOptions,
+    Time,
     TopicOptions,
     about,
     argument,
@@ -23,6 +24,7 @@ from mp4ds.options import (
     jobs,
     latched,
     option,
+    parse_time,
 )
 from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
 from mp4ds.video.codecs import (
@@ -48,11 +50,14 @@ VIEWS = (DEFAULT_LOSSY, "h264", NO_VIEW)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageFolder(Options):
-    """How a folder of images is read as a recording."""
+class ImportOptions(Options):
+    """How a folder of images, or a video, is read as a recording."""
 
     stamps: str | None = option(
-        "Text file with a time per line, or a time and a file name.", metavar="FILE", only=_PLAIN
+        "Text file with a time per line, in the order of the images or frames; of images also a "
+        "time and a file name.",
+        metavar="FILE",
+        only=("plain", "video"),
     )
     rate: str | None = option(
         "Frame rate of images without times, such as 20 or 30000/1001.", metavar="HZ", only=_PLAIN
@@ -60,24 +65,43 @@ class ImageFolder(Options):
     unit: str | None = option(
         "Unit of integer times: s, ms, us or ns; default: ns, if they have enough digits.",
         choices=("s", "ms", "us", "ns"),
-        only=_PLAIN,
+        only=("plain", "video"),
     )
     calibration: str | None = option(
         "Calibration as saved by ROS's camera_calibration.",
         metavar="YAML",
-        only=("plain", "tum"),
+        only=("plain", "tum", "video"),
     )
     topic: str | None = option(
-        "Topic of plain images; default: /camera/image_raw.", panel=WHAT, only=_PLAIN
+        "Topic of the raw images; default: /camera/image_raw. That of JPEG files ends in "
+        "/compressed, that of video packets in /compressed_video.",
+        panel=WHAT,
+        only=("plain", "video"),
     )
-    frame_id: str | None = option("Frame id of plain images; default: camera.", only=_PLAIN)
+    frame_id: str | None = option(
+        "Frame id of the images; default: camera.", only=("plain", "video")
+    )
     encoding: str | None = option(
         "Encoding of plain images, such as bayer_rggb8 or 16UC1; default: as in the files.",
         choices=ENCODINGS,
         only=_PLAIN,
     )
+    offset: Parsed[Time | None] = option(
+        "Time to add to those of the video, such as 1700000000.5 or 2023-11-14T22:13:20; "
+        "default: 0.",
+        None,
+        metavar="TIME",
+        parse=parse_time,
+        only=("video",),
+    )
+    decode: bool = option(
+        "Decode the frames to RGB images, which are packed like any others, instead of copying "
+        "packets.",
+        False,
+        only=("video",),
+    )
 
-    def absolute(self) -> ImageFolder:
+    def absolute(self) -> ImportOptions:
         """The same with absolute paths, for processes elsewhere."""
         stamps, calibration = (
             None if path is None else os.path.abspath(path)  # noqa: PTH100 - keeps links
@@ -166,8 +190,8 @@ class PackOptions(SliceOptions, TopicOptions):
     keep_going: bool = option("If a part fails, continue with the others.", False, panel=LONG)
     restart: bool = option("Discard an unfinished run and start over.", False, panel=LONG)
     force: bool = force()
-    images: ImageFolder | None = argument(
-        "How a folder of images is read as a recording.", changes=ENCODING
+    images: ImportOptions | None = argument(
+        "How a folder of images, or a video, is read as a recording.", changes=ENCODING
     )
 
     @property

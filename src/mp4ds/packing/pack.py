@@ -161,7 +161,7 @@ def pack(
 
     Args:
         sources: A bag, rosbag2 folder, MCAP file or dataset, or several that belong together; or
-            URLs. A folder of images if the options have `images`.
+            URLs. A folder of images or a video if the options have `images`.
         dataset: The folder to make, or its URL; None for a folder in the current one with the name
             of the recording.
         options: How to pack; lossless by default.

@@ -32,7 +32,7 @@ from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.calibrations import find_pairs
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey, depends_on_others
 from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools
-from mp4ds.packing.options import NO_VIEW, ImageFolder, PackOptions
+from mp4ds.packing.options import NO_VIEW, ImportOptions, PackOptions
 from mp4ds.packing.tracks import TrackPlan
 from mp4ds.packing.windows import WindowCoder
 from mp4ds.processes import available_cores
@@ -479,8 +479,8 @@ def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagR
     """Open what is to be packed.
 
     Args:
-        paths: Recordings and datasets that belong together, or a folder of images.
-        options: How: salvaging, as a folder of images, or a slice with the latched messages of
+        paths: Recordings and datasets that belong together, or what is imported.
+        options: How: salvaging, importing, or a slice with the latched messages of
             the topics that are packed.
 
     Raises:
@@ -497,15 +497,15 @@ def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagR
     return reader
 
 
-def _open_whole(paths: Sequence[Path], images: ImageFolder | None, *, salvage: bool) -> BagReader:
-    other = "a folder of images" if images else "a dataset" if any(map(dataset_at, paths)) else ""
+def _open_whole(paths: Sequence[Path], images: ImportOptions | None, *, salvage: bool) -> BagReader:
+    other = "what is imported" if images else "a dataset" if any(map(dataset_at, paths)) else ""
     if salvage and other:
         raise OptionError(f"`salvage` works with recordings, not with {other}.")
     if images is None:
         return open_sources(paths, salvage=salvage, opener=open_source)
     if len(paths) != 1:
         raise OptionError(
-            f"Only one folder of images can be imported at a time, but {len(paths)} were given."
+            f"Only one folder or video can be imported at a time, but {len(paths)} were given."
         )
     reader: BagReader = plugin("images")(paths[0], images)
     return reader

@@ -19,7 +19,7 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import adapted
 from mp4ds.errors import ConversionError, FormatError, OptionError, Refused
 from mp4ds.format.fields import Choice, everything, marked
-from mp4ds.messages.serializations import is_camera, plain_message
+from mp4ds.messages.serializations import TRANSPORTS, is_camera, plain_message
 from mp4ds.messages.wire import NS, Fields, Slots, WireError
 from mp4ds.records import HASH_KEY, Channel, Message, Schema
 from mp4ds.unpacking.pictures import (
@@ -33,8 +33,6 @@ from mp4ds.unpacking.pictures import (
     is_inverse_depth,
 )
 
-_TRANSPORTS = ("compressed", "compressedDepth", "ffmpeg", "foxglove", "compressed_video")
-
 
 def republished_topic(topic: str, type_name: str, kind: str) -> str:
     """The topic that image_transport would have for a topic's images.
@@ -46,7 +44,7 @@ def republished_topic(topic: str, type_name: str, kind: str) -> str:
     """
     family = FAMILIES[type_name.replace(".", "/").rpartition("/")[2]]
     stem, _, last = topic.rpartition("/")
-    has_transport = family != "raw" and last in _TRANSPORTS and stem != ""
+    has_transport = family != "raw" and last in TRANSPORTS and stem != ""
     suffix = KINDS[kind].suffix
     if family == KINDS[kind].family and not (has_transport and last != suffix):
         return topic

@@ -207,7 +207,7 @@ class VideoDecoder:
         self._in_flight = min(os.cpu_count() or 1, _MOST_THREADS) + 1 if sequential else 1
         # the frames that come next, and the number of their first, if a call ended in between
         self._position: tuple[Iterator[av.VideoFrame], int] | None = None
-        self._media = Media(path, file.track if file else None, size=maker.coded_size)
+        self._media = file.open() if file else Media(path, size=maker.coded_size)
         self._container = self._media.container
         try:
             self._media.check(codec, maker.coded_size)
@@ -374,29 +374,40 @@ def _shown_from(
 _SECOND = 1_000_000_000
 _LATEST = 2**63 // _SECOND - 1  # seconds
 _TRIES = 3
+_MATROSKA = (".mkv", ".webm")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class VideoFile:
-    """A video track of an mp4 without a sidecar, of any known codec.
+    """A video track of an mp4, MOV, Matroska or WebM file without a sidecar, of any known codec.
 
     Attributes:
         path: The video.
         track: Which video track, from 0; None: there is only one.
+        container: ffmpeg's name of its demuxer.
         codec: Name in the registry, or ffmpeg's.
         size: Width and height of its frames, as coded.
         ticks: Presentation times in ticks of the track, int64, shape (frames,), in order.
         keys: Numbers of the frames at which decoding can begin.
         times: Presentation times, nanoseconds, rounded down, int64, shape (frames,).
+        is_reordered: Whether frames are coded in another order than they are shown.
+        is_indexed: Whether all of this is in the file's index, so that little is read of it.
     """
 
     path: Path
     track: int | None
+    container: str
     codec: str
     size: tuple[int, int]
     ticks: NDArray[np.int64]
     keys: NDArray[np.int64]
     times: NDArray[np.int64]
+    is_reordered: bool
+    is_indexed: bool
+
+    def open(self) -> Media:
+        """Open it once more."""
+        return Media(self.path, self.track, size=self.size, container=self.container)
 
     def maker(self) -> PictureMaker:
         """Makes 8-bit RGB of its frames, by its colour tags."""
@@ -422,16 +433,18 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
         OptionError: It has no such track.
     """
     advice = "; `mp4ds.open` takes the number of one as `track`"
-    with closing(Media(path, track, advice)) as media:
+    container = "matroska" if path.suffix.lower() in _MATROSKA else "mp4"
+    with closing(Media(path, track, advice, container=container)) as media:
         context = media.track.codec_context
         width, height = context.width, context.height
         if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
             raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
         name = context.codec.canonical_name
         codec = next((key for key, value in CODECS.items() if value.ffmpeg == name), name)
-        ticks, keys = _read_ticks(media, path, track)
-        if not len(ticks):
+        shown, keys, is_indexed = _read_ticks(media, path, track)
+        if not len(shown):
             raise VideoError("video-unreadable", path, "has no frames")
+        ticks = np.sort(shown)
         base = media.track.time_base
         if np.abs(ticks[[0, -1]]).max() * base >= _LATEST or base.numerator != 1:
             raise VideoError("video-unreadable", path, "has times beyond 64 bits")
@@ -439,17 +452,31 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
         times = whole * _SECOND + part * _SECOND // base.denominator
         # a key frame may be hidden: the next one shown is decoded from it
         numbers = np.unique(np.searchsorted(ticks, keys))
-        return VideoFile(path, track, codec, (width, height), ticks, numbers, times)
+        return VideoFile(
+            path,
+            track,
+            container,
+            codec,
+            (width, height),
+            ticks,
+            numbers,
+            times,
+            is_reordered=not np.array_equal(ticks, shown),
+            is_indexed=is_indexed,
+        )
 
 
 def _read_ticks(
     media: Media, path: Path, track: int | None
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Presentation ticks of the frames, and those of the key frames."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64], bool]:
+    """Ticks of the frames as coded, and of key frames in order; whether an index has them."""
     try:
+        if path.suffix.lower() in _MATROSKA:
+            raise Refused("it is no mp4")
         with path.open("rb") as file:
             table = read_sample_table(file, path.stat().st_size, str(path), track)
-        return table.presentation[table.order], np.sort(table.presentation[table.sync])
+        shown = table.presentation[np.sort(table.order)]
+        return shown, np.sort(table.presentation[table.sync]), True
     except Refused:  # ffmpeg reads more, though only by all packets
         ticks, keys = [], []
     except OSError as error:
@@ -465,4 +492,4 @@ def _read_ticks(
     except (FFmpegError, OSError) as error:
         raise_if_scarce(error)
         raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
-    return np.sort(np.array(ticks, np.int64)), np.sort(np.array(keys, np.int64))
+    return np.array(ticks, np.int64), np.sort(np.array(keys, np.int64)), False

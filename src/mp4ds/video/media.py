@@ -68,6 +68,7 @@ class Media:
         track: Which of its video tracks, from 0; None: it has only one.
         advice: What to do where it has several, for errors.
         size: Width and height of its frames, if they should be known; see `most_pixels`.
+        container: See `open_input`.
 
     Attributes:
         container: PyAV's.
@@ -85,6 +86,7 @@ class Media:
         track: int | None = None,
         advice: str = "",
         size: tuple[int, int] | None = None,
+        container: str = "mp4",
     ) -> None:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
@@ -93,7 +95,8 @@ class Media:
         try:
             if remote(path):
                 self._file = _Source(path.open("rb"))
-            self.container: Any = open_input(self._file or str(path.absolute()), size=size)
+            source = self._file or str(path.absolute())
+            self.container: Any = open_input(source, container, size=size)
         except (FFmpegError, OSError) as error:
             self._close_file()
             raise_if_scarce(error)

@@ -1,4 +1,4 @@
-"""Folders of images: EuRoC MAV, TUM RGB-D, and plain ones."""
+"""Folders of images: EuRoC MAV, TUM RGB-D, and plain ones; and videos."""
 
 from __future__ import annotations
 
@@ -15,23 +15,32 @@ from mp4ds.errors import OptionError, Refused, SourceError, SourceNotFoundError
 from mp4ds.files.sources import members
 from mp4ds.files.urls import remote
 from mp4ds.messages.wire import CalibrationFields
-from mp4ds.packing.options import ImageFolder
+from mp4ds.packing.options import ImportOptions
 from mp4ds.plugins.importing.calibrations import (
     euroc_calibration,
     euroc_pose,
     read_yaml,
     ros_calibration,
 )
-from mp4ds.plugins.importing.lists import ListReader, Row, at_rate, is_number, rows_of, unit_of
+from mp4ds.plugins.importing.lists import (
+    MAX_STAMP,
+    ListReader,
+    Row,
+    at_rate,
+    is_number,
+    rows_of,
+    unit_of,
+)
 from mp4ds.plugins.importing.reader import ImagesReader, reading
+from mp4ds.video.clips import Clip
 from mp4ds.video.images import STILL_SUFFIXES, image_size
 
 
-def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
-    """Open a folder of images as a recording.
+def open_images(folder: Path, options: ImportOptions) -> ImagesReader:
+    """Open a folder of images, or a video, as a recording.
 
     Args:
-        folder: The folder, on this machine.
+        folder: The folder or video, on this machine.
         options: How to read it.
 
     Raises:
@@ -42,19 +51,21 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
         raise SourceError(folder, "cannot be read remotely", "Download it first.")
     if not folder.exists():
         raise SourceNotFoundError(folder)
-    if not folder.is_dir():
-        raise SourceError(folder, "is not a folder of images")
     if options.topic is not None and not options.topic.strip("/"):
         raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
     with reading(folder):
         reader = ImagesReader(folder)
-        if any((sensor / "data").is_dir() for sensor in _sensors(folder)):
+        if folder.is_file():
+            options.check_for("video")
+            _add_video(reader, options)
+        elif any((sensor / "data").is_dir() for sensor in _sensors(folder)):
             options.check_for("euroc")
             _add_euroc(reader)
         elif any((folder / f"{name}.txt").is_file() for name in _CAMERAS):
             options.check_for("tum")
             _add_tum(reader, options)
         else:
+            options.check_for("plain")
             _add_plain(reader, options)
     if options.calibration:
         reader.add_file(Path(options.calibration), is_kept=True)
@@ -63,9 +74,9 @@ def open_images(folder: Path, options: ImageFolder) -> ImagesReader:
 
 
 def _calibration(
-    options: ImageFolder, topic: str, images: Sequence[Path]
+    options: ImportOptions, topic: str, images: Sequence[Path], size: tuple[int, int] | None = None
 ) -> CalibrationFields | None:
-    """The given calibration for the images of a camera.
+    """The given calibration for the images of a camera, whose size may be known.
 
     Raises:
         SourceError: It is not valid, or made for a different image size.
@@ -73,7 +84,7 @@ def _calibration(
     if not options.calibration:
         return None
     found = ros_calibration(Path(options.calibration))
-    size = image_size(images[0]) if images else None
+    size = image_size(images[0]) if images else size
     if size not in (None, (found.width, found.height)):
         raise SourceError(
             Path(options.calibration),
@@ -154,7 +165,7 @@ _TABLES = {
 }
 
 
-def _add_tum(reader: ImagesReader, options: ImageFolder) -> None:
+def _add_tum(reader: ImagesReader, options: ImportOptions) -> None:
     """Add the colour and depth images, accelerometer and poses."""
     folder, lists = reader.path, ListReader("s", reader.left_out)
     listed: dict[Path, set[Path]] = {}
@@ -184,6 +195,47 @@ def _add_tum(reader: ImagesReader, options: ImageFolder) -> None:
             reader.leave_out(path, f"{path.name}, which is not part of the layout")
 
 
+# ---------------------------------------------------------------- video
+
+
+def _named(options: ImportOptions) -> tuple[str, str]:
+    """Topic and frame id of the only camera."""
+    frame_id = options.frame_id if options.frame_id is not None else "camera"
+    return options.topic or "/camera/image_raw", frame_id
+
+
+def _add_video(reader: ImagesReader, options: ImportOptions) -> None:
+    """Add the frames of a video.
+
+    Raises:
+        SourceError: They cannot be messages, or there are not as many times.
+    """
+    clip = Clip(reader.path, decode=options.decode)
+    reader.add_file(reader.path)
+    stamps, source = clip.file.times, reader.path
+    if options.stamps:
+        source = Path(options.stamps)
+        rows, lists = _listed(reader, source, options.unit)
+        stamps = lists.times(source, rows)
+        if len(stamps) != len(clip.numbers):
+            raise SourceError(
+                source, f"has {len(stamps)} times, but {reader.path} has {len(clip.numbers)} frames"
+            )
+        if (back := np.flatnonzero(np.diff(stamps) < 0)).size:
+            problem = f"line {rows[back[0] + 1][0]}: it is earlier than the time before"
+            raise SourceError(source, problem)
+    elif options.unit:
+        raise OptionError("`unit` is that of `stamps`. Give a list of times, too.")
+    offset = options.offset.ns if options.offset else 0
+    if stamps[0] + offset < 0 or int(stamps[-1]) + offset > MAX_STAMP:
+        problem = "has times before 1970 or after 2038, the range of ROS 2 times"
+        raise SourceError(source, problem, "Give `offset`.")
+    topic, frame_id = _named(options)
+    calibration = _calibration(options, topic, (), clip.file.size)
+    stamps = stamps + offset
+    reader.add_clip(topic, frame_id, clip, stamps, calibration=calibration, decode=options.decode)
+
+
 # ---------------------------------------------------------------- plain
 
 _LISTED = 3
@@ -206,7 +258,7 @@ def _in_order(path: Path) -> tuple[list[tuple[int, str]], str]:
     return [(int(part or 0), "") if n % 2 else (0, part) for n, part in enumerate(parts)], path.name
 
 
-def _add_plain(reader: ImagesReader, options: ImageFolder) -> None:
+def _add_plain(reader: ImagesReader, options: ImportOptions) -> None:
     """Add the images of one camera.
 
     Raises:
@@ -231,10 +283,10 @@ def _add_plain(reader: ImagesReader, options: ImageFolder) -> None:
         files, stamps = _by_list(reader, images, Path(options.stamps), options.unit)
     else:
         stamps = _by_name(reader, images, options.unit)
-    topic = options.topic or "/camera/image_raw"
+    topic, frame_id = _named(options)
     reader.add_camera(
         topic,
-        options.frame_id if options.frame_id is not None else "camera",
+        frame_id,
         files,
         stamps,
         calibration=_calibration(options, topic, files),
@@ -287,6 +339,19 @@ def _by_list(
     reader: ImagesReader, images: list[Path], path: Path, unit: str | None
 ) -> tuple[list[Path], NDArray[np.int64]]:
     """The images of a list of times, which may also name them."""
+    chosen, lists = _listed(reader, path, unit)
+    if len(chosen[0][1]) > 1:
+        return lists.images(path, reader.path, chosen)
+    stamps = lists.times(path, chosen)
+    if len(stamps) != len(images):
+        raise SourceError(
+            path, f"has {len(stamps)} times, but there are {len(images)} images in {reader.path}"
+        )
+    return images, stamps
+
+
+def _listed(reader: ImagesReader, path: Path, unit: str | None) -> tuple[list[Row], ListReader]:
+    """The times of a list, each with the name of an image if it has names, and their reader."""
     rows = rows_of(path)
     first = next(rows, None)
     header: list[str] = []
@@ -308,15 +373,7 @@ def _by_list(
     unit = unit or unit_of([values[0] for _, values in chosen if is_number(values[0])])
     if unit is None:
         raise OptionError(f"{path}: its times are integers of an unknown unit. Give `unit`.")
-    lists = ListReader(unit, reader.left_out)
-    if name is not None:
-        return lists.images(path, reader.path, chosen)
-    stamps = lists.times(path, chosen)
-    if len(stamps) != len(images):
-        raise SourceError(
-            path, f"has {len(stamps)} times, but there are {len(images)} images in {reader.path}"
-        )
-    return images, stamps
+    return chosen, ListReader(unit, reader.left_out)
 
 
 def _columns(path: Path, number: int, values: list[str]) -> tuple[int, int | None]:

@@ -1,4 +1,4 @@
-"""A folder of images as a ROS 2 recording: each message is made when it is read."""
+"""Images and videos as a ROS 2 recording: each message is made when it is read."""
 
 from __future__ import annotations
 
@@ -32,7 +32,19 @@ from mp4ds.messages.wire import (
     PrimitiveWriter,
     Slots,
 )
-from mp4ds.records import Attachment, Channel, Excerpt, Message, Record
+from mp4ds.records import (
+    QOS_KEY,
+    Attachment,
+    Channel,
+    Excerpt,
+    Message,
+    MetadataRecord,
+    Record,
+    Schema,
+)
+from mp4ds.unpacking.pictures import KINDS
+from mp4ds.unpacking.republish import Types
+from mp4ds.video.clips import Clip
 from mp4ds.video.images import read_image
 
 FILE_LIST = "images.csv"
@@ -91,12 +103,14 @@ class _Track:
         stamps: Their times, nanoseconds, sorted.
         make: Makes the payload of a message by its number.
         files: The file of each message; empty if not made from files.
+        frame_bytes: Of a message in its source, on average, if that is a video.
     """
 
     channel: Channel
     stamps: NDArray[np.int64]
     make: Callable[[int], bytes]
     files: Sequence[Path] = ()
+    frame_bytes: int = 0
 
     def order(self, place: int, excerpt: Excerpt) -> Iterator[tuple[int, int, int]]:
         """Time, place of the track and number of the messages of an excerpt."""
@@ -122,6 +136,7 @@ class ImagesReader(BagReader):
         files: What it was read from, including folders of images.
         kept: Files to store as they are, because messages do not hold all of them.
         transforms: Poses of sensors.
+        metadata: What containers say about videos.
         left_out: What is left out: a phrase -> how many.
     """
 
@@ -136,6 +151,7 @@ class ImagesReader(BagReader):
         self.files: list[Path] = []
         self.kept: list[Path] = []
         self.transforms: list[Transform] = []
+        self.metadata: list[MetadataRecord] = []
         self._skipped = self.left_out = Counter[str]()
         self._tracks: list[_Track] = []
 
@@ -198,10 +214,65 @@ class ImagesReader(BagReader):
 
         add(topic, _IMAGE, ~is_jpeg)
         add(f"{topic}/compressed", _COMPRESSED, is_jpeg)
-        if calibration is not None and paths:
-            fields = calibration
+        if paths:
+            self._add_calibration(topic, frame_id, stamps, calibration)
+
+    def add_clip(
+        self,
+        topic: str,
+        frame_id: str,
+        clip: Clip,
+        stamps: NDArray[np.int64],
+        *,
+        calibration: CalibrationFields | None = None,
+        decode: bool = False,
+    ) -> None:
+        """Add the frames of a video.
+
+        Args:
+            topic: Of its raw images.
+            frame_id: Coordinate frame.
+            clip: The video.
+            stamps: Times of its frames, nanoseconds, none before the last; int64, shape (frames,).
+            calibration: The intrinsics of its camera, if known.
+            decode: Whether the clip gives pixels.
+        """
+        width, height = clip.file.size
+        fields: Fields = CodedFields(clip.file.codec)
+        if decode:
+            fields, kind = ImageFields("rgb8", width, height, 3 * width, is_bigendian=0), "raw"
+        elif clip.file.codec == "mjpeg":
+            fields, kind = CodedFields("jpeg"), "jpeg"
+        else:
+            kind = "compressed-video"
+        suffix = KINDS[kind].suffix
+        topic_of = f"{topic}/{suffix}" if suffix else topic
+        type_name = KINDS[kind].type_name
+        made = Channel(0, topic_of, "cdr", Schema(type_name, "", b""), {QOS_KEY: ""})
+        channel = Types("ros2", kind).channel(made, len(self._tracks), topic_of)
+
+        def make(number: int) -> bytes:
+            body = clip.body(number)
+            return _camera_message(type_name, frame_id, fields, int(stamps[number]), body)
+
+        self._tracks.append(_Track(channel, stamps, make, frame_bytes=clip.frame_bytes))
+        self._add_calibration(topic, frame_id, stamps, calibration)
+        self.metadata.append(clip.metadata)
+        self.left_out.update(clip.left_out)
+        # otherwise, each of the pieces would read all of the file to know its frames
+        self.is_indexed &= clip.file.is_indexed or kind == "compressed-video"
+
+    def _add_calibration(
+        self,
+        topic: str,
+        frame_id: str,
+        stamps: NDArray[np.int64],
+        fields: CalibrationFields | None,
+    ) -> None:
+        if fields is not None:
+            info = f"{''.join(topic.rpartition('/')[:2])}camera_info"
             self._add(
-                f"{''.join(topic.rpartition('/')[:2])}camera_info",
+                info,
                 _INFO,
                 stamps,
                 lambda number: _camera_message(_INFO, frame_id, fields, int(stamps[number])),
@@ -253,7 +324,7 @@ class ImagesReader(BagReader):
         Raises:
             SourceError: There are no images.
         """
-        if not any(track.files for track in self._tracks):
+        if not any(track.files or track.frame_bytes for track in self._tracks):
             raise SourceError(self.path, "holds no images")
         if self.transforms:
             payload = _transforms_message(self._start, self.transforms)
@@ -279,16 +350,19 @@ class ImagesReader(BagReader):
         with reading(self.path):
             if excerpt.others:
                 yield from self._attachments()
+                yield from self.metadata
             for time, place, number in heapq.merge(*orders):
                 track = self._tracks[place]
                 if track.files:
                     self.position += track.files[number].stat().st_size
+                self.position += track.frame_bytes
                 yield Message(track.channel, time, time, 0, track.make(number))
             self.position = sum(map(source_size, self.files))
 
     def _attachments(self) -> Iterator[Attachment]:
         """What messages cannot hold: the original calibrations, and the file names."""
-        yield self._attachment(FILE_LIST, "text/csv", self._file_list())
+        if any(track.files for track in self._tracks):
+            yield self._attachment(FILE_LIST, "text/csv", self._file_list())
         for path in self.kept:
             is_yaml = path.suffix in (".yaml", ".yml")
             media_type = "application/yaml" if is_yaml else "text/plain"

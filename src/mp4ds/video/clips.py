@@ -1,0 +1,145 @@
+"""A video of another program as messages: its packets as they are, or its pictures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from av.error import FFmpegError
+
+from mp4ds.errors import FormatError, Refused, SourceError
+from mp4ds.records import MetadataRecord
+from mp4ds.video.codecs import CODECS, PACKET_CODECS
+from mp4ds.video.coded import REORDERED, StreamParser
+from mp4ds.video.decoder import VideoDecoder, read_video_file
+from mp4ds.video.media import raise_if_scarce
+
+_DECODE = "Give `decode`: its pictures then become images, which `quality` visual keeps small."
+_KINDS = "Give an mp4, mov, mkv or webm file; `ffmpeg -i FILE -c copy NEW.mkv` makes one."
+_MOST_DELAY = 16  # frames, by which decoding times may precede those of showing
+
+
+class Clip:
+    """Consecutive frames of a video, by number.
+
+    Args:
+        path: The video.
+        decode: Whether its frames become RGB images.
+        numbers: Those of the frames; None: all.
+
+    Attributes:
+        file: The video.
+        numbers: Those of the frames.
+        frame_bytes: Bytes of a frame in the file, on average.
+        metadata: What its container says about it.
+        left_out: What messages do not hold of it: a phrase -> how many.
+
+    Raises:
+        SourceError: It cannot be read, or its packets cannot be messages; says what to do.
+    """
+
+    def __init__(self, path: Path, *, decode: bool, numbers: range | None = None) -> None:
+        try:
+            self.file = read_video_file(path)
+        except FormatError as error:
+            raise SourceError(path, error.problem, _KINDS) from None
+        self._decode = decode
+        self.numbers = numbers or range(len(self.file.ticks))
+        self.frame_bytes = path.stat().st_size // len(self.file.ticks)
+        self._bodies: Iterator[bytes] = iter(())
+        self._due = -1
+        self._parser: type[StreamParser] = StreamParser
+        self._units: list[bytes] = []
+        if not decode:
+            self._check_packets()
+        with self._reading(), closing(self.file.open()) as media:
+            texts = {str(key): str(value) for key, value in media.container.metadata.items()}
+            self.metadata = MetadataRecord("video", {**texts, "file": path.name})
+            others = [one.type for one in media.container.streams if one is not media.track]
+            self.left_out = Counter(f"{kind} tracks" for kind in others)
+            if media.hidden:
+                self.left_out["frames that its edit list hides"] = media.hidden
+            turned = next(media.container.decode(media.track)).rotation if numbers is None else 0
+            if turned:
+                self.left_out[f"turn by {turned % 360} degrees, which players apply"] = 1
+
+    def _check_packets(self) -> None:
+        """Refuse a video whose packets cannot be messages."""
+        file = self.file
+        if file.codec not in PACKET_CODECS:
+            raise self._refusal(f"is coded as {file.codec}, not {', '.join(PACKET_CODECS)}")
+        if file.is_reordered:
+            raise self._refusal(f"cannot be copied: {REORDERED}")
+        self._parser = CODECS[file.codec].parser
+        with self._reading(), closing(file.open()) as media:
+            extradata = bytes(media.track.codec_context.extradata or b"")
+            self._units = self._parser.units_of(extradata) if extradata else []
+        first = self.numbers[0]
+        with self._reading(), closing(self._packets(first)) as packets:
+            if not next(packets).is_keyframe:
+                raise Refused(f"frame {first} is not a key frame, and earlier ones are left out")
+
+    def _refusal(self, problem: str) -> SourceError:
+        return SourceError(self.file.path, problem, _DECODE)
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Errors in the terms of a source."""
+        try:
+            yield
+        except FormatError as error:
+            raise SourceError(self.file.path, error.problem) from None
+        except Refused as reason:
+            raise self._refusal(f"cannot be copied: {reason}") from None
+        except (FFmpegError, StopIteration) as error:
+            raise_if_scarce(error)
+            raise SourceError(self.file.path, f"is damaged: {error or 'it ends early'}") from None
+
+    def body(self, number: int) -> bytes:
+        """A frame: its packet as a message has it, or its pixels.
+
+        Args:
+            number: Of the frame in the clip; in order is fastest.
+
+        Raises:
+            SourceError: The video is damaged.
+        """
+        if number != self._due:
+            self._bodies = self._bodies_from(self.numbers[number])
+        self._due = number + 1
+        with self._reading():
+            return next(self._bodies)
+
+    def _bodies_from(self, number: int) -> Iterator[bytes]:
+        if not self._decode:
+            for packet in self._packets(number):
+                units = self._units if packet.is_keyframe else []
+                yield self._parser.stand_alone(bytes(packet), units)
+            return
+        file = self.file
+        with VideoDecoder(
+            file.path, codec=file.codec, frames=len(file.ticks), maker=file.maker(), file=file
+        ) as decoder:
+            for _, (pixels,) in decoder.pictures_at(range(number, self.numbers[-1] + 1)):
+                yield pixels.tobytes()
+
+    def _packets(self, number: int) -> Generator[Any, None, None]:
+        """The packets from a frame to the last one; they are in the order of the frames."""
+        ticks = self.file.ticks
+        with closing(self.file.open()) as media:
+            if number:  # without an index, they are read from the first
+                with suppress(FFmpegError):
+                    before = int(ticks[max(0, number - _MOST_DELAY)])
+                    media.container.seek(before, stream=media.track)
+            for packet in media.container.demux(media.track):
+                if packet.pts is None or packet.is_discard or packet.pts < ticks[number]:
+                    continue
+                if packet.pts != ticks[number]:
+                    raise Refused(f"the packet of frame {number} is not where its index says")
+                yield packet
+                number += 1
+                if number > self.numbers[-1]:
+                    return
