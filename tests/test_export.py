@@ -639,10 +639,12 @@ def test_lerobot_loads_it(lerobot_folder: Path, tmp_path: Path) -> None:
 
 def test_frames_that_are_dropped_and_doubled(dataset: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
-    slow: dict[str, Any] = {"topics": [COLOUR], "fps": 10}
+    slow: dict[str, Any] = {"topics": [COLOUR], "fps": 10, "action": f"{JOINTS}:position[elbow]"}
     summary = export(dataset, "lerobot", tmp_path / "slow", **slow)
+    info = json.loads((tmp_path / "slow/meta/info.json").read_text())
+    assert info["features"]["action"]["names"] == ["elbow"]
     given = len(lerobot_frames(10))
-    assert summary.messages == {COLOUR: given}
+    assert summary.messages == {COLOUR: given, JOINTS: given}
     assert sum(summary.left_out[COLOUR].values()) == FRAMES - given
     fast = {**slow, "fps": 60, "codec": "h265", "resize": 2.0}
     summary = export(dataset, "lerobot", tmp_path / "fast", **fast)

@@ -23,7 +23,8 @@ TIMESCALE = 1_000_000
 MAX_GAP_NS = 1_000 * 10**9
 """Longer gaps are shown with this length: past 2,147 s the container breaks."""
 
-NS_PER_TICK = 10**9 // TIMESCALE
+_NS = 10**9
+NS_PER_TICK = _NS // TIMESCALE
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 _PER_LINE = 32
 _MINUS, _ZERO = ord("-"), ord("0")
@@ -206,9 +207,32 @@ def nearest(times: Integers, wanted: Integers) -> Integers:
     return found
 
 
+def constant_rate(columns: Sequence[Integers], fps: int) -> Integers:
+    """Times at a constant rate, from when all columns have begun until one ends.
+
+    Args:
+        columns: Sorted times of cameras, nanoseconds, at least one each.
+        fps: Times per second.
+
+    Returns:
+        Nanoseconds; none if the columns do not overlap.
+    """
+    start, end = max(int(times[0]) for times in columns), min(int(times[-1]) for times in columns)
+    length = ((end - start) * fps + _NS // 2) // _NS + 1 if end >= start else 0
+    # integers throughout: floats would shift late frames
+    found: Integers = start + (np.arange(length, dtype=np.int64) * _NS + fps // 2) // fps
+    return found
+
+
 def intervals(times: Integers) -> Floats:
     """Nanoseconds from each frame to the next, shape (frames - 1,)."""
     return differences(times[1:], times[:-1])
+
+
+def sound_times(stamps: Integers, log_times: Integers) -> Integers:
+    """The stamps, or the log times if most stamps do not increase: some drivers leave them zero."""
+    steps = np.diff(stamps)
+    return stamps if 2 * int((steps > 0).sum()) >= len(steps) else log_times
 
 
 def usual_interval(steps: Floats) -> float | None:

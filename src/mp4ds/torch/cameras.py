@@ -1,4 +1,4 @@
-"""The recordings and open streams of a worker, and how frames become tensors."""
+"""The open cameras of a worker, and how frames become tensors."""
 
 from __future__ import annotations
 
@@ -8,35 +8,30 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mp4ds.dataset.dataset import datasets_in, open_dataset
-from mp4ds.dataset.stream import Layer, Stream
+from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
-from mp4ds.files.urls import location, remote, spelled
-from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
-from mp4ds.messages.depth import DEPTHS
+from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import LAYOUTS
-from mp4ds.times import nearest, synchronize
+from mp4ds.times import nearest, sound_times
+from mp4ds.torch.recordings import CameraSource, Recording, each, one_of, open_source
 from mp4ds.video.mp4 import read_sample_table
 
 Dtype = Literal["native", "uint8", "float32"]
 Backend = Literal["mp4ds", "torchcodec"]
 
-_T = TypeVar("_T")
 _DTYPES = ("native", "uint8", "float32")
 _BACKENDS = ("mp4ds", "torchcodec")
 
@@ -82,9 +77,9 @@ class Pictures:
         self.channels_first, self.backend, self.device = channels_first, backend, device
         one_of("dtype", self.dtype, _DTYPES)
         one_of("backend", backend, _BACKENDS)
-        formats = _each("format", format, topics, "rgb")
-        sizes = _each("resize", resize, topics, None)
-        crops = _each("crop", crop, topics, None)
+        formats = each("format", format, topics, "rgb")
+        sizes = each("resize", resize, topics, None)
+        crops = each("crop", crop, topics, None)
         for name in formats:
             one_of("format", name, FORMATS)
         for topic, size in zip(topics, sizes, strict=True):
@@ -101,209 +96,6 @@ class Pictures:
             raise OptionError(
                 "backend='torchcodec' only gives format='rgb' without resize; use a transform."
             )
-
-
-def one_of(name: str, value: str, known: Sequence[str]) -> None:
-    """Refuse an unknown value of an argument."""
-    if value not in known:
-        raise OptionError(f"{name} is {value!r}, not one of {', '.join(known)}.")
-
-
-def _each(name: str, given: _T | Mapping[str, _T], topics: Sequence[str], default: _T) -> list[_T]:
-    """A value for each topic, from one for all or a mapping."""
-    if not isinstance(given, Mapping):
-        return [given] * len(topics)
-    unknown = [topic for topic in given if topic not in topics]
-    if unknown:
-        raise OptionError(
-            f"{name} is given for {unknown[0]!r}, which is not among the topics: "
-            f"{', '.join(topics)}."
-        )
-    return [given.get(topic, default) for topic in topics]
-
-
-# ---------------------------------------------------------------- recordings
-
-Paths = Path | str | Sequence[Path | str]
-"""Datasets: folders, videos next to their sidecars, or URLs of these."""
-
-RESERVED = ("stamp_ns", "index", "dataset")
-"""Sample keys that cannot be topic names."""
-
-
-@dataclass(frozen=True, slots=True)
-class CameraSource:
-    """A camera of a recording.
-
-    Attributes:
-        topic: Of its images.
-        name: Of its file, without extension.
-        place: Path or URL of the sidecar, or of a video without one.
-        frames: Number of its frames.
-        layer: Which of them are read.
-    """
-
-    topic: str
-    name: str
-    place: str
-    frames: int
-    layer: Layer
-
-
-@dataclass(frozen=True, slots=True)
-class Recording:
-    """The samples of one dataset, in order: its rows.
-
-    Attributes:
-        path: As given by the user.
-        sources: Its cameras, in the order of the topics.
-        matches: Frame numbers, int64 of shape (rows, cameras); None: row n is frame n of the only
-            camera.
-        unmatched: Frame numbers that are not in any row, by topic.
-    """
-
-    path: str
-    sources: tuple[CameraSource, ...]
-    matches: NDArray[np.int64] | None
-    unmatched: dict[str, NDArray[np.int64]]
-
-    @property
-    def rows(self) -> int:
-        """Number of its samples."""
-        return self.sources[0].frames if self.matches is None else len(self.matches)
-
-    def frames(self, rows: NDArray[np.int64], camera: int) -> NDArray[np.int64]:
-        """A camera's frame numbers for rows; the same shape."""
-        return rows if self.matches is None else self.matches[rows, camera]
-
-
-def recordings_of(
-    paths: Paths, topics: Sequence[str] | None, tolerance_ns: int, layer: Layer
-) -> tuple[tuple[str, ...], list[Recording]]:
-    """The samples of several datasets, one after another.
-
-    For a dataset with one camera only the manifest is read; to match several cameras, also their
-    stamps.
-
-    Args:
-        paths: The datasets, or folders of them.
-        topics: Topics or names of streams; None: those of the first dataset. All must have them.
-        tolerance_ns: Maximum distance of the header stamps of a match, nanoseconds.
-        layer: Which frames are read of cameras that have a view.
-
-    Returns:
-        The topics, and the datasets.
-
-    Raises:
-        OptionError: A topic does not exist, there are no samples, or exact frames are not here.
-        FormatError: A manifest or sidecar breaks a rule of the format.
-        SourceError: A path is not a dataset.
-    """
-    if not isinstance(paths, (str, Path)) and not list(paths):
-        raise OptionError("There are no datasets: the list of paths is empty.")
-    if isinstance(topics, str):
-        raise OptionError(f"topics is a list of topics, such as [{topics!r}].")
-    if tolerance_ns < 0:
-        raise OptionError(f"sync_tolerance_ns is {tolerance_ns}, but must not be negative.")
-    if topics is not None and not topics:
-        raise OptionError("topics is empty; use None for all cameras of the first dataset.")
-    given = datasets_in(paths)
-    one_of("layer", layer, get_args(Layer))
-    known = _sources(given[0], layer)
-    chosen = tuple(topics) if topics is not None else tuple(source.topic for source in known)
-    _check_topics(chosen, given[0])
-    recordings = [
-        _recording(path, known if number == 0 else _sources(path, layer), chosen, tolerance_ns)
-        for number, path in enumerate(given)
-    ]
-    if not any(recording.rows for recording in recordings):
-        raise OptionError(
-            f"{given[0]}: no frames of {', '.join(chosen)} have header stamps within "
-            f"{tolerance_ns} ns of each other. Use a larger sync_tolerance_ns, or one "
-            f"camera: topics=[{chosen[0]!r}]."
-        )
-    return chosen, recordings
-
-
-def _recording(
-    path: Path, known: list[CameraSource], topics: Sequence[str], tolerance_ns: int
-) -> Recording:
-    sources = tuple(_choose(known, topic, path) for topic in topics)
-    if len(sources) == 1:
-        if sources[0].layer == "exact":
-            open_source(sources[0]).close()  # its frames may not be here
-        return Recording(str(path), sources, None, {sources[0].topic: np.empty(0, np.int64)})
-    stamps = {}
-    for topic, source in zip(topics, sources, strict=True):
-        with closing(open_source(source)) as stream:
-            stamps[topic] = stream.stamps
-    sync = synchronize(stamps, tolerance_ns=tolerance_ns)
-    return Recording(str(path), sources, sync.indices, sync.unmatched)
-
-
-def open_source(source: CameraSource) -> Topic:
-    """The frames of a camera; others of its dataset are not touched.
-
-    Args:
-        source: Which.
-
-    Raises:
-        FormatError: It breaks a rule of the format.
-    """
-    path = location(source.place)
-    if path.suffix == ".yaml":
-        stream = Stream(path, layer="view")
-        # what may be depths keeps all its levels, if they are here
-        keeps = stream.encoding in DEPTHS and stream.absent is None
-        return Topic([stream.in_layer("exact" if keeps else source.layer)])
-    return Topic(open_dataset(path).parts)
-
-
-def _sources(path: Path | str, layer: Layer) -> list[CameraSource]:
-    """The cameras of a dataset, from its manifest, without reading the sidecars."""
-    folder = location(path)
-    if folder.name == MANIFEST_NAME:
-        folder = folder.parent
-    if (folder / MANIFEST_NAME).exists():
-        entries = load_manifest(folder / MANIFEST_NAME).streams
-        places = [folder / entry.sidecar for entry in entries]
-        return [
-            CameraSource(entry.topic, place.stem, spelled(place), entry.frames, layer)
-            for entry, place in zip(entries, places, strict=True)
-        ]
-    with open_dataset(path) as dataset:
-        return [
-            CameraSource(one.topic, one.path.stem, spelled(one.path), len(one), layer)
-            for one in dataset.parts
-        ]
-
-
-def _check_topics(topics: Sequence[str], path: Path | str) -> None:
-    if not topics:
-        raise OptionError(f"{path}: has no camera; without topics, the first dataset needs one.")
-    twice = [topic for topic in topics if topics.count(topic) > 1]
-    if twice:
-        raise OptionError(
-            f"{path}: {twice[0]} is given twice among the topics. If it has several streams, "
-            "choose one by its file name."
-        )
-    taken = [topic for topic in topics if topic in RESERVED]
-    if taken:
-        raise OptionError(f"{path}: a topic named {taken[0]!r} cannot be a key of a sample.")
-
-
-def _choose(sources: list[CameraSource], topic: str, path: Path | str) -> CameraSource:
-    found = [s for s in sources if topic in (s.topic, s.name)]
-    if not found:
-        known = ", ".join(dict.fromkeys(s.topic for s in sources)) or "none"
-        raise OptionError(f"{path}: has no topic {topic!r}; there are: {known}.")
-    if len(found) > 1:
-        names = ", ".join(s.name for s in found)
-        raise OptionError(
-            f"{path}: {topic} changes its size or encoding and has {len(found)} streams; choose "
-            f"one of {names}."
-        )
-    return found[0]
 
 
 # ---------------------------------------------------------------- torchcodec
@@ -451,19 +243,23 @@ class OpenCamera:
         return self._topic.stamps
 
     @cached_property
+    def times(self) -> NDArray[np.int64]:
+        """The stamps, or the log times where most stamps do not increase."""
+        return sound_times(self.stamps, self._topic.log_times)
+
+    @cached_property
     def _order(self) -> NDArray[np.intp]:
-        return np.argsort(self.stamps, kind="stable")
+        return np.argsort(self.times, kind="stable")
 
     @cached_property
     def period_ns(self) -> int:
         """Median time between frames, nanoseconds; 0 for a single frame."""
-        gaps = np.diff(self.stamps[self._order])
+        gaps = np.diff(self.times[self._order])
         return int(np.median(gaps)) if len(gaps) else 0
 
     def nearest(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The frames whose stamps are nearest to times; the first of several."""
-        stamps = self.stamps[self._order]
-        return self._order[nearest(stamps, times)].astype(np.int64)
+        """The frames nearest to times; the first of several."""
+        return self._order[nearest(self.times[self._order], times)].astype(np.int64)
 
     @cached_property
     def key_frames(self) -> NDArray[np.int64]:

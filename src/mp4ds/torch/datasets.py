@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import prod
 from operator import index as as_integer
 from reprlib import repr as shortened
-from typing import Any, Literal, NoReturn, SupportsIndex
+from typing import Any, Literal, NoReturn, SupportsIndex, get_args
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from mp4ds.dataset.stream import Layer
+from mp4ds.dataset.vectors import Fields
 from mp4ds.dataset.views import Crop, Resize
 from mp4ds.errors import OptionError, absent, counted
 from mp4ds.torch.cameras import (
@@ -21,15 +22,14 @@ from mp4ds.torch.cameras import (
     Dtype,
     OpenCamera,
     OpenCameras,
-    Paths,
     Pictures,
-    Recording,
-    one_of,
-    recordings_of,
 )
+from mp4ds.torch.recordings import Paths, Recording, each, one_of, recordings_of
+from mp4ds.torch.vectors import Pick, VectorReader, episodes_of
 
 Unit = Literal["frames", "seconds"]
 _MOST_SECONDS = 10**9
+_MOST_FPS = 1000
 
 
 class Offsets:
@@ -92,12 +92,32 @@ class Offsets:
             there = np.clip(wanted, 0, recording.rows - 1)
             return recording.frames(there, camera), there != wanted
         own = recording.frames(rows, camera)[:, None]
-        stamps = timeline.stamps
-        times = stamps[own] + self.steps
+        times = timeline.times[own] + self.steps
         # with equal stamps, the frame nearest to its own time may be a different one
-        found = np.where(self.steps == 0, own, timeline.nearest(times))
+        found = np.where(self.steps == 0, own, timeline.nearest(recording.within(times)))
         tolerance = timeline.period_ns // 2 if self._tolerance_ns is None else self._tolerance_ns
-        return found, np.abs(stamps[found] - times) > tolerance
+        return found, np.abs(timeline.times[found] - times) > tolerance
+
+    def times(
+        self, recording: Recording, row_times: NDArray[np.int64], rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Times of the messages of samples, and which of them are padding.
+
+        Args:
+            recording: Of the samples.
+            row_times: Of all its samples, nanoseconds.
+            rows: The samples, shape (N,).
+
+        Returns:
+            Two arrays of shape (N, offsets).
+        """
+        if self._timed:
+            wanted = row_times[rows][:, None] + self.steps
+            times = recording.within(wanted)
+            return times, times != wanted
+        wanted = rows[:, None] + self.steps
+        there = np.clip(wanted, 0, recording.rows - 1)
+        return row_times[there], there != wanted
 
 
 # ---------------------------------------------------------------- samples
@@ -151,6 +171,13 @@ class FrameDataset(Dataset):
     The samples of a batch are rows of one tensor per camera, which `collate` returns without
     copying: copy those that you keep.
 
+    With `state` and `action`, a sample also has numbers of recorded messages::
+
+        {"state": float32 (D,), "state_is_pad": bool (1,), "action": float32 (T, D), ...}
+
+    They are of the message at the time of the sample's first frame. A message's time is its header
+    stamp; without one, its log time.
+
     With several cameras, a sample has frames matched by header stamp (`mp4ds.Dataset.sync`), each
     frame at most once; `unmatched` has the others.
 
@@ -160,7 +187,23 @@ class FrameDataset(Dataset):
         paths: Datasets, one or several: folders, sidecars, videos, URLs; or folders of datasets
             and patterns such as ``drives/*``.
         topics: Cameras; None: all of the first dataset. The others must have them, too.
+        rename: What some recordings call a topic -> what it is called here:
+            ``{"/cam_left/image": "/left/image_raw"}``.
+        fps: Samples per second, at a constant rate while all cameras run, each of the frames
+            nearest in time; None: the matched frames.
+        episode_topic: Topic whose value (std_msgs/String, Bool, a number) tells episodes: each
+            counts as a dataset of its own. Samples where it is false, empty, negative or not there
+            are left out. None: a dataset is an episode.
+        state: Topics and their fields, such as ``{"/joint_states": "position"}``. Several are a
+            list: ``["pose.position", "data[0:6]", "position[elbow]"]``. ``"/joint_states"`` alone
+            stands for the positions of a JointState, or the data of an array.
+        action: The same.
+        action_offsets: Those of the action, in the unit of `offsets_in`.
+        message: The ``nearest`` one to the time, or the ``previous``, which is not after it.
+        message_tolerance_ns: How far it may be from the time before it counts as padding; None:
+            twice the median time between the topic's messages.
         offsets: Frames of a sample relative to its own: ``(-1, 0)`` is the previous one and itself.
+            A mapping by topic gives each camera, and ``state``, its own.
         offsets_in: ``frames``: samples of the same recording before and after. ``seconds``: in
             each camera the frame whose stamp is nearest.
         tolerance_ns: With seconds, how far a stamp may be from its time before it counts as
@@ -197,7 +240,15 @@ class FrameDataset(Dataset):
         paths: Paths,
         *,
         topics: Sequence[str] | None = None,
-        offsets: Sequence[float] = (0,),
+        rename: Mapping[str, str] | None = None,
+        fps: int | None = None,
+        episode_topic: str | None = None,
+        state: Fields | None = None,
+        action: Fields | None = None,
+        action_offsets: Sequence[float] = (0,),
+        message: Pick = "nearest",
+        message_tolerance_ns: int | None = None,
+        offsets: Sequence[float] | Mapping[str, Sequence[float]] = (0,),
         offsets_in: Unit = "frames",
         tolerance_ns: int | None = None,
         sync_tolerance_ns: int = 20_000_000,
@@ -215,8 +266,39 @@ class FrameDataset(Dataset):
     ) -> None:
         for name in others:  # of other libraries, too
             raise TypeError(absent(self, name))
-        self._offsets = Offsets(offsets, offsets_in, tolerance_ns)
-        self.topics, self.recordings = recordings_of(paths, topics, sync_tolerance_ns, layer)
+        if fps is not None and not 1 <= fps <= _MOST_FPS:
+            raise OptionError(f"fps is {fps}, but must be from 1 to {_MOST_FPS}.")
+        names = rename or {}
+        self.topics, self.recordings = recordings_of(
+            paths,
+            topics,
+            sync_tolerance_ns,
+            layer,
+            rename=names,
+            fps=fps,
+            timed=episode_topic is not None,
+        )
+        if episode_topic is not None:
+            self.recordings = self._split(episode_topic, names)
+        given = {key: one for key, one in (("state", state), ("action", action)) if one is not None}
+        self._check_keys(given, message, message_tolerance_ns)
+        keys = [*self.topics, *(key for key in given if key != "action")]
+        values = each("offsets", offsets, keys, (0,))
+        self._offsets = {
+            key: Offsets(steps, offsets_in, tolerance_ns)
+            for key, steps in [*zip(keys, values, strict=True), ("action", action_offsets)]
+        }
+        self._vectors = {
+            key: VectorReader(
+                key,
+                one,
+                self.recordings,
+                pick=message,
+                tolerance_ns=message_tolerance_ns,
+                rename=names,
+            )
+            for key, one in given.items()
+        }
         starts = np.cumsum([0, *(recording.rows for recording in self.recordings)])
         self._starts: NDArray[np.int64] = starts.astype(np.int64)
         self._transform = transform
@@ -232,6 +314,29 @@ class FrameDataset(Dataset):
         )
         self._cameras = OpenCameras(cache_files, self._pictures)
         self._collates = False
+
+    def _split(self, topic: str, rename: Mapping[str, str]) -> list[Recording]:
+        """The episodes of all recordings."""
+        found = [part for one in self.recordings for part in episodes_of(one, topic, rename)]
+        if not found:
+            raise OptionError(
+                f"{self.recordings[0].path}: no sample is in an episode: while all cameras run, "
+                f"{topic} is false, empty or not there."
+            )
+        return found
+
+    def _check_keys(self, given: Mapping[str, object], message: str, tolerance: int | None) -> None:
+        one_of("message", message, get_args(Pick))
+        if tolerance is not None and tolerance < 0:
+            raise OptionError(f"message_tolerance_ns is {tolerance}, but must not be negative.")
+        for key in given:
+            if key in self.topics:
+                raise OptionError(f"a topic named {key!r} cannot be a key beside the {key}.")
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """What the numbers of the state and action are called: joints, or fields."""
+        return {key: reader.names for key, reader in self._vectors.items()}
 
     @property
     def paths(self) -> list[str]:
@@ -250,7 +355,7 @@ class FrameDataset(Dataset):
 
     def __repr__(self) -> str:
         count = counted(len(self.recordings), "dataset")
-        return f"<FrameDataset: {len(self)} samples of {count}, {', '.join(self.topics)}>"
+        return f"<{type(self).__name__}: {len(self)} samples of {count}, {', '.join(self.topics)}>"
 
     def __len__(self) -> int:
         return int(self._starts[-1])
@@ -290,12 +395,13 @@ class FrameDataset(Dataset):
             recording = self.recordings[owner]
             places = np.flatnonzero(owners == owner).tolist()
             rows = wanted[places] - self._starts[owner]
-            flags: dict[str, torch.Tensor] = {}
+            columns: dict[str, torch.Tensor] = {}
             stamps: list[int] = []
             for number, topic in enumerate(self.topics):
+                offsets = self._offsets[topic]
                 with self._cameras.using(recording, number) as camera:
-                    frames, padded = self._offsets.frames(recording, number, camera, rows)
-                    like = camera.empty(len(self._offsets.steps))
+                    frames, padded = offsets.frames(recording, number, camera, rows)
+                    like = camera.empty(len(offsets.steps))
                     if topic not in tensors:
                         tensors[topic] = _longer(like, len(numbers), shared=shared)
                     outs = [tensors[topic][place] for place in places]
@@ -304,12 +410,21 @@ class FrameDataset(Dataset):
                     camera.read(frames.ravel().tolist(), [frame for row in outs for frame in row])
                     if number == 0:
                         stamps = camera.stamps[recording.frames(rows, 0)].tolist()
-                flags[f"{topic}_is_pad"] = torch.from_numpy(padded)
+                        row_times = recording.times
+                        if self._vectors and row_times is None:
+                            row_times = camera.times[recording.frames(np.arange(recording.rows), 0)]
+                columns[f"{topic}_is_pad"] = torch.from_numpy(padded)
                 for place, out in zip(places, outs, strict=True):
                     shown = out.movedim(-1, -3) if self._pictures.channels_first else out
-                    samples[place][topic] = shown[0] if self._offsets.is_single else shown
+                    samples[place][topic] = shown[0] if offsets.is_single else shown
+            for key, reader in self._vectors.items():
+                offsets = self._offsets[key]
+                times, padded = offsets.times(recording, row_times, rows)
+                values, is_far = reader.at(recording, times)
+                columns[key] = torch.from_numpy(values[:, 0] if offsets.is_single else values)
+                columns[f"{key}_is_pad"] = torch.from_numpy(padded | is_far)
             for n, place in enumerate(places):
-                samples[place] |= {name: padded[n] for name, padded in flags.items()}
+                samples[place] |= {name: column[n] for name, column in columns.items()}
                 index = int(wanted[place])
                 samples[place] |= {"stamp_ns": stamps[n], "index": index, "dataset": owner}
         return samples if self._transform is None else [self._transform(s) for s in samples]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
 from mp4ds.errors import OptionError, absent
-from mp4ds.torch.cameras import Paths, Recording
 from mp4ds.torch.datasets import FrameDataset
+from mp4ds.torch.recordings import Paths, Recording
 
 _T = TypeVar("_T")
 _UNREAD = object()

@@ -30,7 +30,7 @@ from mp4ds.messages.depth import (
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
 from mp4ds.options import WHAT, Parsed, TopicOptions, option, parse_resize
-from mp4ds.times import intervals, usual_interval
+from mp4ds.times import intervals, sound_times, usual_interval
 from mp4ds.video.codecs import CODECS, VISUAL
 from mp4ds.video.images import ImageFile
 
@@ -192,7 +192,8 @@ class ReductionOptions(TopicOptions):
         is_kept[:: self.every] = True
         if self.max_rate is not None:
             chosen = np.flatnonzero(is_kept)
-            is_kept[chosen] = at_most(self.max_rate, times_of(columns)[chosen])
+            times = sound_times(columns.stamp, columns.log_time)
+            is_kept[chosen] = at_most(self.max_rate, times[chosen])
         return is_kept
 
 
@@ -208,16 +209,6 @@ def _check_size(resize: Any) -> None:
             f"`resize` {resize!r} is not a size: use a factor such as 0.5, or width and height of "
             f"1 to {MAX_SIDE} pixels."
         )
-
-
-def times_of(columns: DecodedColumns) -> NDArray[np.int64]:
-    """When the frames were taken, nanoseconds: by their stamps, or by their log times.
-
-    The latter if most stamps do not increase, as with cameras that leave them zero.
-    """
-    steps = np.diff(columns.stamp)
-    is_sound = 2 * int((steps > 0).sum()) >= len(steps)
-    return columns.stamp if is_sound else columns.log_time
 
 
 def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:

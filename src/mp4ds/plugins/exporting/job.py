@@ -22,8 +22,8 @@ from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import WHAT, Parsed, SliceOptions, force, option
-from mp4ds.times import intervals, synchronize, usual_interval
-from mp4ds.unpacking.pictures import ReductionOptions, is_inverse_depth, times_of
+from mp4ds.times import intervals, sound_times, synchronize, usual_interval
+from mp4ds.unpacking.pictures import ReductionOptions, is_inverse_depth
 from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
 
@@ -70,10 +70,16 @@ class ExportOptions(SliceOptions, ReductionOptions):
         only=_LEROBOT,
     )
     state: str | None = option(
-        "Topic for lerobot's observation.state.", panel=WHAT, metavar="TOPIC", only=_LEROBOT
+        "Topic for lerobot's observation.state, and which of its fields.",
+        panel=WHAT,
+        metavar="TOPIC[:FIELD,...]",
+        only=_LEROBOT,
     )
     action: str | None = option(
-        "Topic for lerobot's action.", panel=WHAT, metavar="TOPIC", only=_LEROBOT
+        "The same for lerobot's action.",
+        panel=WHAT,
+        metavar="TOPIC[:FIELD,...]",
+        only=_LEROBOT,
     )
     task: str = option(
         "Task description, for lerobot.", "", panel=WHAT, metavar="TEXT", only=_LEROBOT
@@ -97,7 +103,8 @@ class ExportOptions(SliceOptions, ReductionOptions):
 
     def chosen(self, topic: str) -> bool:
         """Whether a topic was selected, by a glob or by name."""
-        return self.selected(topic) or topic in (self.poses, self.state, self.action)
+        given = (topics.partition(":")[0] for topics in (self.state, self.action) if topics)
+        return self.selected(topic) or topic in (self.poses, *given)
 
     def uses(self, topic: str) -> bool:
         """Whether messages of a topic may be read: static transforms always are."""
@@ -246,11 +253,6 @@ _MEASURES: Mapping[str, Mapping[str, Callable[[Any], Sequence[float]]]] = {
             m.transform.translation, m.transform.rotation
         ),
     },
-    "vector": {
-        "sensor_msgs/JointState": lambda m: m.position,
-        "std_msgs/Float64MultiArray": lambda m: m.data,
-        "std_msgs/Float32MultiArray": lambda m: m.data,
-    },
 }
 
 
@@ -263,12 +265,12 @@ def ros_type(dataset: Dataset, topic: str) -> str:
 
 
 class Measures:
-    """The numbers of a topic.
+    """The measurements of a topic.
 
     Args:
         dataset: The dataset.
         topic: The topic.
-        kind: ``imu``, ``poses`` or ``vector``.
+        kind: ``imu`` or ``poses``.
         option: That named the topic, for errors.
 
     Attributes:
@@ -302,16 +304,8 @@ class Measures:
         """Frame whose poses these are; empty if messages do not say."""
         return str(getattr(self.first, "child_frame_id", ""))
 
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of the numbers, from the first message if it has them."""
-        count = len(self._values(self.first)) if self.first else 0
-        own = [str(name) for name in getattr(self.first, "name", ())]
-        last = self.topic.strip("/").rpartition("/")[2]
-        return own if len(own) == count else [f"{last}_{number}" for number in range(count)]
-
     def rows(self) -> Iterator[Row]:
-        """The numbers by stamp; an array has none and gets its log time.
+        """The numbers by stamp.
 
         Raises:
             SourceError: A message does not match its topic's type.
@@ -320,9 +314,8 @@ class Measures:
 
     def _rows(self) -> Iterator[Row]:
         for message in self._dataset.messages([self.topic]):
-            decoded, time = message.decoded, message.log_time_ns
-            if hasattr(decoded, "header"):
-                time = int(decoded.header.stamp.sec) * _NS + int(decoded.header.stamp.nanosec)
+            decoded = message.decoded
+            time = int(decoded.header.stamp.sec) * _NS + int(decoded.header.stamp.nanosec)
             yield time, tuple(map(float, self._values(decoded)))
 
 
@@ -460,7 +453,7 @@ class ExportJob:
         columns = stream.columns
         kept = np.flatnonzero(self.options.kept(columns))
         self.leave_out(stream.topic, _THINNED, len(stream) - len(kept))
-        times = times_of(columns)
+        times = sound_times(columns.stamp, columns.log_time)
         if times is not columns.stamp:
             self.note(f"{stream.topic}: its stamps do not increase, so log times are used instead")
         kept = kept[np.argsort(times[kept], kind="stable")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,12 +15,24 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from mp4ds.dataset.features import (
+    ACTION,
+    COLUMNS,
+    STATE,
+    Feature,
+    Statistics,
+    image_features,
+    merged,
+    sampled_statistics,
+    statistics_of,
+    vector_feature,
+    video_feature,
+)
 from mp4ds.dataset.topic import Topic
+from mp4ds.dataset.vectors import Vectors, fields_of, read_vectors
 from mp4ds.errors import OptionError
-from mp4ds.format.sidecars import FileNames
-from mp4ds.messages.encodings import Pixels
-from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, Integers, Measures
-from mp4ds.times import TIMESCALE, nearest
+from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, Integers
+from mp4ds.times import TIMESCALE, constant_rate, nearest
 from mp4ds.video.codecs import CODECS, recipe_for
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketReader
@@ -29,60 +41,11 @@ _VERSION = "v3.0"
 _CHUNK = 1000  # files per folder
 _NS = 10**9
 _GOP = 2  # frames between key frames, as in LeRobot: samples are read individually
-_SAMPLES = 100  # frames used for a camera's statistics
-_STEP_FROM, _SIDE = 300, 150  # pixels of a side from which pixels are subsampled, to about this
 _MOST_THREADS = 8
 _TELL_EVERY = 16  # frames
-_VECTORS = {"observation.state": "state", "action": "action"}  # feature -> option
+_VECTORS = {STATE: "state", ACTION: "action"}  # feature -> option
 _EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 _FILE = "chunk-{chunk:03d}/file-{file:03d}"
-
-
-# ---------------------------------------------------------------- statistics
-
-Statistics = Mapping[str, NDArray[Any]]
-"""``min``, ``max``, ``mean`` and ``std`` of a feature, and ``count``, as LeRobot names them."""
-
-
-def statistics_of(values: NDArray[Any]) -> Statistics:
-    """Statistics of rows, shape (rows, numbers)."""
-    rows = values.astype(np.float64)
-    return {
-        "min": rows.min(0),
-        "max": rows.max(0),
-        "mean": rows.mean(0),
-        "std": rows.std(0),
-        "count": np.array([len(rows)]),
-    }
-
-
-def picture_statistics(pixels: Pixels) -> Statistics:
-    """Statistics of a picture's colours from 0 to 1, subsampled if it is large.
-
-    Args:
-        pixels: uint8, shape (H, W, 3).
-    """
-    side = max(pixels.shape[:2])
-    step = side // _SIDE if side >= _STEP_FROM else 1
-    found = statistics_of(pixels[::step, ::step].reshape(-1, 3) / 255.0)
-    shaped = {name: value.reshape(3, 1, 1) for name, value in found.items() if name != "count"}
-    return {**shaped, "count": np.array([1])}
-
-
-def merged(parts: Sequence[Statistics]) -> Statistics:
-    """The statistics of all parts combined."""
-    counts = np.concatenate([part["count"] for part in parts])
-    weights = counts / counts.sum()
-    means = np.stack([part["mean"] for part in parts])
-    mean = np.tensordot(weights, means, 1)
-    squares = np.stack([part["std"] for part in parts]) ** 2 + (means - mean) ** 2
-    return {
-        "min": np.stack([part["min"] for part in parts]).min(0),
-        "max": np.stack([part["max"] for part in parts]).max(0),
-        "mean": mean,
-        "std": np.sqrt(np.tensordot(weights, squares, 1)),
-        "count": counts.sum(keepdims=True),
-    }
 
 
 # ---------------------------------------------------------------- episodes
@@ -175,15 +138,11 @@ def _shown(job: ExportJob) -> list[ExportedCamera]:
 
 def _grid(job: ExportJob, cameras: Sequence[ExportedCamera], fps: int) -> Integers:
     """The times of an episode's frames: while all cameras run."""
-    start = max(int(camera.times[0]) for camera in cameras)
-    end = min(int(camera.times[-1]) for camera in cameras)
-    if end < start:
+    times = constant_rate([camera.times for camera in cameras], fps)
+    if not len(times):
         raise OptionError(
             f"{job.dataset.path}: its cameras do not overlap in time. Select some with `topics`."
         )
-    length = ((end - start) * fps + _NS // 2) // _NS + 1
-    # integers throughout: floats would shift late frames
-    times: Integers = start + (np.arange(length, dtype=np.int64) * _NS + fps // 2) // fps
     return times
 
 
@@ -196,16 +155,17 @@ def _add_videos(
     episode: Episode,
     fps: int,
 ) -> None:
-    names = FileNames()
-    for camera in cameras:
-        feature = f"observation.images.{names.name_for(camera.topic)}"
+    features = image_features([camera.topic for camera in cameras])
+    for feature, camera in zip(features, cameras, strict=True):
         path = job.path / episode.path(f"videos/{feature}", "mp4")
         path.parent.mkdir(parents=True, exist_ok=True)
         used, repeats = np.unique(nearest(camera.times, episode.times), return_counts=True)
         _count(job, camera, used, episode.times, fps)
         size = _encode(job, camera.at(used), repeats.tolist(), path, fps)
         episode.features[feature] = _video_feature(path, size, job.options.codec, fps)
-        episode.statistics[feature] = _sampled(camera, job.options.size_of(camera.stream))
+        resize = job.options.size_of(camera.stream)
+        with closing(Topic([camera.stream])) as topic:
+            episode.statistics[feature] = sampled_statistics(topic, camera.numbers, resize=resize)
         episode.videos.append(feature)
         job.places[f"videos/{feature}"] = camera.topic
 
@@ -256,79 +216,44 @@ def _encode(
         return encoder.width, encoder.height
 
 
-def _video_feature(path: Path, size: tuple[int, int], codec: str, fps: int) -> dict[str, Any]:
+def _video_feature(path: Path, size: tuple[int, int], codec: str, fps: int) -> Feature:
     with PacketReader(path, codec=codec) as packets:
         pixel_format = packets.pixel_format
-    width, height = size
-    return {
-        "dtype": "video",
-        "shape": [height, width, 3],
-        "names": ["height", "width", "channels"],
-        "info": {
-            "video.height": height,
-            "video.width": width,
-            "video.codec": CODECS[codec].ffmpeg,
-            "video.pix_fmt": pixel_format,
-            "video.is_depth_map": False,
-            "video.fps": fps,
-            "video.channels": 3,
-            "has_audio": False,
-        },
-    }
-
-
-def _sampled(camera: ExportedCamera, size: tuple[int, int] | None) -> Statistics:
-    """The statistics of some frames' pixels, 0 to 1, by colour."""
-    count = min(_SAMPLES, len(camera))
-    chosen = np.unique(np.linspace(0, len(camera) - 1, count).astype(np.int64))
-    found = []
-    with closing(Topic([camera.stream])) as topic:
-        for number in camera.numbers[chosen].tolist():
-            found.append(picture_statistics(topic.read([number], resize=size)[0]))
-    return merged(found)
+    info = {"video.codec": CODECS[codec].ffmpeg, "video.pix_fmt": pixel_format}
+    return video_feature(size, fps, info)
 
 
 # ---------------------------------------------------------------- vectors
 
 
 def _add_vectors(job: ExportJob, episode: Episode, fps: int) -> None:
-    known: dict[str, NDArray[np.float32]] = {}
+    counted: set[str] = set()  # a topic may be both, and is counted once
     for feature, option in _VECTORS.items():
-        topic = getattr(job.options, option)
-        if not topic:
+        given = getattr(job.options, option)
+        if not given:
             continue
-        measures = Measures(job.dataset, topic, "vector", option)
-        if measures.first is None:
-            raise OptionError(f"`{option}` {topic} has no message in {job.dataset.path}.")
-        names = [*measures.names]
-        if topic not in known:  # one topic may be both, and is counted once
-            known[topic] = _vector(job, measures, len(names), episode.times, fps)
-        episode.vectors[feature] = known[topic]
-        episode.features[feature] = {"dtype": "float32", "shape": [len(names)], "names": names}
-        episode.statistics[feature] = statistics_of(known[topic])
+        ((topic, paths),) = fields_of(given, f"`{option}`").items()
+        found = read_vectors(job.dataset, topic, paths)
+        episode.vectors[feature] = _at(job, found, episode.times, fps, topic in counted)
+        episode.features[feature] = vector_feature(found.names)
+        episode.statistics[feature] = statistics_of(episode.vectors[feature])
         job.places[feature] = topic
+        counted.add(topic)
 
 
-def _vector(
-    job: ExportJob, measures: Measures, count: int, times: Integers, fps: int
+def _at(
+    job: ExportJob, found: Vectors, times: Integers, fps: int, is_counted: bool
 ) -> NDArray[np.float32]:
     """The message nearest to each time."""
-    topic, rows = measures.topic, [*measures.rows()]
-    for _, values in rows:
-        if len(values) != count:
-            raise OptionError(
-                f"{topic} has messages of {count} and of {len(values)} numbers, but LeRobot "
-                "needs the same number in each frame."
-            )
-    own = np.array([time for time, _ in rows], np.int64)
-    places = nearest(own, times)
-    used = len(np.unique(places))
-    job.keep(topic, used)
-    reason = f"another message is nearer at {fps} frames per second"
-    job.leave_out(topic, reason, len(rows) - used)
-    away = int(np.abs(own[places] - times).max())
-    job.note(f"{topic}: each frame gets the nearest message, at most {away / _NS:.3f} s away")
-    return np.array([values for _, values in rows], np.float32).reshape(-1, count)[places]
+    places = found.nearest(times)
+    if not is_counted:
+        used = len(np.unique(places))
+        job.keep(found.topic, used)
+        reason = f"another message is nearer at {fps} frames per second"
+        job.leave_out(found.topic, reason, len(found.times) - used)
+        away = int(np.abs(found.times[places] - times).max()) / _NS
+        job.note(f"{found.topic}: each frame gets the nearest message, at most {away:.3f} s away")
+    return found.values[places]
 
 
 # ---------------------------------------------------------------- tables
@@ -394,9 +319,6 @@ def _episode_row(episode: Episode, task: str, fps: int) -> dict[str, Any]:
 
 def _info(episodes: Sequence[Episode], fps: int) -> dict[str, Any]:
     path = _FILE.replace("chunk:", "chunk_index:").replace("file:", "file_index:")
-    columns = {"timestamp": {"dtype": "float32", "shape": [1], "names": None}}
-    for name in ("frame_index", "episode_index", "index", "task_index"):
-        columns[name] = {"dtype": "int64", "shape": [1], "names": None}
     return {
         "codebase_version": _VERSION,
         "robot_type": None,
@@ -410,7 +332,7 @@ def _info(episodes: Sequence[Episode], fps: int) -> dict[str, Any]:
         "splits": {"train": f"0:{len(episodes)}"},
         "data_path": f"data/{path}.parquet",
         "video_path": f"videos/{{video_key}}/{path}.mp4",
-        "features": {**episodes[0].features, **columns},
+        "features": {**episodes[0].features, **COLUMNS},
     }
 
 
