@@ -85,15 +85,17 @@ def statistics_of(values: NDArray[Any]) -> Statistics:
 
 
 def picture_statistics(pixels: Pixels) -> Statistics:
-    """Statistics of a picture's colours from 0 to 1, subsampled if it is large.
+    """Statistics of a picture's colours from 0 to 1, or depths, subsampled if it is large.
 
     Args:
-        pixels: uint8, shape (H, W, 3).
+        pixels: uint8, shape (H, W, 3); depths: shape (H, W).
     """
     side = max(pixels.shape[:2])
     step = side // _SIDE if side >= _STEP_FROM else 1
-    found = statistics_of(pixels[::step, ::step].reshape(-1, 3) / 255.0)
-    shaped = {name: value.reshape(3, 1, 1) for name, value in found.items() if name != "count"}
+    is_depth = pixels.ndim == 2
+    rows = pixels[::step, ::step].reshape(-1, 1 if is_depth else 3)
+    found = statistics_of(np.nan_to_num(rows) if is_depth else rows / 255.0)
+    shaped = {name: value.reshape(-1, 1, 1) for name, value in found.items() if name != "count"}
     return {**shaped, "count": np.array([1])}
 
 

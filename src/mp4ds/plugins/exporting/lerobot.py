@@ -31,6 +31,7 @@ from mp4ds.dataset.features import (
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.vectors import Vectors, fields_of, read_vectors
 from mp4ds.errors import OptionError
+from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, DepthCodes
 from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, Integers
 from mp4ds.times import TIMESCALE, constant_rate, nearest
 from mp4ds.video.codecs import CODECS, recipe_for
@@ -119,11 +120,11 @@ def write(*jobs: ExportJob) -> None:
 
 
 def _shown(job: ExportJob) -> list[ExportedCamera]:
-    """The cameras that LeRobot's videos can show, in the order of their frames."""
+    """The cameras that LeRobot's videos can show, in the order of their frames; depth is last."""
     found = []
-    for camera in job.cameras:
-        if camera.view.encoding.name != "rgb8":
-            reason = f"LeRobot's videos are in 8-bit colour, not {camera.stream.encoding}"
+    for camera in sorted(job.cameras, key=_is_depth):
+        if camera.view.encoding.name != "rgb8" and not _is_depth(camera):
+            reason = f"LeRobot's videos are in 8-bit colour or depth, not {camera.stream.encoding}"
             job.leave_out(camera.topic, reason, len(camera))
             continue
         is_later = camera.numbers >= np.maximum.accumulate(camera.numbers)
@@ -131,9 +132,14 @@ def _shown(job: ExportJob) -> list[ExportedCamera]:
         found.append(camera.at(np.flatnonzero(is_later)))
     if not found:
         raise OptionError(
-            f"{job.dataset.path} has no camera for LeRobot, whose videos are in 8-bit colour."
+            f"{job.dataset.path} has no camera for LeRobot, whose videos are in 8-bit colour or "
+            "depth."
         )
     return found
+
+
+def _is_depth(camera: ExportedCamera) -> bool:
+    return DepthCodes.suit(camera.view.encoding.name)
 
 
 def _grid(job: ExportJob, cameras: Sequence[ExportedCamera], fps: int) -> Integers:
@@ -161,11 +167,21 @@ def _add_videos(
         path.parent.mkdir(parents=True, exist_ok=True)
         used, repeats = np.unique(nearest(camera.times, episode.times), return_counts=True)
         _count(job, camera, used, episode.times, fps)
-        size = _encode(job, camera.at(used), repeats.tolist(), path, fps)
-        episode.features[feature] = _video_feature(path, size, job.options.codec, fps)
-        resize = job.options.size_of(camera.stream)
+        depths = DepthCodes(camera.view.encoding.name) if _is_depth(camera) else None
+        size = _encode(job, camera.at(used), repeats.tolist(), path, fps, depths)
+        codec = "h265" if depths else job.options.codec
+        episode.features[feature] = own = _video_feature(path, size, codec, fps)
+        if depths:
+            own["shape"][2] = own["info"]["video.channels"] = 1
+            del own["info"]["video.is_depth_map"]
+            own["info"] |= depths.info
+            job.note(f"{camera.topic}: {depths}")
+        view = {
+            "resize": job.options.size_of(camera.stream),
+            "format": "native" if depths else "rgb",
+        }
         with closing(Topic([camera.stream])) as topic:
-            episode.statistics[feature] = sampled_statistics(topic, camera.numbers, resize=resize)
+            episode.statistics[feature] = sampled_statistics(topic, camera.numbers, **view)
         episode.videos.append(feature)
         job.places[f"videos/{feature}"] = camera.topic
 
@@ -190,17 +206,25 @@ def _count(
 
 
 def _encode(
-    job: ExportJob, camera: ExportedCamera, repeats: Sequence[int], path: Path, fps: int
+    job: ExportJob,
+    camera: ExportedCamera,
+    repeats: Sequence[int],
+    path: Path,
+    fps: int,
+    depths: DepthCodes | None,
 ) -> tuple[int, int]:
     """Write a video; returns its width and height, which are even."""
-    recipe = recipe_for("rgb24", lossless=False, codec=job.options.codec, crf=job.options.crf)
-    # torchcodec, LeRobot's decoder, takes all AV1 for limited range
-    recipe = replace(recipe, full_range=False)
+    if depths:
+        recipe = recipe_for(DEPTH_FORMAT, lossless=True, codec="h265")
+    else:
+        recipe = recipe_for("rgb24", lossless=False, codec=job.options.codec, crf=job.options.crf)
+        # torchcodec, LeRobot's decoder, takes all AV1 for limited range
+        recipe = replace(recipe, full_range=False)
     written = 0
     with VideoEncoder(
         path,
         recipe,
-        picture_format="rgb24",
+        picture_format=DEPTH_FORMAT if depths else "rgb24",
         width=camera.size[0],
         height=camera.size[1],
         gop=_GOP,
@@ -210,8 +234,9 @@ def _encode(
         for number, (place, pixels) in enumerate(camera.pictures()):
             if number % _TELL_EVERY == 0:
                 job.tell(f"{camera.topic}: frame {number} of {len(camera)}", None)
+            shown = depths.of(pixels) if depths else pixels
             for _ in range(repeats[place]):
-                encoder.write((pixels,), (written * TIMESCALE + fps // 2) // fps)
+                encoder.write((shown,), (written * TIMESCALE + fps // 2) // fps)
                 written += 1
         return encoder.width, encoder.height
 
