@@ -69,7 +69,9 @@ def main() -> None:
     command.add_argument("--size", type=parse_size, default=(1280, 720), help="WxH")
     command.add_argument("--codec", nargs="+", choices=CODECS, default=list(CODECS))
     command.add_argument("--gop", nargs="+", type=int, default=list(GOPS))
-    command.add_argument("--way", nargs="+", help="CODEC-GOP, lerobot, png, jpeg; instead of both")
+    command.add_argument(
+        "--way", nargs="+", help="CODEC-GOP, lerobot, png, jpeg, lossless, exact, view"
+    )
     command.add_argument("--peer", nargs="+", help="all by default")
     command.add_argument("--pattern", nargs="+", choices=PATTERNS, default=list(PATTERNS))
     command.add_argument("--resize", type=parse_size, help="WxH to ask for")

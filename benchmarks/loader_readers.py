@@ -63,6 +63,8 @@ PATTERNS = {
     "order": "all in order",
 }
 """What is measured of each reader."""
+LOSSLESS = {"lossless": "none", "exact": None, "view": None}
+"""What is read of a lossless dataset -> its view; `exact` and `view` are of the same one."""
 STILLS = {"png": ".png", "jpeg": ".jpg"}
 JPEG_QUALITY = 95
 _PART = 480  # frames of each part of a pack, more than any GOP
@@ -133,8 +135,9 @@ class Stored:
 
     @cached_property
     def bytes_per_frame(self) -> float:
-        """Of the video, or of the files."""
-        return size_of(self.path) / self.frames
+        """Of the video, or of the files; of what is exact, of all videos."""
+        paths = self.path.parent.glob("*.mp4") if self.name == "exact" else [self.path]
+        return sum(map(size_of, paths)) / self.frames
 
     def still(self, number: int) -> str:
         """The file of a frame."""
@@ -221,14 +224,15 @@ class Store:
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def stored(self, name: str) -> Stored:
-        """The clip, stored as ``CODEC-GOP``, ``lerobot``, ``png`` or ``jpeg``; made if new."""
+        """The clip, stored as ``CODEC-GOP`` or one of the other ways; made if new."""
         if name in STILLS:
             found = Stored(name, self._stills(name), None, self.stills)
         elif name == "lerobot":
             found = Stored(name, self._lerobot(), None, self.frames)
         else:
-            dataset = self._dataset(name)
-            found = Stored(name, next(dataset.glob("*.mp4")), dataset, self.frames)
+            dataset = self._lossless(name) if name in LOSSLESS else self._dataset(name)
+            with mp4ds.open(dataset, layer="view" if name == "view" else "exact") as opened:
+                found = Stored(name, opened.streams[0].video_path, dataset, self.frames)
         found.make_reference()
         return found
 
@@ -254,6 +258,12 @@ class Store:
                 quality=quality, codec=codec, preset=preset, gop=int(gop), window=window
             )
             mp4ds.pack(self.recording, path, options)
+        return path
+
+    def _lossless(self, name: str) -> Path:
+        path = self.folder / ("lossless" if LOSSLESS[name] else "layers")
+        if not path.exists():
+            mp4ds.pack(self.recording, path, mp4ds.PackOptions(view=LOSSLESS[name]))
         return path
 
     def _lerobot(self) -> Path:
@@ -314,7 +324,8 @@ class Mp4ds:
 
     def __init__(self, stored: Stored, size: Size | None = None) -> None:
         self._size = size
-        self._dataset = mp4ds.open(stored.dataset or stored.path)
+        layer = "view" if stored.name == "view" else "exact"
+        self._dataset = mp4ds.open(stored.dataset or stored.path, layer=layer)
         self._stream: Any = self._dataset[TOPIC if stored.dataset else stored.path.stem]
 
     def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102
@@ -465,6 +476,8 @@ def peers_for(name: str) -> dict[str, Opener]:
     """Who reads what is stored in a way."""
     if name == "lerobot":
         return LEROBOT_PEERS
+    if name in ("lossless", "exact"):  # whose planes no other reader puts together
+        return {OURS: VIDEO_PEERS[OURS]}
     return STILL_PEERS if name in STILLS else VIDEO_PEERS
 
 
