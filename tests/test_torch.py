@@ -10,7 +10,6 @@ import pickle
 import re
 import shutil
 import signal
-import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
@@ -18,15 +17,17 @@ from pathlib import Path
 from typing import Any
 
 import av
+import nbformat
 import numpy as np
 import pytest
+from nbclient import NotebookClient
 
 import mp4ds
 from commands import program
 from mp4ds.packing.options import PackOptions
 from scenes import PERIOD, Scene, scene
 from sources import SOURCES
-from test_examples import ROOT, run
+from test_examples import ROOT
 
 torch = pytest.importorskip("torch")
 
@@ -779,12 +780,14 @@ def test_torchcodec_never_shows_differences(with_views: Path) -> None:
         FrameDataset(with_views, layer="exact", **options)[0]
 
 
-# ---------------------------------------------------------------- example and tutorial
+# ---------------------------------------------------------------- the notebook
 
 
-@pytest.mark.slow
-def test_the_example_learns(drives: list[Path]) -> None:
-    out = run(sys.executable, str(ROOT / "examples/train.py"), str(drives[0]), "3", cwd=ROOT)
-    errors = [float(line.split("error ")[1].split(",")[0]) for line in out.splitlines()[1:]]
-    assert len(errors) == 3
-    assert errors[2] < errors[0]
+def test_a_policy_learns_in_the_notebook(tmp_path: Path) -> None:
+    notebook: Any = nbformat.read(ROOT / "examples/train.ipynb", 4)
+    where = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, timeout=None, resources=where).execute()
+    (last,) = notebook.cells[-1].outputs
+    found = re.fullmatch(r"of 50 targets the policy reaches (\d+), random moves (\d+)\n", last.text)
+    assert found
+    assert int(found[1]) > 25 > int(found[2])
