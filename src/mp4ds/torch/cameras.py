@@ -288,6 +288,11 @@ class OpenCamera:
         Raises:
             OptionError: The frames cannot be returned as requested.
         """
+        return self._none.new_empty((0, frames, *self._none.shape[1:]))
+
+    @cached_property
+    def _none(self) -> Tensor:
+        """No frames, shape (0, H, W, C)."""
         like = self._pixels([])
         if self._pictures.dtype == "uint8" and like.dtype != torch.uint8:
             kind = str(like.dtype).removeprefix("torch.")
@@ -296,7 +301,7 @@ class OpenCamera:
                 "dtype='native' to get them as stored, or dtype='float32'."
             )
         dtype = torch.float32 if self._pictures.dtype == "float32" else like.dtype
-        return like.new_empty((0, frames, *like.shape[1:3], *(like.shape[3:] or (1,))), dtype=dtype)
+        return like.new_empty((0, *like.shape[1:3], *(like.shape[3:] or (1,))), dtype=dtype)
 
     def read(self, frames: Sequence[int], outs: Sequence[Tensor]) -> None:
         """Decode frames in one pass.

@@ -89,7 +89,7 @@ class Offsets:
         """
         if not self._timed:
             wanted = rows[:, None] + self.steps
-            there = np.clip(wanted, 0, recording.rows - 1)
+            there = np.minimum(np.maximum(wanted, 0), recording.rows - 1)
             return recording.frames(there, camera), there != wanted
         own = recording.frames(rows, camera)[:, None]
         times = timeline.times[own] + self.steps

@@ -167,6 +167,9 @@ class Chains:
 
     def split(self, samples: list[int]) -> Iterator[list[int]]:
         """Packets by group; those of a group must be consecutive."""
+        if len(samples) == 1:
+            yield samples
+            return
         places = np.searchsorted(self._keys, np.array(samples, np.int64), side="right")
         bounds = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), len(samples)]
         for start, end in pairwise(bounds):
