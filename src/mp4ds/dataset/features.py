@@ -15,10 +15,10 @@ from mp4ds.messages.encodings import Pixels
 Integers = NDArray[np.int64]
 Feature = dict[str, Any]
 
-_SAMPLES = 100  # frames used for a camera's statistics
 _STEP_FROM, _SIDE = 300, 150  # pixels of a side from which pixels are subsampled, to about this
 
 STATE, ACTION = "observation.state", "action"
+SAMPLES = 100  # frames of an episode used for a camera's statistics
 
 COLUMNS: Mapping[str, Feature] = {
     "timestamp": {"dtype": "float32", "shape": [1], "names": None},
@@ -115,15 +115,16 @@ def merged(parts: Sequence[Statistics]) -> Statistics:
     }
 
 
-def sampled_statistics(topic: Topic, numbers: Integers, **view: Any) -> Statistics:
+def sampled_statistics(topic: Topic, numbers: Integers, most: int, **view: Any) -> Statistics:
     """The statistics of some frames' pixels, 0 to 1, by colour.
 
     Args:
         topic: Of the frames.
         numbers: Those to choose from, int64, shape (frames,).
+        most: How many are taken.
         **view: How they look, as in `Topic.read`.
     """
-    count = min(_SAMPLES, len(numbers))
+    count = min(most, len(numbers))
     chosen = np.unique(np.linspace(0, len(numbers) - 1, count).astype(np.int64))
     return merged(
         [picture_statistics(topic.read([n], **view)[0]) for n in numbers[chosen].tolist()]

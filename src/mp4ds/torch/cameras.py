@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mp4ds.dataset.features import Statistics, sampled_statistics
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
@@ -349,6 +350,10 @@ class OpenCamera:
             except Mp4dsError as its:
                 return SampleError(f"frame {number}: {its}")
         return SampleError(f"one of {len(frames)} frames: {error}")
+
+    def statistics(self, frames: NDArray[np.int64], most: int) -> Statistics:
+        """Those of the colours of some of the frames, at most so many."""
+        return sampled_statistics(self._topic, frames, most, **self._view)
 
     def close(self) -> None:
         """Close the video."""

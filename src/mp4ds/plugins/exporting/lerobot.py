@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mp4ds.dataset.features import (
     ACTION,
     COLUMNS,
+    SAMPLES,
     STATE,
     Feature,
     Statistics,
@@ -181,7 +182,8 @@ def _add_videos(
             "format": "native" if depths else "rgb",
         }
         with closing(Topic([camera.stream])) as topic:
-            episode.statistics[feature] = sampled_statistics(topic, camera.numbers, **view)
+            numbers = camera.numbers[used]
+            episode.statistics[feature] = sampled_statistics(topic, numbers, SAMPLES, **view)
         episode.videos.append(feature)
         job.places[f"videos/{feature}"] = camera.topic
 
