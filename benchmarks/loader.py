@@ -6,9 +6,11 @@
 All readers (loader_readers.py) read the same mp4 files, of the same clip, encoded with several
 GOPs; beside them LeRobot's encoding as its loader reads it, and folders of PNG and JPEG files.
 Measured are single frames at random, batches of 32 random frames, windows of 8 consecutive frames
-at random places, and all frames in order. Each reader is in a process of its own, for ``--seconds``
-a pattern, and they take turns within each round; places are the same for all. CPU time is user and
-system time of all threads, opening and imports left out.
+at random places, all frames in order, and a shuffled epoch: every frame once, in batches, at
+random, or as FrameStream mixes them, of which is told how alike neighbours are. Each reader is in
+a process of its own, for ``--seconds`` a pattern, and they take turns within each round; places
+are the same for all. CPU time is user and system time of all threads, opening and imports left
+out.
 
 Every frame that is read is compared with one pass in order: ours by all pixels (which are read
 once more for it), the others by 16 x 16 of its pixels, which have to be more like those of this
@@ -41,10 +43,12 @@ from PIL import Image
 from loader_readers import (
     BATCH,
     CODECS,
+    LOADERS,
     OURS,
     PATTERNS,
     STILLS,
     WINDOW,
+    Loader,
     Peer,
     Size,
     Store,
@@ -55,6 +59,7 @@ from loader_readers import (
     versions,
 )
 from measure import cpu_seconds, isolated, parse_size, parser_of, print_machine, print_table
+from recordings import HERTZ
 
 GOPS = (2, 30, 120, 240)
 LEAST_DB = 30.0
@@ -111,10 +116,12 @@ def take_turns(cells: Cells, stored: Stored, number: int, options: argparse.Name
     turn = number % max(len(peers), 1)
     for peer in [*peers[turn:], *peers[:turn]]:
         for pattern in options.pattern:
+            if peer in LOADERS and pattern != "epoch":
+                continue
             cell = cells[stored.name, pattern, peer]
             arguments = stored, peer, pattern, options.resize, options.seconds, number
             try:
-                frames, cpu, wall, fault = isolated(measured, *arguments)
+                frames, cpu, wall, fault, cell.mixed = isolated(measured, *arguments)
             except Exception as error:  # whatever a library raises, or that it is missing
                 cell.failures[short(f"{type(error).__name__}: {error}")] = None
                 continue
@@ -126,27 +133,39 @@ def take_turns(cells: Cells, stored: Stored, number: int, options: argparse.Name
 
 def measured(
     stored: Stored, name: str, pattern: str, size: Size | None, seconds: float, seed: int
-) -> tuple[int, float, float, str]:
-    """Frames, CPU seconds and seconds of one reader with one pattern; what is wrong with them."""
+) -> tuple[int, float, float, str, str]:
+    """Frames, CPU seconds and seconds of one reader with one pattern; what is wrong; how mixed."""
     peer = peers_for(stored.name)[name](stored, size)
-    peer.read([0])  # with what is loaded when the first frame is read
+    if name in LOADERS:  # with what is loaded when the first frame is read
+        next(peer.batches())
+    else:
+        peer.read([0])
     numbers: list[int] = []
     grids: list[Any] = []
     start, cpu = time.perf_counter(), cpu_seconds()
     for reads, (wanted, found) in enumerate(_reads(peer, stored, pattern, size, seed), 1):
         grids.extend(np.array(some) for some in grid(found))
         numbers += wanted
-        if time.perf_counter() - start >= seconds and reads >= _LEAST_READS:
+        late = pattern != "epoch" and time.perf_counter() - start >= seconds
+        if late and reads >= _LEAST_READS:
             break
     cpu, wall = cpu_seconds() - cpu, time.perf_counter() - start
     if size:
-        fault = reduced_verdict(peer, stored, size)
+        fault = "" if name in LOADERS else reduced_verdict(peer, stored, size)
     else:
         exact = name == OURS and stored.dataset is not None
         fault = verdict(stored, np.array(numbers), np.stack(grids), exact=exact)
         if exact and not fault:
             fault = _replay(peer, stored, np.array(numbers), pattern)
-    return len(numbers), cpu, wall, fault
+    return len(numbers), cpu, wall, fault, mixed(numbers) if pattern == "epoch" else ""
+
+
+def mixed(numbers: Sequence[int]) -> str:
+    """How far samples are from those before them in the clip: as in order 1, as by chance 0."""
+    whole = np.reshape(numbers[: len(numbers) // BATCH * BATCH], (-1, BATCH))
+    correlation = np.corrcoef(whole[:, :-1].ravel(), whole[:, 1:].ravel())[0, 1]
+    near = np.abs(whole[:, :, None] - whole[:, None, :]) < HERTZ
+    return f"neighbours correlate by {correlation:.2f}, {near.mean():.0%} within a second"
 
 
 def _reads(
@@ -161,6 +180,13 @@ def _reads(
         for number, frame in enumerate(peer.in_order()):
             yield [number], frame[None]
     rng = np.random.default_rng((seed, list(PATTERNS).index(pattern)))
+    if pattern == "epoch":
+        if isinstance(peer, Loader):
+            yield from peer.batches()
+            return
+        for batch in np.split(rng.permutation(count), range(BATCH, count, BATCH)):
+            yield batch.tolist(), peer.read(batch.tolist())
+        return
     while True:
         if pattern == "single":
             wanted = [int(rng.integers(count))]
@@ -212,7 +238,7 @@ def reduced_verdict(peer: Peer, stored: Stored, size: Size) -> str:
 def _replay(peer: Peer, stored: Stored, numbers: NDArray[np.int64], pattern: str) -> str:
     """Read the same frames once more, and compare all of their pixels."""
     digests = stored.reference["digests"]
-    step = {"single": 1, "batch": BATCH, "window": WINDOW}.get(pattern, 1)
+    step = {"single": 1, "batch": BATCH, "epoch": BATCH, "window": WINDOW}.get(pattern, 1)
     if pattern == "order":
         found = (digest(frame) for frame in peer.in_order())
         pairs = zip(digests[: len(numbers)].tolist(), found, strict=False)
@@ -237,12 +263,14 @@ class Cell:
         per_second: Frames per second on the clock, of each round.
         faults: What is wrong with its frames, and how much of the last round.
         failures: Why there are none.
+        mixed: How an epoch was shuffled.
     """
 
     per_cpu: list[float] = field(default_factory=list)
     per_second: list[float] = field(default_factory=list)
     faults: dict[str, str] = field(default_factory=dict)
     failures: dict[str, None] = field(default_factory=dict)
+    mixed: str = ""
 
     @property
     def rate(self) -> float:
@@ -264,7 +292,7 @@ class Cell:
         if len(self.per_cpu) > 1:
             text += f" ({number(min(self.per_cpu))} to {number(max(self.per_cpu))})"
         text += f", {number(median(self.per_second))}/s"
-        return f"{text}; {faults}" if faults else text
+        return "; ".join(filter(None, (text, faults, self.mixed)))
 
 
 def number(value: float) -> str:

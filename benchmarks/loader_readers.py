@@ -20,6 +20,7 @@ All give RGB of 8 bits, but for LeRobot's, which gives floats.
 - lerobot (emulated): a torchcodec decoder of the mode that LeRobot uses, and its conversion to
   floats; lerobot, uint8: without the conversion, as LeRobot 0.6 reads on request.
 - pil: one file per frame.
+- FrameDataset, FrameStream: those of `mp4ds.torch`, through a DataLoader without workers.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ PATTERNS = {
     "batch": f"{BATCH} random frames",
     "window": f"windows of {WINDOW}",
     "order": "all in order",
+    "epoch": f"a shuffled epoch, batches of {BATCH}",
 }
 """What is measured of each reader."""
 LOSSLESS = {"lossless": "none", "exact": None, "view": None}
@@ -454,10 +456,46 @@ class PilStills:
         yield from map(self._one, range(self._stored.frames))
 
 
+class Loader:
+    """Our datasets for PyTorch, each frame once, in batches as a DataLoader's worker reads them.
+
+    Args:
+        stored: What to read.
+        size: Width and height to make.
+        kind: ``FrameDataset`` or ``FrameStream``.
+    """
+
+    def __init__(self, stored: Stored, size: Size | None = None, *, kind: str) -> None:
+        from mp4ds import torch as ours
+
+        path = stored.dataset or stored.path
+        layer = "exact" if stored.name == "exact" else "view"
+        given: dict[str, Any] = {"resize": size, "layer": layer, "channels_first": False}
+        if kind == "FrameStream":
+            given |= STREAM
+        self._frames: Any = getattr(ours, kind)(path, **given)
+        self._key = self._frames.topics[0]
+
+    def batches(self) -> Iterator[tuple[list[int], Any]]:
+        """Numbers of the frames, and what is read."""
+        from torch.utils.data import DataLoader
+
+        shuffled = {} if hasattr(self._frames, "set_epoch") else {"shuffle": True}
+        for batch in DataLoader(self._frames, batch_size=BATCH, **shuffled):
+            yield batch["index"].tolist(), batch[self._key].numpy()
+
+
+STREAM = {"window": 120, "buffer": 240}
+"""What the stream keeps together, and mixes: frames."""
 OURS = "mp4ds"
+LOADERS = ("FrameDataset", "FrameStream")
 Opener = Callable[[Stored, Size | None], Peer]
-VIDEO_PEERS: dict[str, Opener] = {
+OWN_PEERS: dict[str, Opener] = {
     OURS: Mp4ds,
+    **{kind: partial(Loader, kind=kind) for kind in LOADERS},
+}
+VIDEO_PEERS: dict[str, Opener] = {
+    **OWN_PEERS,
     "pyav": PyAv,
     **{
         f"torchcodec {mode}": partial(TorchCodec, mode=mode)
@@ -477,7 +515,7 @@ def peers_for(name: str) -> dict[str, Opener]:
     if name == "lerobot":
         return LEROBOT_PEERS
     if name in ("lossless", "exact"):  # whose planes no other reader puts together
-        return {OURS: VIDEO_PEERS[OURS]}
+        return OWN_PEERS
     return STILL_PEERS if name in STILLS else VIDEO_PEERS
 
 
