@@ -134,8 +134,8 @@ def test_every_encoding_can_be_looked_at(encoding: str, tmp_path: Path) -> None:
         assert np.abs(blocks(jpeg) - blocks(seen)).mean() < 4
     png = read(tmp_path / "out.png")
     assert png.shape == seen.shape
-    is_wide = encoding.endswith("16") or encoding == "16UC3" or encoding == "16UC4"
-    assert png.dtype == (np.uint16 if is_wide else np.uint8)
+    assert png.dtype == np.uint8
+    assert png.max() > 150  # dark ones of 16 bits, too, whose exact values look black
 
 
 def test_exact_floats_have_no_image(tmp_path: Path) -> None:

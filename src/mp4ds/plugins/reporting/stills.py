@@ -243,8 +243,8 @@ class StillSummary:
 def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> StillSummary:
     """Save a frame, or a contact sheet of evenly spaced frames.
 
-    A frame is shown as it looks: mosaics are interpolated, 16-bit images stay 16-bit in a PNG file,
-    depths and other measurements are in false colour.
+    A frame is shown as it looks: mosaics are interpolated, 16-bit images are scaled so that the
+    brightest is white, depths and other measurements are in false colour.
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
@@ -271,7 +271,7 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
             numbers = [number_at(topic, options.at)]
             part, number = topic.place_of(numbers[0])
             with closing(Topic([part])) as alone:  # which has one size and encoding
-                pixels, encoding = _still(alone, number, kind, options)
+                pixels, encoding = _still(alone, number, options)
         elif options.sheet:
             first, end = _places(topic, options.slice)
             numbers = [first + n for n in spread(end - first, options.sheet[0] * options.sheet[1])]
@@ -363,12 +363,12 @@ def number_at(topic: Topic, at: Time | int) -> int:
 # ---------------------------------------------------------------- how
 
 
-def _still(topic: Topic, number: int, kind: str, options: StillOptions) -> tuple[Pixels, str]:
+def _still(topic: Topic, number: int, options: StillOptions) -> tuple[Pixels, str]:
     """Pixels of one frame, and their encoding."""
     if options.exact:
         return topic.get([number])[0].data, topic.encoding
     encoding = ENCODINGS[topic.encoding]
-    if encoding_as(encoding, "rgb") and (encoding.bytes_per_sample == 1 or kind == "png"):
+    if encoding_as(encoding, "rgb") and encoding.bytes_per_sample == 1:
         frame = topic.get([number], format="rgb", resize=options.resize)[0]
         return frame.data, frame.encoding
     size = topic.image_size
