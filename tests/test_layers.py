@@ -26,7 +26,7 @@ import jail
 import mp4ds
 from commands import call
 from edits import agreed, changed, flip
-from mp4ds import FormatError, SourceError, UnpackOptions
+from mp4ds import FormatError, OptionError, SourceError, UnpackOptions
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.messages.encodings import ENCODINGS
 
@@ -130,6 +130,61 @@ def test_topics_whose_exact_videos_are_here_are_unpacked(dataset: Path) -> None:
     exact(dataset, ONE).unlink()
     found = unpacked(dataset, UnpackOptions(exclude=(TOPICS[0],)))
     assert hashes(found) == {topic: RECORDED[topic] for topic in TOPICS[1:]}
+
+
+def test_exact_frames_that_are_asked_for_and_away(dataset: Path) -> None:
+    exact(dataset, ONE).unlink()
+    with mp4ds.open(dataset, layer="exact") as opened:
+        opened[TOPICS[1]].read([0])
+        with pytest.raises(
+            OptionError, match=rf"no exact frames here: {ONE}\.exact\.mp4 is missing"
+        ):
+            opened[TOPICS[0]].read([0])
+    named = f"exact layer not here: 1 file, .*: {ONE}\\.exact\\.mp4"
+    with pytest.raises(SourceError, match=named):  # which of several it is
+        mp4ds.unpack(dataset, "mcap", dataset.with_name("refused.mcap"))
+
+
+def test_without_its_view_an_exact_video_is_nothing(dataset: Path) -> None:
+    view(dataset, ONE).unlink()
+    with mp4ds.open(dataset) as opened:
+        with pytest.raises(FormatError, match=rf"{ONE}\.exact\.mp4 only has differences to it"):
+            opened[TOPICS[0]].read([0])
+        opened[TOPICS[1]].read([0])
+    (dataset / f"{ONE}.yaml").unlink()
+    with pytest.raises(FormatError, match="is a video without its sidecar"):  # nor other frames
+        mp4ds.open(exact(dataset, ONE).rename(dataset.parent / f"{ONE}.exact.mp4"))
+
+
+@pytest.mark.parametrize("place", [view, exact])
+def test_frames_of_another_dataset_are_not_read(
+    place: Callable[[Path, str], Path], dataset: Path
+) -> None:
+    """Both decode, and there is no digest of pixels; other sizes tell them apart."""
+    whole = place(dataset, ONE)
+    with whole.open("ab") as file:
+        file.write(bytes([0, 0, 0, 8, *b"free"]))
+    with mp4ds.open(dataset) as opened:
+        for read in (lambda topic: topic.read([0]), list):
+            with pytest.raises(FormatError, match=rf"{whole.name}: has \d+ bytes, but its sidecar"):
+                read(opened[TOPICS[0]])
+
+
+def test_what_may_be_depths_is_exact_wherever_that_is_here(tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(CASE.with_name("views-deep"), tmp_path / "dataset"))
+    topic, other = "/mono16_12/image_raw", "/rgb16_12/image_raw"
+    recorded, seen = unpacked(dataset), unpacked(dataset, VISUAL)
+    assert seen[topic] == recorded[topic]
+    assert seen[other] != recorded[other]
+    with mp4ds.open(dataset, layer="view") as opened:
+        depths = opened[topic].read([1], format="depth_m")
+        assert np.array_equal(np.rint(depths * 1000), opened[topic].read([1], format="native"))
+        with pytest.raises(OptionError, match="what a view shows of depths cannot be measured"):
+            opened[topic].read([1], format="depth_m", layer="view")
+    exact(dataset, "mono16_12_image_raw").unlink()
+    assert unpacked(dataset, VISUAL)[topic] != recorded[topic]
+    with mp4ds.open(dataset) as opened, pytest.raises(OptionError, match="no exact frames here"):
+        opened[topic].read([1], format="depth_m")
 
 
 @pytest.mark.parametrize("given", [view, exact])

@@ -26,7 +26,7 @@ from mp4ds.dataset.messages import (
     by_time,
     channel_groups,
 )
-from mp4ds.dataset.stream import Layer, Stream
+from mp4ds.dataset.stream import Layer, Stream, open_stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.errors import (
     FormatError,
@@ -41,6 +41,7 @@ from mp4ds.files.sources import HOW_TO_OPEN, is_folder, refuse_unfinished, video
 from mp4ds.files.urls import RemotePath, location
 from mp4ds.format.fields import MESSAGES_NAME, Choice, everything, within
 from mp4ds.format.manifest import Manifest
+from mp4ds.format.models import EXACT_SUFFIX
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, sidecar_of, verify_file
 from mp4ds.messages.serializations import is_camera
 from mp4ds.records import Channel, Excerpt, Message, Record
@@ -119,7 +120,7 @@ class Dataset:
                 raise FormatError("file-missing", self.path, problem)
             sidecars = [sidecar]
         self.streams = [
-            Stream(sidecar, layer=layer, jpeg_quality=jpeg_quality) for sidecar in sidecars
+            open_stream(sidecar, layer, jpeg_quality=jpeg_quality) for sidecar in sidecars
         ]
         self.messages_file = MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
 
@@ -171,7 +172,10 @@ class Dataset:
         if not absent:
             return ""
         size = sum(video.size or 0 for video in absent)
-        return f"exact layer not here: {counted(len(absent), 'file')}, {size_text(size)}"
+        found = f"exact layer not here: {counted(len(absent), 'file')}, {size_text(size)}"
+        if len(absent) == sum(stream.exact_path is not None for stream in self.streams):
+            return found
+        return f"{found}: {', '.join(video.file for video in absent)}"
 
     def require_exact(self, selected: Callable[[str], bool] = lambda _: True) -> None:
         """Refuse to take the images of views for those recorded.
@@ -598,7 +602,8 @@ def open_dataset(
         OptionError: There is no such track, or it is not such a video. See `Dataset` for others.
     """
     place = location(path)
-    if place.suffix.lower() in _VIDEOS and place.is_file():
+    is_half = place.name.endswith(EXACT_SUFFIX)  # of two videos: differences show nothing
+    if place.suffix.lower() in _VIDEOS and not is_half and place.is_file():
         beside = (sidecar_of(place), place.parent / MANIFEST_NAME)
         if not any(path.exists() for path in beside):
             return Dataset.of(place, None, [], MessagesFile(None), VideoImages(place, track))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.dataset.views import Crop, Resize, View, view_of
-from mp4ds.errors import FormatError, Refused, VideoError
+from mp4ds.errors import FormatError, OptionError, Refused, VideoError
 from mp4ds.format.fields import Choice, DecodedColumns, everything
 from mp4ds.format.models import Calibration
 from mp4ds.messages import depth, png
@@ -45,6 +45,7 @@ class Images(ABC):
         encoding: ROS image encoding of the frames as recorded.
         image_size: Width and height of the images, pixels.
         are_jpeg_files: Whether the messages hold JPEG files that are stored as they are.
+        is_lossy: Whether they differ from those recorded.
         shows_colours: Whether the decoder can make RGB directly, in any size; see
             `mp4ds.video.pixels.shows_colours`.
     """
@@ -56,6 +57,7 @@ class Images(ABC):
     encoding: str
     image_size: tuple[int, int]
     are_jpeg_files = False
+    is_lossy = False
     shows_colours = False
 
     def __repr__(self) -> str:
@@ -159,6 +161,11 @@ class Images(ABC):
         Raises:
             OptionError: The format, crop or size is invalid, or not available for these frames.
         """
+        if format == "depth_m" and self.is_lossy and self.encoding in depth.DEPTHS:
+            raise OptionError(
+                f"{self.topic} has no exact frames here, and what a view shows of depths cannot be "
+                "measured: format='depth_m' is not available"
+            )
         return view_of(
             self.topic,
             ENCODINGS[encoding or self.encoding],

@@ -11,7 +11,7 @@ import numpy as np
 
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import MessagesFile, recorded_format
-from mp4ds.dataset.stream import Layer, Stream
+from mp4ds.dataset.stream import Layer, Stream, open_stream
 from mp4ds.errors import FormatError, SourceError, SourceNotFoundError, VersionError
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
@@ -227,7 +227,7 @@ class _Opening:
     ) -> Stream | None:
         path = self._folder / name
         try:
-            stream = Stream(path, layer=self._layer, jpeg_quality=self._jpeg_quality)
+            stream = open_stream(path, self._layer, jpeg_quality=self._jpeg_quality)
             if manifest is not None and any(map(self._selected, stream.topics)):
                 self._compare(path, manifest.file(name), stream.topics)
             return stream

@@ -24,12 +24,23 @@ from mp4ds.messages.encodings import Picture, Pixels
 from mp4ds.messages.layouts import Layout
 from mp4ds.records import Channel, Message
 from mp4ds.video.access import FrameReader
+from mp4ds.video.codecs import LOSSLESS
 from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.packets import PacketReader
 from mp4ds.video.pixels import PictureMaker, Scale
 
 Layer = Literal["exact", "view"]
 """Which frames are read of a stream that has a view: those recorded, or those that it shows."""
+
+
+def open_stream(path: Path, layer: Layer | None = None, *, jpeg_quality: int = 95) -> Stream:
+    """A stream of a dataset that is read in a layer: see `Stream`.
+
+    What may be depths is exact in both layers, if that is here: a view has 256 levels of it.
+    """
+    stream = Stream(path, layer=layer, jpeg_quality=jpeg_quality)
+    keeps = stream.encoding in depth.DEPTHS and stream.absent is None
+    return stream.in_layer("exact") if keeps else stream
 
 
 class Stream(Images):
@@ -85,6 +96,7 @@ class Stream(Images):
         self.encoding, self.image_size = image.encoding, (image.width, image.height)
         is_packet = self.sidecar.body == "packet"
         self.are_jpeg_files = is_packet and self.sidecar.video.codec == "mjpeg"
+        self.is_lossy = self.sidecar.profile != LOSSLESS
         self.shows_colours = self.sidecar.shows_colours and not self.sidecar.is_predicted
 
     @property
@@ -113,10 +125,7 @@ class Stream(Images):
         if layer == self.layer or self.exact_path is None:
             return self
         if layer == "exact" and not self.exact_path.exists():
-            raise OptionError(
-                f"{self.topic} has no exact frames here: {self.exact_path.name} is missing. Copy "
-                f"it to {self.path.parent}, or read the layer 'view'."
-            )
+            raise self._no_exact()
         quality = self._jpeg_quality
         other = Stream(self.path, sidecar=self._whole, layer=layer, jpeg_quality=quality)
         if layer == "view":  # of a damaged one, exact frames are lost as well
@@ -129,18 +138,50 @@ class Stream(Images):
         return self.in_layer("view") if self.sidecar.is_predicted else None
 
     @cached_property
+    def _size(self) -> int:
+        """Bytes of the video.
+
+        Raises:
+            OptionError: It has the exact frames, and is not here.
+            FormatError: It is missing.
+        """
+        try:
+            return self.video_path.stat().st_size
+        except OSError as error:
+            if self.video_path == self.exact_path and not self.exact_path.exists():
+                raise self._no_exact() from None
+            problem = f"cannot be read: {error.strerror}"
+            if self.layer == "view" and self._whole.is_predicted:
+                problem += f"; {self._whole.video.file} only has differences to it: copy it back"
+            raise FormatError("file-missing", self.video_path, problem) from None
+
+    def _no_exact(self) -> OptionError:
+        return OptionError(
+            f"{self.topic} has no exact frames here: {self._whole.video.file} is missing. Copy it "
+            f"to {self.path.parent}, or read the layer 'view'."
+        )
+
+    def _check_size(self) -> None:
+        """Refuse a video that is another one: its frames would be taken for those recorded.
+
+        Raises:
+            FormatError: ``size-mismatch``.
+        """
+        due = self.sidecar.video.size
+        if due is not None and self._size != due:
+            problem = (
+                f"has {self._size} bytes, but its sidecar says {due}: it was cut short or replaced"
+            )
+            raise FormatError("size-mismatch", self.video_path, problem)
+
+    @cached_property
     def columns(self) -> DecodedColumns:
         """One value per frame: its times, and what fills its message; checked on first use.
 
         Raises:
             FormatError: ``column-invalid``; or the video is missing, or too short for so many.
         """
-        try:
-            size = self.video_path.stat().st_size
-        except OSError as error:
-            raise FormatError(
-                "file-missing", self.video_path, f"cannot be read: {error.strerror}"
-            ) from None
+        size = self._size
         if self.sidecar.frames > size:  # a coded frame takes at least a byte
             raise FormatError(
                 "frame-count", self.path, f"declares {self.sidecar.frames} frames in {size} bytes"
@@ -222,12 +263,17 @@ class Stream(Images):
 
     def open_reader(self) -> FrameReader | PredictedFrames:
         """A separate decoder for frames by number."""
+        self._check_size()
         recorded = self.sidecar.video.references
         references = recorded.decode if recorded else None
         reader = FrameReader(self.video_path, **self._expected(), references=references)
         if self._view is None:
             return reader
-        return PredictedFrames(reader, self._view.open_reader(), self.predicted)
+        with ExitStack() as failed:
+            failed.callback(reader.close)
+            shown = self._view.open_reader()
+            failed.pop_all()
+        return PredictedFrames(reader, shown, self.predicted)
 
     def write_pixels(self, picture: Picture, out: Pixels) -> None:
         """Write the pixels of a picture, as recorded."""
@@ -305,6 +351,8 @@ class Stream(Images):
         Raises:
             VideoError: See `VideoDecoder.pictures_at`.
         """
+        if is_strict and self.sound is None:
+            self._check_size()
         with self.naming_frames():
             if self._view is None:
                 yield from self._decoded(choice, scale, is_strict=is_strict)

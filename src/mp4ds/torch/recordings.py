@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.dataset.dataset import datasets_in, open_dataset
-from mp4ds.dataset.stream import Layer, Stream
+from mp4ds.dataset.stream import Layer, open_stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.errors import OptionError
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
-from mp4ds.messages.depth import DEPTHS
 from mp4ds.times import (
     constant_rate,
     intervals,
@@ -180,7 +179,7 @@ def _matched(
 ) -> Recording:
     if len(sources) == 1 and not timed:
         if sources[0].layer == "exact":
-            open_source(sources[0]).close()  # its frames may not be here
+            _ = open_source(sources[0]).stamps  # its frames may not be here
         return Recording(str(path), sources, None, {sources[0].topic: np.empty(0, np.int64)})
     stamps = {}
     for topic, source in zip(topics, sources, strict=True):
@@ -235,10 +234,7 @@ def open_source(source: CameraSource) -> Topic:
     """
     path = location(source.place)
     if path.suffix == ".yaml":
-        stream = Stream(path, layer="view")
-        # what may be depths keeps all its levels, if they are here
-        keeps = stream.encoding in DEPTHS and stream.absent is None
-        return Topic([stream.in_layer("exact" if keeps else source.layer)])
+        return Topic([open_stream(path, source.layer)])
     return Topic(open_dataset(path).parts)
 
 
