@@ -81,7 +81,7 @@ HOMES = {
     "rospy": ("plugins/ros",),
     "rclpy": ("plugins/ros",),
     "cyclonedds": ("plugins/ros",),
-    "pyarrow": ("plugins/exporting",),
+    "pyarrow": ("plugins/exporting", "plugins/importing"),
     "yaml": ("yamlio.py", "bags", "plugins/ros"),
     "pydantic": ("format", "dataset/checks.py", "plugins/evaluating", "plugins/importing"),
     "jsonschema": ("dataset/checks.py",),

@@ -31,7 +31,7 @@ COMMANDS = {
     "pack": ("pack", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
     "repack": ("pack", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
     "unpack": ("pack", "Turn a dataset back into a recording: a bag, rosbag2, MCAP or images."),
-    "import": ("pack", "Make a dataset from images, or from a video."),
+    "import": ("pack", "Make a dataset from images, from a video, or from a LeRobotDataset."),
     "export": (
         "pack",
         "Export a dataset to another tool's format, keeping what that format supports.",

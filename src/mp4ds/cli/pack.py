@@ -42,9 +42,11 @@ from mp4ds.packing.options import (
     PackSummary,
     TopicSummary,
 )
+from mp4ds.packing.pack import is_packed
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.exporting.export import export
 from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
+from mp4ds.plugins.importing.layouts import episodes_in
 from mp4ds.records import Loss, latched_text
 from mp4ds.unpacking.unpack import UnpackOptions, UnpackProgress, UnpackSummary, unpack, unpack_each
 
@@ -361,7 +363,7 @@ _force = option("--force", "-f", is_flag=True, panel=WHERE, help="Replace an exi
 
 @click.group("import")
 def import_command() -> None:
-    """Make a dataset from images, or from a video."""
+    """Make a dataset from images, from a video, or from a LeRobotDataset."""
 
 
 def _imports(*kinds: str) -> Callable[[Callable[..., Any]], Any]:
@@ -375,6 +377,19 @@ def _import(source: str, output: str, images: ImportOptions, options: PackOption
     with pack_progress() as progress:
         summary = mp4ds.pack(source, output, replace(options, images=images), progress=progress)
     show(summary, print_pack)
+
+
+def _import_episodes(folder: str, output: str, images: ImportOptions, options: PackOptions) -> None:
+    """A dataset for each episode; those that an earlier run made are left as they are."""
+    numbers, summaries = episodes_in(Path(folder)), []
+    with pack_progress() as progress:
+        for number in numbers:
+            target = Path(output) / f"episode_{number:06d}"
+            chosen = replace(options, images=replace(images, episode=number))
+            if options.force or not is_packed(Path(folder), target, chosen):
+                target.parent.mkdir(exist_ok=True)
+                summaries.append(mp4ds.pack(folder, target, chosen, progress=progress))
+    show(summaries, lambda _: [*map(print_pack, summaries)])
 
 
 @command("images")
@@ -403,6 +418,26 @@ def video_command(video: str, output: str, images: ImportOptions, options: PackO
     _import(video, output, images, options)
 
 
+@command("lerobot")
+@argument("folder", "FOLDER", "A LeRobotDataset v3: the folder with meta, data and videos.")
+@output_option(
+    "DATASET",
+    "Folder to create; without --episode, the folder for episode_000000 and so on.",
+    required=True,
+)
+@_imports("lerobot")
+def lerobot_command(folder: str, output: str, images: ImportOptions, options: PackOptions) -> None:
+    """Make datasets of the episodes of a LeRobotDataset v3.
+
+    Packets of videos are copied; states, actions and other rows become messages. To resume, run
+    the same command again.
+    """
+    if images.episode is None:
+        _import_episodes(folder, output, images, options)
+    else:
+        _import(folder, output, images, options)
+
+
 @command("ros-mp4")
 @argument("video", "VIDEO", "The mp4 file.")
 @argument("sidecar", "YAML", "The YAML file that belongs to it.")
@@ -418,6 +453,7 @@ def ros_mp4_command(video: str, sidecar: str, output: str, force: bool) -> None:
 
 import_command.add_command(images_command)
 import_command.add_command(video_command)
+import_command.add_command(lerobot_command)
 import_command.add_command(ros_mp4_command)
 
 

@@ -98,7 +98,13 @@ class ImportOptions(Options):
         "Decode the frames to RGB images, which are packed like any others, instead of copying "
         "packets.",
         False,
-        only=("video",),
+        only=("video", "lerobot"),
+    )
+    episode: int | None = option(
+        "Number of the episode; default: each becomes a dataset.",
+        panel=WHAT,
+        least=0,
+        only=("lerobot",),
     )
 
     def absolute(self) -> ImportOptions:

@@ -369,7 +369,7 @@ def pack_each(
     missing = {
         target: source
         for target, source in targets.items()
-        if asked.force or not _is_packed(source, target, asked)
+        if asked.force or not is_packed(source, target, asked)
     }
     made: dict[Path, PackSummary] = {}
     parted = []
@@ -385,8 +385,17 @@ def pack_each(
     return [made[target] for target in missing if target in made]
 
 
-def _is_packed(source: Path, target: Path, options: PackOptions) -> bool:
-    """Whether a dataset of a recording already exists."""
+def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
+    """Whether a dataset of a recording already exists.
+
+    Args:
+        source: The recording.
+        target: The dataset.
+        options: How it is packed.
+
+    Raises:
+        TargetExistsError: Something else is there.
+    """
     if not (target / MANIFEST_NAME).exists() if remote(target) else not os.path.lexists(target):
         return False
     try:

@@ -14,7 +14,7 @@ from mp4ds.errors import FormatError, Refused, SourceError
 from mp4ds.records import MetadataRecord
 from mp4ds.video.codecs import CODECS, PACKET_CODECS
 from mp4ds.video.coded import REORDERED, StreamParser
-from mp4ds.video.decoder import VideoDecoder, read_video_file
+from mp4ds.video.decoder import VideoDecoder, VideoFile, read_video_file
 from mp4ds.video.media import raise_if_scarce
 
 _DECODE = "Give `decode`: its pictures then become images, which `quality` visual keeps small."
@@ -22,16 +22,29 @@ _KINDS = "Give an mp4, mov, mkv or webm file; `ffmpeg -i FILE -c copy NEW.mkv` m
 _MOST_DELAY = 16  # frames, by which decoding times may precede those of showing
 
 
+def open_video(path: Path) -> VideoFile:
+    """What is in a video.
+
+    Raises:
+        SourceError: It cannot be read; says what to do.
+    """
+    try:
+        return read_video_file(path)
+    except FormatError as error:
+        raise SourceError(path, error.problem, _KINDS) from None
+
+
 class Clip:
     """Consecutive frames of a video, by number.
 
     Args:
-        path: The video.
-        decode: Whether its frames become RGB images.
+        file: The video.
+        pictures: Pixel format of what its frames are decoded to; empty to copy packets.
         numbers: Those of the frames; None: all.
 
     Attributes:
         file: The video.
+        is_decoded: Whether `body` gives pixels.
         numbers: Those of the frames.
         frame_bytes: Bytes of a frame in the file, on average.
         metadata: What its container says about it.
@@ -41,23 +54,22 @@ class Clip:
         SourceError: It cannot be read, or its packets cannot be messages; says what to do.
     """
 
-    def __init__(self, path: Path, *, decode: bool, numbers: range | None = None) -> None:
-        try:
-            self.file = read_video_file(path)
-        except FormatError as error:
-            raise SourceError(path, error.problem, _KINDS) from None
-        self._decode = decode
-        self.numbers = numbers or range(len(self.file.ticks))
-        self.frame_bytes = path.stat().st_size // len(self.file.ticks)
+    def __init__(
+        self, file: VideoFile, *, pictures: str = "", numbers: range | None = None
+    ) -> None:
+        self.file = file
+        self.is_decoded, self._pictures = bool(pictures), pictures
+        self.numbers = numbers or range(len(file.ticks))
+        self.frame_bytes = file.path.stat().st_size // len(self.file.ticks)
         self._bodies: Iterator[bytes] = iter(())
         self._due = -1
         self._parser: type[StreamParser] = StreamParser
         self._units: list[bytes] = []
-        if not decode:
+        if not pictures:
             self._check_packets()
         with self._reading(), closing(self.file.open()) as media:
             texts = {str(key): str(value) for key, value in media.container.metadata.items()}
-            self.metadata = MetadataRecord("video", {**texts, "file": path.name})
+            self.metadata = MetadataRecord("video", {**texts, "file": file.path.name})
             others = [one.type for one in media.container.streams if one is not media.track]
             self.left_out = Counter(f"{kind} tracks" for kind in others)
             if media.hidden:
@@ -114,14 +126,15 @@ class Clip:
             return next(self._bodies)
 
     def _bodies_from(self, number: int) -> Iterator[bytes]:
-        if not self._decode:
+        if not self.is_decoded:
             for packet in self._packets(number):
                 units = self._units if packet.is_keyframe else []
                 yield self._parser.stand_alone(bytes(packet), units)
             return
         file = self.file
+        maker = file.maker(self._pictures)
         with VideoDecoder(
-            file.path, codec=file.codec, frames=len(file.ticks), maker=file.maker(), file=file
+            file.path, codec=file.codec, frames=len(file.ticks), maker=maker, file=file
         ) as decoder:
             for _, (pixels,) in decoder.pictures_at(range(number, self.numbers[-1] + 1)):
                 yield pixels.tobytes()

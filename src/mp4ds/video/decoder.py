@@ -409,12 +409,12 @@ class VideoFile:
         """Open it once more."""
         return Media(self.path, self.track, size=self.size, container=self.container)
 
-    def maker(self) -> PictureMaker:
-        """Makes 8-bit RGB of its frames, by its colour tags."""
+    def maker(self, picture_format: str = "rgb24") -> PictureMaker:
+        """Makes 8-bit RGB of its frames, by its colour tags; or of another format what they are."""
         return PictureMaker(
             self.path,
             coded_size=self.size,
-            picture_format="rgb24",
+            picture_format=picture_format,
             picture_size=self.size,
             matrix=None,
             full_range=False,

@@ -6,7 +6,7 @@ The constants and the steps in single precision are LeRobot's (0.6.1), so that c
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,45 @@ DEPTH_FORMAT = "gray12le"
 _UNITS = {"16UC1": ("mm", 1.0), "32FC1": ("m", 1000.0)}
 """Encoding -> unit of its numbers, in LeRobot's words, and millimetres in it."""
 
-# metres: others would do, but datasets with different ones cannot be merged
-_NEAR, _FAR, _SHIFT = 0.01, 10.0, 3.5
 _MOST = 2**12 - 1
 _MM = 1000.0
+
+
+class DepthScale(NamedTuple):
+    """What depths codes stand for, as LeRobot names it; metres."""
+
+    depth_min: float = 0.01
+    depth_max: float = 10.0
+    shift: float = 3.5
+    use_log: bool = True
+
+    def table(self, *, in_metres: bool = False) -> NDArray[Any]:
+        """The depths that LeRobot gives for codes, by code.
+
+        Args:
+            in_metres: Whether as float32 in metres; else as uint16 in millimetres.
+
+        Raises:
+            ValueError: There are no such codes.
+        """
+        near, far = float(self.depth_min), float(self.depth_max)
+        shift = float(self.shift) if self.use_log else 0.0
+        ends = [math.log(x + shift) if self.use_log else x for x in (near, far)]
+        if not 0 <= near < far < math.inf:
+            raise ValueError(f"depths from {near} to {far} m")
+        scale, offset = np.float32((ends[1] - ends[0]) / _MOST), np.float32(ends[0])
+        depth = np.arange(_MOST + 1, dtype=np.float32) * scale + offset
+        depth = np.exp(depth) - np.float32(shift) if self.use_log else depth
+        depth = depth.clip(near, far).astype(np.float32)
+        return depth if in_metres else np.rint(depth * np.float32(_MM)).clip(0, 65535).astype("<u2")
+
+
+# others would do, but datasets with different ones cannot be merged
+LEROBOT_SCALE = DepthScale()
+"""That of LeRobot's own recordings."""
+
+_NEAR, _FAR, _SHIFT, _ = LEROBOT_SCALE
+_RESTORED = LEROBOT_SCALE.table().astype(np.float64)
 
 
 class DepthCodes:
@@ -48,10 +83,7 @@ class DepthCodes:
         return {
             "is_depth_map": True,
             "depth_unit": self._unit,
-            "video.depth_min": _NEAR,
-            "video.depth_max": _FAR,
-            "video.shift": _SHIFT,
-            "video.use_log": True,
+            **{f"video.{name}": value for name, value in LEROBOT_SCALE._asdict().items()},
         }
 
     def of(self, pixels: Pixels) -> NDArray[np.uint16]:
@@ -68,7 +100,7 @@ class DepthCodes:
         scaled = (np.log(depth + shift) - low) / (high - low)
         codes: NDArray[np.uint16] = np.rint(scaled * _MOST).clip(0, _MOST).astype(np.uint16)
         is_within = (depth >= near) & (depth <= far)
-        off = np.abs(restored(codes)[is_within] - depth[is_within].astype(np.float64) * self._in_mm)
+        off = np.abs(_RESTORED[codes[is_within]] - depth[is_within].astype(float) * self._in_mm)
         self._measured += off.size
         self._missing += int((~is_there).sum())
         self._outside += int(is_there.sum()) - off.size
@@ -90,12 +122,3 @@ class DepthCodes:
                 f"; {100 * share:.1f} % are not from 10 mm to 10 m and become the nearer of these"
             )
         return text
-
-
-def restored(codes: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """The depths that LeRobot gives for codes, in whole millimetres."""
-    low, high = math.log(_NEAR + _SHIFT), math.log(_FAR + _SHIFT)
-    scale, offset = np.float32((high - low) / _MOST), np.float32(low)
-    depth = np.exp(np.arange(_MOST + 1, dtype=np.float32) * scale + offset) - np.float32(_SHIFT)
-    table: NDArray[np.float32] = np.rint(depth.clip(_NEAR, _FAR) * np.float32(_MM))
-    return table[codes]

@@ -82,7 +82,11 @@ class ExportOptions(SliceOptions, ReductionOptions):
         only=_LEROBOT,
     )
     task: str = option(
-        "Task description, for lerobot.", "", panel=WHAT, metavar="TEXT", only=_LEROBOT
+        "Task description, for lerobot; or a topic of std_msgs/String with them, such as /task.",
+        "",
+        panel=WHAT,
+        metavar="TEXT",
+        only=_LEROBOT,
     )
     codec: str = option(
         "Video codec for lerobot: av1, h264 or h265.",
@@ -104,7 +108,7 @@ class ExportOptions(SliceOptions, ReductionOptions):
     def chosen(self, topic: str) -> bool:
         """Whether a topic was selected, by a glob or by name."""
         given = (topics.partition(":")[0] for topics in (self.state, self.action) if topics)
-        return self.selected(topic) or topic in (self.poses, *given)
+        return self.selected(topic) or topic in (self.poses, self.task, *given)
 
     def uses(self, topic: str) -> bool:
         """Whether messages of a topic may be read: static transforms always are."""

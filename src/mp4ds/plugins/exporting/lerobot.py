@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,7 +33,7 @@ from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.vectors import Vectors, fields_of, read_vectors
 from mp4ds.errors import OptionError
 from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, DepthCodes
-from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, Integers
+from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, Integers, ros_type
 from mp4ds.times import TIMESCALE, constant_rate, nearest
 from mp4ds.video.codecs import CODECS, recipe_for
 from mp4ds.video.encoder import VideoEncoder
@@ -65,6 +65,7 @@ class Episode:
         features: As in info.json.
         statistics: By feature.
         videos: Features that are videos.
+        tasks: Of its frames.
     """
 
     number: int
@@ -74,6 +75,7 @@ class Episode:
     features: dict[str, dict[str, Any]] = field(default_factory=dict)
     statistics: dict[str, Statistics] = field(default_factory=dict)
     videos: list[str] = field(default_factory=list)
+    tasks: list[str] = field(default_factory=list)
 
     def path(self, folder: str, suffix: str) -> str:
         """Path of its file in a folder of chunks."""
@@ -84,13 +86,17 @@ class Episode:
 def write(*jobs: ExportJob) -> None:
     """Write the format."""
     cameras = [_shown(job) for job in jobs]
-    path, task = jobs[0].path, jobs[0].options.task
+    path = jobs[0].path
     fps = jobs[0].options.fps or max(1, round(cameras[0][0].rate))
     episodes: list[Episode] = []
+    tasks: dict[str, int] = {}
     first = 0
     for number, (job, own) in enumerate(zip(jobs, cameras, strict=True)):
         job.tell(f"episode {number + 1} of {len(jobs)}", number / len(jobs))
         episode = Episode(number, first, _grid(job, own, fps))
+        episode.tasks = _tasks(job, episode.times, fps)
+        for task in episode.tasks:
+            tasks.setdefault(task, len(tasks))
         _add_vectors(job, episode, fps)  # first: their topic may be unsuitable
         _add_videos(job, own, episode, fps)
         if episodes and episode.features != episodes[0].features:
@@ -99,11 +105,11 @@ def write(*jobs: ExportJob) -> None:
                 f"{jobs[0].dataset.path}, but LeRobot episodes must agree. Select with "
                 "`topics`, and `resize` WxH."
             )
-        _write_table(path / episode.path("data", "parquet"), _frames_table(episode, fps))
+        _write_table(path / episode.path("data", "parquet"), _frames_table(episode, tasks, fps))
         episodes.append(episode)
         first += len(episode.times)
-    _write_table(path / "meta/tasks.parquet", _tasks_table(task))
-    rows = [_episode_row(episode, task, fps) for episode in episodes]
+    _write_table(path / "meta/tasks.parquet", _tasks_table([*tasks]))
+    rows = [_episode_row(episode, fps) for episode in episodes]
     table = pa.table({name: [row[name] for row in rows] for name in rows[0]})
     _write_table(path / _EPISODES_PATH, table)
     statistics = {
@@ -111,8 +117,8 @@ def write(*jobs: ExportJob) -> None:
         for name in episodes[0].statistics
     }
     _write_json(path / "meta/stats.json", statistics)
-    _write_json(path / "meta/info.json", _info(episodes, fps))
-    if not task:
+    _write_json(path / "meta/info.json", _info(episodes, len(tasks), fps))
+    if not jobs[0].options.task:
         jobs[0].note("no --task was given: every frame's task is empty")
     jobs[0].note(
         f"stamps count up at {fps} frames per second from the first frame; recorded stamps are "
@@ -286,7 +292,29 @@ def _at(
 # ---------------------------------------------------------------- tables
 
 
-def _frames_table(episode: Episode, fps: int) -> Any:
+def _tasks(job: ExportJob, times: Integers, fps: int) -> list[str]:
+    """The task of each frame: the one given, or what a topic last said until then.
+
+    Raises:
+        OptionError: There is no such topic.
+    """
+    topic = job.options.task
+    if not topic.startswith("/"):
+        return [topic] * len(times)
+    if ros_type(job.dataset, topic) != "std_msgs/String":
+        raise OptionError(
+            f"`task` {topic} is not a topic of std_msgs/String in {job.dataset.path}."
+        )
+    said = [(one.log_time_ns, str(one.decoded.data)) for one in job.dataset.messages([topic])]
+    if not said:
+        raise OptionError(f"`task` {topic} has no message in {job.dataset.path}.")
+    job.keep(topic, len(said))
+    # a message that comes with a frame is that frame's, whatever its rounding
+    last = np.searchsorted([time for time, _ in said], times + _NS // fps // 2) - 1
+    return [said[place][1] for place in last.clip(0).tolist()]
+
+
+def _frames_table(episode: Episode, tasks: Mapping[str, int], fps: int) -> Any:
     columns: dict[str, pa.Array] = {}
     for name, values in episode.vectors.items():
         flat, count = pa.array(values.ravel(), pa.float32()), values.shape[1]
@@ -297,13 +325,13 @@ def _frames_table(episode: Episode, fps: int) -> Any:
     columns["frame_index"] = pa.array(numbers)
     columns["episode_index"] = pa.array(np.full(len(numbers), episode.number, np.int64))
     columns["index"] = pa.array(numbers + episode.first)
-    columns["task_index"] = pa.array(np.zeros(len(numbers), np.int64))
+    columns["task_index"] = pa.array([tasks[task] for task in episode.tasks], pa.int64())
     return pa.table(columns)
 
 
-def _tasks_table(task: str) -> Any:
+def _tasks_table(tasks: Sequence[str]) -> Any:
     """The table of tasks, which pandas reads with the task as its index."""
-    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [task]})
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})
     kinds = [("task_index", "int64", "int64"), ("task", "unicode", "object")]
     described = {
         "index_columns": ["task"],
@@ -319,13 +347,13 @@ def _tasks_table(task: str) -> Any:
     return table.replace_schema_metadata({"pandas": json.dumps(described)})
 
 
-def _episode_row(episode: Episode, task: str, fps: int) -> dict[str, Any]:
+def _episode_row(episode: Episode, fps: int) -> dict[str, Any]:
     """The row of an episode in the table of episodes."""
     length = len(episode.times)
     chunk, file = divmod(episode.number, _CHUNK)
     row: dict[str, Any] = {
         "episode_index": episode.number,
-        "tasks": [task],
+        "tasks": [*dict.fromkeys(episode.tasks)],
         "length": length,
         "data/chunk_index": chunk,
         "data/file_index": file,
@@ -344,14 +372,14 @@ def _episode_row(episode: Episode, task: str, fps: int) -> dict[str, Any]:
     return row
 
 
-def _info(episodes: Sequence[Episode], fps: int) -> dict[str, Any]:
+def _info(episodes: Sequence[Episode], tasks: int, fps: int) -> dict[str, Any]:
     path = _FILE.replace("chunk:", "chunk_index:").replace("file:", "file_index:")
     return {
         "codebase_version": _VERSION,
         "robot_type": None,
         "total_episodes": len(episodes),
         "total_frames": sum(len(episode.times) for episode in episodes),
-        "total_tasks": 1,
+        "total_tasks": tasks,
         "chunks_size": _CHUNK,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,10 @@ from mp4ds.plugins.importing.lists import (
     unit_of,
 )
 from mp4ds.plugins.importing.reader import ImagesReader, reading
-from mp4ds.video.clips import Clip
+from mp4ds.video.clips import Clip, open_video
 from mp4ds.video.images import STILL_SUFFIXES, image_size
+
+_LEROBOT = "meta/info.json"
 
 
 def open_images(folder: Path, options: ImportOptions) -> ImagesReader:
@@ -51,6 +54,10 @@ def open_images(folder: Path, options: ImportOptions) -> ImagesReader:
         raise SourceError(folder, "cannot be read remotely", "Download it first.")
     if not folder.exists():
         raise SourceNotFoundError(folder)
+    if options.episode is not None or (folder / _LEROBOT).is_file():
+        with reading(folder):
+            reader: ImagesReader = _lerobot().open_episode(folder, options)
+        return reader
     if options.topic is not None and not options.topic.strip("/"):
         raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
     with reading(folder):
@@ -71,6 +78,29 @@ def open_images(folder: Path, options: ImportOptions) -> ImagesReader:
         reader.add_file(Path(options.calibration), is_kept=True)
     reader.finish()
     return reader
+
+
+def _lerobot() -> Any:
+    try:
+        return import_module("mp4ds.plugins.importing.lerobot")
+    except ImportError as error:
+        raise OptionError(
+            f"LeRobot needs pyarrow ({error}). Install it: pip install 'mp4ds[lerobot]'"
+        ) from None
+
+
+def episodes_in(folder: Path) -> list[int]:
+    """The numbers of the episodes of a LeRobotDataset v3.
+
+    Raises:
+        SourceError: It is not one, or has none.
+        OptionError: The library for its tables is missing.
+    """
+    if not (folder / _LEROBOT).is_file():
+        raise SourceError(folder, f"is not a LeRobotDataset v3: it has no {_LEROBOT}")
+    with reading(folder):
+        found: list[int] = _lerobot().episodes_in(folder)
+    return found
 
 
 def _calibration(
@@ -210,7 +240,7 @@ def _add_video(reader: ImagesReader, options: ImportOptions) -> None:
     Raises:
         SourceError: They cannot be messages, or there are not as many times.
     """
-    clip = Clip(reader.path, decode=options.decode)
+    clip = Clip(open_video(reader.path), pictures="rgb24" if options.decode else "")
     reader.add_file(reader.path)
     stamps, source = clip.file.times, reader.path
     if options.stamps:
@@ -233,7 +263,7 @@ def _add_video(reader: ImagesReader, options: ImportOptions) -> None:
     topic, frame_id = _named(options)
     calibration = _calibration(options, topic, (), clip.file.size)
     stamps = stamps + offset
-    reader.add_clip(topic, frame_id, clip, stamps, calibration=calibration, decode=options.decode)
+    reader.add_clip(topic, frame_id, clip, stamps, calibration=calibration)
 
 
 # ---------------------------------------------------------------- plain

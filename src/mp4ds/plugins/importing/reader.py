@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import heapq
 import io
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +58,16 @@ _INFO = "sensor_msgs/msg/CameraInfo"
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _TF_STATIC = "/tf_static"
 _JPEG = (".jpg", ".jpeg")
+
+# dtype -> message of std_msgs, and the code of its data
+_NUMBERS = {
+    **{f"{kind}{bits}": (f"{kind.capitalize()}{bits}", code) for kind, bits, code in (
+        *(("int", 8 << n, code) for n, code in enumerate("bhiq")),
+        ("float", 32, "f"), ("float", 64, "d"),
+    )},
+    **{f"uint{8 << n}": (f"UInt{8 << n}", code) for n, code in enumerate("BHIQ")},
+    "bool": ("Bool", "?"),
+}  # fmt: skip
 
 _WIRE, _PREFIX = "cdr-le", b"\x00\x01\x00\x00"
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
@@ -225,7 +237,7 @@ class ImagesReader(BagReader):
         stamps: NDArray[np.int64],
         *,
         calibration: CalibrationFields | None = None,
-        decode: bool = False,
+        depths: NDArray[Any] | None = None,
     ) -> None:
         """Add the frames of a video.
 
@@ -235,12 +247,14 @@ class ImagesReader(BagReader):
             clip: The video.
             stamps: Times of its frames, nanoseconds, none before the last; int64, shape (frames,).
             calibration: The intrinsics of its camera, if known.
-            decode: Whether the clip gives pixels.
+            depths: The depths, uint16 or float32, whose numbers its pixels are, if they are that.
         """
         width, height = clip.file.size
         fields: Fields = CodedFields(clip.file.codec)
-        if decode:
-            fields, kind = ImageFields("rgb8", width, height, 3 * width, is_bigendian=0), "raw"
+        if clip.is_decoded:
+            name = "rgb8" if depths is None else {"u": "16UC1", "f": "32FC1"}[depths.dtype.kind]
+            step = width * ENCODINGS[name].pixel_bytes
+            fields, kind = ImageFields(name, width, height, step, is_bigendian=0), "raw"
         elif clip.file.codec == "mjpeg":
             fields, kind = CodedFields("jpeg"), "jpeg"
         else:
@@ -253,6 +267,8 @@ class ImagesReader(BagReader):
 
         def make(number: int) -> bytes:
             body = clip.body(number)
+            if depths is not None:
+                body = depths[np.frombuffer(body, "<u2")].tobytes()
             return _camera_message(type_name, frame_id, fields, int(stamps[number]), body)
 
         self._tracks.append(_Track(channel, stamps, make, frame_bytes=clip.frame_bytes))
@@ -261,6 +277,82 @@ class ImagesReader(BagReader):
         self.left_out.update(clip.left_out)
         # otherwise, each of the pieces would read all of the file to know its frames
         self.is_indexed &= clip.file.is_indexed or kind == "compressed-video"
+
+    def add_joints(
+        self,
+        topic: str,
+        names: Sequence[str],
+        stamps: NDArray[np.int64],
+        rows: NDArray[np.float64],
+    ) -> None:
+        """Add numbers with names, as the positions of joints.
+
+        Args:
+            topic: Their topic.
+            names: Of the numbers.
+            stamps: Nanoseconds, sorted, int64, shape (rows,).
+            rows: float64, shape (rows, names).
+        """
+
+        def make(number: int) -> bytes:
+            writer = PrimitiveWriter(_PREFIX, "<", is_cdr=True)
+            _put_header(writer, int(stamps[number]), "")
+            writer.put("I", len(names))
+            for name in names:
+                writer.string(name)
+            writer.put("I", len(names))
+            writer.put("d", *rows[number].tolist())
+            writer.put("I", 0, 0)  # neither velocities nor efforts
+            return writer.getvalue()
+
+        self._add(topic, "sensor_msgs/msg/JointState", stamps, make)
+
+    def add_numbers(
+        self,
+        topic: str,
+        stamps: NDArray[np.int64],
+        rows: NDArray[Any],
+        shape: Sequence[int],
+        *,
+        latched: bool = False,
+    ) -> None:
+        """Add numbers or texts as messages of std_msgs: one as such, several as an array.
+
+        Args:
+            topic: Their topic.
+            stamps: Nanoseconds, sorted, int64, shape (rows,).
+            rows: Shape (rows, numbers).
+            shape: Of the numbers of a row.
+            latched: Whether late subscribers get the last one.
+
+        Raises:
+            ValueError: There are no messages for them.
+        """
+        is_single = rows.shape[1] == 1
+        if rows.dtype.name == "bool" and not is_single:
+            rows = rows.astype(np.uint8)
+        kind, code = _NUMBERS.get(rows.dtype.name, ("String", "s"))
+        if code == "s" and not (is_single and all(isinstance(one, str) for one in rows.flat)):
+            raise ValueError(f"rows of {rows.dtype.name} have no message")
+        sides = list(map(int, shape))
+
+        def make(number: int) -> bytes:
+            writer = PrimitiveWriter(_PREFIX, "<", is_cdr=True)
+            values = rows[number].tolist()
+            if code == "s":
+                writer.string(values[0])
+                return writer.getvalue()
+            if not is_single:
+                writer.put("I", len(sides))
+                for place, side in enumerate(sides):
+                    writer.string(f"dim{place}")
+                    writer.put("I", side, math.prod(sides[place:]))
+                writer.put("I", 0, len(values))
+            writer.put(code, *values)
+            return writer.getvalue()
+
+        name = f"std_msgs/msg/{kind}" + ("" if is_single else "MultiArray")
+        self._add(topic, name, stamps, make, latched=latched)
 
     def _add_calibration(
         self,
@@ -314,8 +406,11 @@ class ImagesReader(BagReader):
         stamps: NDArray[np.int64],
         make: Callable[[int], bytes],
         files: Sequence[Path] = (),
+        *,
+        latched: bool = False,
     ) -> None:
-        channel = ros2_channel(len(self._tracks), topic, type_name, "")
+        qos = LATCHED_QOS if latched else ""
+        channel = ros2_channel(len(self._tracks), topic, type_name, qos)
         self._tracks.append(_Track(channel, stamps, make, files))
 
     def finish(self) -> None:
