@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import index as as_integer
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from mp4ds.format.models import Calibration
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
 from mp4ds.messages.wire import CalibrationFields
+from mp4ds.options import ENCODING, WHAT, Options, Parsed, option, parse_resize
 from mp4ds.video.images import Renderer, encoding_as, shown_format
 from mp4ds.video.pixels import Scale
 
@@ -180,6 +183,7 @@ def view_of(
     resize: Resize,
     crop: Crop,
     shows_colours: bool = False,
+    nearest: bool = False,
 ) -> View:
     """The requested view.
 
@@ -191,6 +195,7 @@ def view_of(
         resize: A factor, or width and height.
         crop: x, y, width, height.
         shows_colours: See `mp4ds.video.pixels.shows_colours`.
+        nearest: Never interpolate native values, as of masks and labels.
 
     Raises:
         OptionError: The format, crop or size is invalid, or not available for these images.
@@ -222,7 +227,7 @@ def view_of(
         return View(given, shape, dtype, is_plain=True, scale=scale)
     placement = None if is_whole else (part, size)
     is_rendered = not in_metres and (
-        format != "native" or (size != cut and _is_interpolated(encoding))
+        format != "native" or (size != cut and _is_interpolated(encoding) and not nearest)
     )
     renderer = (
         Renderer(encoding, given.name, crop=part if crop is not None else None, size=size)
@@ -230,6 +235,86 @@ def view_of(
         else None
     )
     return View(given, shape, dtype, False, in_metres, scale, placement, renderer)
+
+
+# ---------------------------------------------------------------- fewer, and smaller
+
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reduction(Options):
+    """How to reduce images."""
+
+    every: int = option(
+        "Keep only every Nth frame, starting with the first.",
+        1,
+        panel=WHAT,
+        metavar="N",
+        changes=ENCODING,
+    )
+    max_rate: float | None = option(
+        "Maximum frames per second.", panel=WHAT, metavar="HZ", changes=ENCODING
+    )
+    resize: Parsed[float | tuple[int, int] | None] = option(
+        "Scale images down, and the calibrations with them.",
+        metavar="0.5|WxH",
+        parse=parse_resize,
+        changes=ENCODING,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.resize is not None:
+            _check_size(self.resize)
+        if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
+            raise OptionError(f"`every` {self.every!r} is not a number of frames: use 1 or more.")
+        rate = self.max_rate
+        if rate is not None and not (
+            isinstance(rate, int | float)
+            and not isinstance(rate, bool)
+            and math.isfinite(rate)
+            and 0 < rate <= _NS
+        ):
+            raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether there may be fewer images."""
+        return self.every > 1 or self.max_rate is not None
+
+    @property
+    def reduces(self) -> bool:
+        """Whether there may be fewer images, or smaller ones."""
+        return self.leaves_out or self.resize is not None
+
+    def size_of(self, topic: str, image_size: _Size) -> _Size | None:
+        """New width and height for images of one size; None if unchanged.
+
+        Raises:
+            OptionError: They are too large for an image.
+        """
+        if self.resize is None:
+            return None
+        size = size_after(topic, image_size, self.resize)
+        return size if size != image_size else None
+
+
+def _check_size(resize: Any) -> None:
+    sides = [*resize] if isinstance(resize, tuple | list) else [resize]
+    kinds = (int,) if len(sides) == 2 else (int, float)
+    is_known = isinstance(resize, tuple | list) == (len(sides) == 2)
+    for side in sides:
+        is_number = isinstance(side, kinds) and not isinstance(side, bool)
+        is_known = is_known and is_number and 0 < side <= MAX_SIDE
+    if not is_known:
+        raise OptionError(
+            f"`resize` {resize!r} is not a size: use a factor such as 0.5, or width and height of "
+            f"1 to {MAX_SIDE} pixels."
+        )
+
+
+# ---------------------------------------------------------------- one view
 
 
 def _part(topic: str, image_size: _Size, crop: Sequence[int]) -> _Part:

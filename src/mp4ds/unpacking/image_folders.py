@@ -105,7 +105,7 @@ class TopicImages:
             numbers = frames.numbers_of(place)
             kept = is_kept[numbers]
             self.thinned += part.count(~kept)
-            size = options.size_of(part)
+            size = options.size_of(part.topic, part.image_size)
             keeps_files = size is None and part.are_jpeg_files and image_format != "png"
             kind = "jpeg" if keeps_files else image_format or "png"
             view = resized_view(part, size)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 from mp4ds.dataset.images import Images
 from mp4ds.dataset.rebuild import form_for
 from mp4ds.dataset.stream import Layer, Stream
-from mp4ds.dataset.views import View, size_after
+from mp4ds.dataset.views import Reduction, View
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.fields import Choice, DecodedColumns, everything, unbroken
 from mp4ds.format.models import Header, StreamSidecar
@@ -27,9 +25,9 @@ from mp4ds.messages.depth import (
     metres_of,
     told_encoding,
 )
-from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Pixels, pixel_view
+from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
-from mp4ds.options import WHAT, Parsed, TopicOptions, option, parse_resize
+from mp4ds.options import TopicOptions, option
 from mp4ds.times import intervals, sound_times, usual_interval
 from mp4ds.video.codecs import CODECS, VISUAL
 from mp4ds.video.images import ImageFile
@@ -128,63 +126,18 @@ def packet_format(form: ImageForm, sidecar: StreamSidecar, pixel_format: str) ->
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReductionOptions(TopicOptions):
+class ReductionOptions(Reduction, TopicOptions):
     """Which topics, and how to reduce their images: each stream separately."""
 
     quality: str | None = option(
         "visual: the images of the views of lossless cameras; default: as recorded.",
         choices=(VISUAL,),
     )
-    every: int = option(
-        "Keep only every Nth frame, starting with the first.", 1, panel=WHAT, metavar="N"
-    )
-    max_rate: float | None = option("Maximum frames per second.", panel=WHAT, metavar="HZ")
-    resize: Parsed[float | tuple[int, int] | None] = option(
-        "Scale images down, and the calibrations with them.",
-        metavar="0.5|WxH",
-        parse=parse_resize,
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.resize is not None:
-            _check_size(self.resize)
-        if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
-            raise OptionError(f"`every` {self.every!r} is not a number of frames: use 1 or more.")
-        rate = self.max_rate
-        if rate is not None and not (
-            isinstance(rate, int | float)
-            and not isinstance(rate, bool)
-            and math.isfinite(rate)
-            and 0 < rate <= _NS
-        ):
-            raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
 
     @property
     def layer(self) -> Layer | None:
         """Which frames are read of cameras that have a view; None: exact ones where they are."""
         return "view" if self.quality else None
-
-    @property
-    def leaves_out(self) -> bool:
-        """Whether there may be fewer images."""
-        return self.every > 1 or self.max_rate is not None
-
-    @property
-    def reduces(self) -> bool:
-        """Whether there may be fewer images, or smaller ones."""
-        return self.leaves_out or self.resize is not None
-
-    def size_of(self, frames: Images) -> tuple[int, int] | None:
-        """New width and height for images of one size; None if unchanged.
-
-        Raises:
-            OptionError: They are too large for an image.
-        """
-        if self.resize is None:
-            return None
-        size = size_after(frames.topic, frames.image_size, self.resize)
-        return size if size != frames.image_size else None
 
     def kept(self, columns: DecodedColumns) -> NDArray[np.bool_]:
         """Which frames are kept, shape (frames,); see `at_most` for a maximum rate."""
@@ -197,21 +150,7 @@ class ReductionOptions(TopicOptions):
         return is_kept
 
 
-def _check_size(resize: Any) -> None:
-    sides = [*resize] if isinstance(resize, tuple | list) else [resize]
-    kinds = (int,) if len(sides) == 2 else (int, float)
-    is_known = isinstance(resize, tuple | list) == (len(sides) == 2)
-    for side in sides:
-        is_number = isinstance(side, kinds) and not isinstance(side, bool)
-        is_known = is_known and is_number and 0 < side <= MAX_SIDE
-    if not is_known:
-        raise OptionError(
-            f"`resize` {resize!r} is not a size: use a factor such as 0.5, or width and height of "
-            f"1 to {MAX_SIDE} pixels."
-        )
-
-
-def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:
+class RateLimit:
     """Which frames of a camera to keep for a maximum rate.
 
     A grid of points, 1 / rate apart, begins at the first frame. For each point the first frame is
@@ -222,21 +161,34 @@ def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:
 
     Args:
         rate: Hz.
-        times: Nanoseconds, shape (frames,).
+        usual: The usual interval, nanoseconds; None if unknown.
     """
-    period = max(1, round(_NS / rate))
-    usual = usual_interval(intervals(times))
-    early = min(period, int(usual or period)) // 2
-    is_kept = np.zeros(len(times), np.bool_)
-    due: int | None = None
-    for index, time in enumerate(times.tolist()):
+
+    def __init__(self, rate: float, usual: float | None) -> None:
+        self._period = max(1, round(_NS / rate))
+        self._early = min(self._period, int(usual or self._period)) // 2
+        self._due: int | None = None
+
+    def keeps(self, time: int) -> bool:
+        """Whether to keep the next frame, by its time in nanoseconds."""
+        due, period, early = self._due, self._period, self._early
         if due is None or time >= due + period or time < due - period - early:
             due = time
         elif time < due - early:
-            continue
-        is_kept[index] = True
-        due += period
-    return is_kept
+            return False
+        self._due = due + period
+        return True
+
+
+def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which frames of a camera to keep for a maximum rate; see `RateLimit`.
+
+    Args:
+        rate: Hz.
+        times: Nanoseconds, shape (frames,).
+    """
+    limit = RateLimit(rate, usual_interval(intervals(times)))
+    return np.array([limit.keeps(time) for time in times.tolist()], np.bool_)
 
 
 # ---------------------------------------------------------------- forms
@@ -299,7 +251,7 @@ def _maker(stream: Stream, header: Header, form: ImageForm) -> tuple[View, Make]
     if form.kind == "raw":
         prefix = bytes.fromhex(header.prefix)
         as_metres = partial(metres_of, header=prefix) if is_inverse else None
-        return view, partial(_raw, encoding=encoding, convert=as_metres)
+        return view, partial(raw_image, encoding=encoding, convert=as_metres)
     try:
         file = ImageFile(encoding, form.kind, quality=form.jpeg_quality)
     except OptionError:
@@ -335,7 +287,13 @@ def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
         if told not in DEPTHS:
             raise Refused(f"its format {header.format!r} does not give the unit of its depths")
         return told
-    known = ENCODINGS.get(told, own)
+    return named_encoding(own.name, header.format)
+
+
+def named_encoding(encoding: str, format_: str | None) -> str:
+    """The encoding of a coded image of one: that of the field ``format``, where it can be."""
+    own = ENCODINGS[encoding]
+    known = ENCODINGS.get(told_encoding(format_), own)
     is_alike = known.rows == 1 and known.channels == own.channels == 1
     return known.name if is_alike and known.dtype == own.dtype else own.name
 
@@ -372,9 +330,10 @@ def format_of(encoding: str, form: ImageForm, *, has_mosaic: bool) -> str:
     return f"{encoding}; {form.kind} compressed {inner}"
 
 
-def _raw(
+def raw_image(
     pixels: Pixels, *, encoding: str, convert: Callable[[Pixels], Pixels] | None = None
 ) -> Given:
+    """A raw image of pixels in native byte order, or of what they are converted to."""
     if convert is not None:
         pixels = convert(pixels)
     height, width = pixels.shape[:2]

@@ -263,7 +263,7 @@ class Republisher:
         return [plan for plan in plans if plan.conversion or plan.is_kept is not None]
 
     def _plan(self, stream: Stream) -> _Plan:
-        size = self._reduction.size_of(stream)
+        size = self._reduction.size_of(stream.topic, stream.image_size)
         is_replaced = stream.sidecar.replaces_packets
         kind = self._kind or (_kind_of(stream, self._reduction) if size or is_replaced else "")
         is_kept = None

@@ -474,7 +474,7 @@ class ExportJob:
         # depths and other measurements have no colours
         has_colours = encoding_as(known, "rgb") is not None
         colours = "rgb" if has_colours and (self._in_colour or is_converted) else "native"
-        return stream.view(colours, self.options.size_of(stream))
+        return stream.view(colours, self.options.size_of(stream.topic, stream.image_size))
 
     def _matched(self, cameras: list[ExportedCamera], tolerance_ns: int) -> list[ExportedCamera]:
         """The frames that every camera has, frame n of each taken at the same time."""

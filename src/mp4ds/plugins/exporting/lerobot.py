@@ -184,7 +184,7 @@ def _add_videos(
             own["info"] |= depths.info
             job.note(f"{camera.topic}: {depths}")
         view = {
-            "resize": job.options.size_of(camera.stream),
+            "resize": job.options.size_of(camera.topic, camera.stream.image_size),
             "format": "native" if depths else "rgb",
         }
         with closing(Topic([camera.stream])) as topic:
