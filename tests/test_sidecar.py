@@ -243,6 +243,25 @@ def dataset() -> Document:
             "keywords": ["stereo"],
         },
         "derived_from": [{"name": "first", "profile": "visual", "sha256": "b" * 64}],
+        "reductions": [
+            {
+                "crop": [0, 4, 60, 40],
+                "factor": 0.5,
+                "size": [30, 20],
+                "nearest": ["/masks/*"],
+                "every": 2,
+                "max_rate": 10.5,
+                "images": [
+                    {
+                        "topic": "/cam/image_raw",
+                        "type": "sensor_msgs/Image",
+                        "encoding": "bayer_rggb8",
+                        "width": 64,
+                        "height": 48,
+                    }
+                ],
+            }
+        ],
         "messages": 9,
         "losses": [
             {

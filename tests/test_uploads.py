@@ -369,6 +369,7 @@ def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -
         "deep": True,
         "problems": [],
         "absent": "",
+        "reduced": "",
     }
     again = f"{folder_url}/again.bag"
     assert run("unpack", dataset, "--to", "bag", "-o", again)["output"] == again

@@ -70,6 +70,8 @@ class BagReader(ABC):
         tables: Small tables of a database, verbatim: a name -> content; empty for other formats.
         begin: Log time from which slices are counted, ns; None for that of the first message.
         slice: What is given of it; all, unless it was set.
+        pairs: Calibration channels and those of their images, by id; None: yet to be found.
+        reduction: What is done to its images, as manifests have it; empty for nothing.
     """
 
     format: Format
@@ -80,6 +82,8 @@ class BagReader(ABC):
     tables: Mapping[str, str] = MappingProxyType({})
     begin: int | None = None
     slice: RecordingSlice = WHOLE
+    pairs: Mapping[int, int] | None = None
+    reduction: Mapping[str, Any] = MappingProxyType({})
 
     # what was found so far, which may grow while reading
     _channels: Mapping[Any, Channel] = MappingProxyType({})

@@ -103,23 +103,31 @@ def validate_command(datasets: Sequence[str], deep: bool, jobs: int | None) -> N
             for path, problems in each(partial(validate, deep=deep), places, jobs):
                 found[path] = problems
                 tell(f"{len(found)} of {len(places)} datasets", len(found) / len(places))
-    absent = {path: "" if problems else _absence(path) for path, problems in found.items()}
+    absent, reduced = {}, {}
+    for path, problems in found.items():
+        absent[path], reduced[path] = ("", "") if problems else _remarks(path)
     result = [
-        {"path": path, "deep": deep, "problems": problems, "absent": absent[path]}
+        {
+            "path": path,
+            "deep": deep,
+            "problems": problems,
+            "absent": absent[path],
+            "reduced": reduced[path],
+        }
         for path, problems in found.items()
     ]
     show(
         result[0] if len(result) == 1 else result,
-        lambda _: _print_validation(found, absent, deep=deep),
+        lambda _: _print_validation(found, absent, reduced, deep=deep),
     )
     if any(found.values()):
         raise click.exceptions.Exit(1)
 
 
-def _absence(path: Path) -> str:
-    """Which files of a valid dataset are not here."""
+def _remarks(path: Path) -> tuple[str, str]:
+    """Which files of a valid dataset are not here, and what was done to its images."""
     with Dataset(path) as dataset:
-        return dataset.absence()
+        return dataset.absence(), dataset.manifest.reduced if dataset.manifest else ""
 
 
 def _found(paths: Sequence[str]) -> list[Path]:
@@ -146,14 +154,18 @@ def _print_checksums(found: Mapping[str, str]) -> None:
 
 
 def _print_validation(
-    found: Mapping[Path, list[Problem]], absent: Mapping[Path, str], *, deep: bool
+    found: Mapping[Path, list[Problem]],
+    absent: Mapping[Path, str],
+    reduced: Mapping[Path, str],
+    *,
+    deep: bool,
 ) -> None:
     """Print all problems of datasets, what they lack, and how thorough the check was."""
     for problem in chain.from_iterable(found.values()):
         say(path_text(problem))
-    for path, absence in absent.items():
-        if absence:
-            say(f"{path_text(path)}: {absence}")
+    for path, remark in chain(absent.items(), reduced.items()):
+        if remark:
+            say(f"{path_text(path)}: {remark}")
     count = sum(map(len, found.values()))
     problems = counted(count, "problem") if count else "no problems"
     if not deep:

@@ -11,6 +11,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from mp4ds import records
 from mp4ds.format.fields import Count, FileName, Model, Profile, Sha256, Size, Time, Version
 from mp4ds.format.models import StreamSidecar
+from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.messages.transforms import MAX_TRANSFORMS, Transform, TransformCollector
 from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Loss
 
@@ -49,6 +50,59 @@ class EarlierDataset(Model):
     name: str = Field(description="Of its folder.")
     profile: Profile = Field(description="What was asked for when it was packed.")
     sha256: Sha256 = Field(description="Of its manifest, which has those of all its files.")
+
+
+_Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
+_Place = Annotated[int, Field(ge=0, le=MAX_SIDE)]
+
+
+class ReducedImages(Model):
+    """What the images of a topic were before a reduction."""
+
+    topic: str
+    type: str = Field(description="Of their messages.")
+    encoding: str = Field(description="ROS image encoding of the first, decoded.")
+    width: _Side = Field(description="Columns of the first.")
+    height: _Side = Field(description="Rows of the first.")
+
+
+class ReductionEntry(Model):
+    """How images were made smaller, or fewer, before they were packed."""
+
+    crop: Annotated[list[_Place], Field(min_length=4, max_length=4)] | None = Field(
+        None, description="x, y, width and height of the part that was kept, pixels."
+    )
+    factor: Annotated[FiniteFloat, Field(gt=0)] | None = Field(
+        None, description="By which width and height were multiplied, after the crop."
+    )
+    size: Annotated[list[_Side], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="Width and height to which images were resized, after the crop."
+    )
+    nearest: list[str] = Field(
+        default_factory=list, description="Patterns of topics of which no values were mixed."
+    )
+    every: Annotated[int, Field(ge=2)] | None = Field(
+        None, description="Only every Nth image of each channel was kept, from the first on."
+    )
+    max_rate: Annotated[FiniteFloat, Field(gt=0)] | None = Field(
+        None, description="Most images of each channel in a second, by their stamps."
+    )
+    images: list[ReducedImages] = Field(
+        default_factory=list, description="Those that were cropped, resized or decoded."
+    )
+
+    @property
+    def text(self) -> str:
+        """All of it in words."""
+        told = [
+            f"cropped to {self.crop[2]}x{self.crop[3]} at {self.crop[:2]}" if self.crop else "",
+            f"resized by {self.factor:g}" if self.factor else "",
+            f"resized to {self.size[0]}x{self.size[1]}" if self.size else "",
+            f"without mixing values of {', '.join(self.nearest)}" if self.nearest else "",
+            f"one image in {self.every}" if self.every else "",
+            f"at most {self.max_rate:g} images a second" if self.max_rate else "",
+        ]
+        return ", ".join(filter(None, told))
 
 
 class StreamEntry(Model):
@@ -233,6 +287,10 @@ class Manifest(Model):
     derived_from: list[EarlierDataset] = Field(
         default_factory=list, description="Datasets that were packed again, the oldest first."
     )
+    reductions: list[ReductionEntry] = Field(
+        default_factory=list,
+        description="What was done to the images before they were packed, the oldest first.",
+    )
     messages: Size = Field(description="Messages of the recording that were packed.")
     losses: Annotated[list[LossEntry], Field(max_length=MAX_LOSSES)] = Field(
         default_factory=list, description="What of the recording could not be read."
@@ -253,6 +311,12 @@ class Manifest(Model):
     def file(self, name: str) -> FileEntry | None:
         """The entry of a file; None if it is not listed."""
         return next((entry for entry in self.files if entry.name == name), None)
+
+    @property
+    def reduced(self) -> str:
+        """What was done to the images before they were packed, in words; empty for nothing."""
+        told = "; then ".join(entry.text for entry in self.reductions)
+        return told and f"images were reduced before they were packed: {told}"
 
     @model_validator(mode="after")
     def _once(self) -> Manifest:

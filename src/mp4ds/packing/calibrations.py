@@ -190,8 +190,8 @@ def _namespace_of_images(topic: str) -> str:
 
 
 def _base(image: Channel) -> str:
-    """The base topic of a transport; the topic itself for a plain one."""
-    if _is_coded(image) and _leaf(image.topic) in TRANSPORTS and _parent(image.topic):
+    """The base topic of a transport, even if its images were decoded; else the topic itself."""
+    if _leaf(image.topic) in TRANSPORTS and _parent(image.topic):
         return _parent(image.topic)
     return image.topic.strip("/")
 

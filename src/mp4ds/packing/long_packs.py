@@ -44,6 +44,7 @@ from mp4ds.packing.parts import (
 )
 from mp4ds.packing.planning import Piece, Plan
 from mp4ds.processes import failure_of
+from mp4ds.records import Channel
 
 Report = Callable[[PackProgress], None]
 
@@ -304,18 +305,23 @@ def _check_index(
     Raises:
         SourceError: The recording's index is wrong.
     """
+
+    def key_of(channel: Channel) -> tuple[object, ...]:
+        # an image that cannot be reduced stays on its own channel
+        return (channel.topic,) if reader.reduction else channel.identity
+
     found = Counter[tuple[object, ...]]()  # by channel; equal ones of a recording are one in a part
     for part in parts:
         counts = part.counts()
         for channel in part.channels:
-            found[channel.identity] += counts.get(channel.id, 0)
+            found[key_of(channel)] += counts.get(channel.id, 0)
     stats = reader.stats()
     due = Counter[tuple[object, ...]]()
     for channel in reader.channels:
         if selected(channel.topic) and channel.id in stats:
-            due[channel.identity] += stats[channel.id].count
+            due[key_of(channel)] += stats[channel.id].count
     for channel in reader.channels:
-        key = channel.identity
+        key = key_of(channel)
         if key in due and found[key] != due[key]:
             raise SourceError(
                 reader.path,

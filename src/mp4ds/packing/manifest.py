@@ -21,6 +21,7 @@ from mp4ds.format.manifest import (
     FileEntry,
     LossEntry,
     Manifest,
+    ReductionEntry,
     Source,
     StreamEntry,
     TimeRange,
@@ -131,6 +132,9 @@ def origin_of(
         about = abouts[0]
     losses = [entry.to_record() for one in manifests.values() for entry in one.losses]
     left_out = [topic for one in manifests.values() for topic in one.topics_left_out]
+    reductions = [entry for one in manifests.values() for entry in one.reductions]
+    if reader.reduction:
+        reductions.append(ReductionEntry.model_validate(reader.reduction))
     return {
         "about": about,
         "format": reader.format,
@@ -138,6 +142,7 @@ def origin_of(
         "library": reader.library,
         "sources": [source.within(reader.slice.span) for source in sources],
         "derived_from": earlier,
+        "reductions": reductions,
         "losses": list(map(LossEntry.from_record, bounded([*losses, *part.losses]))),
         "topics_left_out": list(dict.fromkeys([*left_out, *part.left_out])),
     }

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from operator import index
 from pathlib import Path
+from typing import Any
 
+from mp4ds.dataset.views import Reduction
 from mp4ds.errors import OptionError
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import (
@@ -119,8 +123,24 @@ class ImportOptions(Options):
 # ---------------------------------------------------------------- pack
 
 
+def _parse_crop(value: str | Sequence[int]) -> tuple[int, int, int, int]:
+    """x, y, width and height, also of text.
+
+    Raises:
+        OptionError: They are not.
+    """
+    sides = value.split(",") if isinstance(value, str) else value
+    with suppress(TypeError, ValueError):
+        x, y, width, height = (
+            int(side) if isinstance(side, str) else index(side) for side in sides
+        )
+        if min(x, y) >= 0 < min(width, height):
+            return x, y, width, height
+    raise OptionError(f"{value!r} is not X,Y,W,H in pixels, such as 0,120,640,240.")
+
+
 @dataclass(frozen=True, kw_only=True)
-class PackOptions(SliceOptions, TopicOptions):
+class PackOptions(Reduction, SliceOptions, TopicOptions):
     """How to pack."""
 
     latched: bool = latched()
@@ -128,6 +148,18 @@ class PackOptions(SliceOptions, TopicOptions):
         "Pack what is still readable of a damaged recording.",
         False,
         panel=WHAT,
+        changes=ENCODING,
+    )
+    crop: Parsed[tuple[int, int, int, int] | None] = option(
+        "Keep this part of the images, in pixels; before `resize`.",
+        metavar="X,Y,W,H",
+        parse=_parse_crop,
+        changes=ENCODING,
+    )
+    nearest: Sequence[str] = option(
+        "Resize images of matching topics without mixing their values: masks and labels.",
+        (),
+        metavar="GLOB",
         changes=ENCODING,
     )
     camera_info: Sequence[str] = option(
@@ -163,7 +195,8 @@ class PackOptions(SliceOptions, TopicOptions):
     )
     purpose: str | None = option(
         "archive: smallest files. speed: fastest packing, as while recording, without views. "
-        "training: fastest random access, with videos up to 15 % larger.",
+        "training: fastest random access, with videos up to 15 % larger; default for smaller or "
+        "fewer images.",
         None,
         "--for",
         choices=(ARCHIVE, SPEED, TRAINING),
@@ -199,6 +232,33 @@ class PackOptions(SliceOptions, TopicOptions):
     images: ImportOptions | None = argument(
         "How a folder of images, or a video, is read as a recording.", changes=ENCODING
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.nearest and self.resize is None:
+            raise OptionError("`nearest` says how images are resized: give `resize`, too.")
+        if self.derives and self.purpose is None and self.gop is None:
+            object.__setattr__(self, "purpose", TRAINING)
+
+    @property
+    def derives(self) -> bool:
+        """Whether images are changed, or left out, before they are packed."""
+        return self.reduces or self.crop is not None
+
+    @property
+    def reduction(self) -> dict[str, Any]:
+        """What is done to images, as a manifest has it; see `ReductionEntry`."""
+        resize: Any = self.resize
+        is_factor = isinstance(resize, (int, float))
+        told: dict[str, Any] = {
+            "crop": self.crop and list(self.crop),
+            "factor": is_factor and float(resize),
+            "size": resize and not is_factor and list(resize),
+            "nearest": list(self.nearest),
+            "every": self.every > 1 and self.every,
+            "max_rate": self.max_rate and float(self.max_rate),
+        }
+        return {key: value for key, value in told.items() if value}
 
     @property
     def goal(self) -> QualitySetting:

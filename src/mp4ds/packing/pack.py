@@ -40,10 +40,11 @@ from mp4ds.files.sources import (
 )
 from mp4ds.files.uploads import local_path, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
+from mp4ds.format.manifest import ReductionEntry
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.options import ENCODING
+from mp4ds.options import CONTENT, ENCODING
 from mp4ds.packing.long_packs import PartedPack, Report, pack_parts
 from mp4ds.packing.manifest import (
     PartRecord,
@@ -403,11 +404,15 @@ def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
     except FormatError:
         raise TargetExistsError(target) from None
     folder = dataset_at(source)
-    with open_recording([source], replace(options, latched=False)) as reader:
+    plain = PackOptions(**options.changing(CONTENT), salvage=options.salvage, images=options.images)
+    with open_recording([source], replace(plain, latched=False)) as reader:
         span = reader.slice.span
         sizes = sorted(map(source_size, reader.files))
+    reductions = [ReductionEntry.model_validate(options.reduction)] if options.derives else []
     if folder:
-        due = [item.within(span) for item in load_manifest(folder / MANIFEST_NAME).sources]
+        known = load_manifest(folder / MANIFEST_NAME)
+        reductions = [*known.reductions, *reductions]
+        due = [item.within(span) for item in known.sources]
         earlier = [item.sha256 for item in manifest.derived_from[-1:]]
         is_same = earlier == [digest_file(folder / MANIFEST_NAME)[1]] and manifest.sources == due
     else:
@@ -415,7 +420,9 @@ def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
             item.within(span) == item.model_copy(update={"excerpt": None}).within(span)
             for item in manifest.sources
         )
-    if not is_same:
+    done = [entry.model_copy(update={"images": []}) for entry in manifest.reductions]
+    asked = [entry.model_copy(update={"images": []}) for entry in reductions]
+    if not is_same or done != asked:
         raise TargetExistsError(target)
     return True
 

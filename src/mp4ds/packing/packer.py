@@ -431,6 +431,7 @@ class _Camera:
 # ---------------------------------------------------------------- packer
 
 _Made = TypeVar("_Made")
+_NOT_ADAPTED = "as recorded, not adapted: no images are known to be its own (`camera_info`)"
 
 
 def until_in_reach(make: Callable[[Exact], _Made]) -> _Made:
@@ -562,6 +563,8 @@ class Packer:
                 self._cameras[channel.identity] = _Camera(self, channel)
             return self._cameras[channel.identity].take
         if is_calibration(channel):
+            if self.reader.reduction.get("images") and channel.id not in self.plan.pairs:
+                self.part.topic(channel).notes.append(_NOT_ADAPTED)
             return self.calibrations.take
         if self._transforms.takes(channel):
             return self._take_transforms

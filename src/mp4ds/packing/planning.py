@@ -488,12 +488,14 @@ def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagR
         OptionError: The options do not apply to it.
     """
     reader = _open_whole(paths, options.images, salvage=options.salvage)
-    if options.slice:
-        try:
+    try:
+        if options.slice:
             take_slice(reader, options.slice, options.selected)
-        except BaseException:
-            reader.close()
-            raise
+        if options.derives:
+            reader = plugin("reduce")(reader, options)
+    except BaseException:
+        reader.close()
+        raise
     return reader
 
 
@@ -541,7 +543,9 @@ def divide(
     selected.check(channel.topic for channel in reader.channels)
     channels = [channel for channel in reader.channels if selected(channel.topic)]
     packed = [channel for channel in channels if is_camera(channel)]
-    pairs = find_pairs(reader, options.camera_info, channels)
+    pairs = reader.pairs
+    if pairs is None:
+        pairs = find_pairs(reader, options.camera_info, channels)
     pieces = _pieces(reader, channels, pairs, options) if reader.is_indexed else []
     cores = max(1, available_cores() // recordings)
     stats = reader.stats()
@@ -672,6 +676,7 @@ def _samples(
 _PLUGINS = {
     "images": "importing.layouts:open_images",
     "cluster": "cluster:cluster_executor",
+    "reduce": "reducing:ReducedReader",
 }
 """What the core asks for -> module of `mp4ds.plugins`, and its name there."""
 

@@ -300,6 +300,7 @@ def notes_of(dataset: Dataset) -> list[str]:
         if manifest.derived_from:
             earlier = (f"{item.name} ({item.profile})" for item in manifest.derived_from)
             notes.append(f"repacked from {', '.join(earlier)}")
+        notes += filter(None, [manifest.reduced])
         notes += [f"lost when packed: {loss.file}: {loss.problem}" for loss in manifest.losses]
         if manifest.topics_left_out:
             notes.append(f"left out when packed: {', '.join(manifest.topics_left_out)}")

@@ -28,6 +28,7 @@ from mp4ds.unpacking.pictures import (
     Conversion,
     Given,
     ImageForm,
+    Kind,
     ReductionOptions,
     holds_files,
     is_inverse_depth,
@@ -460,11 +461,13 @@ class Types:
     Args:
         world: ``ros1`` or ``ros2``.
         kind: One of `KINDS`.
+        made: What its messages are, if it is none of them.
     """
 
-    def __init__(self, world: str, kind: str) -> None:
+    def __init__(self, world: str, kind: str, made: Kind | None = None) -> None:
         self.encoding = ENCODINGS[world]
         self._kind = kind
+        self._made = made or KINDS[kind]
         self._converter = Converter(world)
         self._has_seq = world == "ros1" and kind != "compressed-video"
         self._without_seq = 0
@@ -510,7 +513,7 @@ class Types:
 
     def _defined(self, encoding: str) -> tuple[Schema, str]:
         """The type's definition, and its md5sum or hash."""
-        kind, standard = KINDS[self._kind], standard_of(encoding)
+        kind, standard = self._made, standard_of(encoding)
         text = kind.definitions.get(encoding, "")
         schema = Schema(kind.type_name, SCHEMA_ENCODINGS[encoding] if text else "", text.encode())
         store = make_store(types_of(schema, standard), standard)
@@ -547,7 +550,7 @@ class Types:
         self._without_seq += slots.seq is not None and not self._has_seq
         stamp = _wrapped(slots.stamp, signed=self.encoding == "cdr")
         slots = Slots(stamp, slots.seq, slots.pts)
-        wire, name = _WIRES[self.encoding], KINDS[self._kind].type_name
+        wire, name = _WIRES[self.encoding], self._made.type_name
         return plain_message(wire, name, frame_id, fields, slots, body, flags=int(is_key))
 
 

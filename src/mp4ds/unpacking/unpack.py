@@ -269,6 +269,8 @@ def _notes(dataset: Dataset, options: UnpackOptions) -> Iterator[str]:
     """What else the output does not have of the recording."""
     if dataset.damage:
         yield dataset.damage
+    if dataset.manifest and dataset.manifest.reduced:
+        yield dataset.manifest.reduced
     has_packets = options.images is not None and KINDS[options.images].family == "video"
     for stream in dataset.streams:
         shown = shown_by_packets(stream) if has_packets else stream
