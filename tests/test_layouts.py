@@ -84,7 +84,7 @@ def test_the_general_layout_gives_all_pixels_back(name: str, layout: str) -> Non
             for big in (False, True):
                 for pad in (0, 1, 6):
                     view = as_message(pixels, encoding, pad=pad, is_bigendian=big)
-                    assert general.refuses(view) is None
+                    assert general.values.refuses(view) is None
                     assert bits_of(through(general, view)) == bits_of(pixels)
                     target = np.ndarray(
                         view.shape, view.dtype, bytearray(len(view) * view.strides[0]),
@@ -95,7 +95,7 @@ def test_the_general_layout_gives_all_pixels_back(name: str, layout: str) -> Non
 
 def refused_or_returned(layout: Layout, pixels: np.ndarray) -> bool:
     """Exactly one of both; the picture of folded bits has room for some that are refused."""
-    refused = layout.refuses(pixels) is not None
+    refused = layout.values.refuses(pixels) is not None
     returned = bits_of(through(layout, pixels)) == bits_of(pixels)
     return refused != returned or (refused and layout.name.endswith("fold"))
 
@@ -109,7 +109,7 @@ def test_what_is_not_refused_comes_back(name: str, layout: str) -> None:
         for seed in range(4):
             fitted = bound(layout, encoding, 16, 12, seed)
             pixels = suited(layout, encoding, 16, 12, seed)
-            assert fitted.refuses(pixels) is None
+            assert fitted.values.refuses(pixels) is None
             other = values(encoding, kind, 16, 12, seed)
             for y, x in ((0, 0), (11, 15), (5, 7)):
                 changed = pixels.copy()
@@ -125,7 +125,7 @@ def test_every_word_comes_back(dtype: str) -> None:
     folds = [Parameters(bits=16, shift=0, low=low) for low in (6, 7, 8)]
     for name, parameters in [("gray16", NO_PARAMETERS), *(("fold", p) for p in folds)]:
         layout = bind(name, encoding, parameters)
-        assert layout.refuses(pixels) is None
+        assert layout.values.refuses(pixels) is None
         assert bits_of(through(layout, pixels)) == bits_of(pixels)
 
 
@@ -167,7 +167,7 @@ def test_an_alpha_that_is_the_same_is_left_out(encoding: str) -> None:
     assert np.array_equal(picture, pixels[..., :3])
     assert bits_of(through(layout, pixels)) == bits_of(pixels)
     pixels[2, 3, 3] = 201
-    assert "an alpha that is not the stream's, 200" in str(layout.refuses(pixels))
+    assert "an alpha that is not the stream's, 200" in str(layout.values.refuses(pixels))
 
 
 @pytest.mark.parametrize(
@@ -300,9 +300,9 @@ def test_bits_that_are_refused(encoding: str, bits: int, shift: int, bad: int) -
     known = ENCODINGS[encoding]
     layout = bind("gray_bits", known, Parameters(bits=bits, shift=shift))
     pixels = np.zeros((4, 4), known.dtype)
-    assert layout.refuses(pixels) is None
+    assert layout.values.refuses(pixels) is None
     pixels[2, 3] = bad
-    assert f"does not fit into {bits} bits" in str(layout.refuses(pixels))
+    assert f"does not fit into {bits} bits" in str(layout.values.refuses(pixels))
 
 
 def test_a_table_is_of_what_occurs() -> None:
@@ -337,7 +337,7 @@ def test_a_table_refuses_what_it_does_not_have() -> None:
     for value in (0.0, 1.0, 3.0, -np.nan, np.inf):
         changed = pixels.copy()
         changed[0, 0] = value
-        assert "in the stream's table" in str(layout.refuses(changed))
+        assert "in the stream's table" in str(layout.values.refuses(changed))
 
 
 @pytest.mark.parametrize("encoding", ["mono16", "16SC1", "32FC1"])
@@ -353,10 +353,10 @@ def test_images_of_few_values_have_palettes(encoding: str, count: int) -> None:
     assert layout is not None
     assert layout.pixel_format == "gray"
     for pixels in images:
-        assert layout.refuses(pixels) is None
+        assert layout.values.refuses(pixels) is None
         assert bits_of(through(layout, pixels)) == bits_of(pixels)
     many = values(known, "random", 100, 90)
-    assert "more than the" in str(layout.refuses(many))
+    assert "more than the" in str(layout.values.refuses(many))
     assert fit("palette", known, [many]) is None
     (picture,) = layout.to_picture(images[0])
     layout.to_pixels((picture | 0xF0,), np.empty_like(images[0]))  # damaged: no error
@@ -374,7 +374,7 @@ def test_all_millimetres_come_back(name: str, hole: int, scale: str) -> None:
     layout = fit(name, ENCODINGS["32FC1"], [pixels])
     assert layout is not None
     assert layout.parameters == Parameters(hole=hole, scale=scale)
-    assert layout.refuses(pixels) is None
+    assert layout.values.refuses(pixels) is None
     assert bits_of(through(layout, pixels)) == bits_of(pixels)
 
 
@@ -385,9 +385,9 @@ def test_other_floats_are_refused(value: float) -> None:
     floats = ENCODINGS["32FC1"]
     layout = bind("metres16", floats, Parameters(hole=0, scale="quotient"))
     pixels = np.array([[1.0, 0.0], [2.5, 65.535]], np.float32)
-    assert layout.refuses(pixels) is None
+    assert layout.values.refuses(pixels) is None
     pixels[0, 1] = value
-    assert "neither whole millimetres" in str(layout.refuses(pixels))
+    assert "neither whole millimetres" in str(layout.values.refuses(pixels))
     assert fit("metres16", floats, [pixels, np.zeros_like(pixels)]) is None
 
 
@@ -428,16 +428,16 @@ def test_a_tone_shows_the_nearest_level(name: str, bits: int, shift: int) -> Non
     assert (table[0], table[-1]) == (0, (2**bits - 1) << shift)
     for big in (False, True):
         view = as_message(pixels, encoding, pad=6, is_bigendian=big)
-        assert layout.refuses(view) is None
+        assert layout.values.refuses(view) is None
         shown = through(layout, view)
         nearest = np.abs(table - pixels.reshape(-1, 1).astype(int)).min(axis=1)
         assert np.array_equal(np.abs(shown.astype(int) - pixels).ravel(), nearest)
     if bits + shift < 16:
         pixels[3, 5] = 2 ** (bits + shift)
-        assert f"does not fit into {bits} bits" in str(layout.refuses(pixels))
+        assert f"does not fit into {bits} bits" in str(layout.values.refuses(pixels))
     if shift:
         pixels[3, 5] = 1
-        assert f"above {shift} zero bits" in str(layout.refuses(pixels))
+        assert f"above {shift} zero bits" in str(layout.values.refuses(pixels))
 
 
 @pytest.mark.parametrize(
@@ -489,13 +489,13 @@ def test_all_differences_to_a_view_fit(name: str, layout: str, parameters: dict[
     )
     if layout == "opaque":
         pixels[..., 3] = shown[..., 3] = 200
-    assert view.refuses(pixels) is view.refuses(shown) is None
+    assert view.values.refuses(pixels) is view.values.refuses(shown) is None
     different = difference(pixels, shown, view.used_bits)
     found = difference_layouts(view)
     assert encoding.general in [one.name for one in found]
     assert len(found) > 1 or parameters.get("bits") not in (10, 12, 14)
     for one in found:
-        assert one.refuses(different) is None
+        assert one.values.refuses(different) is None
         again = through(one, different)
         add_prediction(again, shown, view.used_bits)
         assert bits_of(again) == bits_of(pixels)

@@ -68,7 +68,7 @@ def test_the_estimate_is_near_the_truth(encoding: str, tmp_path: Path) -> None:
     samples = scene(encoding, 24)
     choice = chosen(samples[:6], encoding)
     layout = choice.layout
-    if any(map(layout.refuses, samples)):
+    if any(map(layout.values.refuses, samples)):
         samples = [*samples[:6], *samples[5::-1]] * 2
     size = video_size(tmp_path / "v.mp4", samples, encoding, choice)
     assert 0.75 < 60 * choice.bytes_per_frame / (60 / 24 * size) < 1.25
@@ -101,7 +101,7 @@ def test_some_layout_is_chosen_for_every_encoding(encoding: str) -> None:
     assert first == again
     assert first.recipe.lossless
     assert first.layout.name in ENCODINGS[encoding].exact
-    assert not any(map(first.layout.refuses, samples))
+    assert not any(map(first.layout.values.refuses, samples))
     assert 0 < first.bytes_per_frame < samples[0].nbytes * 1.1
     views = [
         as_message(pixels, ENCODINGS[encoding], pad=8, is_bigendian=True) for pixels in samples

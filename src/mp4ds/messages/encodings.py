@@ -408,6 +408,19 @@ class Values(ABC):
         """Why these pixels would not be restored, or None if they would."""
         return None
 
+    def prove(self, pixels: Pixels) -> Samples | None:
+        """Prove that pixels would be restored.
+
+        Returns:
+            New samples, where that takes making them; else None.
+
+        Raises:
+            Refused: They would not be.
+        """
+        if reason := self.refuses(pixels):
+            raise Refused(reason)
+        return None
+
     @abstractmethod
     def encode(self, pixels: Pixels) -> Samples:
         """Samples of accepted pixels; may be a view."""

@@ -36,7 +36,7 @@ from mp4ds.messages.encodings import (
     patterns,
 )
 from mp4ds.messages.numbers import Few, Metres, Palette, PatternTable, Tone
-from mp4ds.messages.sources import Converted, ConvertedTall, Demosaiced
+from mp4ds.messages.sources import Converted, ConvertedTall, Demosaiced, Source
 
 # ---------------------------------------------------------------- arrangements
 
@@ -521,6 +521,7 @@ class Layout:
         is_exact: Whether the pixels are restored if the picture is.
         is_shown: Whether the picture looks like the image, so that its colours are tagged.
         pixel_format: ffmpeg's name of the picture's format.
+        values: The step on values.
     """
 
     name: str
@@ -529,7 +530,7 @@ class Layout:
     is_exact: bool
     is_shown: bool
     pixel_format: str
-    _values: Values = field(compare=False)  # the others say which
+    values: Values = field(compare=False)  # the others say which, too
     _arrangement: Arrangement = field(compare=False)
 
     @property
@@ -542,7 +543,7 @@ class Layout:
     @property
     def is_source(self) -> bool:
         """Whether its samples are what the colours of the images were made of."""
-        return isinstance(self._values, Demosaiced | Converted)
+        return isinstance(self.values, Source)
 
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of the image -> of the picture.
@@ -555,14 +556,6 @@ class Layout:
             raise ValueError(f"{width}x{height} pixels, where chroma needs even sides")
         return self._arrangement.picture_size(width, height)
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """Why an image's pixels would not be restored, or None if they would.
-
-        Args:
-            pixels: As `mp4ds.messages.encodings.pixel_view` gives them.
-        """
-        return self._values.refuses(pixels)
-
     def to_picture(self, pixels: Pixels, prediction: Prediction | None = None) -> Picture:
         """The picture of accepted pixels; may be a view of them.
 
@@ -573,11 +566,16 @@ class Layout:
         Returns:
             One array of shape (rows, columns) or (rows, columns, channels), or one per plane.
         """
-        if prediction is not None and not self.is_source:
+        if self.is_source:
+            return self.arrange(self.values.encode(pixels), prediction)
+        if prediction is not None:
             pixels = difference(pixels, *prediction)
-        samples = self._values.encode(pixels)
-        if prediction is not None and self.is_source:
-            samples = difference(samples, self._values.predicted(prediction[0]), prediction[1])
+        return self._arrangement.arrange(self.values.encode(pixels))
+
+    def arrange(self, samples: Samples, prediction: Prediction | None = None) -> Picture:
+        """As `to_picture`, of what `Values.prove` gave."""
+        if prediction is not None:
+            samples = difference(samples, self.values.predicted(prediction[0]), prediction[1])
         return self._arrangement.arrange(samples)
 
     def to_pixels(
@@ -590,14 +588,14 @@ class Layout:
             out: Shape `Encoding.shape`; its type is the encoding's, in any byte order.
             prediction: As for `to_picture`.
         """
-        if self._values.is_identity:
+        if self.values.is_identity:
             self._arrangement.restore(picture, patterns(out))
         else:
-            samples = np.empty(self._values.shape(out), f"u{(self._values.bits + 7) // 8}")
+            samples = np.empty(self.values.shape(out), f"u{(self.values.bits + 7) // 8}")
             self._arrangement.restore(picture, samples)
             if prediction is not None and self.is_source:
-                add_prediction(samples, self._values.predicted(prediction[0]), prediction[1])
-            self._values.decode(samples, out)
+                add_prediction(samples, self.values.predicted(prediction[0]), prediction[1])
+            self.values.decode(samples, out)
         if prediction is not None and not self.is_source:
             add_prediction(out, *prediction)
 
@@ -630,7 +628,7 @@ def bind(name: str, encoding: Encoding, parameters: Parameters = NO_PARAMETERS) 
         is_exact=kind.is_exact,
         is_shown=kind.is_shown,
         pixel_format=pixel_format,
-        _values=values,
+        values=values,
         _arrangement=arrangement,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -10,6 +11,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.errors import Refused
 from mp4ds.messages.encodings import (
     Encoding,
     Parameters,
@@ -21,6 +23,26 @@ from mp4ds.messages.encodings import (
 )
 
 _BANDS = 6  # places of an image that are looked at first
+
+
+class Source(Values):
+    """What the colours of an image were made of."""
+
+    @abstractmethod
+    def source(self, pixels: Pixels) -> Samples | str:
+        """New samples that `decode` gives the pixels of, or why there are none."""
+
+    def refuses(self, pixels: Pixels) -> str | None:
+        """What `source` says if there are no samples."""
+        found = self.source(pixels)
+        return found if isinstance(found, str) else None
+
+    def prove(self, pixels: Pixels) -> Samples:
+        """New samples."""
+        found = self.source(pixels)
+        if isinstance(found, str):
+            raise Refused(found)
+        return found
 
 
 def _colours(pixels: Pixels, encoding: Encoding) -> Pixels:
@@ -154,7 +176,7 @@ def _beside(options: int, least: int) -> int:
     )
 
 
-class Demosaiced(Values):
+class Demosaiced(Source):
     """The mosaic of colours that were made of it by bilinear interpolation.
 
     Attributes:
@@ -191,12 +213,13 @@ class Demosaiced(Values):
         """Write the pixels."""
         _demosaic(samples, self.mosaic, _colours(patterns(out), self._encoding))
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """A colour that interpolation does not give."""
+    def source(self, pixels: Pixels) -> Samples | str:
+        """The mosaic, if interpolation gives every colour."""
         made = np.empty(pixels.shape, native(pixels).dtype)
-        self.decode(self.encode(pixels), made)
+        samples = self.encode(pixels)
+        self.decode(samples, made)
         if np.array_equal(made, native(pixels)):
-            return None
+            return samples
         return f"it was not made of a mosaic ({self.mosaic})"
 
     @classmethod
@@ -466,7 +489,7 @@ def _estimate(colours: Samples) -> Samples:
     return np.stack([u, v])
 
 
-class Converted(Values):
+class Converted(Source):
     """The YUV, chroma halved, of colours that were made of it.
 
     Attributes:
@@ -514,6 +537,9 @@ class Converted(Values):
         """New samples."""
         solution = self._solved(pixels)
         solution.complete()
+        return self._placed(solution, pixels)
+
+    def _placed(self, solution: _Solution, pixels: Pixels) -> Samples:
         samples = np.empty(self.shape(pixels), np.uint8)
         luma, u, v = self._planes(samples)
         down = 1 + self.is_tall
@@ -555,14 +581,16 @@ class Converted(Values):
         for color, made in enumerate(CONVERSIONS[self.rule].colours(blocks, chroma)):
             target[..., color] = np.clip(made, 0, 255).reshape(luma.shape)
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """A colour that no YUV gives."""
+    def source(self, pixels: Pixels) -> Samples | str:
+        """The YUV, if there is one for every colour."""
         if pixels.shape[1] % 2 or (self.is_tall and pixels.shape[0] % 2):
             return "it has an odd side"
         solution = self._solved(pixels)
         if not solution.is_refuted:
             solution.complete()
-        return f"it was not made of YUV ({self.rule})" if solution.is_open.any() else None
+        if solution.is_open.any():
+            return f"it was not made of YUV ({self.rule})"
+        return self._placed(solution, pixels)
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:

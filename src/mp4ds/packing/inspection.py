@@ -15,7 +15,7 @@ import numpy as np
 from mp4ds.errors import Refused
 from mp4ds.format.fields import MAX_VARIANTS, Body, Columns, columns_model
 from mp4ds.messages import depth, png
-from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view, row_padding
+from mp4ds.messages.encodings import ENCODINGS, Pixels, Samples, pixel_view, row_padding
 from mp4ds.messages.layouts import why_not
 from mp4ds.messages.png import PNG_ENCODINGS
 from mp4ds.messages.serializations import MessageSplitter
@@ -92,6 +92,7 @@ class CameraMessage:
         key: Its stream's.
         wrap: What its body has besides the packet or pixels.
         pixels: Its pixels, shape as `pixel_view` gives it; None for a packet.
+        source: What its colours were made of, if a track that keeps that has proven it.
         keyframe: Whether decoding can begin at its packet.
         parameters: What a decoder needs before the packet.
     """
@@ -102,6 +103,7 @@ class CameraMessage:
     key: StreamKey
     wrap: BodyFraming = BodyFraming()
     pixels: Pixels | None = None
+    source: Samples | None = None
     keyframe: bool = True
     parameters: bytes = b""
 

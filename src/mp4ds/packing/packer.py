@@ -196,8 +196,7 @@ class StreamWriter:
         """
         message, parts = seen.message, seen.parts
         self._table.check(message, parts)
-        if refusal := self._track.refuses(seen):
-            raise Refused(refusal)
+        proven = self._track.prove(seen)
         self._table.add(
             message,
             parts,
@@ -211,7 +210,7 @@ class StreamWriter:
             if self._plan.is_exact:
                 self._digests.append(xxhash.xxh64_intdigest(message.data))
             try:
-                self._track.write(seen, tick)
+                self._track.write(proven, tick)
             except Refused as reason:
                 raise self._out_of_reach(reason) from None
 

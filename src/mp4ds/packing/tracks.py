@@ -84,15 +84,22 @@ class Track(ABC):
     view: Track | None = None
 
     @abstractmethod
-    def refuses(self, seen: CameraMessage) -> str | None:
-        """Why the track cannot carry a message exactly, or None if it can."""
+    def prove(self, seen: CameraMessage) -> CameraMessage:
+        """Prove that the track can carry a message exactly.
+
+        Returns:
+            The message for `write`.
+
+        Raises:
+            Refused: It cannot.
+        """
 
     @abstractmethod
     def write(self, seen: CameraMessage, tick: int) -> None:
         """Write a message's frame.
 
         Args:
-            seen: The message.
+            seen: The message, as `prove` gave it.
             tick: Presentation time in ticks, greater than the last.
 
         Raises:
@@ -169,14 +176,11 @@ class _CopiedTrack(Track):
             rate=rate,
         )
 
-    def refuses(self, seen: CameraMessage) -> str | None:
+    def prove(self, seen: CameraMessage) -> CameraMessage:
         if not self._begun:
-            try:
-                self._writer.begin(seen.parts.body)
-            except Refused as reason:
-                return str(reason)
+            self._writer.begin(seen.parts.body)
             self._begun = True
-        return None
+        return seen
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         self._writer.write(seen.parts.body, tick, keyframe=seen.keyframe)
@@ -213,10 +217,10 @@ class _PictureTrack(Track):
     size: tuple[int, int]
     options: Mapping[str, str]
 
-    def refuses(self, seen: CameraMessage) -> str | None:
+    def prove(self, seen: CameraMessage) -> CameraMessage:
         if seen.pixels is None:
-            return "it has no pixels"
-        return self.coding.layout.refuses(seen.pixels)
+            raise Refused("it has no pixels")
+        return replace(seen, source=self.coding.layout.values.prove(seen.pixels))
 
     def describe(self) -> dict[str, Any]:
         layout, recipe = self.coding.layout, self.coding.recipe
@@ -280,12 +284,16 @@ class _EncodedTrack(_PictureTrack):
         raise Refused(refusals[0])
 
     def write(self, seen: CameraMessage, tick: int) -> None:
-        if seen.pixels is not None:
+        if seen.source is not None:
+            self.encode(seen.source, tick)
+        elif seen.pixels is not None:
             self.encode(seen.pixels, tick)
 
     def encode(self, pixels: Pixels, tick: int, prediction: Prediction | None = None) -> None:
-        """Encode an image, or its difference to a prediction."""
-        self._encoder.write(self.coding.layout.to_picture(pixels, prediction), tick)
+        """Encode an image, given by its source if the layout has that; or its difference."""
+        layout = self.coding.layout
+        make = layout.arrange if layout.is_source else layout.to_picture
+        self._encoder.write(make(pixels, prediction), tick)
 
     @property
     def configuration(self) -> bytes:
@@ -334,20 +342,22 @@ class _LayeredTrack(Track):
         self._predictor = Predictor(plan.view, size, self.view.configuration)
         self._waiting: deque[tuple[Pixels, int]] = deque()
 
-    def refuses(self, seen: CameraMessage) -> str | None:
+    def prove(self, seen: CameraMessage) -> CameraMessage:
+        self.view.prove(seen)
         # others can hold every difference
         is_asked = self._own.coding.layout.is_source or not self._is_predicted
-        return self.view.refuses(seen) or (self._own.refuses(seen) if is_asked else None)
+        return self._own.prove(seen) if is_asked else seen
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         if seen.pixels is None:
             return
         if not self._is_predicted:
-            self._own.encode(seen.pixels, tick)
+            self._own.write(seen, tick)
             self.view.encode(seen.pixels, tick)
             return
-        pixels = native(seen.pixels).copy()  # the message may be gone when its turn comes
-        self._waiting.append((pixels, tick))
+        pixels = native(seen.pixels)
+        # the message may be gone when its turn comes
+        self._waiting.append((pixels.copy() if seen.source is None else seen.source, tick))
         self.view.encode(pixels, tick)
 
     def _follow(self, packet: bytes | None) -> None:
@@ -406,8 +416,8 @@ class _ViewedTrack(Track):
         self._due: deque[int] = deque()  # ticks of frames that are not in the view yet
         self._done = 0
 
-    def refuses(self, seen: CameraMessage) -> str | None:
-        return self._own.refuses(seen)
+    def prove(self, seen: CameraMessage) -> CameraMessage:
+        return self._own.prove(seen)
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         self._own.write(seen, tick)
