@@ -346,6 +346,16 @@ def test_parameters_of_a_recipe_reach_svt_av1(threads: int, tmp_path: Path) -> N
     assert came_back == [False, True]
 
 
+def test_a_recipe_has_the_last_word(tmp_path: Path) -> None:
+    """Such as that of av1-10bit on levels, of which there is a default."""
+    pictures = scene_pictures("mono8", 64, 48, 20)
+    recipe = recipe_for("gray", lossless=False, codec="av1", crf=30)
+    other = replace(recipe, options={**recipe.options, "svtav1-params": "hierarchical-levels=2"})
+    for name, item in (("usual", recipe), ("other", other)):
+        encode(tmp_path / name, item, pictures, "gray", threads=1)
+    assert (tmp_path / "usual").read_bytes() != (tmp_path / "other").read_bytes()
+
+
 @pytest.mark.parametrize("rate", [None, 0.0, 1e-9, 0.3, 29.97, 1e9])
 def test_any_rate_and_a_single_frame(rate: float | None, tmp_path: Path) -> None:
     pixels = scene_pictures("mono8", 64, 48, 1)[0]

@@ -291,8 +291,9 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
         given = context.options.get("svtav1-params")
         if min(width, height) < _NARROW_AV1:
             threads = 1  # with several, it never ends on some sizes, such as 70x20
-        # it keeps room, and pictures, for one level more than it uses by itself
-        parameters = ":".join(filter(None, (given, "hierarchical-levels=4", f"lp={threads}")))
+        # it keeps room, and pictures, for one level more than it uses by itself; the last one of
+        # equal names counts
+        parameters = ":".join(filter(None, ("hierarchical-levels=4", given, f"lp={threads}")))
         context.options = {**context.options, "svtav1-params": parameters}
     if recipe.encoder == "libx265":
         # it would write its threads and the processor beside the parameter sets
