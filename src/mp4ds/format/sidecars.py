@@ -425,3 +425,7 @@ class FileNames:
             name = f"{stem}-{number}"
         self._taken.add(name.casefold())
         return name
+
+    def release(self, name: str) -> None:
+        """Take back a name of which no files were made."""
+        self._taken.remove(name.casefold())

@@ -584,8 +584,13 @@ class Packer:
         Raises:
             Refused: The encoder does not take such pictures.
         """
-        stem = self.part.folder / self._names.name_for(seen.message.channel.topic)
-        stream = StreamWriter(stem, len(self._streams), seen, plan, self.plan.threads, rate)
+        name = self._names.name_for(seen.message.channel.topic)
+        stem, number = self.part.folder / name, len(self._streams)
+        try:
+            stream = StreamWriter(stem, number, seen, plan, self.plan.threads, rate)
+        except Refused:
+            self._names.release(name)  # for the next plan
+            raise
         self._streams.append(stream)
         return stream
 
