@@ -211,6 +211,17 @@ def test_the_command_refuses(tmp_path: Path) -> None:
     pack = ("pack", source, "-o", tmp_path / "x", "--view")
     refused(call(*pack, "--for", "speed"), 2, "--for speed encodes nothing twice")
     refused(call(*pack[:-1], "--view=mpeg"), 2, "--view 'mpeg' is not known. Use av1, h264, none")
+    mp4ds.pack(source, tmp_path / "small", PackOptions(quality="crf=40", transcode=True))
+    pack = ("pack", tmp_path / "small", "-o", tmp_path / "x", "--view")
+    refused(call(*pack), 2, "of a dataset of crf=40, the videos are what a view would be")
+
+
+def test_a_view_that_no_encoder_makes_leaves_the_name(tmp_path: Path) -> None:
+    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"](frames=2, width=2, height=2))
+    mp4ds.pack(source, tmp_path / "dataset", PackOptions(view="av1"))
+    assert [path.name for path in (tmp_path / "dataset").glob("*.mp4")] == [
+        "cam_image_raw_compressed.mp4"
+    ]
 
 
 # ---------------------------------------------------------------- without the exact video
@@ -404,6 +415,7 @@ def test_views_come_and_go(case: str, tmp_path: Path) -> None:
     assert mp4ds.validate(second / "dataset", deep=True) == []
     assert compare(made.sources, unpacked(second, "mcap")) == []
     mp4ds.pack(second / "dataset", tmp_path / "dataset", PackOptions(view="none"))
+    assert mp4ds.pack(tmp_path / "dataset", tmp_path / "copy", PackOptions(view="none")).is_copy
     assert codecs(tmp_path / "dataset") == [None]
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     assert compare(made.sources, unpacked(tmp_path, "mcap")) == []
@@ -412,6 +424,7 @@ def test_views_come_and_go(case: str, tmp_path: Path) -> None:
 KEPT: dict[str, tuple[dict[str, Any], list[str | None], int]] = {
     "as it is": ({}, ["av1"], 1),
     "a slice": ({"start": "0.1", "duration": "0.1"}, ["av1"], 1),
+    "that view again": ({"view": "av1"}, ["av1"], 1),
     "visual": ({"quality": "visual"}, ["av1"], 1),
     "visual and transcoded": ({"quality": "visual", "transcode": True}, [None], 0),
 }

@@ -53,7 +53,7 @@ from mp4ds.packing.manifest import (
     summarize,
     write_manifest,
 )
-from mp4ds.packing.options import PackOptions, PackProgress, PackSummary
+from mp4ds.packing.options import NO_VIEW, PackOptions, PackProgress, PackSummary
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.parts import PartsFolder, PlanNote, digest_source
 from mp4ds.packing.planning import (
@@ -69,7 +69,6 @@ from mp4ds.processes import ProcessExecutor, available_cores, memory_bytes
 from mp4ds.video.codecs import (
     LOSSLESS,
     VISUAL,
-    QualitySetting,
     check_codec,
     parse_quality,
 )
@@ -430,17 +429,31 @@ def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
 def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
     """Whether it is one dataset, and no option asks for encoding its videos."""
     is_visual = options.quality is not None and options.quality.name == VISUAL
-    kept = replace(options, quality=None, transcode=options.transcode and not is_visual)
-    if kept.changing(ENCODING) != PackOptions().changing(ENCODING):
-        return False
     is_divided = options.join or options.cluster is not None
     folder = dataset_at(paths[0]) if len(paths) == 1 and not is_divided else None
+    kept = replace(options, quality=None, transcode=options.transcode and not is_visual)
+    if folder and options.view and not options.quality and _has_views(folder, options):
+        kept = replace(kept, view=None)
+    if kept.changing(ENCODING) != PackOptions().changing(ENCODING):
+        return False
     if folder is None or options.quality is None:
         return folder is not None
     streams = _streams_of(folder)
     encoded = [stream for stream in streams if _is_encoded(stream, options)]
     has_views = all(one.exact_path or one.sidecar.profile == VISUAL for one in encoded)
     return is_visual and has_views and any(stream.exact_path for stream in streams)
+
+
+def _has_views(folder: Path, options: PackOptions) -> bool:
+    """Whether the streams of a dataset have the views that are asked for already."""
+    chosen = [one.sidecar for one in _streams_of(folder) if options.selected(one.topic)]
+    if options.view == NO_VIEW:
+        return all(one.view is None for one in chosen)
+    return all(
+        one.view.codec == options.view if one.view else not ENCODINGS[one.image.encoding].lossy
+        for one in chosen
+        if one.profile == LOSSLESS
+    ) and any(one.view for one in chosen)
 
 
 def _streams_of(folder: Path) -> list[Stream]:
@@ -473,6 +486,8 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
         load_about(options.about)  # fails before anything is read
     if may_copy and _is_copy(paths, options):
         return options
+    if options.asks_for_views:
+        _check_views(paths, options)
     quality = options.quality or parse_quality(_quality_of(paths))
     for folder in filter(None, map(dataset_at, paths)):
         if quality.name != VISUAL:  # a score would be one of the views
@@ -482,8 +497,6 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
             "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
             "any lossless video of its pixels."
         )
-    if options.asks_for_views:
-        _check_views(quality, options)
     codec = check_codec(
         options.codec,
         options.preset,
@@ -504,16 +517,18 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
     return chosen
 
 
-def _check_views(quality: QualitySetting, options: PackOptions) -> None:
+def _check_views(paths: Sequence[Path], options: PackOptions) -> None:
     """Refuse views where there are none.
 
     Raises:
         OptionError: Says why.
     """
-    if not quality.lossless:
+    told = {f"with `quality` {options.quality}": options.goal.lossless}
+    if options.quality is None:
+        told = {f"of a dataset of {one}": one == LOSSLESS for one in _profiles(paths)}
+    if lossy := [words for words, is_lossless in told.items() if not is_lossless]:
         raise OptionError(
-            f"`view` is for lossless packing: with `quality` {quality}, the videos are what a view "
-            "would be."
+            f"`view` is for lossless packing: {lossy[0]}, the videos are what a view would be."
         )
     if options.is_fast:
         raise OptionError(
@@ -528,10 +543,7 @@ def _quality_of(paths: Sequence[Path]) -> str:
     Raises:
         OptionError: It does not determine the new quality.
     """
-    folders = [dataset_at(path) for path in paths]
-    found = {
-        load_manifest(folder / MANIFEST_NAME).profile if folder else LOSSLESS for folder in folders
-    }
+    found = _profiles(paths)
     if not found:
         return LOSSLESS
     if len(found) == 1 and parse_quality(*found).crf is None:
@@ -540,6 +552,14 @@ def _quality_of(paths: Sequence[Path]) -> str:
         f"There is no default `quality` for what was packed as {', '.join(sorted(found))}. Give "
         "one."
     )
+
+
+def _profiles(paths: Sequence[Path]) -> set[str]:
+    """Those of the source datasets; lossless for recordings."""
+    folders = [dataset_at(path) for path in paths]
+    return {
+        load_manifest(folder / MANIFEST_NAME).profile if folder else LOSSLESS for folder in folders
+    }
 
 
 def _view_of_packets(paths: Sequence[Path]) -> str | None:
