@@ -388,9 +388,6 @@ class ExportJob:
         self._in_colour, self._written = in_colour, 0
         if dataset.damage:
             self.note(dataset.damage)
-        for stream in dataset.streams:
-            if stream.layer == "view" and options.selected(stream.topic):
-                self.note(f"{stream.topic}: its pixels are those of its view")
         options.selected.check(dataset.all_topics)
         dataset.verify_sidecars(options.chosen)
         streams = [stream for stream in dataset.streams if options.selected(stream.topic)]
@@ -419,7 +416,7 @@ class ExportJob:
             self._summary.notes.append(self._where + sentence)
 
     def leave_out_rest(self, name: str) -> None:
-        """Count the remaining messages with their reason.
+        """Count the remaining messages with their reason, and note which kept ones are of views.
 
         Args:
             name: Of the format.
@@ -436,6 +433,9 @@ class ExportJob:
             else:
                 reason = f"{name} has no place for {channels[topic].type_name or 'such messages'}"
             self.leave_out(topic, reason, total - self._counted[topic])
+        for stream in self.dataset.streams:
+            if stream.layer == "view" and stream.topic in self._summary.messages:
+                self.note(f"{stream.topic}: its pixels are those of its view")
 
     def topics_of(self, type_name: str) -> list[str]:
         """The selected topics with a ROS type, such as ``sensor_msgs/Imu``."""
