@@ -37,6 +37,9 @@ from mp4ds.video.encoder import Coding, Predictor, VideoEncoder
 from mp4ds.video.packets import PacketWriter, join_segments
 
 _GREY = 128
+_VIEW_THREADS = 2
+"""Most threads of a view's encoder beside that of the images, which takes more time than it: with
+eight, SVT-AV1 takes two and a half times the memory of two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,8 +335,9 @@ class _LayeredTrack(Track):
         self._is_predicted = plan.is_predicted
         self._own = _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
         coded = self._follow if plan.is_predicted else None
+        few = min(threads, _VIEW_THREADS)
         try:
-            self.view = _EncodedTrack(view_path, plan.view, size, threads, rate, "", coded=coded)
+            self.view = _EncodedTrack(view_path, plan.view, size, few, rate, "", coded=coded)
         except BaseException:
             self._own.abandon()
             path.unlink(missing_ok=True)
