@@ -47,22 +47,23 @@ def fields_of(given: Fields, option: str) -> dict[str, tuple[str, ...]]:
     if isinstance(given, str):
         topic, _, listed = given.partition(":")
         given = {topic: listed.split(",") if listed else None}
-    if not isinstance(given, Mapping) or not given or not all(given):
-        raise OptionError(
-            f"{option} is {given!r}, not a topic, or a mapping such as "
-            '{"/joint_states": "position"}.'
-        )
-    found = {
-        topic: (paths,) if isinstance(paths, str) else tuple(paths or ())
-        for topic, paths in given.items()
-    }
-    for topic, paths in found.items():
-        for path in paths:
-            if not re.fullmatch(f"(?:{_PART.pattern})+", path):
+    found: dict[str, tuple[str, ...]] = {}
+    for topic, paths in given.items() if isinstance(given, Mapping) else ():
+        several = [paths] if isinstance(paths, str) else paths or []
+        if not topic or not isinstance(several, Sequence):
+            break
+        for path in several:
+            if not isinstance(path, str) or not re.fullmatch(f"(?:{_PART.pattern})+", path):
                 raise OptionError(
                     f"{option} {topic} has the field {path!r}, which is not like pose.position.x, "
                     "position[0:6] or position[elbow]."
                 )
+        found[topic] = tuple(several)
+    if not found or len(found) < len(given):
+        raise OptionError(
+            f"{option} is {given!r}, not a topic, or a mapping such as "
+            '{"/joint_states": "position"}.'
+        )
     return found
 
 

@@ -266,8 +266,8 @@ class FrameDataset(Dataset):
     ) -> None:
         for name in others:  # of other libraries, too
             raise TypeError(absent(self, name))
-        if fps is not None and not 1 <= fps <= _MOST_FPS:
-            raise OptionError(f"fps is {fps}, but must be from 1 to {_MOST_FPS}.")
+        if fps is not None and not (isinstance(fps, int) and 1 <= fps <= _MOST_FPS):
+            raise OptionError(f"fps is {fps!r}, but must be a whole number from 1 to {_MOST_FPS}.")
         names = rename or {}
         self.topics, self.recordings = recordings_of(
             paths,
@@ -428,6 +428,20 @@ class FrameDataset(Dataset):
                 index = int(wanted[place])
                 samples[place] |= {"stamp_ns": stamps[n], "index": index, "dataset": owner}
         return samples if self._transform is None else [self._transform(s) for s in samples]
+
+    def load_messages(self) -> None:
+        """Read the messages of states and actions of all recordings now.
+
+        Workers of a DataLoader that start later need not read them. Otherwise each process reads
+        those of a recording with its first sample.
+
+        Raises:
+            SampleError: Messages cannot be read.
+            OptionError: Messages differ in their numbers.
+        """
+        for reader in self._vectors.values():
+            for recording in self.recordings:
+                reader.at(recording, np.empty(0, np.int64))
 
     def collate(self, samples: Sequence[Any]) -> Any:
         """Like `torch.utils.data.default_collate`, without copying frames.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,8 @@ Pick = Literal["nearest", "previous"]
 class VectorReader:
     """The numbers of samples under one key: ``state`` or ``action``.
 
-    Messages of a recording are read when the first sample of it is; then they are kept, 4 bytes for
-    each number and 8 for each message. A copy, by pickling, has read none.
+    Messages of a recording are read when the first sample of it is; then they are kept, also by
+    copies for other processes: 4 bytes for each number and 8 for each message.
 
     Args:
         key: The key.
@@ -111,9 +111,6 @@ class VectorReader:
             raise
         except Mp4dsError as error:
             raise SampleError(f"{path}: {error}") from None
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_read": {}}
 
 
 def called(path: str, topic: str, rename: Mapping[str, str]) -> str:
