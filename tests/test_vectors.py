@@ -9,8 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Reader
+from rosbags.typesys import Stores, get_typestore
 
 import mp4ds
+from conftest import DATA
+from mp4ds.dataset.vectors import read_vectors
 from scenes import PERIOD, START, Record, Scene, scene
 from sources import SOURCES
 
@@ -244,6 +248,26 @@ def test_messages_that_differ(tmp_path: Path, values: dict[str, Any], sentence: 
     frames = FrameDataset(packed(tmp_path, with_joints(robot(), **values)), state=JOINTS)
     with pytest.raises(mp4ds.OptionError, match=sentence):
         frames[0]
+
+
+def test_a_robot_that_was_recorded(tmp_path: Path) -> None:
+    """1598 messages of 42 joints, beside a reader of bags that is not ours."""
+    path = DATA / "bags/joint_states_bz2.bag"
+    if not path.exists():
+        pytest.skip("needs the recordings")
+    mp4ds.pack(path, tmp_path / "robot")
+    with mp4ds.Dataset(tmp_path / "robot") as dataset:
+        fields = ["position[head_pan_joint]", "velocity"]
+        found = read_vectors(dataset, "joint_states", fields)
+    rows = []
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Reader(path) as reader:
+        for connection, _, payload in reader.messages():
+            message = store.deserialize_ros1(payload, connection.msgtype)
+            place = message.name.index("head_pan_joint")
+            rows.append([message.position[place], *message.velocity])
+    assert found.names[:2] == ("position.head_pan_joint", f"velocity.{message.name[0]}")
+    assert (found.values == np.array(rows, np.float32)).all()
 
 
 @pytest.mark.parametrize("method", [None, "fork", "spawn"])

@@ -28,6 +28,7 @@ _KNOWN_FOR = {
     "std_msgs/Float32MultiArray": "data",
 }
 _PART = re.compile(r"\.?([^.\[\]]+)(?:\[([^\[\]]+)\])?")
+_STAMPS = (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec"))  # ROS, protobuf, JSON
 _NS = 10**9
 _DEEPEST = 12  # fields of fields: definitions of protobuf may contain themselves
 _MOST_LISTED = 24
@@ -74,8 +75,8 @@ class Vectors:
     Attributes:
         topic: The topic.
         names: Of the numbers; those of joints where messages have them.
-        times: Header stamps, or log times where messages have none or most of them do not increase;
-            nanoseconds, int64, shape (messages,).
+        times: Header stamps (``timestamp`` of Foxglove's messages), or log times where messages
+            have none or most of them do not increase; nanoseconds, int64, shape (messages,).
         values: float32, shape (messages, numbers).
     """
 
@@ -143,9 +144,12 @@ def read_vectors(
 
 
 def _stamp(message: Any, log_time: int) -> int:
-    stamp = _child(_child(message, "header"), "stamp")
-    seconds, rest = _child(stamp, "sec"), _child(stamp, "nanosec")
-    return log_time if seconds is None or rest is None else int(seconds) * _NS + int(rest)
+    stamp = _child(_child(message, "header"), "stamp") or _child(message, "timestamp")
+    for names in _STAMPS:
+        seconds, rest = (_child(stamp, name) for name in names)
+        if seconds is not None and rest is not None:
+            return int(seconds) * _NS + int(rest)
+    return log_time
 
 
 class _Reader:

@@ -239,6 +239,11 @@ class OpenCamera:
             self._torchcodec = TorchcodecReader(self._topic, view["crop"], pictures.device)
 
     @property
+    def encoding(self) -> str:
+        """Of the images, as recorded."""
+        return self._topic.encoding
+
+    @property
     def stamps(self) -> NDArray[np.int64]:
         """Header stamps, nanoseconds, by frame."""
         return self._topic.stamps

@@ -34,6 +34,7 @@ from mp4ds.torch.recordings import Paths, usual_rate
 
 _TOLERANCE_S = 1e-4  # of a multiple of the period, as in LeRobot
 _EVER = 2**62  # nanoseconds
+_IN_MM = {"16UC1": 1.0, "32FC1": 1000.0}
 _FEWEST, _IN_ALL = 5, 2000  # frames for a camera's statistics, of an episode and of all
 
 
@@ -60,7 +61,6 @@ class Metadata:
 
     robot_type = None
     has_language_columns = False
-    depth_keys: tuple[str, ...] = ()
     image_keys: tuple[str, ...] = ()
 
     @cached_property
@@ -77,6 +77,11 @@ class Metadata:
         return [key for key, one in self.features.items() if one["dtype"] == "video"]
 
     video_keys = camera_keys
+
+    @property
+    def depth_keys(self) -> list[str]:
+        """Those of depths."""
+        return [key for key in self.camera_keys if self.features[key]["info"].get("is_depth_map")]
 
     @property
     def names(self) -> dict[str, Any]:
@@ -114,7 +119,8 @@ class LeRobotDataset(FrameDataset):
          "index": ..., "task_index": ..., "task": str}
 
     and for the keys of `delta_timestamps` (T, ...) with ``KEY_is_pad``: bool (T,). Samples are at
-    a constant rate, of the frames and messages nearest in time. `meta`, `num_frames`,
+    a constant rate, of the frames and messages nearest in time. Depths (16UC1, 32FC1) are float32
+    (1, H, W) in millimetres, 0 where there is no measurement. `meta`, `num_frames`,
     `num_episodes`, `episodes` and `absolute_to_relative_idx` are LeRobot's, too.
 
     Args:
@@ -127,7 +133,7 @@ class LeRobotDataset(FrameDataset):
         episode_topic: As for `FrameDataset`.
         episodes: Numbers of the episodes to read; None: all. `meta` is always that of all.
         delta_timestamps: Key -> seconds from a sample's own time, multiples of 1 / fps.
-        image_transforms: Called with the frames of each camera.
+        image_transforms: Called with the frames of each camera that has no depths.
         return_uint8: Whether frames are bytes instead of float32 from 0 to 1.
         rename: As for `FrameDataset`.
         layer: As for `FrameDataset`.
@@ -138,7 +144,7 @@ class LeRobotDataset(FrameDataset):
         meta: Features, episodes, statistics.
 
     Raises:
-        OptionError: An option is wrong, a topic is not there, or a camera has no 8-bit colour.
+        OptionError: An option is wrong, or a topic is not there.
         SourceError: A path is not a dataset.
         FormatError: A manifest or sidecar breaks a rule of the format.
     """
@@ -172,7 +178,7 @@ class LeRobotDataset(FrameDataset):
             episode_topic=episode_topic,
             rename=rename,
             layer=layer,
-            dtype="uint8" if return_uint8 else "float32",
+            dtype="native" if return_uint8 else "float32",
             **options,
         )
         self._images = dict(zip(image_features(self.topics), self.topics, strict=True))
@@ -186,6 +192,7 @@ class LeRobotDataset(FrameDataset):
                 raise OptionError(f"delta_timestamps has {key!r}, which is not one of {known}.")
             self._offsets[own] = Offsets(_steps(key, seconds, rate), "frames", None)
         self._transforms = image_transforms
+        self._scales: dict[str, float] = {}  # of depths, to millimetres
         tasks = [task if task is not None else one.task for one in self.recordings]
         self._tasks = list(dict.fromkeys(tasks))
         self.meta = Metadata(
@@ -203,15 +210,17 @@ class LeRobotDataset(FrameDataset):
 
     def _features(self, fps: int) -> dict[str, Feature]:
         found: dict[str, Feature] = {}
-        for number, (key, topic) in enumerate(self._images.items()):
+        for number, key in enumerate(self._images):
             with self._cameras.using(self.recordings[0], number) as camera:
-                like = camera.empty(1)
-            *_, height, width, channels = like.shape
-            if channels != 3:
-                raise OptionError(
-                    f"topic {topic}: LeRobot's images are in colour. Select others with `topics`."
-                )
+                if camera.encoding in _IN_MM:
+                    self._scales[key] = _IN_MM[camera.encoding]
+                    self._pictures.views[number]["format"] = "native"
+                height, width, channels = camera.empty(1).shape[2:]
             found[key] = video_feature((width, height), fps, {})
+            if key in self._scales:
+                found[key]["shape"][2] = found[key]["info"]["video.channels"] = channels
+                found[key]["info"] |= {"is_depth_map": True, "depth_unit": "mm"}
+                del found[key]["info"]["video.is_depth_map"]
         found |= {key: vector_feature(self.names[own]) for key, own in self._keys.items()}
         found |= COLUMNS
         return {key: {**one, "shape": tuple(one["shape"])} for key, one in found.items()}
@@ -249,7 +258,10 @@ class LeRobotDataset(FrameDataset):
                 if recording.times is not None:
                     values, _ = self._vectors[own].at(recording, recording.times)
                     parts[key].append(statistics_of(values))
-        return {key: dict(merged(found)) for key, found in parts.items()}
+        stats = {key: dict(merged(found)) for key, found in parts.items()}
+        for key, scale in self._scales.items():
+            stats[key] |= {n: v * scale for n, v in stats[key].items() if n != "count"}
+        return stats
 
     # ------------------------------------------------ samples
 
@@ -263,7 +275,13 @@ class LeRobotDataset(FrameDataset):
             image = sample[topic]
             if image.ndim == 4 and len(image) == 1:
                 image = image[0]
-            found[key] = image if self._transforms is None else self._transforms(image)
+            if key in self._scales:
+                image = (
+                    image.to(torch.float32).nan_to_num(0, posinf=0, neginf=0) * self._scales[key]
+                )
+            elif self._transforms is not None:
+                image = self._transforms(image)
+            found[key] = image
         for key, own in self._keys.items():
             vector = sample[own]
             if key in self._deltas and self._offsets[own].is_single:
