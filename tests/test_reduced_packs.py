@@ -160,13 +160,26 @@ def test_packets_of_which_some_are_left_out(name: str, tmp_path: Path) -> None:
         assert row[2] == IMAGE or row == recorded
 
 
-def test_a_maximum_rate_goes_by_stamps(tmp_path: Path) -> None:
-    sources = SOURCES["bag-lz4"](tmp_path, scene("mono8", frames=30))
+@pytest.mark.parametrize("stamp", [None, 0, 7])
+def test_a_maximum_rate_goes_by_stamps(stamp: int | None, tmp_path: Path) -> None:
+    """By log times where all stamps are the same."""
+    made = scene("mono8", frames=30)
+    if stamp is not None:
+        head = {"stamp": stamp, "frame_id": "cam"}
+        made.messages[:] = [
+            replace(one, values={**one.values, "header": head}) if one.topic == TOPIC else one
+            for one in made.messages
+        ]
+    sources = SOURCES["bag-lz4"](tmp_path, made)
     mp4ds.pack(sources, tmp_path / "all")
     mp4ds.pack(tmp_path / "all", tmp_path / "slow", PackOptions(max_rate=10))
     with mp4ds.open(tmp_path / "all") as before, mp4ds.open(tmp_path / "slow") as after:
-        stamps = before[TOPIC].stamps
-        assert (after[TOPIC].stamps == stamps[at_most(10, stamps)]).all()
+        times = before[TOPIC].stamps if stamp is None else before[TOPIC].log_times
+        kept = before[TOPIC].log_times[at_most(10, times)]
+        if stamp == 7:  # the first is by its stamp: one more, as the clock changes after it
+            assert len(after[TOPIC]) == len(kept) + 1
+        else:
+            assert after[TOPIC].log_times.tolist() == kept.tolist()
         assert after[TOPIC].shape == before[TOPIC].shape
     assert others(tmp_path / "slow", TOPIC) == others(tmp_path / "all", TOPIC)
 

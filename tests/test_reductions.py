@@ -21,11 +21,11 @@ from commands import call
 from definitions import COMPRESSED, IMAGE, INFO
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, OptionError
-from mp4ds.format.fields import DecodedColumns
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
-from mp4ds.unpacking.pictures import ReductionOptions, at_most, times_of
+from mp4ds.times import sound_times
+from mp4ds.unpacking.pictures import ReductionOptions, at_most
 from mp4ds.unpacking.republish import Republisher
 from mp4ds.unpacking.unpack import UnpackOptions
 from pictures import picture
@@ -426,9 +426,7 @@ def test_times_are_stamps_or_log_times(stamps: str) -> None:
         "sound": log - 5,
         "doubled": np.repeat(log[::3], 3)[:10],
     }[stamps]
-    zeros = np.zeros(10, np.int64)
-    columns = DecodedColumns(log, log, zeros, stamp, None, None, zeros, np.arange(10))
-    assert times_of(columns) is (stamp if stamps == "sound" else log)
+    assert sound_times(stamp, log) is (stamp if stamps == "sound" else log)
 
 
 # ---------------------------------------------------------------- options

@@ -295,7 +295,7 @@ class _Camera:
         self, reader: ReducedReader, channel: Channel, before: int, limit: RateLimit | None
     ) -> None:
         self._reader, self._channel = reader, channel
-        self._count, self._limit = before, limit
+        self._count, self._limit, self._stamp = before, limit, 0
         self._splitter = MessageSplitter(channel)
         self._inspector = MessageInspector(channel) if channel.id in reader.videos else None
         self._pictures: PacketPictures | None = None
@@ -312,8 +312,9 @@ class _Camera:
             return
         try:
             form, parts = self._splitter.split(message)
+            is_later, self._stamp = parts.stamp > self._stamp, parts.stamp  # some are always zero
             if is_kept and self._limit:
-                is_kept = self._limit.keeps(parts.stamp or message.log_time)
+                is_kept = self._limit.keeps(parts.stamp if is_later else message.log_time)
             if self._inspector:
                 seen = self._inspector.inspect(with_own_payload(message))
                 yield from self._decoded(seen, is_kept)
