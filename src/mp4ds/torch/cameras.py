@@ -24,9 +24,10 @@ from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
 from mp4ds.files.urls import remote
-from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.times import nearest, sound_times
+from mp4ds.torch.cache import FrameCache
 from mp4ds.torch.recordings import CameraSource, Recording, each, one_of, open_source
 from mp4ds.video.mp4 import read_sample_table
 
@@ -221,12 +222,19 @@ class OpenCamera:
         source: Which.
         view: How its frames are wanted, as in `Pictures.views`.
         pictures: How they become tensors.
+        cache: Where they are kept; None: nowhere.
 
     Raises:
         FormatError: The stream breaks a rule of the format.
     """
 
-    def __init__(self, source: CameraSource, view: dict[str, Any], pictures: Pictures) -> None:
+    def __init__(
+        self,
+        source: CameraSource,
+        view: dict[str, Any],
+        pictures: Pictures,
+        cache: FrameCache | None,
+    ) -> None:
         self._source = source
         self._view = view
         self._pictures = pictures
@@ -237,6 +245,9 @@ class OpenCamera:
         self._torchcodec = None
         if pictures.backend == "torchcodec":
             self._torchcodec = TorchcodecReader(self._topic, view["crop"], pictures.device)
+        self._cached = None
+        if cache is not None:
+            self._cached = cache.camera(self._topic, view, self._topic.read([], **view))
 
     @property
     def encoding(self) -> str:
@@ -331,7 +342,7 @@ class OpenCamera:
         if self._torchcodec is None and self._pictures.dtype != "float32":
             # arrays share the memory of tensors; those of grey images have no channels
             rows = [(out.squeeze(-1) if out.shape[-1] == 1 else out).numpy() for out in outs]
-            self._topic.read_into(frames, rows, **self._view)
+            self._fill(frames, rows)
             return
         for pixels, out in zip(self._pixels(frames), outs, strict=True):
             shaped = pixels.view(out.shape)
@@ -345,7 +356,24 @@ class OpenCamera:
         """Frames as decoded, shape (N, H, W) or (N, H, W, C)."""
         if self._torchcodec is not None:
             return self._torchcodec.read(frames)
-        return torch.from_numpy(self._topic.read(frames, **self._view))  # shares the memory
+        like = self._topic.read([], **self._view)
+        pixels = np.empty((len(frames), *like.shape[1:]), like.dtype)
+        self._fill(frames, list(pixels))
+        return torch.from_numpy(pixels)  # shares the memory
+
+    def _fill(self, frames: Sequence[int], rows: Sequence[Pixels]) -> None:
+        """Write frames, each into its own array: those in the cache, and all others decoded."""
+        cached = self._cached
+        if cached is None:
+            self._topic.read_into(frames, rows, **self._view)
+            return
+        pairs = zip(frames, rows, strict=True)
+        missing = [(number, row) for number, row in pairs if not cached.load(number, row)]
+        if missing:
+            numbers, others = zip(*missing, strict=True)
+            self._topic.read_into(numbers, others, **self._view)
+        for number, row in missing:
+            cached.store(number, row)
 
     def _first_failure(self, frames: Sequence[int], error: Mp4dsError) -> SampleError:
         """Which frame failed, since an error about many does not always say."""
@@ -364,6 +392,8 @@ class OpenCamera:
         """Close the video."""
         self._torchcodec = None
         self._topic.close()
+        if self._cached:
+            self._cached.close()
 
 
 class OpenCameras:
@@ -375,14 +405,16 @@ class OpenCameras:
     Args:
         most: Maximum number of open cameras.
         pictures: How their frames become tensors.
+        cache: Where these are kept; None: nowhere.
 
     Raises:
         OptionError: `most` is less than one.
     """
 
-    def __init__(self, most: int, pictures: Pictures) -> None:
+    def __init__(self, most: int, pictures: Pictures, cache: FrameCache | None) -> None:
         self._most = most
         self._pictures = pictures
+        self._cache = cache
         # by process: what a parent opened is kept as it is, since closing or freeing its decoders
         # could hang, and its lock may be held by a thread that a fork did not copy
         self._opened: dict[int, tuple[threading.RLock, OrderedDict[str, OpenCamera]]] = {}
@@ -406,7 +438,8 @@ class OpenCameras:
                 if found is None:
                     while len(opened) >= self._most:
                         opened.popitem(last=False)[1].close()
-                    found = OpenCamera(source, self._pictures.views[camera], self._pictures)
+                    view = self._pictures.views[camera]
+                    found = OpenCamera(source, view, self._pictures, self._cache)
                 opened[source.place] = found
                 yield found
         except OptionError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import prod
 from operator import index as as_integer
+from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any, Literal, NoReturn, SupportsIndex, get_args
 
@@ -17,6 +18,7 @@ from mp4ds.dataset.stream import Layer
 from mp4ds.dataset.vectors import Fields
 from mp4ds.dataset.views import Crop, Resize
 from mp4ds.errors import OptionError, absent, counted
+from mp4ds.torch.cache import CACHE_BYTES, FrameCache
 from mp4ds.torch.cameras import (
     Backend,
     Dtype,
@@ -221,6 +223,9 @@ class FrameDataset(Dataset):
             but refused for those. ``float32``: 0 to 1; native pixels keep their values.
         channels_first: (C, H, W), not (H, W, C).
         transform: Called with each sample; its return value replaces the sample.
+        cache: Where to keep frames as they are returned, for later epochs: a folder that all
+            workers and processes of a machine share, or ``ram``. None: nowhere.
+        cache_bytes: Maximum size of that, over all cameras; other frames are decoded each time.
         cache_files: Maximum number of open videos per process.
         backend: ``torchcodec`` decodes with torchcodec, whose colours differ slightly.
         device: With ``torchcodec``, where to decode and keep the tensors, such as ``cuda``.
@@ -259,6 +264,8 @@ class FrameDataset(Dataset):
         dtype: Dtype = "native",
         channels_first: bool = True,
         transform: Transform | None = None,
+        cache: str | Path | None = None,
+        cache_bytes: int = CACHE_BYTES,
         cache_files: int = 16,
         backend: Backend = "mp4ds",
         device: str = "cpu",
@@ -312,7 +319,13 @@ class FrameDataset(Dataset):
             backend=backend,
             device=device,
         )
-        self._cameras = OpenCameras(cache_files, self._pictures)
+        kept = None
+        if cache is not None:
+            if backend != "mp4ds":
+                raise OptionError("cache needs backend='mp4ds'.")
+            sources = {one for recording in self.recordings for one in recording.sources}
+            kept = FrameCache(cache, cache_bytes, max(sum(one.frames for one in sources), 1))
+        self._cameras = OpenCameras(cache_files, self._pictures, kept)
         self._collates = False
 
     def _split(self, topic: str, rename: Mapping[str, str]) -> list[Recording]:
