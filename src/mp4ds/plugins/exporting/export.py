@@ -105,6 +105,7 @@ def export(
                 sources=[dataset.path for dataset in opened],
             )
         )
+        views = [[part.topic for part in one.streams if part.layer == "view"] for one in opened]
         opened = [
             stack.enter_context(
                 sliced(
@@ -126,8 +127,9 @@ def export(
                 progress or (lambda *_: None),
                 where=f"{one.path.name}: " if len(opened) > 1 else "",
                 in_colour=to == "lerobot",  # its videos are
+                views=shown,
             )
-            for one in opened
+            for one, shown in zip(opened, views, strict=True)
         ]
         write(*jobs)
         for job in jobs:

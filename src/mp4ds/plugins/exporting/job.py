@@ -357,6 +357,7 @@ class ExportJob:
         tell: Called now and then with a phrase, and the share of frames done.
         where: What notes begin with, if there are several datasets.
         in_colour: Whether all images with colours become RGB.
+        views: Topics with the images of views, of which a slice does not tell.
 
     Attributes:
         dataset: The dataset.
@@ -381,11 +382,12 @@ class ExportJob:
         *,
         where: str,
         in_colour: bool,
+        views: Sequence[str],
     ) -> None:
         self.dataset, self.path, self.options, self.tell = dataset, path, options, tell
         self.places, self._summary, self._where = summary.places, summary, where
         self._counted: Counter[str] = Counter()
-        self._in_colour, self._written = in_colour, 0
+        self._in_colour, self._views, self._written = in_colour, views, 0
         if dataset.damage:
             self.note(dataset.damage)
         options.selected.check(dataset.all_topics)
@@ -433,9 +435,9 @@ class ExportJob:
             else:
                 reason = f"{name} has no place for {channels[topic].type_name or 'such messages'}"
             self.leave_out(topic, reason, total - self._counted[topic])
-        for stream in self.dataset.streams:
-            if stream.layer == "view" and stream.topic in self._summary.messages:
-                self.note(f"{stream.topic}: its pixels are those of its view")
+        for topic in self._views:
+            if topic in self._summary.messages:
+                self.note(f"{topic}: its pixels are those of its view")
 
     def topics_of(self, type_name: str) -> list[str]:
         """The selected topics with a ROS type, such as ``sensor_msgs/Imu``."""
@@ -467,7 +469,7 @@ class ExportJob:
         known = ENCODINGS[stream.encoding]
         is_native = known.mosaic and self.options.native
         is_converted = not known.is_plain and (self._in_colour or not is_native)
-        if is_converted and stream.layer == "exact":
+        if is_converted and stream.topic not in self._views:
             kind = "a Bayer mosaic" if known.mosaic else "YUV"
             kept = ", which --native keeps" if known.mosaic and not self._in_colour else ""
             self.note(f"{stream.topic}: its pixels are converted from {kind}{kept}")
