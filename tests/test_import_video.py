@@ -173,6 +173,10 @@ def test_what_is_no_such_video_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("no video")
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
     (tmp_path / "other.mkv").write_bytes(data)
+    (tmp_path / "a.exact.mp4").write_bytes(data)
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "a.mp4").write_bytes(data)
+    (tmp_path / "drive" / "dataset.yaml").touch()
     write_video(tmp_path / "a.avi", "mjpeg")
     write_video(tmp_path / "mpeg4.mp4", "mpeg4")
     for name, problem in (
@@ -181,6 +185,8 @@ def test_what_is_no_such_video_is_refused(tmp_path: Path) -> None:
         ("other.mkv", ["other.mkv: "]),
         ("a.avi", ["is not an mp4", "Give an mp4, mov, mkv or webm file"]),
         ("mpeg4.mp4", ["is coded as mpeg4, not h264", "Give --decode"]),
+        ("a.exact.mp4", ["is a video of a dataset", "Use the dataset itself"]),
+        ("drive/a.mp4", ["is a video of a dataset", "Use the dataset itself"]),
     ):
         refused(call("import", "video", tmp_path / name, "-o", tmp_path / "ds"), 2, *problem)
         assert not (tmp_path / "ds").exists()

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from mp4ds.errors import OptionError, Refused, SourceError, SourceNotFoundError
 from mp4ds.files.sources import members
 from mp4ds.files.urls import remote
+from mp4ds.format.models import EXACT_SUFFIX
+from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.packing.options import ImportOptions
 from mp4ds.plugins.importing.calibrations import (
@@ -240,6 +242,13 @@ def _add_video(reader: ImagesReader, options: ImportOptions) -> None:
     Raises:
         SourceError: They cannot be messages, or there are not as many times.
     """
+    is_half = reader.path.name.endswith(EXACT_SUFFIX)
+    if is_half or (reader.path.parent / MANIFEST_NAME).is_file():
+        raise SourceError(
+            reader.path,
+            "is a video of a dataset, which also has its stamps and what makes it exact",
+            "Use the dataset itself: `mp4ds pack`, `unpack` and the others take it.",
+        )
     clip = Clip(open_video(reader.path), pictures="rgb24" if options.decode else "")
     reader.add_file(reader.path)
     stamps, source = clip.file.times, reader.path
