@@ -144,6 +144,19 @@ def test_packets_that_play_need_no_view(kind: str, view: str, tmp_path: Path) ->
 def test_foxglove(kind: str, source: str, tmp_path: Path) -> None:
     made = journey(tmp_path, FOXGLOVE_SOURCES[source], FOXGLOVE[kind](), "mcap", view="h264")
     assert codecs(made.dataset) == ["h264"]
+    with mp4ds.open(made.dataset) as opened:
+        (topic,) = opened.topics
+        recorded = opened.streams[0].channel.type_name
+        shown = opened[topic].read(range(FRAMES), format="gray", layer="view").astype(float)
+    remove_exact(made.dataset)
+    mp4ds.unpack(made.dataset, "mcap", tmp_path / "views.mcap", VISUAL)
+    types = {name for name, _ in messages(tmp_path / "views.mcap", topic)}
+    # packets of another codec are of ROS 2's type, which Foxglove shows as well
+    assert types == {recorded if kind.startswith("jpeg") else "foxglove_msgs/msg/CompressedVideo"}
+    mp4ds.pack(tmp_path / "views.mcap", tmp_path / "once more", PackOptions())
+    with mp4ds.open(tmp_path / "once more") as opened:
+        again = opened[topic].read(range(FRAMES), format="gray").astype(float)
+    assert np.abs(again - shown).mean() < 2
 
 
 SINGLE: dict[str, Any] = {"view": "none"}
