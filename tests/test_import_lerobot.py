@@ -212,7 +212,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], str]] = {
     "climbs": (_with(data_path="../data.parquet"), "data_path is not data/chunk-"),
     "attribute": (_with(video_path="{chunk_index.__class__}"), "video_path is not videos/"),
     "key": (_climbing, "names a file outside of its folder"),
-    "no-column": (_feature("other", dtype="float32", shape=[1]), "KeyError"),
+    "no-column": (_feature("other", dtype="float32", shape=[1]), "is damaged.*other"),
     "count": (_feature("action", shape=[4]), "not of 4 numbers each"),
     "no-video": (_column(EPISODES, f"videos/{KEY}/file_index", [5, 5]), "file-005.mp4: does not"),
     "other-frames": (_column(EPISODES, f"videos/{KEY}/from_timestamp", [0.0, 9.0]), "other frames"),
@@ -241,6 +241,20 @@ def test_what_is_wrong_with_a_folder_is_told(case: str, tmp_path: Path) -> None:
     refused(done, 2)
     assert re.search(problem, done.err), done.err
     assert not (tmp_path / "out").exists()
+
+
+def test_what_has_no_message_is_counted(tmp_path: Path) -> None:
+    root = write_folder(tmp_path / "in")
+    _feature("spoken", dtype="language", shape=[1])(root)
+    _feature("seen", dtype="image", shape=[4, 4, 3])(root)
+    _column(DATA, "spoken", [[{"role": "user", "content": "go"}]] * sum(LENGTHS))(root)
+    _column(DATA, "seen", [{"bytes": b"x", "path": "x.png"}] * sum(LENGTHS))(root)
+    _column(DATA, "more", [1] * sum(LENGTHS))(root)
+    assert imported(root, tmp_path / "ds", episode=0).skipped == {
+        "rows of spoken, whose type has no message": 7,
+        "images of seen, which are not in a video": 7,
+        "columns that are not features": 1,
+    }
 
 
 def test_which_episodes(tmp_path: Path) -> None:

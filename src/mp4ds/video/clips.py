@@ -10,7 +10,7 @@ from typing import Any
 
 from av.error import FFmpegError
 
-from mp4ds.errors import FormatError, Refused, SourceError
+from mp4ds.errors import FormatError, Refused, SourceError, reason_of
 from mp4ds.records import MetadataRecord
 from mp4ds.video.codecs import CODECS, PACKET_CODECS
 from mp4ds.video.coded import REORDERED, StreamParser
@@ -74,9 +74,9 @@ class Clip:
             self.left_out = Counter(f"{kind} tracks" for kind in others)
             if media.hidden:
                 self.left_out["frames that its edit list hides"] = media.hidden
-            turned = next(media.container.decode(media.track)).rotation if numbers is None else 0
-            if turned:
-                self.left_out[f"turn by {turned % 360} degrees, which players apply"] = 1
+            with suppress(FFmpegError, StopIteration):  # a damaged one is copied, too
+                if turned := next(media.container.decode(media.track)).rotation % 360:
+                    self.left_out[f"turn by {turned} degrees, which players apply"] = 1
 
     def _check_packets(self) -> None:
         """Refuse a video whose packets cannot be messages."""
@@ -108,7 +108,8 @@ class Clip:
             raise self._refusal(f"cannot be copied: {reason}") from None
         except (FFmpegError, StopIteration) as error:
             raise_if_scarce(error)
-            raise SourceError(self.file.path, f"is damaged: {error or 'it ends early'}") from None
+            problem = reason_of(error) if error.args else "it ends early"
+            raise SourceError(self.file.path, f"is damaged: {problem}") from None
 
     def body(self, number: int) -> bytes:
         """A frame: its packet as a message has it, or its pixels.

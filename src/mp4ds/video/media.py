@@ -90,7 +90,7 @@ class Media:
     ) -> None:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
-        self._path = path
+        self._path, self._is_mp4 = path, container == "mp4"
         self._file: _Source | None = None
         try:
             if remote(path):
@@ -100,7 +100,7 @@ class Media:
         except (FFmpegError, OSError) as error:
             self._close_file()
             raise_if_scarce(error)
-            problem = why_unreadable(path) or f"cannot be read: {error.strerror or error}"
+            problem = self._why() or f"cannot be read: {error.strerror or error}"
             raise VideoError("video-unreadable", path, problem) from None
         except BaseException:
             self._close_file()
@@ -112,6 +112,9 @@ class Media:
             self.close()
             raise
 
+    def _why(self) -> str:
+        return why_unreadable(self._path) if self._is_mp4 else ""
+
     def _chosen(self, number: int | None, advice: str) -> Any:
         # a picture of the cover comes as one more track
         streams = self.container.streams.video
@@ -121,7 +124,7 @@ class Media:
             problem = f"has {len(tracks)} video tracks, not one"
             if tracks:
                 problem += f" ({listed}){advice}"
-            problem = why_unreadable(self._path) or problem
+            problem = self._why() or problem
             raise VideoError("video-unreadable", self._path, problem)
         if number is not None and not 0 <= number < len(tracks):
             raise OptionError(
@@ -129,7 +132,7 @@ class Media:
             )
         track = tracks[number or 0]
         if track.codec_context is None or track.codec_context.codec is None:
-            problem = why_unreadable(self._path) or "has a video track with an unknown codec"
+            problem = self._why() or "has a video track with an unknown codec"
             raise VideoError("video-unreadable", self._path, problem)
         return track
 

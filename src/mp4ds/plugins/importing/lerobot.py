@@ -58,8 +58,7 @@ class _Folder:
             for name, feature in self.features.items():
                 _check_feature(name, feature)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-            problem = f"is not valid: {type(error).__name__}: {error}"
-            raise SourceError(self.info_path, problem.replace("\n", " ")) from None
+            raise SourceError(self.info_path, f"is not valid: {_told(error)}") from None
         if not version.startswith("v3."):
             raise SourceError(
                 path,
@@ -88,14 +87,16 @@ class _Folder:
         """Whether a column has the numbers or texts of a feature."""
         return name in self.features and self.features[name]["dtype"] not in ("video", "image")
 
-    def episodes(self) -> Iterator[tuple[Path, dict[str, Any]]]:
-        """The rows of all episodes, without statistics, and their files."""
+    def episodes(self, number: int | None = None) -> list[tuple[Path, dict[str, Any]]]:
+        """The rows of all episodes, or of one, without statistics, and their files."""
+        found: list[tuple[Path, dict[str, Any]]] = []
+        only = None if number is None else [("episode_index", "==", number)]
         for path in sorted((self.path / _EPISODES).glob("chunk-*/file-*.parquet")):
             with _reading(path):
-                file = pq.ParquetFile(path)
-                names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-                for batch in file.iter_batches(columns=names):
-                    yield from ((path, row) for row in batch.to_pylist())
+                names = [name for name in pq.read_schema(path).names if name[:6] != "stats/"]
+                rows = pq.read_table(path, columns=names, filters=only).to_pylist()
+                found += ((path, row) for row in rows if int(row["episode_index"]) >= 0)
+        return found
 
 
 def _check_feature(name: str, feature: Any) -> None:
@@ -115,11 +116,17 @@ def _reading(path: Path) -> Iterator[None]:
     """Errors of a table in the terms of a source."""
     try:
         yield
-    except (pa.ArrowException, KeyError, ValueError, TypeError, OverflowError) as error:
-        if isinstance(error, SourceError):
+    except (pa.ArrowException, OSError, KeyError, ValueError, TypeError, OverflowError) as error:
+        if isinstance(error, SourceError) or getattr(error, "errno", None):
             raise
-        text = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise SourceError(path, f"is damaged, or not a table of LeRobot's: {text}") from None
+        problem = f"is damaged, or not a table of LeRobot's: {_told(error)}"
+        raise SourceError(path, problem) from None
+
+
+def _told(error: Exception) -> str:
+    """An error of a library in one line."""
+    text = str(error).partition("\n")[0].rstrip(".")
+    return f"{text} is missing" if isinstance(error, KeyError) and " " not in text else text
 
 
 def episodes_in(folder: Path) -> list[int]:
@@ -128,13 +135,10 @@ def episodes_in(folder: Path) -> list[int]:
     Raises:
         SourceError: It is not a LeRobotDataset v3, or has none.
     """
-    found = []
-    for path, row in _Folder(folder).episodes():
-        with _reading(path):
-            found.append(int(row["episode_index"]))
+    found = sorted(row["episode_index"] for _, row in _Folder(folder).episodes())
     if not found:
         raise SourceError(folder, "has no episodes")
-    return sorted(found)
+    return found
 
 
 def open_episode(folder: Path, options: ImportOptions) -> ImagesReader:
@@ -183,6 +187,8 @@ def open_episode(folder: Path, options: ImportOptions) -> ImagesReader:
             _add_video(reader, known, key, video, begin + times.astype(np.float64), stamps, options)
         elif feature["dtype"] == "image":
             reader.left_out[f"images of {key}, which are not in a video"] = length
+        elif key in held and not _has_messages(table.schema.field(key).type):
+            reader.left_out[f"rows of {key}, whose type has no message"] = length
         else:
             with _reading(data):
                 _add_rows(reader, _topic(key), feature, table[key], stamps)
@@ -199,11 +205,7 @@ def _topic(key: str) -> str:
 
 def _chosen(folder: _Folder, number: int | None) -> tuple[Path, dict[str, Any]]:
     """The row of an episode."""
-    found = [
-        (path, row)
-        for path, row in folder.episodes()
-        if number is None or row.get("episode_index") == number
-    ]
+    found = folder.episodes(number)
     if not found:
         raise OptionError(f"{folder.path} has no `episode` {number}.")
     if len(found) > 1:
@@ -296,6 +298,15 @@ def _add_rows(
         reader.add_joints(topic, names, stamps, rows.astype(np.float64))
     else:
         reader.add_numbers(topic, stamps, rows, shape)
+
+
+def _has_messages(kind: Any) -> bool:
+    """Whether a column is of numbers, texts, or lists of these."""
+    while pa.types.is_nested(kind) and hasattr(kind, "value_type"):
+        kind = kind.value_type
+    # a column without any value is of no type, and refused later
+    plain = (pa.float32(), pa.float64(), pa.bool_(), pa.string(), pa.null())
+    return kind in plain or bool(pa.types.is_integer(kind))
 
 
 def _rows(column: Any, count: int, length: int) -> NDArray[Any]:
