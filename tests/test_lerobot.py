@@ -258,3 +258,5 @@ def test_wrong_options(drives: list[Path], options: dict[str, Any], sentence: st
     with pytest.raises(mp4ds.OptionError) as caught:
         dataset(drives, **options)
     assert sentence in str(caught.value)
+    with pytest.raises(TypeError, match="LeRobotDataset has no 'offsets'"):
+        dataset(drives, offsets=(0, 1))

@@ -323,7 +323,7 @@ _ELSEWHERE = {
     "get_frame_played_at": "dataset[topic].at(stamp_ns)",
     "get_frames_played_in_range": "dataset[topic].between(start_ns, end_ns)",
     "get_batch": "dataset[topic].read([0, 5])",
-    "delta_timestamps": 'offsets=(-0.1, 0), offsets_in="seconds"',
+    "delta_timestamps": 'offsets=(-0.1, 0), offsets_in="seconds", or use LeRobotDataset',
     "tolerance_s": "tolerance_ns",
     "image_transforms": "transform",
 }

@@ -27,13 +27,14 @@ from mp4ds.dataset.features import (
 )
 from mp4ds.dataset.stream import Layer
 from mp4ds.dataset.vectors import Fields
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, absent
 from mp4ds.files.urls import location
 from mp4ds.torch.datasets import FrameDataset, Offsets, Sample
 from mp4ds.torch.recordings import Paths, usual_rate
 
 _TOLERANCE_S = 1e-4  # of a multiple of the period, as in LeRobot
 _EVER = 2**62  # nanoseconds
+_OTHERS = ("offsets", "offsets_in", "action_offsets", "format", "channels_first", "transform")
 _IN_MM = {"16UC1": 1.0, "32FC1": 1000.0}
 _FEWEST, _IN_ALL = 5, 2000  # frames for a camera's statistics, of an episode and of all
 
@@ -167,6 +168,9 @@ class LeRobotDataset(FrameDataset):
         layer: Layer = "view",
         **options: Any,
     ) -> None:
+        for name in _OTHERS:
+            if name in options:
+                raise TypeError(absent(self, name))
         rate = usual_rate(paths, topics, layer, rename or {}) if fps is None else fps
         options.setdefault("message_tolerance_ns", _EVER)  # LeRobot marks what is beyond an episode
         super().__init__(
