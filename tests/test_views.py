@@ -521,6 +521,8 @@ def test_a_view_beside_images_that_it_does_not_predict(tmp_path: Path) -> None:
     mp4ds.pack(tmp_path / "drive.mcap", tmp_path / "dataset", PackOptions(view="av1"))
     (sidecar,) = sidecars(tmp_path / "dataset")
     assert (sidecar.predicted, codecs(tmp_path / "dataset")) == (False, ["av1"])
+    assert sidecar.view is not None
+    assert sidecar.view.options["preset"] == "9"
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
     assert compare(tmp_path / "drive.mcap", unpacked(tmp_path, "mcap")) == []
     with mp4ds.open(tmp_path / "dataset") as opened:

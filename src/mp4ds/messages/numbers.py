@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -68,17 +68,20 @@ class PatternTable(Values):
 
     def _numbers(self, samples: Samples) -> Samples:
         """For each sample the index of the last pattern that is not greater, or 0."""
-        if samples.dtype.itemsize == 2:
-            every = np.arange(65536, dtype=np.uint16)
-            numbers = np.searchsorted(self.table, every, side="right")
-            return (np.maximum(numbers, 1) - 1).astype(np.uint16)[samples]
         numbers = np.searchsorted(self.table, samples, side="right")
         return (np.maximum(numbers, 1) - 1).astype(np.uint16)
 
+    @cached_property
+    def _numbers_of_words(self) -> Samples:
+        """Those of each pattern of 16 bits."""
+        return self._numbers(np.arange(65536, dtype=np.uint16))
+
     def encode(self, pixels: Pixels) -> Samples:
         """New samples."""
-        numbers = self._numbers(native(pixels))
-        return numbers.astype(np.uint8) if self.bits == 8 else numbers
+        samples = native(pixels)
+        is_word = samples.dtype.itemsize == 2
+        numbers = self._numbers_of_words[samples] if is_word else self._numbers(samples)
+        return numbers.astype(np.uint8, copy=False) if self.bits == 8 else numbers
 
     def decode(self, samples: Samples, out: Pixels) -> None:
         """Write the pixels; indices beyond the table, from a damaged video, mean the last entry."""
@@ -87,7 +90,7 @@ class PatternTable(Values):
     def refuses(self, pixels: Pixels) -> str | None:
         """A pattern that is not in the table."""
         samples = native(pixels)
-        unknown = self.table[self._numbers(samples)] != samples
+        unknown = self.table[self.encode(pixels)] != samples
         if unknown.any():
             value = np.ascontiguousarray(pixels[unknown][:1]).item()
             return f"value {value} is not one of the {len(self.table)} in the stream's table"
@@ -146,9 +149,8 @@ class Tone(PatternTable):
         return cls(table, used)
 
     def _numbers(self, samples: Samples) -> Samples:
-        every = np.arange(65536, dtype=np.uint16)
-        found: Samples = np.searchsorted(self._between, every, side="right").astype(np.uint8)
-        return found[samples]
+        found: Samples = np.searchsorted(self._between, samples, side="right").astype(np.uint8)
+        return found
 
     def refuses(self, pixels: Pixels) -> str | None:
         """A bit outside the kept ones."""

@@ -40,6 +40,7 @@ from mp4ds.records import EVERYTHING, Channel, Excerpt, Message
 from mp4ds.times import cut_times
 from mp4ds.video.codecs import (
     AV1,
+    BESIDE_PRESET,
     DEFAULT_LOSSY,
     LOSSY_GOP,
     LOSSY_TRAINING_GOP,
@@ -288,6 +289,8 @@ def _lossless_plans(
                 larger = f"with its view about {size / least:.1f} times as large as without"
                 note = "; ".join(filter(None, (note, larger if options.asks_for_views else "")))
             if size <= _LARGER * least or options.asks_for_views:
+                if not is_predicted:
+                    view = _view_coding(pixels, encoding, options, beside=True)
                 best, least = both if is_predicted else best, min(least, size)
                 plan = TrackPlan(best, view, is_predicted, note=note)
     _refuse_noise(samples, least)
@@ -299,14 +302,15 @@ def _lossless_plans(
 
 
 def _view_coding(
-    pixels: Sequence[Pixels], encoding: Encoding, options: PackOptions
+    pixels: Sequence[Pixels], encoding: Encoding, options: PackOptions, *, beside: bool = False
 ) -> Coding | None:
-    """How the view of lossless images is encoded; None without a view."""
+    """How the view of lossless images is encoded, beside what it does not predict; None without."""
     layout = None if options.view == NO_VIEW else _shown_layout(encoding, pixels)
     if layout is None:
         return None
     codec = options.view or DEFAULT_LOSSY
-    preset = PURPOSE_PRESET if options.purpose else VIEW_PRESET
+    usual = BESIDE_PRESET if beside else VIEW_PRESET
+    preset = PURPOSE_PRESET if options.purpose else usual
     recipe = recipe_for(
         layout.pixel_format,
         lossless=False,

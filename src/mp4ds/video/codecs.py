@@ -254,9 +254,16 @@ def lossless_codecs(pixel_format: str) -> Sequence[str]:
     return tuple(_LOSSLESS[pixel_format])
 
 
-def codecs_to_try(pixel_format: str) -> Sequence[str]:
-    """Those of `lossless_codecs` that are worth trying."""
-    return tuple(name for name, coding in _LOSSLESS[pixel_format].items() if coding.tried)
+def codecs_to_try(pixel_format: str, is_noise: bool = False) -> Sequence[str]:
+    """Those of `lossless_codecs` that are worth trying.
+
+    Args:
+        pixel_format: Of the pictures.
+        is_noise: As for `recipe_for`; of grey noise, FFV1 is never the smallest.
+    """
+    left_out = "ffv1" if is_noise and pixel_format == "gray" else ""
+    tried = (name for name, coding in _LOSSLESS[pixel_format].items() if coding.tried)
+    return tuple(name for name in tried if name != left_out)
 
 
 def codec_name(name: str) -> str:
@@ -425,8 +432,9 @@ VISUAL_TABLE: tuple[tuple[float, int, int], ...] = (
 )
 """Frame rate in Hz, crf and preset of SVT-AV1 for VMAF 99.5: the paper's rates and crf."""
 
-VIEW_CRF, VIEW_PRESET = 22, "8"
-"""Of SVT-AV1 for views: what they lack costs about as much in the other video (spec/notes.md)."""
+VIEW_CRF, VIEW_PRESET, BESIDE_PRESET = 22, "8", "9"
+"""Of SVT-AV1 for views: what they lack costs about as much in the other video (spec/notes.md); the
+last of those that predict nothing."""
 
 _UNKNOWN_RATE = 30.0
 

@@ -548,6 +548,7 @@ def choose(
         EncoderRefusedError: No codec takes such pictures.
     """
     crops, share = _crops(samples, encoding)
+    is_noise = bool(differences)
     tried: list[tuple[Coding, Coded]] = []
     refusals: list[Exception] = []
     candidates = differences or (
@@ -555,14 +556,10 @@ def choose(
     )
     for layout, pictures in candidates:
         picture_format = layout.pixel_format
-        for name in codecs_to_try(picture_format) if codec is None else [codec]:
+        for name in codecs_to_try(picture_format, is_noise) if codec is None else [codec]:
             try:
                 recipe = recipe_for(
-                    picture_format,
-                    lossless=True,
-                    codec=name,
-                    preset=preset,
-                    is_noise=bool(differences),
+                    picture_format, lossless=True, codec=name, preset=preset, is_noise=is_noise
                 )
                 coded = encode_on_trial(
                     pictures, recipe, picture_format=picture_format, threads=threads
