@@ -285,7 +285,10 @@ def test_each_of_several(tmp_path: Path) -> None:
         ),
         (["--crop", "0,0,9"], "--crop '0,0,9' is not X,Y,W,H in pixels"),
         (["--nearest", "/cam/*"], "--nearest says how images are resized: give --resize, too"),
-        (["--resize", "0.5", "--nearest", "/mask"], "'/mask' matches no topic"),
+        (
+            ["--resize", "0.5", "--nearest", "/mask"],
+            "--nearest '/mask' matches no topic of images. Topics of images: /cam/image_raw",
+        ),
         (["--every", "0"], "--every 0 is not a number of frames"),
         (["--resize", "0.5", "--for", "training", "--gop", "2"], "Give --for or --gop, not both"),
     ],

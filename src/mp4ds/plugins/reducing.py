@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from mp4ds.bags.protocols import BagReader, with_own_payload
 from mp4ds.dataset.images import Shown, shown_by
 from mp4ds.dataset.views import View, view_of
-from mp4ds.errors import ConversionError, Refused
+from mp4ds.errors import ConversionError, OptionError, Refused
+from mp4ds.format.manifest import ReducedImages
 from mp4ds.format.models import Calibration
 from mp4ds.messages.depth import metres_of
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels
@@ -67,7 +68,7 @@ class ReducedReader(BagReader):
         options: What to do to its images; of which topics.
 
     Raises:
-        OptionError: A pair of calibrations and images is not possible.
+        OptionError: A pair of calibrations and images, or a pattern of topics, is not possible.
     """
 
     is_indexed: bool = False
@@ -82,40 +83,42 @@ class ReducedReader(BagReader):
             deque(reader.records(Excerpt(others=False)), maxlen=0)  # which declares them
         chosen = [channel for channel in reader.channels if options.selected(channel.topic)]
         self._cameras = {channel.id: channel for channel in filter(is_camera, chosen)}
-        self._nearest = Selection(options.nearest)
-        if options.nearest:
-            self._nearest.check(channel.topic for channel in self._cameras.values())
-        self.videos = {one.id for one in chosen if one.type_name.endswith(_PACKETS)}
-        is_reshaped = options.resize is not None or options.crop is not None
-        kinds = (is_camera, is_calibration) if is_reshaped else ()
-        self.remade = self.videos.union(one.id for one in chosen if any(is_(one) for is_ in kinds))
-        self._types = {
-            one.id: Types(
-                "ros1" if one.message_encoding == "ros1" else "ros2",
-                "raw",
-                _INFO if is_calibration(one) else None,
-            )
-            for one in chosen
-            if one.id in self.remade and not _keeps_type(one)
+        for pattern in options.nearest:
+            topics = [channel.topic for channel in self._cameras.values()]
+            if not any(map(Selection([pattern]), topics)):
+                listed = ", ".join(topics) or "none"
+                problem = f"`nearest` {pattern!r} matches no topic of images"
+                raise OptionError(f"{problem}. Topics of images: {listed}.")
+        self.videos = {
+            key for key, one in self._cameras.items() if one.type_name.endswith(_PACKETS)
         }
-        self._given = {
-            one.id: self._types[one.id].channel(one, one.id, one.topic)
-            for one in chosen
-            if one.id in self._types
-        }
+        self.remade = set(self.videos)
+        if options.resize is not None or options.crop is not None:
+            self.remade |= self._cameras.keys() | {one.id for one in chosen if is_calibration(one)}
+        self._types: dict[int, Types] = {}
+        self._given: dict[int, Channel] = {}
+        for one in chosen:
+            if one.id in self.remade and not _keeps_type(one):
+                world = "ros1" if one.message_encoding == "ros1" else "ros2"
+                types = Types(world, "raw", _INFO if is_calibration(one) else None)
+                self._types[one.id] = types
+                self._given[one.id] = types.channel(one, one.id, one.topic)
         self.is_indexed = reader.is_indexed and options.max_rate is None and not self.videos
         self.pairs = self._images = find_pairs(reader, options.camera_info, chosen)
         self._views: dict[tuple[str, _Kind], View] = {}
-        found = {
-            key: self._original(self._cameras[key]) for key in self._cameras.keys() & self.remade
-        }
-        self._originals = {key: original for key, original in sorted(found.items()) if original}
-        names = "topic", "type", "encoding", "width", "height"
+        self._originals: dict[int, _Kind] = {}
         images = []
-        for key, (encoding, size) in self._originals.items():
-            channel = self._cameras[key]
-            told = channel.topic, channel.type_name, encoding, *size
-            images.append(dict(zip(names, told, strict=True)))
+        for key, one in self._cameras.items():
+            if key in self.remade and (original := self._original(one)):
+                self._originals[key] = encoding, (width, height) = original
+                told = ReducedImages(
+                    topic=one.topic,
+                    type=one.type_name,
+                    encoding=encoding,
+                    width=width,
+                    height=height,
+                )
+                images.append(told)
         self.reduction = {**options.reduction, "images": images}
 
     def _original(self, channel: Channel) -> _Kind | None:
@@ -215,7 +218,7 @@ class ReducedReader(BagReader):
                 format="native" if is_native else "rgb",
                 resize=smaller,
                 crop=crop,
-                nearest=bool(self.options.nearest) and self._nearest(topic),
+                nearest=any(Selection([glob])(topic) for glob in self.options.nearest),
             )
         return self._views[topic, of]
 
