@@ -224,7 +224,8 @@ def test_tasks_and_single_numbers(drives: list[Path]) -> None:
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
 def test_depths(encoding: str, tmp_path: Path) -> None:
     made = scene(encoding, frames=4, with_info=False)
-    own = LeRobotDataset(packed(tmp_path, made), return_uint8=encoding == "16UC1")
+    drive = packed(tmp_path, made)
+    own = LeRobotDataset(drive, return_uint8=encoding == "16UC1", cache=tmp_path / "cache")
     key = "observation.images.cam_image_raw"
     assert (own.meta.depth_keys, own.meta.shapes[key]) == ([key], (48, 64, 1))
     with mp4ds.open(own.paths[0]) as recorded:
@@ -232,7 +233,7 @@ def test_depths(encoding: str, tmp_path: Path) -> None:
     depths[~np.isfinite(depths)] = 0
     with np.errstate(over="ignore"):  # some are absurd
         expected = depths * np.float32({"16UC1": 1, "32FC1": 1000}[encoding])
-    for number in range(4):
+    for number in (0, 1, 2, 3, 1):  # the last from the cache
         assert own[number][key].dtype == torch.float32
         assert np.array_equal(own[number][key][0].numpy(), expected[number])
     if encoding == "16UC1":

@@ -250,11 +250,6 @@ class OpenCamera:
             self._cached = cache.camera(self._topic, view, self._topic.read([], **view))
 
     @property
-    def encoding(self) -> str:
-        """Of the images, as recorded."""
-        return self._topic.encoding
-
-    @property
     def stamps(self) -> NDArray[np.int64]:
         """Header stamps, nanoseconds, by frame."""
         return self._topic.stamps

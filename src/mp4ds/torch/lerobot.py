@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import SimpleNamespace
@@ -30,7 +31,7 @@ from mp4ds.dataset.vectors import Fields
 from mp4ds.errors import OptionError, absent
 from mp4ds.files.urls import location
 from mp4ds.torch.datasets import FrameDataset, Offsets, Sample
-from mp4ds.torch.recordings import Paths, usual_rate
+from mp4ds.torch.recordings import Paths, open_source, usual_rate
 
 _TOLERANCE_S = 1e-4  # of a multiple of the period, as in LeRobot
 _EVER = 2**62  # nanoseconds
@@ -215,10 +216,12 @@ class LeRobotDataset(FrameDataset):
     def _features(self, fps: int) -> dict[str, Feature]:
         found: dict[str, Feature] = {}
         for number, key in enumerate(self._images):
+            with closing(open_source(self.recordings[0].sources[number])) as topic:
+                encoding = topic.encoding
+            if encoding in _IN_MM:
+                self._scales[key] = _IN_MM[encoding]
+                self._pictures.views[number]["format"] = "native"
             with self._cameras.using(self.recordings[0], number) as camera:
-                if camera.encoding in _IN_MM:
-                    self._scales[key] = _IN_MM[camera.encoding]
-                    self._pictures.views[number]["format"] = "native"
                 height, width, channels = camera.empty(1).shape[2:]
             found[key] = video_feature((width, height), fps, {})
             if key in self._scales:
