@@ -72,8 +72,8 @@ class Clip:
             self.metadata = MetadataRecord("video", {**texts, "file": file.path.name})
             others = [one.type for one in media.container.streams if one is not media.track]
             self.left_out = Counter(f"{kind} tracks" for kind in others)
-            if media.hidden:
-                self.left_out["frames that its edit list hides"] = media.hidden
+            if file.hidden:
+                self.left_out["frames that its edit list hides"] = file.hidden
             with suppress(FFmpegError, StopIteration):  # a damaged one is copied, too
                 if turned := next(media.container.decode(media.track)).rotation % 360:
                     self.left_out[f"turn by {turned} degrees, which players apply"] = 1

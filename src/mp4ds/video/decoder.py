@@ -22,7 +22,7 @@ from mp4ds.errors import Refused, VideoError, reason_of
 from mp4ds.messages.encodings import MAX_SIDE, Picture
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.media import Media, most_pixels, raise_if_scarce
-from mp4ds.video.mp4 import read_sample_table
+from mp4ds.video.mp4 import SampleTable
 from mp4ds.video.pixels import PictureMaker, Scale
 
 _ENCODINGS = {"L": "mono8", "RGB": "rgb8"}
@@ -222,7 +222,7 @@ class VideoDecoder:
     @property
     def coded_frames(self) -> int:
         """Frames in the file's index, without those hidden by an edit list at the beginning."""
-        return len(self._stream.index_entries) - self._media.hidden
+        return len(self._media.table.order)
 
     def pictures_at(
         self, indices: Iterable[int], scale: Scale | None = None
@@ -313,15 +313,10 @@ class VideoDecoder:
         """Presentation ticks of the frames, and numbers of those at which decoding can begin."""
         if self._file:
             return self._file.ticks, self._file.keys
-        # without B-frames the index's decoding times are the presentation times
-        entries = self._stream.index_entries
-        ticks = [entry.timestamp for entry in entries][self._media.hidden :]
-        if len(ticks) != self._frames:
-            raise VideoError(
-                "frame-count", self._path, f"has {len(ticks)} frames, not {self._frames}"
-            )
-        keys = [entry.is_keyframe for entry in entries]
-        return np.sort(np.array(ticks, np.int64)), np.flatnonzero(keys[self._media.hidden :])
+        if self.coded_frames != self._frames:
+            problem = f"has {self.coded_frames} frames, not {self._frames}"
+            raise VideoError("frame-count", self._path, problem)
+        return _times_and_keys(self._media.table)
 
     def _decoded(self, first: int, *, is_strict: bool) -> Iterator[av.VideoFrame]:
         """The frames from here on; the first one's number is for errors."""
@@ -392,6 +387,7 @@ class VideoFile:
         times: Presentation times, nanoseconds, rounded down, int64, shape (frames,).
         is_reordered: Whether frames are coded in another order than they are shown.
         is_indexed: Whether all of this is in the file's index, so that little is read of it.
+        hidden: How many coded frames its edit list hides before the first that is shown.
     """
 
     path: Path
@@ -404,6 +400,7 @@ class VideoFile:
     times: NDArray[np.int64]
     is_reordered: bool
     is_indexed: bool
+    hidden: int
 
     def open(self) -> Media:
         """Open it once more."""
@@ -441,17 +438,15 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
             raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
         name = context.codec.canonical_name
         codec = next((key for key, value in CODECS.items() if value.ffmpeg == name), name)
-        shown, keys, is_indexed = _read_ticks(media, path, track)
-        if not len(shown):
+        table = media.table
+        ticks, keys = _times_and_keys(table)
+        if not len(ticks):
             raise VideoError("video-unreadable", path, "has no frames")
-        ticks = np.sort(shown)
         base = media.track.time_base
         if np.abs(ticks[[0, -1]]).max() * base >= _LATEST or base.numerator != 1:
             raise VideoError("video-unreadable", path, "has times beyond 64 bits")
         whole, part = np.divmod(ticks, base.denominator)
         times = whole * _SECOND + part * _SECOND // base.denominator
-        # a key frame may be hidden: the next one shown is decoded from it
-        numbers = np.unique(np.searchsorted(ticks, keys))
         return VideoFile(
             path,
             track,
@@ -459,37 +454,16 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
             codec,
             (width, height),
             ticks,
-            numbers,
+            keys,
             times,
-            is_reordered=not np.array_equal(ticks, shown),
-            is_indexed=is_indexed,
+            is_reordered=bool(np.any(np.diff(table.order) < 0)),
+            is_indexed=bool(table.entry.codec),
+            hidden=int(table.order.min()),
         )
 
 
-def _read_ticks(
-    media: Media, path: Path, track: int | None
-) -> tuple[NDArray[np.int64], NDArray[np.int64], bool]:
-    """Ticks of the frames as coded, and of key frames in order; whether an index has them."""
-    try:
-        if path.suffix.lower() in _MATROSKA:
-            raise Refused("it is no mp4")
-        with path.open("rb") as file:
-            table = read_sample_table(file, path.stat().st_size, str(path), track)
-        shown = table.presentation[np.sort(table.order)]
-        return shown, np.sort(table.presentation[table.sync]), True
-    except Refused:  # ffmpeg reads more, though only by all packets
-        ticks, keys = [], []
-    except OSError as error:
-        raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
-    try:
-        for packet in media.container.demux(media.track):
-            if packet.pts is None:
-                continue
-            if packet.is_keyframe:
-                keys.append(packet.pts)
-            if not packet.is_discard:
-                ticks.append(packet.pts)
-    except (FFmpegError, OSError) as error:
-        raise_if_scarce(error)
-        raise VideoError("video-unreadable", path, f"cannot be read: {error}") from None
-    return np.array(ticks, np.int64), np.sort(np.array(keys, np.int64)), False
+def _times_and_keys(table: SampleTable) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Presentation ticks of the frames, and numbers of those at which decoding can begin."""
+    ticks = table.presentation[table.order]
+    # a key frame may be hidden: the next one shown is decoded from it
+    return ticks, np.unique(np.searchsorted(ticks, np.sort(table.presentation[table.sync])))

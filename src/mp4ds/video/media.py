@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import av
+import numpy as np
 from av.error import FFmpegError
 from av.stream import Disposition
 
-from mp4ds.errors import Mp4dsError, OptionError, RemoteError, VideoError
+from mp4ds.errors import Mp4dsError, OptionError, Refused, RemoteError, VideoError
 from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import CODECS
-from mp4ds.video.mp4 import why_unreadable
+from mp4ds.video.mp4 import SampleEntry, SampleTable, read_sample_table, why_unreadable
 
 _FILES = (errno.EMFILE, errno.ENFILE)
 _ENOUGH_BYTES = 32 * 2**20
@@ -90,7 +91,7 @@ class Media:
     ) -> None:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
-        self._path, self._is_mp4 = path, container == "mp4"
+        self._path, self._number, self._is_mp4 = path, track, container == "mp4"
         self._file: _Source | None = None
         try:
             if remote(path):
@@ -137,10 +138,50 @@ class Media:
         return track
 
     @cached_property
-    def hidden(self) -> int:
-        """How many coded frames an edit list hides before the first that is shown."""
-        entries = self.track.index_entries
-        return next((n for n, item in enumerate(entries) if not item.is_discard), len(entries))
+    def table(self) -> SampleTable:
+        """The index of the track; for fragments and Matroska, of all packets, with an empty entry.
+
+        Raises:
+            VideoError: ``video-unreadable``.
+        """
+        try:
+            if not self._is_mp4:
+                raise Refused("it is no mp4")
+            with self._path.open("rb") as file:
+                size = self._path.stat().st_size
+                return read_sample_table(file, size, str(self._path), self._number)
+        except Refused:  # ffmpeg reads more, though only by all packets
+            return self._table_of_packets()
+        except OSError as error:
+            raise self._unreadable(error) from None
+
+    def _table_of_packets(self) -> SampleTable:
+        try:
+            packets = [
+                (p.pos or 0, p.size, p.dts, p.pts, p.is_keyframe, p.is_discard)
+                for p in self.container.demux(self.track)
+                if p.pts is not None  # as of the packet that ends a video
+            ]
+        except (FFmpegError, OSError) as error:
+            raise_if_scarce(error)
+            raise self._unreadable(error) from None
+        given = [(*p[:2], p[3] if p[2] is None else p[2], *p[3:]) for p in packets]
+        rows = np.array(given, np.int64).reshape(-1, 6)
+        places, sizes, decoding, presentation, sync, hidden = rows.T
+        shown = np.flatnonzero(hidden == 0)
+        return SampleTable(
+            entry=SampleEntry("", b"", ()),
+            timescale=self.track.time_base.denominator,
+            places=places,
+            sizes=sizes,
+            decoding=decoding,
+            presentation=presentation,
+            sync=sync.astype(np.bool_),
+            order=shown[np.argsort(presentation[shown], kind="stable")],
+        )
+
+    def _unreadable(self, error: Exception) -> VideoError:
+        return VideoError("video-unreadable", self._path, f"cannot be read: {error}")
 
     def check(self, codec: str, coded_size: tuple[int, int] | None) -> None:
         """Compare the header with what a sidecar says.

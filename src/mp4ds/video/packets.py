@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import av
+import numpy as np
 from av.error import FFmpegError
+from numpy.typing import NDArray
 
 from mp4ds.errors import Mp4dsError, Refused, VideoError, path_text
 from mp4ds.times import TIMESCALE
@@ -200,9 +202,9 @@ def packet_format(codec: str, parameters: bytes, body: bytes | memoryview) -> st
 class PacketReader:
     """The packets of an mp4's video track. A context manager.
 
-    They are read from where the file's index says, which ffmpeg reads: the format allows fragments,
-    which `read_sample_table` refuses. A forged index costs no memory beyond the file's size. Packet
-    0 is the first that is shown; those that an edit list hides before it have negative numbers.
+    They are read from where the file's index says. A forged index costs no memory beyond the
+    file's size. Packet 0 is the first that is shown; those that an edit list hides before it have
+    negative numbers.
 
     Args:
         path: The video.
@@ -239,33 +241,21 @@ class PacketReader:
             context = media.track.codec_context
             self.extradata: bytes = bytes(context.extradata or b"")
             self.pixel_format = pixel_format_of(context)
-            entries = media.track.index_entries
-            self.hidden = media.hidden
-            count = len(entries) - self.hidden
-            if not count:
-                raise VideoError("frame-count", path, "has no frames")
-            if frames is not None and count != frames:
-                raise VideoError("frame-count", path, f"has {count} frames, not {frames}")
-            ticks, self._sizes, self._places = array("q"), array("q"), array("q")
-            self._keyframes = bytearray()
-            for entry in entries:
-                ticks.append(entry.timestamp)
-                self._sizes.append(entry.size)
-                self._places.append(entry.pos)
-                self._keyframes.append(entry.is_keyframe)
-        self.ticks, self.sizes = ticks[self.hidden :], self._sizes[self.hidden :]
-        self.keyframes = self._keyframes[self.hidden :]
+            table = media.table
+        count = len(table.order)
+        if not count:
+            raise VideoError("frame-count", path, "has no frames")
+        if frames is not None and count != frames:
+            raise VideoError("frame-count", path, f"has {count} frames, not {frames}")
+        if table.sizes.sum() > path.stat().st_size:
+            raise VideoError("video-unreadable", path, "has an index that is damaged")
+        self.hidden = int(table.order.min())
+        shown = slice(self.hidden, self.hidden + count)
+        self._places, self._sizes = _integers(table.places), _integers(table.sizes)
+        self._keyframes = bytearray(table.sync.tobytes())
+        self.ticks, self.sizes = _integers(table.decoding)[shown], self._sizes[shown]
+        self.keyframes = self._keyframes[shown]
         self._file = path.open("rb")
-        self._check_index()
-
-    def _check_index(self) -> None:
-        length = self._file.seek(0, io.SEEK_END)
-        total = 0
-        for place, size in zip(self._places, self._sizes, strict=True):
-            total += size
-            if place < 0 or size < 0 or place + size > length or total > length:
-                self._file.close()
-                raise VideoError("video-unreadable", self.path, "has an index that is damaged")
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -344,6 +334,10 @@ class PacketReader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _integers(numbers: NDArray[np.int64]) -> array[int]:
+    return array("q", numbers.tobytes())
 
 
 # ---------------------------------------------------------------- cut, join
@@ -494,11 +488,10 @@ def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
 def _last_duration(path: Path) -> int:
     """How long the last frame lasts, in ticks; all others last until the next one."""
     with closing(Media(path)) as source:
-        entries = source.track.index_entries
-        if not len(entries):
+        ticks = source.table.decoding
+        if not len(ticks):
             raise VideoError("frame-count", path, "has no frames")
-        elapsed = entries[len(entries) - 1].timestamp - entries[0].timestamp
-        return max(int(source.track.duration or 0) - int(elapsed), 1)
+        return max(int(source.track.duration or 0) - int(ticks[-1] - ticks[0]), 1)
 
 
 def _copy(
