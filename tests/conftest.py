@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 
 import mp4ds
+from mp4ds.errors import Mp4dsError
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.demo import demo
+from mp4ds.video.codecs import check_pyav
 from mp4ds.video.encoder import ordinary_scheduling
 from sources import SOURCES, scene
 
@@ -111,6 +113,19 @@ def unsynced() -> Iterator[None]:
     """Do not wait for the disk: no test goes on after a power cut."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("os.fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def written() -> Iterator[None]:
+    """Skip what writes videos where PyAV is only good for reading."""
+    with pytest.MonkeyPatch.context() as patch:
+        try:
+            check_pyav()
+        except Mp4dsError as error:
+            reason = str(error)
+            for module in ("codecs", "media"):
+                patch.setattr(f"mp4ds.video.{module}.check_pyav", lambda: pytest.skip(reason))
         yield
 
 

@@ -22,6 +22,7 @@ from av.video.frame import PictureType
 from numpy.typing import NDArray
 from PIL import Image
 
+from mp4ds.video.pixels import ONE_THREAD
 from pictures import picture
 
 Pixels = NDArray[Any]
@@ -209,7 +210,7 @@ def encoded(
             context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
             context.options = options
         frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-        frame = frame.reformat(format=pixel_format, threads=1)
+        frame = frame.reformat(format=pixel_format, **ONE_THREAD)
         frame.pts = number
         if all_p and number:
             frame.pict_type = PictureType.P

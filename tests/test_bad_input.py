@@ -309,6 +309,22 @@ def test_a_terminal_that_cannot_show_a_topic(tmp_path: Path) -> None:
     assert "topic.mp4" in packed.out
 
 
+@pytest.mark.parametrize("job", ["pack", "slice", "lerobot", "evaluate"])
+def test_a_pyav_that_only_reads(
+    job: str, demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mp4ds.video.codecs.AV_VERSION", (17, 0))
+    arguments = {
+        "pack": ("pack", demo / "drive.bag", "-o", tmp_path / "x"),
+        "slice": ("pack", demo / "drive", "-o", tmp_path / "x", "--duration", 0.5),
+        "lerobot": ("export", "lerobot", demo / "drive", "-o", tmp_path / "x"),
+        "evaluate": ("evaluate", demo / "drive", "-o", tmp_path / "x"),
+    }[job]
+    with unchanged(tmp_path):
+        refused(call(*arguments), 1, "To write videos", "run pip install 'av>=17.1'")
+    assert call("validate", demo / "drive").code == 0
+
+
 # ---------------------------------------------------------------- targets that may not be written
 
 

@@ -29,6 +29,7 @@ from edits import agreed, changed, flip
 from mp4ds import FormatError, OptionError, SourceError, UnpackOptions
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.video.media import new_mp4
 
 CASE = Path(__file__).parents[1] / "conformance" / "cases" / "datasets" / "views"
 EXPECTED: list[dict[str, Any]] = json.loads((CASE / "expected.json").read_text())["streams"]
@@ -385,7 +386,7 @@ def test_a_picture_of_a_gigabyte_is_not_made(place: int, huge: bytes, dataset: P
     width, height = EXPECTED[0]["coded_size"]
     files = [png_file(width, height, 0, 8)] * 3
     files[place] = huge
-    with av.open(str(exact(dataset, ONE)), "w", format="mp4") as container:
+    with new_mp4(exact(dataset, ONE)) as container:
         stream = container.add_mux_stream("png", rate=30, width=width, height=height)
         for number, data in enumerate(files):
             packet = av.Packet(data)

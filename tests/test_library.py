@@ -14,6 +14,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from rosbags.highlevel import AnyReader
 
 import mp4ds
@@ -58,6 +59,17 @@ def colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
     """A dataset of rgb8 images, not to be changed, and what was recorded."""
     source = scene("rgb8", frames=12)
     return packed(tmp_path_factory.mktemp("colour"), source, gop=5), source
+
+
+@pytest.mark.parametrize("name", ["lossy-av1", "lossy-h264", "lossy-h265"])
+def test_smaller_frames_have_the_same_colours(name: str) -> None:
+    """Matrix and range are those of the video, as in full size."""
+    with mp4ds.open(Path(__file__).parents[1] / "conformance/cases/datasets" / name) as dataset:
+        for topic in ("rgb8", "bgr8"):
+            frames = dataset[f"/{topic}/cam/image_raw"]
+            (whole,), (small,) = (frames.read([0], format="rgb", resize=x) for x in (None, 0.5))
+            due = Image.fromarray(whole).resize(small.shape[1::-1], Image.Resampling.BOX)
+            assert np.abs(np.asarray(due).astype(int) - small).mean() < 3
 
 
 # ---------------------------------------------------------------- frames of coded messages

@@ -22,6 +22,7 @@ from encoders import Packet
 from mp4ds.video import av1
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded import CodedFrame, StreamParser
+from mp4ds.video.pixels import ONE_THREAD
 
 WIDTH, HEIGHT, FRAMES, GOP = 128, 96, 45, 20
 QUIET = "log-level=error:pools=none:frame-threads=1"
@@ -145,7 +146,7 @@ def encoded_file(recipe: Recipe) -> bytes:
         stream.codec_context.thread_count = 1
         for number, pixels in enumerate(pictures()):
             frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-            frame = frame.reformat(format=recipe.pixel_format, threads=1)
+            frame = frame.reformat(format=recipe.pixel_format, **ONE_THREAD)
             frame.pts, frame.time_base = number, Fraction(1, 30)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))

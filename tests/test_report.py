@@ -93,6 +93,18 @@ def digests(folder: Path) -> dict[str, str]:
     return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.glob("*.*")}
 
 
+CASES = Path(__file__).parents[1] / "conformance/cases/datasets"
+
+
+@pytest.mark.parametrize("name", ["bag", "layouts-deep", "packets", "views", "views-alone"])
+def test_of_the_conformance_suite(name: str, tmp_path: Path) -> None:
+    made = report(shutil.copytree(CASES / name, tmp_path / name))
+    due = json.loads((CASES / name / "expected.json").read_text())["streams"]
+    assert made.problems == []
+    assert {camera.topic for camera in made.cameras} == {stream["topic"] for stream in due}
+    assert all(path.stat().st_size for path in made.files.values())
+
+
 # ---------------------------------------------------------------- columns and figures
 
 

@@ -10,11 +10,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from mp4ds.errors import OptionError, Refused
+import av
+
+from mp4ds.errors import Mp4dsError, OptionError, Refused
 from mp4ds.video.av1 import Av1
 from mp4ds.video.coded import Ffv1, Jpeg, Png, StreamParser, Vp9
 from mp4ds.video.h264 import H264
 from mp4ds.video.h265 import H265
+
+AV_VERSION = tuple(map(int, re.findall(r"\d+", av.__version__)[:2]))
+"""Of PyAV: major and minor."""
+
+WRITING = (17, 1)
+"""The oldest PyAV that writes videos: 17.0 damages joined ones, older ones take no JPEG packets."""
 
 TEN_BITS = "yuv420p10le"
 """The pixel format of 4:2:0 with 10 bits."""
@@ -277,6 +285,21 @@ def fastest_preset(codec: str) -> str | None:
     return str(_AV1_FAST) if name in AV1 else next(iter(_PRESETS.get(name, ())), None)
 
 
+def check_pyav() -> None:
+    """Refuse to write videos with a PyAV that is only good for reading.
+
+    Raises:
+        Mp4dsError: It is older than `WRITING`.
+    """
+    if AV_VERSION < WRITING:
+        least = ".".join(map(str, WRITING))
+        raise Mp4dsError(
+            f"PyAV {av.__version__} is installed, which is enough to read datasets. To write "
+            f"videos, mp4ds needs {least} or newer: run pip install 'av>={least}', in an "
+            "environment of its own if this one has a package that does not allow it, as LeRobot."
+        )
+
+
 def check_codec(
     codec: str | None,
     preset: str | None,
@@ -299,7 +322,9 @@ def check_codec(
 
     Raises:
         OptionError: Names those that can.
+        Mp4dsError: As for `check_pyav`.
     """
+    check_pyav()
     codec = codec and codec_name(codec)
     able = {name for codings in _LOSSLESS.values() for name in codings} if lossless else _LOSSY
     if codec is not None and codec not in able:

@@ -23,7 +23,7 @@ from mp4ds.messages import png
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels, check_size
 from mp4ds.messages.layouts import CHROMA_SHIFTS, Layout, bind, layout_for
 from mp4ds.video.colour import samples
-from mp4ds.video.pixels import PictureConverter, plain_frame, scaling
+from mp4ds.video.pixels import PictureConverter, plain_frame, reformat, scaling
 
 STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp")
 """Suffixes of the image files that are read."""
@@ -397,7 +397,7 @@ class Renderer:
             raise ValueError(f"{encoding.name} images cannot be displayed")
         self._encoding = encoding
         self._source = shown
-        self._target = shown_format(ENCODINGS[target])
+        self._target = shown_format(ENCODINGS[target]) or shown
         self._crop = crop
         self._size = size
         self._layout = bind(encoding.general, encoding) if shown in CHROMA_SHIFTS else None
@@ -420,17 +420,14 @@ class Renderer:
         if pixel_format == self._target and (width, height) == self._size:
             np.copyto(out, array)
             return
-        frame = self._reformatter.reformat(
+        frame = reformat(
+            self._reformatter,
             _frame(array, pixel_format),
-            width=self._size[0],
-            height=self._size[1],
-            format=self._target,
-            src_colorspace=Colorspace.ITU601,
-            dst_colorspace=Colorspace.ITU601,
-            src_color_range=ColorRange.JPEG,
-            dst_color_range=ColorRange.JPEG,
+            self._target,
+            matrix=Colorspace.ITU601,
+            ranges=(ColorRange.JPEG, ColorRange.JPEG),
+            size=self._size,
             interpolation=scaling((width, height), self._size),
-            threads=1,  # a pool inherited over fork would never end
         )
         np.copyto(out, samples(frame))
 

@@ -18,7 +18,7 @@ from mp4ds.errors import Mp4dsError, OptionError, Refused, RemoteError, VideoErr
 from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.times import TIMESCALE
-from mp4ds.video.codecs import CODECS
+from mp4ds.video.codecs import AV_VERSION, CODECS, check_pyav
 from mp4ds.video.mp4 import SampleEntry, SampleTable, read_sample_table, why_unreadable
 
 _FILES = (errno.EMFILE, errno.ENFILE)
@@ -56,9 +56,7 @@ def _described(track: Any) -> str:
 
 
 # names and comments need not be UTF-8; PyAV 19 takes them as they are
-_ANY_METADATA: dict[str, Any] = (
-    {"metadata_errors": "ignore"} if int(av.__version__.split(".")[0]) < 19 else {}
-)
+_ANY_METADATA: dict[str, Any] = {"metadata_errors": "ignore"} if AV_VERSION < (19,) else {}
 
 
 class Media:
@@ -294,7 +292,11 @@ def new_mp4(path: Path) -> Any:
 
     Args:
         path: The file to make, when the first packet comes.
+
+    Raises:
+        Mp4dsError: As for `check_pyav`.
     """
+    check_pyav()
     options = {
         "video_track_timescale": str(TIMESCALE),
         "movie_timescale": str(TIMESCALE),

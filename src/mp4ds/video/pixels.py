@@ -17,7 +17,7 @@ from mp4ds.errors import VideoError
 from mp4ds.messages.encodings import Picture
 from mp4ds.messages.layouts import CHROMA_SHIFTS
 from mp4ds.video import colour
-from mp4ds.video.codecs import TEN_BITS, Recipe
+from mp4ds.video.codecs import AV_VERSION, TEN_BITS, Recipe
 from mp4ds.video.colour import samples
 from mp4ds.video.media import Media, raise_if_scarce
 
@@ -115,6 +115,9 @@ _CARE = _FULL_CHROMA | _ACCURATE | _BITEXACT
 _INTERPOLATION = _BICUBIC | _CARE
 _MATRICES = {"bt709": Colorspace.ITU709, "smpte170m": Colorspace.ITU601}
 
+ONE_THREAD: dict[str, Any] = {"threads": 1} if AV_VERSION >= (17,) else {}
+"""For libswscale: a pool inherited over fork would never end. Older PyAV has no pools."""
+
 _PACKED = ("rgb24", "bgr24", "rgba", "bgra")
 _VIA_PLANES = ("rgb24", "bgr24")
 _ROUNDED = ("yuv420p", TEN_BITS)
@@ -153,6 +156,48 @@ def scaling(size: tuple[int, int], made: tuple[int, int]) -> int:
     """Flags of libswscale for scaling: by area to reduce, bicubic to enlarge."""
     is_smaller = made[0] * made[1] < size[0] * size[1]
     return (_BY_AREA if is_smaller else _BICUBIC) | _CARE
+
+
+def reformat(
+    reformatter: VideoReformatter,
+    frame: av.VideoFrame,
+    pixel_format: str,
+    *,
+    matrix: Colorspace,
+    ranges: tuple[ColorRange, ColorRange],
+    size: tuple[int, int] | None = None,
+    interpolation: int = _INTERPOLATION,
+) -> av.VideoFrame:
+    """A frame in another pixel format or size, by libswscale.
+
+    Args:
+        reformatter: PyAV's, of which each thread needs its own.
+        frame: What to convert.
+        pixel_format: To which.
+        matrix: Between RGB and YUV.
+        ranges: Of the samples of the frame and of the result; that of RGB does not matter.
+        size: Columns and rows of the result; None: those of the frame.
+        interpolation: libswscale's flags.
+    """
+    given, made = ranges
+    is_rgb = frame.format.is_rgb, av.VideoFormat(pixel_format).is_rgb
+    if AV_VERSION < (17,) and given == made and any(is_rgb) and not all(is_rgb):
+        # which takes note of matrix and ranges only where one of them changes
+        other = ColorRange.MPEG if given == ColorRange.JPEG else ColorRange.JPEG
+        given, made = (other, made) if is_rgb[0] else (given, other)
+    width, height = size or (None, None)
+    return reformatter.reformat(
+        frame,
+        width=width,
+        height=height,
+        format=pixel_format,
+        src_colorspace=matrix,
+        dst_colorspace=matrix,
+        src_color_range=given,
+        dst_color_range=made,
+        interpolation=interpolation,
+        **ONE_THREAD,
+    )
 
 
 class PictureConverter:
@@ -250,20 +295,15 @@ class PictureConverter:
         pixel_format: str,
         scale: Scale | None = None,
     ) -> av.VideoFrame:
-        interpolation = _INTERPOLATION
-        if scale is not None:
-            interpolation = scaling((frame.width, frame.height), (scale.width, scale.height))
-        return reformatter.reformat(
+        size = (scale.width, scale.height) if scale else None
+        return reformat(
+            reformatter,
             frame,
-            width=scale.width if scale else None,
-            height=scale.height if scale else None,
-            format=pixel_format,
-            src_colorspace=_MATRICES[self._matrix],
-            dst_colorspace=_MATRICES[self._matrix],
-            src_color_range=self._source_range,
-            dst_color_range=self._range,
-            interpolation=interpolation,
-            threads=1,  # a pool inherited over fork would never end
+            pixel_format,
+            matrix=_MATRICES[self._matrix],
+            ranges=(self._source_range, self._range),
+            size=size,
+            interpolation=scaling((frame.width, frame.height), size) if size else _INTERPOLATION,
         )
 
 

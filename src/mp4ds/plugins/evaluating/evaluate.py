@@ -55,6 +55,7 @@ from mp4ds.video.codecs import (
     MAX_CRF,
     QualityTarget,
     check_codec,
+    check_pyav,
     codec_name,
     parse_quality,
 )
@@ -157,7 +158,9 @@ def settings_of(options: EvaluateOptions) -> list[Setting]:
 
     Raises:
         OptionError: There is no such codec, preset or crf, or too many of them.
+        Mp4dsError: As for `check_pyav`.
     """
+    check_pyav()
     codecs = list(dict.fromkeys(map(codec_name, options.codecs)))
     wrong = [codec for codec in codecs if codec not in MAX_CRF]
     if wrong or not codecs:
