@@ -256,6 +256,18 @@ def test_for_training_there_are_as_many_key_frames_as_cost_little(name: str) -> 
     assert (training.gop < 10) == (name == "moving")
 
 
+@pytest.mark.parametrize(("asked", "gop"), [({}, "3"), ({"gop": 20}, "20")])
+def test_key_frames_of_differences(asked: dict[str, Any], gop: str, tmp_path: Path) -> None:
+    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("bayer_rggb8", frames=7))
+    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(codec="h264", view="av1", **asked))
+    with mp4ds.open(tmp_path / "dataset") as dataset:
+        (sidecar,) = (stream.sidecar for stream in dataset.streams)
+    assert sidecar.view
+    assert sidecar.predicted
+    assert sidecar.video.options["g"] == gop
+    assert compare(paths, unpacked(tmp_path, "mcap")) == []
+
+
 def test_an_archive_has_the_smallest() -> None:
     samples = scene("mono8", width=320, height=240)
     archive = chosen(samples, "mono8", purpose="archive")

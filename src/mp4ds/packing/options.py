@@ -203,7 +203,7 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
         changes=ENCODING,
     )
     gop: int | None = option(
-        "Maximum key frame interval in frames; default: 10, or 30 if lossy.",
+        "Maximum key frame interval in frames; default: at most 10, or 30 if lossy.",
         least=1,
         most=MAX_GOP,
         changes=ENCODING,

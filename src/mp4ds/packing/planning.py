@@ -44,6 +44,7 @@ from mp4ds.video.codecs import (
     DEFAULT_LOSSY,
     LOSSY_GOP,
     LOSSY_TRAINING_GOP,
+    MOSAIC_DIFFERENCES_GOP,
     PURPOSE_PRESET,
     TRAINING,
     VIEW_CRF,
@@ -271,6 +272,7 @@ def _lossless_plans(
     view = _view_coding(pixels, encoding, options)
     if view is not None:
         source = [best.layout] if best.layout.is_source else []
+        is_usual = encoding.mosaic and options.gop is None and options.purpose is None
         with suppress(OptionError, EncoderRefusedError):
             both, beside = choose_predicted(
                 pixels,
@@ -278,6 +280,7 @@ def _lossless_plans(
                 view,
                 _AS_SMALL * least,
                 gop=options.group_frames,
+                h264_gop=MOSAIC_DIFFERENCES_GOP if is_usual else None,
                 threads=threads,
                 codec=codec,
                 preset=options.preset if asked else None,

@@ -96,7 +96,7 @@ def packet_codec(message_format: str) -> str:
 # ---------------------------------------------------------------- encoders
 
 # maximum distance of key frames, chosen by cost (spec/notes.md)
-LOSSLESS_GOP, LOSSY_GOP = 10, 30
+LOSSLESS_GOP, LOSSY_GOP, MOSAIC_DIFFERENCES_GOP = 10, 30, 3
 ARCHIVE_GOP, LOSSY_TRAINING_GOP = 120, 15
 PURPOSE_PRESET = "4"
 """Preset of SVT-AV1 when the purpose of a dataset is known."""

@@ -525,6 +525,7 @@ def choose(
     threads: int,
     purpose: str | None = None,
     differences: Sequence[tuple[Layout, Sequence[Picture]]] = (),
+    h264_gop: int | None = None,
 ) -> Coding:
     """The best lossless layout, recipe and distance of key frames, found by trying each.
 
@@ -537,6 +538,7 @@ def choose(
         threads: Threads of the encoder.
         purpose: What the video is for.
         differences: To what a view shows of the samples, by their layouts; to be coded instead.
+        h264_gop: `gop` for H.264, whose frames all need the one before; None: the same.
 
     Returns:
         The first, in the order of the encoding's layouts and their codecs, within 2 % of the
@@ -567,8 +569,9 @@ def choose(
             except (OptionError, EncoderRefusedError) as error:
                 refusals.append(error)
             else:
-                size = coded.bytes_per_frame(gop) / share
-                tried.append((Coding(layout, recipe, gop, size), coded))
+                most = (h264_gop if name == "h264" else None) or gop
+                size = coded.bytes_per_frame(most) / share
+                tried.append((Coding(layout, recipe, most, size), coded))
     if not tried:
         # that an encoder refuses the size says more than that another has no such format
         raise next((e for e in refusals if isinstance(e, EncoderRefusedError)), refusals[0])
