@@ -284,12 +284,12 @@ def test_lossy_videos_for_a_purpose(tmp_path: Path) -> None:
         mp4ds.pack(paths, tmp_path / f"{purpose}", PackOptions(quality="visual", purpose=purpose))
         with mp4ds.open(tmp_path / f"{purpose}") as dataset:
             options = dataset.streams[0].sidecar.video.options
-            found[purpose] = options["preset"], options["g"]
+            found[purpose] = options["crf"], options["preset"], options["g"]
     assert found == {
-        None: ("7", "30"),
-        "archive": ("4", "120"),
-        "training": ("4", "15"),
-        "speed": ("11", "30"),
+        None: ("18", "7", "30"),
+        "archive": ("18", "4", "120"),
+        "training": ("33", "6", "2"),
+        "speed": ("18", "11", "30"),
     }
 
 

@@ -195,8 +195,8 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
     )
     purpose: str | None = option(
         "archive: smallest files. speed: fastest packing, as while recording, without views. "
-        "training: fastest random access, with videos up to 15 % larger; default for smaller or "
-        "fewer images.",
+        "training: fastest random access; lossy videos are up to 2.5 times as large, "
+        "others up to 15 %; default for smaller or fewer images.",
         None,
         "--for",
         choices=(ARCHIVE, SPEED, TRAINING),

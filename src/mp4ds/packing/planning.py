@@ -43,12 +43,14 @@ from mp4ds.video.codecs import (
     BESIDE_PRESET,
     DEFAULT_LOSSY,
     LOSSY_GOP,
-    LOSSY_TRAINING_GOP,
     MOSAIC_DIFFERENCES_GOP,
     PURPOSE_PRESET,
     TRAINING,
+    TRAINING_CRF,
+    TRAINING_PRESET,
     VIEW_CRF,
     VIEW_PRESET,
+    VIEW_TRAINING_GOP,
     fastest_preset,
     lossless_codecs,
     recipe_for,
@@ -196,6 +198,8 @@ def _lossy_plans(
         crf, table_preset = visual_setting(rate)
         if options.codec in (None, *AV1):
             usual = PURPOSE_PRESET if options.purpose else str(table_preset)
+            if options.purpose == TRAINING:
+                crf, usual = TRAINING_CRF, TRAINING_PRESET
             preset = preset or (_SCORE_PRESET if target else usual)
     recipe = recipe_for(
         layout.pixel_format,
@@ -321,7 +325,7 @@ def _view_coding(
         crf=VIEW_CRF,
         preset=preset if codec in AV1 else None,
     )
-    gop = LOSSY_TRAINING_GOP if options.purpose == TRAINING else LOSSY_GOP
+    gop = VIEW_TRAINING_GOP if options.purpose == TRAINING else LOSSY_GOP
     return Coding(layout, recipe, gop)
 
 

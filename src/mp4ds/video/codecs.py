@@ -97,9 +97,11 @@ def packet_codec(message_format: str) -> str:
 
 # maximum distance of key frames, chosen by cost (spec/notes.md)
 LOSSLESS_GOP, LOSSY_GOP, MOSAIC_DIFFERENCES_GOP = 10, 30, 3
-ARCHIVE_GOP, LOSSY_TRAINING_GOP = 120, 15
+ARCHIVE_GOP, LOSSY_TRAINING_GOP, VIEW_TRAINING_GOP = 120, 2, 15
 PURPOSE_PRESET = "4"
 """Preset of SVT-AV1 when the purpose of a dataset is known."""
+TRAINING_CRF, TRAINING_PRESET = 33, "6"
+"""Of SVT-AV1 for lossy videos with key frames so close, all of which it codes as the crf says."""
 
 _X264 = MappingProxyType({"bf": "0"})  # without B-frames, frames are coded in the order shown
 _X265 = "bframes=0:open-gop=0"  # an open GOP cannot be sought exactly
