@@ -6,6 +6,7 @@ The videos are written, and what comes out is read, with PyAV and mcap.
 from __future__ import annotations
 
 import json
+import struct
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,8 @@ def write_video(path: Path, encoder: str, **options: str) -> Path:
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(encoder, rate=10, options={"g": "4", **options})
         stream.width, stream.height = SIZE
-        stream.pix_fmt = "yuvj420p" if encoder == "mjpeg" else "yuv420p"
+        usual = "yuvj420p" if encoder == "mjpeg" else "yuv420p"
+        stream.pix_fmt = options.pop("pix_fmt", usual)
         stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
         for number, tick in enumerate(TICKS):
             frame = av.VideoFrame.from_ndarray(picture(number), "rgb24")
@@ -177,12 +179,17 @@ def test_what_is_no_such_video_is_refused(tmp_path: Path) -> None:
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive" / "a.mp4").write_bytes(data)
     (tmp_path / "drive" / "dataset.yaml").touch()
+    write_video(tmp_path / "whole.mkv", "libx264", bf="0")
+    (tmp_path / "cut.mkv").write_bytes((tmp_path / "whole.mkv").read_bytes()[:-200])
+    write_twice(tmp_path / "twice.mp4", video)
     write_video(tmp_path / "a.avi", "mjpeg")
     write_video(tmp_path / "mpeg4.mp4", "mpeg4")
     for name, problem in (
         ("text.mp4", ["is not an mp4"]),
         ("cut.mp4", ["was cut short"]),
         ("other.mkv", ["other.mkv: "]),
+        ("cut.mkv", ["was cut short", "keeps the rest"]),
+        ("twice.mp4", ["cannot be copied", "Give --decode"]),
         ("a.avi", ["is not an mp4", "Give an mp4, mov, mkv or webm file"]),
         ("mpeg4.mp4", ["is coded as mpeg4, not h264", "Give --decode"]),
         ("a.exact.mp4", ["is a video of a dataset", "Use the dataset itself"]),
@@ -190,6 +197,46 @@ def test_what_is_no_such_video_is_refused(tmp_path: Path) -> None:
     ):
         refused(call("import", "video", tmp_path / name, "-o", tmp_path / "ds"), 2, *problem)
         assert not (tmp_path / "ds").exists()
+
+
+def write_twice(path: Path, video: Path) -> None:
+    """A video whose last frames have a description, with parameters, of their own."""
+    data = bytearray(video.read_bytes())
+    (size,) = struct.unpack_from(">I", data, entry := data.index(b"avc1", data.index(b"stsd")) - 4)
+    # its frames in two chunks instead of one, of which the second has the second entry
+    sizes = struct.unpack_from(f">{len(TICKS)}I", data, data.index(b"stsz") + 16)
+    (start,) = struct.unpack_from(">I", data, data.index(b"stco") + 12)
+    made = {
+        b"stsd": struct.pack(">2I", 0, 2) + 2 * data[entry : entry + size],
+        b"stsc": struct.pack(">8I", 0, 2, 1, 4, 1, 2, len(TICKS) - 4, 2),
+        b"stco": struct.pack(">4I", 0, 2, start, start + sum(sizes[:4])),
+    }
+    added = 0
+    for kind, body in made.items():
+        (old,) = struct.unpack_from(">I", data, at := data.index(kind) - 4)
+        data[at : at + old] = struct.pack(">I4s", len(body) + 8, kind) + body
+        added += len(body) + 8 - old
+    for kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
+        at = data.index(kind) - 4
+        struct.pack_into(">I", data, at, struct.unpack_from(">I", data, at)[0] + added)
+    path.write_bytes(data)
+
+
+def test_what_messages_lack_is_counted(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "a.mp4", "libx264", bf="0")
+    data = bytearray(video.read_bytes())
+    lasts = data.index(b"elst") + 12
+    struct.pack_into(">I", data, lasts, 350)  # milliseconds
+    video.write_bytes(data)
+    deep = write_video(tmp_path / "deep.mkv", "ffv1", pix_fmt="gray16le")
+    clear = write_video(tmp_path / "clear.mkv", "ffv1", pix_fmt="yuva420p")
+    for path, options, left_out in (
+        (video, (), {"frames that its edit list hides": 3}),
+        (deep, ("--decode",), {"low bits of each sample, which 8 bits do not hold": 8}),
+        (clear, ("--decode",), {"alpha channels": 1}),
+    ):
+        said = call("import", "video", path, "-o", tmp_path / "ds", "-f", "--json", *options)
+        assert json.loads(said.out)["skipped"] == left_out
 
 
 @pytest.mark.parametrize(

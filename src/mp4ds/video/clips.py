@@ -8,6 +8,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from av import Packet, VideoFormat
 from av.error import FFmpegError
 
 from mp4ds.errors import FormatError, Refused, SourceError, reason_of
@@ -15,10 +16,12 @@ from mp4ds.records import MetadataRecord
 from mp4ds.video.codecs import CODECS, PACKET_CODECS
 from mp4ds.video.coded import REORDERED, StreamParser
 from mp4ds.video.decoder import VideoDecoder, VideoFile, read_video_file
-from mp4ds.video.media import raise_if_scarce
+from mp4ds.video.media import Media, raise_if_scarce
 
 _DECODE = "Give `decode`: its pictures then become images, which `quality` visual keeps small."
 _KINDS = "Give an mp4, mov, mkv or webm file; `ffmpeg -i FILE -c copy NEW.mkv` makes one."
+_MATROSKA = (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67")  # the head, then all of the rest
+_LONGEST_HEAD = 4096
 _MOST_DELAY = 16  # frames, by which decoding times may precede those of showing
 
 
@@ -29,9 +32,31 @@ def open_video(path: Path) -> VideoFile:
         SourceError: It cannot be read; says what to do.
     """
     try:
-        return read_video_file(path)
+        file = read_video_file(path)
     except FormatError as error:
         raise SourceError(path, error.problem, _KINDS) from None
+    with path.open("rb") as data:
+        if _end_of_matroska(data.read(_LONGEST_HEAD)) > path.stat().st_size:
+            raise SourceError(
+                path, "was cut short", "`ffmpeg -i FILE -c copy NEW.mkv` keeps the rest."
+            )
+    return file
+
+
+def _end_of_matroska(head: bytes) -> int:
+    """Where a Matroska or WebM file ends (RFC 9559), by its beginning; 0 if it does not say."""
+    place = 0
+    for kind in _MATROSKA:
+        if not head.startswith(kind, place):
+            return 0
+        place += len(kind)
+        length = 9 - head[place].bit_length()
+        unknown = (1 << 7 * length) - 1
+        size = int.from_bytes(head[place : place + length], "big") & unknown
+        if size == unknown:
+            return 0
+        place += length + size
+    return place
 
 
 class Clip:
@@ -65,6 +90,8 @@ class Clip:
         self._due = -1
         self._parser: type[StreamParser] = StreamParser
         self._units: list[bytes] = []
+        # an index that is read has one description of all packets
+        self._may_change = not (pictures or file.is_indexed) and file.container == "mp4"
         if not pictures:
             self._check_packets()
         with self._reading(), closing(self.file.open()) as media:
@@ -74,9 +101,22 @@ class Clip:
             self.left_out = Counter(f"{kind} tracks" for kind in others)
             if file.hidden:
                 self.left_out["frames that its edit list hides"] = file.hidden
+            self._count_lost_samples(media)
             with suppress(FFmpegError, StopIteration):  # a damaged one is copied, too
                 if turned := next(media.container.decode(media.track)).rotation % 360:
                     self.left_out[f"turn by {turned} degrees, which players apply"] = 1
+
+    def _count_lost_samples(self, media: Media) -> None:
+        """Count what neither packets nor pictures hold of the pixels."""
+        has_alpha = media.track.metadata.get("alpha_mode") == "1"  # VP9 has it beside its packets
+        if self.is_decoded and media.track.codec_context.format:
+            own = media.track.codec_context.format.components
+            has_alpha = has_alpha or any(one.is_alpha for one in own)
+            bits = max(one.bits for one in VideoFormat(self._pictures).components)
+            if (lost := max(one.bits for one in own) - bits) > 0:
+                self.left_out[f"low bits of each sample, which {bits} bits do not hold"] = lost
+        if has_alpha:
+            self.left_out["alpha channels"] = 1
 
     def _check_packets(self) -> None:
         """Refuse a video whose packets cannot be messages."""
@@ -85,6 +125,8 @@ class Clip:
             raise self._refusal(f"is coded as {file.codec}, not {', '.join(PACKET_CODECS)}")
         if file.is_reordered:
             raise self._refusal(f"cannot be copied: {REORDERED}")
+        if self._may_change and not hasattr(Packet, "has_sidedata"):
+            raise self._refusal("cannot be copied: what its index is like takes PyAV 16 to follow")
         self._parser = CODECS[file.codec].parser
         with self._reading(), closing(file.open()) as media:
             extradata = bytes(media.track.codec_context.extradata or b"")
@@ -153,6 +195,8 @@ class Clip:
                     continue
                 if packet.pts != ticks[number]:
                     raise Refused(f"the packet of frame {number} is not where its index says")
+                if self._may_change and packet.has_sidedata("new_extradata"):
+                    raise Refused(f"the parameters of its decoder change at frame {number}")
                 yield packet
                 number += 1
                 if number > self.numbers[-1]:

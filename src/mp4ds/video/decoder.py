@@ -387,7 +387,7 @@ class VideoFile:
         times: Presentation times, nanoseconds, rounded down, int64, shape (frames,).
         is_reordered: Whether frames are coded in another order than they are shown.
         is_indexed: Whether all of this is in the file's index, so that little is read of it.
-        hidden: How many coded frames its edit list hides before the first that is shown.
+        hidden: How many coded frames its edit list hides.
     """
 
     path: Path
@@ -458,7 +458,8 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
             times,
             is_reordered=bool(np.any(np.diff(table.order) < 0)),
             is_indexed=bool(table.entry.codec),
-            hidden=int(table.order.min()),
+            # ffmpeg may list none of those after the last that is shown
+            hidden=max(len(table.sizes), media.track.frames) - len(ticks),
         )
 
 
