@@ -83,7 +83,7 @@ def main() -> None:
     command.add_argument("--seconds", type=float, default=3.0, help="of each pattern")
     command.add_argument("--rounds", type=int, default=3)
     command.add_argument("--stills", type=int, default=300, help="PNG and JPEG files")
-    command.add_argument("--plot", type=Path, help="an SVG to draw")
+    command.add_argument("--plot", type=Path, help="an SVG to draw, of the first pattern")
     folder = Path(tempfile.gettempdir()) / "mp4ds-loader"
     command.add_argument("--folder", type=Path, default=folder)
     options = parser.parse_args()
@@ -104,7 +104,8 @@ def main() -> None:
             take_turns(cells, one, number, options)
     report(dict(cells), {one.name: one.bytes_per_frame for one in stored}, options.pattern)
     if options.plot:
-        draw(cells, {one.name: one.bytes_per_frame for one in stored}, options.plot)
+        sizes = {one.name: one.bytes_per_frame for one in stored}
+        draw(cells, sizes, options.plot, options.pattern[0])
 
 
 # ---------------------------------------------------------------- measuring
@@ -359,31 +360,37 @@ def _others(
 
 # ---------------------------------------------------------------- a drawing
 
-_COLOURS = {"mp4ds": "#0b5fff", "torchcodec": "#d1495b", "pyav": "#8a8a8a"}
+_COLOURS = {
+    "mp4ds": "#0b5fff",
+    "FrameStream": "#0b5fff",
+    "FrameDataset": "#6c3bd1",
+    "torchcodec": "#d1495b",
+    "pyav": "#8a8a8a",
+}
 _OTHER = "#444444"
 _TICKS = ((5, 10, 20, 50, 100, 200, 500, 1000, 2000), (10, 20, 50, 100, 200, 500))
 
 
 def curves_of(
-    cells: Cells, sizes: Mapping[str, float]
+    cells: Cells, sizes: Mapping[str, float], drawn: str
 ) -> dict[tuple[str, str], dict[float, tuple[float, str]]]:
-    """Of each codec and reader, by bytes a frame: random frames per CPU second, and the GOP.
+    """Of each codec and reader, by bytes a frame: frames per CPU second, and the GOP.
 
     Of torchcodec's modes the best at each point.
     """
     curves: dict[tuple[str, str], dict[float, tuple[float, str]]] = defaultdict(dict)
     for (way, pattern, peer), cell in cells.items():
         # how we read LeRobot's file is no way to store frames
-        if pattern != "single" or not cell.counts or (way, peer) == ("lerobot", OURS):
+        if pattern != drawn or not cell.counts or (way, peer) == ("lerobot", OURS):
             continue
         codec, _, gop = way.partition("-")
-        curve = curves[codec, peer.partition(" ")[0] if gop else ""]
+        curve = curves[codec, "" if way in ("lerobot", *STILLS) else peer.partition(" ")[0]]
         curve[sizes[way]] = max(curve.get(sizes[way], (0.0, gop)), (cell.rate, gop))
     return curves
 
 
-def draw(cells: Cells, sizes: Mapping[str, float], path: Path) -> None:
-    """Draw bytes of a frame against random frames per CPU second, as an SVG."""
+def draw(cells: Cells, sizes: Mapping[str, float], path: Path, pattern: str) -> None:
+    """Draw bytes of a frame against frames per CPU second of a pattern, as an SVG."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -391,7 +398,7 @@ def draw(cells: Cells, sizes: Mapping[str, float], path: Path) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(9, 5))
-    for (codec, reader), curve in curves_of(cells, sizes).items():
+    for (codec, reader), curve in curves_of(cells, sizes, pattern).items():
         name = f"{codec}, {reader}" if reader else codec
         style = "--" if codec == "h264" else "-"
         points = sorted((size / 1e3, *point) for size, point in curve.items())
@@ -407,7 +414,7 @@ def draw(cells: Cells, sizes: Mapping[str, float], path: Path) -> None:
         axis.set_major_locator(matplotlib.ticker.FixedLocator(ticks))
         axis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%d"))
         axis.set_minor_locator(matplotlib.ticker.NullLocator())
-    axes.set(xlabel="kB a frame", ylabel="random frames per CPU second")
+    axes.set(xlabel="kB a frame", ylabel=f"frames per CPU second, {PATTERNS[pattern]}")
     axes.grid(visible=True, alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     lines = [line for line in axes.get_lines() if len(line.get_xdata()) > 1]

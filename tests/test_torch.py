@@ -821,6 +821,23 @@ def test_torchcodec_refuses_what_it_would_show_wrongly(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("torchcodec")
+def test_torchcodec_takes_our_index(drives: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    options: dict[str, Any] = {"topics": [LEFT], "backend": "torchcodec"}
+    scanned = [FrameDataset(drives[0], **options)[n][LEFT] for n in range(FRAMES)]
+    monkeypatch.setattr("mp4ds.torch.cameras._SCANNED", 0)
+    indexed = FrameDataset(drives[0], **options)
+    for number in reversed(range(FRAMES)):
+        assert torch.equal(indexed[number][LEFT], scanned[number])
+    with (
+        mp4ds.open(drives[0]) as dataset,
+        av.open(str(dataset[LEFT].streams[0].video_path)) as container,
+    ):
+        frames = json.loads(dataset[LEFT].streams[0].frame_mappings())["frames"]
+        packets = sorted((p.pts, p.is_keyframe) for p in container.demux(video=0) if p.size)
+    assert [(frame["pts"], bool(frame["key_frame"])) for frame in frames] == packets
+
+
+@pytest.mark.usefixtures("torchcodec")
 def test_torchcodec_never_shows_differences(with_views: Path) -> None:
     options: dict[str, Any] = {"topics": ["/right/image_raw"], "backend": "torchcodec"}
     with pytest.raises(mp4ds.OptionError, match="made of two videos"):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import cached_property
 from itertools import tee
 from pathlib import Path
@@ -26,6 +27,7 @@ from mp4ds.records import Channel, Message
 from mp4ds.video.access import FrameReader
 from mp4ds.video.codecs import LOSSLESS
 from mp4ds.video.decoder import VideoDecoder
+from mp4ds.video.media import Media
 from mp4ds.video.packets import PacketReader
 from mp4ds.video.pixels import PictureMaker, Scale
 
@@ -462,6 +464,26 @@ class Stream(Images):
                 if reader.hidden:
                     return True
         return False
+
+    def frame_mappings(self) -> str:
+        """What torchcodec takes as `custom_frame_mappings`, so that it need not scan the video.
+
+        Returns:
+            JSON: ``pts``, ``duration`` and ``key_frame`` of each frame, in ticks of the video.
+
+        Raises:
+            VideoError: The video's index cannot be read.
+        """
+        with closing(Media(self.video_path)) as media:
+            table = media.table
+        starts = table.presentation[table.order]
+        durations = np.diff(starts, append=2 * starts[-1] - starts[-2] if len(starts) > 1 else 1)
+        keys = table.sync[table.order]
+        names = ("pts", "duration", "key_frame")
+        columns = (column.astype(np.int64).tolist() for column in (starts, durations, keys))
+        return json.dumps(
+            {"frames": [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]}
+        )
 
     # ------------------------------------------------------------ damage
 

@@ -103,6 +103,10 @@ class Pictures:
 # ---------------------------------------------------------------- torchcodec
 
 
+_SCANNED = 32 * 2**20
+"""Bytes of a video that torchcodec scans as quickly as it reads our index."""
+
+
 class TorchcodecReader:
     """Decodes a stream's video by ``torchcodec.decoders.VideoDecoder``.
 
@@ -118,7 +122,7 @@ class TorchcodecReader:
     """
 
     def __init__(self, topic: Topic, crop: Crop, device: str) -> None:
-        self._path = topic.parts[0].video_path
+        self._path, self._streams = topic.parts[0].video_path, topic.streams
         for stream in topic.streams:
             _check_layout(stream)
             if stream.hides_frames:
@@ -151,10 +155,13 @@ class TorchcodecReader:
                 f"torchcodec is installed but cannot be used: {reason} If it finds no FFmpeg, "
                 "install that."
             ) from None
+        # either way, frame n is the n-th shown, whatever its presentation time
+        how: dict[str, Any] = {"seek_mode": "exact"}  # which reads the whole file
+        if self._streams and self._path.stat().st_size > _SCANNED:
+            how = {"custom_frame_mappings": self._streams[0].frame_mappings()}
         try:
-            # with exact seeking, frame n is the n-th shown, whatever its presentation time
             return module.VideoDecoder(
-                str(self._path), dimension_order="NHWC", device=device, seek_mode="exact"
+                str(self._path), dimension_order="NHWC", device=device, **how
             )
         except (RuntimeError, ValueError) as error:
             raise self._refused(error) from None
