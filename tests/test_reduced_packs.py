@@ -160,6 +160,23 @@ def test_packets_of_which_some_are_left_out(name: str, tmp_path: Path) -> None:
         assert row[2] == IMAGE or row == recorded
 
 
+@pytest.mark.parametrize("name", ["video-h264", "video-vp9"])
+def test_a_slice_that_does_not_begin_with_a_key_frame(name: str, tmp_path: Path) -> None:
+    sources = SOURCES["mcap-ros2-zstd"](tmp_path, CODED[name]())
+    mp4ds.pack(sources, tmp_path / "all")
+    small = PackOptions(resize=0.5)
+    mp4ds.pack(sources, tmp_path / "small", small)
+    with mp4ds.open(tmp_path / "small") as dataset:
+        (topic,) = dataset.camera_topics
+    due = [row for row in rows(tmp_path / "small") if row[0] == topic]
+    assert {row[2] for row in due} == {IMAGE}
+    start = due[2][1]
+    for number, source in enumerate((sources, tmp_path / "all")):
+        part = tmp_path / f"part{number}"
+        mp4ds.pack(source, part, replace(small, start=str(start)))
+        assert [row for row in rows(part) if row[0] == topic] == due[2:]
+
+
 @pytest.mark.parametrize("stamp", [None, 0, 7])
 def test_a_maximum_rate_goes_by_stamps(stamp: int | None, tmp_path: Path) -> None:
     """By log times where all stamps are the same."""

@@ -153,6 +153,13 @@ class BagReader(ABC):
         latched = [message for message in self.slice.latched if excerpt.has(message)]
         return self._begun_by(latched, records) if latched else records
 
+    def records_before(self, topics: Iterable[str]) -> Iterator[Record]:
+        """Records of topics from before the slice, to decode what is in it."""
+        start = self.slice.span.start
+        if start is None:
+            return iter(())
+        return self._records(Excerpt(end=start, topics=frozenset(topics), others=False))
+
     @staticmethod
     def _begun_by(latched: Sequence[Message], records: Iterator[Record]) -> Iterator[Record]:
         # What is not a message comes first: it may tell about those that follow.

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,7 @@ from mp4ds.unpacking.republish import Types
 from mp4ds.video.decoder import PacketPictures
 
 _MOST_LOOKED_AT = 1000  # messages of a topic for an image that can be decoded
+_MOST_BEFORE = 1000  # packets before a slice that are held
 _MOST_WAITING = 64  # packets without a picture: more than any decoder holds back
 _INFO = Kind("sensor_msgs/msg/CameraInfo", "info", "calibrations", None)
 _PACKETS = ("CompressedVideo", "FFMPEGPacket")
@@ -125,7 +126,10 @@ class ReducedReader(BagReader):
         """Encoding and size of the first image of a channel; None if there is none."""
         splitter, inspector = MessageSplitter(channel), MessageInspector(channel)
         excerpt = Excerpt(topics=frozenset([channel.topic]), others=False)
-        for record in islice(self._reader.records(excerpt), _MOST_LOOKED_AT):
+        records = chain(
+            self._reader.records_before(self._videos_in(excerpt)), self._reader.records(excerpt)
+        )
+        for record in islice(records, _MOST_LOOKED_AT):
             if not isinstance(record, Message) or record.channel.id != channel.id:
                 continue
             with suppress(Refused):
@@ -167,9 +171,21 @@ class ReducedReader(BagReader):
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         return self.records(excerpt)
 
+    def _videos_in(self, excerpt: Excerpt) -> list[str]:
+        """Topics of packets, of which those before a slice may be needed to decode those in it."""
+        videos = {one.topic for key, one in self._cameras.items() if key in self.videos}
+        return [topic for topic in videos if excerpt.start is None and excerpt.has_topic(topic)]
+
     def records(self, excerpt: Excerpt = EVERYTHING) -> Iterator[Record]:
         """Read an excerpt, with images as they are wanted; see `BagReader.records`."""
         cameras: dict[int, _Camera] = {}
+        if videos := self._videos_in(excerpt):
+            for record in self._reader.records_before(videos):
+                if isinstance(record, Message) and record.channel.id in self.videos:
+                    key = record.channel.id
+                    if key not in cameras:
+                        cameras[key] = self._camera(record.channel, excerpt.start)
+                    cameras[key].precede(record)
         splitters: dict[int, MessageSplitter] = {}
         for record in self._reader.records(excerpt):
             channel = record.channel if isinstance(record, Message) else None
@@ -306,6 +322,19 @@ class _Camera:
         self._begun = 0  # packets that were given to them
         # those without a picture yet: their numbers, and whether they are kept
         self._waiting: deque[tuple[int, bool, CameraMessage]] = deque()
+        self._before: deque[CameraMessage] = deque()  # since the last key frame
+
+    def precede(self, message: Message) -> None:
+        """Note a packet of before those that are taken, which may need it."""
+        if self._inspector is None:
+            return
+        with suppress(Refused):
+            seen = self._inspector.inspect(with_own_payload(message))
+            if seen.keyframe:
+                self._before.clear()
+            self._before.append(seen)
+        if len(self._before) > _MOST_BEFORE:
+            deque(self._decoded(self._before.popleft(), is_kept=False), maxlen=0)
 
     def take(self, message: Message) -> Iterator[Message]:
         """The messages that are ready with one more."""
@@ -313,6 +342,8 @@ class _Camera:
         self._count += 1
         if not (is_kept or self._inspector):
             return
+        while self._before:
+            yield from self._decoded(self._before.popleft(), is_kept=False)
         try:
             form, parts = self._splitter.split(message)
             is_later, self._stamp = parts.stamp > self._stamp, parts.stamp  # some are always zero
@@ -320,7 +351,7 @@ class _Camera:
                 is_kept = self._limit.keeps(parts.stamp if is_later else message.log_time)
             if self._inspector:
                 seen = self._inspector.inspect(with_own_payload(message))
-                yield from self._decoded(seen, is_kept)
+                yield from self._decoded(seen, is_kept=is_kept)
             elif is_kept and self._channel.id in self._reader.remade:
                 shown = shown_by(self._channel, parts)
                 yield self._reader.image(message, form, parts, shown)
@@ -330,7 +361,7 @@ class _Camera:
             if is_kept:
                 yield self._reader.as_recorded(message)
 
-    def _decoded(self, seen: CameraMessage, is_kept: bool) -> Iterator[Message]:
+    def _decoded(self, seen: CameraMessage, *, is_kept: bool) -> Iterator[Message]:
         kind = seen.key.codec, (seen.key.width, seen.key.height)
         if self._pictures is None or kind != self._kind:
             yield from self.rest()
