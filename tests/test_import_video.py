@@ -180,7 +180,12 @@ def test_what_is_no_such_video_is_refused(tmp_path: Path) -> None:
     (tmp_path / "drive" / "a.mp4").write_bytes(data)
     (tmp_path / "drive" / "dataset.yaml").touch()
     write_video(tmp_path / "whole.mkv", "libx264", bf="0")
-    (tmp_path / "cut.mkv").write_bytes((tmp_path / "whole.mkv").read_bytes()[:-200])
+    whole = bytearray((tmp_path / "whole.mkv").read_bytes())
+    (tmp_path / "cut.mkv").write_bytes(whole[:-200])
+    with av.open(str(tmp_path / "whole.mkv")) as container:
+        last = [bytes(packet) for packet in container.demux(video=0) if packet.size][-1]
+    whole[whole.rindex(b"\xa3", 0, whole.index(last) - 4)] ^= 1  # what ffmpeg passes over
+    (tmp_path / "damaged.mkv").write_bytes(whole)
     write_twice(tmp_path / "twice.mp4", video)
     write_video(tmp_path / "a.avi", "mjpeg")
     write_video(tmp_path / "mpeg4.mp4", "mpeg4")
@@ -189,6 +194,7 @@ def test_what_is_no_such_video_is_refused(tmp_path: Path) -> None:
         ("cut.mp4", ["was cut short"]),
         ("other.mkv", ["other.mkv: "]),
         ("cut.mkv", ["was cut short", "keeps the rest"]),
+        ("damaged.mkv", ["is damaged at byte", "keeps the rest"]),
         ("twice.mp4", ["cannot be copied", "Give --decode"]),
         ("a.avi", ["is not an mp4", "Give an mp4, mov, mkv or webm file"]),
         ("mpeg4.mp4", ["is coded as mpeg4, not h264", "Give --decode"]),

@@ -20,8 +20,13 @@ from mp4ds.video.media import Media, raise_if_scarce
 
 _DECODE = "Give `decode`: its pictures then become images, which `quality` visual keeps small."
 _KINDS = "Give an mp4, mov, mkv or webm file; `ffmpeg -i FILE -c copy NEW.mkv` makes one."
-_MATROSKA = (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67")  # the head, then all of the rest
-_LONGEST_HEAD = 4096
+_SEGMENT, _CLUSTER = "18538067", "1f43b675"
+_ELEMENTS = {  # of Matroska: at the top, in a segment, and in a cluster
+    *("1a45dfa3", _SEGMENT, "ec", "bf"),
+    *("114d9b74", "1549a966", "1654ae6b", _CLUSTER, "1c53bb6b", "1941a469", "1043a770", "1254c367"),
+    *("e7", "a3", "a0", "a7", "ab", "5854", "af"),
+}
+_LONGEST_HEAD = 12
 _MOST_DELAY = 16  # frames, by which decoding times may precede those of showing
 
 
@@ -35,28 +40,33 @@ def open_video(path: Path) -> VideoFile:
         file = read_video_file(path)
     except FormatError as error:
         raise SourceError(path, error.problem, _KINDS) from None
-    with path.open("rb") as data:
-        if _end_of_matroska(data.read(_LONGEST_HEAD)) > path.stat().st_size:
-            raise SourceError(
-                path, "was cut short", "`ffmpeg -i FILE -c copy NEW.mkv` keeps the rest."
-            )
+    if file.container == "matroska" and (problem := _damage(path)):
+        raise SourceError(path, problem, "`ffmpeg -i FILE -c copy NEW.mkv` keeps the rest.")
     return file
 
 
-def _end_of_matroska(head: bytes) -> int:
-    """Where a Matroska or WebM file ends (RFC 9559), by its beginning; 0 if it does not say."""
-    place = 0
-    for kind in _MATROSKA:
-        if not head.startswith(kind, place):
-            return 0
-        place += len(kind)
-        length = 9 - head[place].bit_length()
-        unknown = (1 << 7 * length) - 1
-        size = int.from_bytes(head[place : place + length], "big") & unknown
-        if size == unknown:
-            return 0
-        place += length + size
-    return place
+def _damage(path: Path) -> str:
+    """Why ffmpeg would pass over a part of a Matroska or WebM file (RFC 9559); else empty."""
+    place, end = 0, path.stat().st_size
+    with path.open("rb") as file:
+        while place < end:
+            file.seek(place)
+            head = file.read(_LONGEST_HEAD)
+            after = 9 - head[0].bit_length()
+            kind = head[:after].hex()
+            sized = 9 - head[after].bit_length() if after < len(head) else 9
+            if kind not in _ELEMENTS or sized > 8:
+                return f"is damaged at byte {place}"
+            unknown = (1 << 7 * sized) - 1
+            size = int.from_bytes(head[after : after + sized], "big") & unknown
+            place += after + sized
+            if kind == _SEGMENT and size != unknown:
+                if place + size > end:
+                    break
+                end = place + size
+            if kind not in (_SEGMENT, _CLUSTER):  # what is in these is walked through
+                place += size
+    return "" if place == end else "was cut short"
 
 
 class Clip:
