@@ -49,6 +49,7 @@ from mp4ds.video.codecs import (
     TRAINING_CRF,
     TRAINING_PRESET,
     VIEW_CRF,
+    VIEW_LEVELS,
     VIEW_PRESET,
     VIEW_TRAINING_GOP,
     fastest_preset,
@@ -325,6 +326,8 @@ def _view_coding(
         crf=VIEW_CRF,
         preset=preset if codec in AV1 else None,
     )
+    if codec == DEFAULT_LOSSY:
+        recipe = replace(recipe, options={**recipe.options, "svtav1-params": VIEW_LEVELS})
     gop = VIEW_TRAINING_GOP if options.purpose == TRAINING else LOSSY_GOP
     return Coding(layout, recipe, gop)
 

@@ -462,6 +462,8 @@ VISUAL_TABLE: tuple[tuple[float, int, int], ...] = (
 VIEW_CRF, VIEW_PRESET, BESIDE_PRESET = 22, "8", "9"
 """Of SVT-AV1 for views: what they lack costs about as much in the other video (spec/notes.md); the
 last of those that predict nothing."""
+VIEW_LEVELS = "hierarchical-levels=3"
+"""Of AV1 views: groups of 8 frames fit between their key frames, and what is noisy gets smaller."""
 
 _UNKNOWN_RATE = 30.0
 
