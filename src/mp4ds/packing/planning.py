@@ -317,8 +317,7 @@ def _view_coding(
     if layout is None:
         return None
     codec = options.view or DEFAULT_LOSSY
-    usual = BESIDE_PRESET if beside else VIEW_PRESET
-    preset = PURPOSE_PRESET if options.purpose else usual
+    preset = PURPOSE_PRESET if options.purpose else BESIDE_PRESET if beside else VIEW_PRESET
     recipe = recipe_for(
         layout.pixel_format,
         lossless=False,
