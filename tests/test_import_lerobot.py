@@ -243,8 +243,22 @@ def test_what_is_wrong_with_a_folder_is_told(case: str, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("numbers", "problem"), [([1, -1], "it has an episode -1"), ([1, 1], "has episode 1 twice")]
+)
+def test_no_episode_is_passed_over(numbers: list[int], problem: str, tmp_path: Path) -> None:
+    root = write_folder(tmp_path / "in")
+    _column(EPISODES, "episode_index", numbers)(root)
+    command = ["import", "lerobot", root, "-o", tmp_path / "out"]
+    refused(call(*command), 2, problem)
+    if numbers == [1, 1]:
+        refused(call(*command, "--episode", 1), 2, problem)
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_has_no_message_is_counted(tmp_path: Path) -> None:
     root = write_folder(tmp_path / "in")
+    (root / "meta/tasks.parquet").unlink()
     _feature("spoken", dtype="language", shape=[1])(root)
     _feature("seen", dtype="image", shape=[4, 4, 3])(root)
     _column(DATA, "spoken", [[{"role": "user", "content": "go"}]] * sum(LENGTHS))(root)
@@ -253,6 +267,7 @@ def test_what_has_no_message_is_counted(tmp_path: Path) -> None:
     assert imported(root, tmp_path / "ds", episode=0).skipped == {
         "rows of spoken, whose type has no message": 7,
         "images of seen, which are not in a video": 7,
+        "numbers of tasks, of which no texts are there": 7,
         "columns that are not features": 1,
     }
 

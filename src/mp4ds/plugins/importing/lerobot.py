@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -95,7 +96,9 @@ class _Folder:
             with _reading(path):
                 names = [name for name in pq.read_schema(path).names if name[:6] != "stats/"]
                 rows = pq.read_table(path, columns=names, filters=only).to_pylist()
-                found += ((path, row) for row in rows if int(row["episode_index"]) >= 0)
+                if (least := min((int(row["episode_index"]) for row in rows), default=0)) < 0:
+                    raise ValueError(f"it has an episode {least}")
+                found += ((path, row) for row in rows)
         return found
 
 
@@ -138,6 +141,8 @@ def episodes_in(folder: Path) -> list[int]:
     found = sorted(row["episode_index"] for _, row in _Folder(folder).episodes())
     if not found:
         raise SourceError(folder, "has no episodes")
+    if twice := {one for one, other in pairwise(found) if one == other}:
+        raise SourceError(folder, f"has episode {min(twice)} twice")
     return found
 
 
@@ -208,6 +213,8 @@ def _chosen(folder: _Folder, number: int | None) -> tuple[Path, dict[str, Any]]:
     found = folder.episodes(number)
     if not found:
         raise OptionError(f"{folder.path} has no `episode` {number}.")
+    if len(found) > 1 and number is not None:
+        raise SourceError(folder.path, f"has episode {number} twice")
     if len(found) > 1:
         raise OptionError(
             f"{folder.path} has {len(found)} episodes. Give `episode`, or use "
@@ -335,6 +342,7 @@ def _add_tasks(
 ) -> None:
     """Add the tasks, where they change."""
     if not path.is_file():
+        reader.left_out["numbers of tasks, of which no texts are there"] = len(numbers)
         return
     with _reading(path):
         table = pq.read_table(path, columns=["task_index", "task"]).to_pydict()
