@@ -65,6 +65,8 @@ def test_what_is_taken(source: str, way: str, tmp_path: Path) -> None:
     if way == "dataset":
         mp4ds.pack(whole, dataset, PackOptions(**ONLY))
         assert hides_frames(dataset)
+        with mp4ds.open(dataset) as opened, pytest.raises(mp4ds.OptionError, match="torchcodec"):
+            opened.streams[0].frame_mappings()
     elif way == "dataset-anew":
         mp4ds.pack(whole, dataset, PackOptions(**ONLY, codec="ffv1"))
     if way == "unpack":

@@ -472,8 +472,14 @@ class Stream(Images):
             JSON: ``pts``, ``duration`` and ``key_frame`` of each frame, in ticks of the video.
 
         Raises:
+            OptionError: The video was cut out of another: torchcodec would give wrong frames.
             VideoError: The video's index cannot be read.
         """
+        if self.hides_frames:
+            raise OptionError(
+                f"topic {self.topic}: torchcodec returns wrong frames at the beginning of a video "
+                "cut out of another. Use mp4ds, or a dataset packed with a `codec`."
+            )
         with closing(Media(self.video_path)) as media:
             table = media.table
         starts = table.presentation[table.order]
