@@ -1010,7 +1010,7 @@ REFUSED = ("hash-mismatch", "digest-mismatch", "decode-failed")
 
 def without_sum(sidecar: Path) -> None:
     lines = sidecar.read_text("utf-8").splitlines(keepends=True)
-    kept_ = [line for line in lines if not line.startswith(("  sha256:", "checksum:"))]
+    kept_ = [line for line in lines if not line.startswith(("  sha256:", "  size:", "checksum:"))]
     sidecar.write_text("".join(kept_), "utf-8")
 
 
