@@ -322,8 +322,17 @@ def test_a_purpose_that_is_none(text: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(70, 20), (20, 70), (320, 16)])
 def test_views_of_narrow_images_end(size: tuple[int, int], tmp_path: Path) -> None:
-    """SVT-AV1 with several threads waits for ever on them."""
+    """SVT-AV1 with several threads waits forever on them."""
     made = source_scene("mono8", frames=3, width=size[0], height=size[1])
     paths = SOURCES["mcap-ros2-none"](tmp_path, made)
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(view="av1"))
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+
+
+def test_groups_of_two_frames_end(tmp_path: Path) -> None:
+    """SVT-AV1 with an own number of levels waits forever on them."""
+    made = source_scene("rgb8", frames=60, width=160, height=96)
+    paths = SOURCES["mcap-ros2-none"](tmp_path, made)
+    options = PackOptions(quality="crf=30", codec="av1", preset="4", gop=2, window=60)
+    mp4ds.pack(paths, tmp_path / "dataset", options)
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []

@@ -291,9 +291,10 @@ def open_encoder(context: Any, recipe: Recipe, width: int, height: int, *, threa
         given = context.options.get("svtav1-params")
         if min(width, height) < _NARROW_AV1:
             threads = 1  # with several, it never ends on some sizes, such as 70x20
-        # it keeps room, and pictures, for one level more than it uses by itself; the last one of
-        # equal names counts
-        parameters = ":".join(filter(None, ("hierarchical-levels=4", given, f"lp={threads}")))
+        # it keeps room, and pictures, for one level more than it uses by itself; told so, it waits
+        # forever in groups of two with presets up to 4. The last one of equal names counts
+        levels = "hierarchical-levels=4" if int(context.options["g"]) > 2 else None
+        parameters = ":".join(filter(None, (levels, given, f"lp={threads}")))
         context.options = {**context.options, "svtav1-params": parameters}
     if recipe.encoder == "libx265":
         # it would write its threads and the processor beside the parameter sets
