@@ -236,6 +236,9 @@ def _examples(name: str, examples: list[tuple[str, str, str]]) -> Iterator[str]:
 def api_text(page: str, title: str) -> str:
     """The page of a part of the API; mkdocstrings makes the rest of it from the docstrings."""
     parts = [f"# {title}\n"]
+    if page == "torch":  # what the module says of itself
+        parts += ["::: mp4ds.torch", "    options: {members: false, show_root_heading: false}"]
+        parts += ["\nMore on this: [frames in PyTorch](../training.md).\n"]
     for name in names_of(page):
         value = None if page == "torch" else getattr(mp4ds, name)
         is_options = isinstance(value, type) and issubclass(value, Options)

@@ -1,6 +1,6 @@
 """Robot camera recordings as mp4 files with YAML sidecars, and back again exactly.
 
-The public API, and nothing else::
+The public API, and nothing else:
 
     mp4ds.pack("drive.mcap", "drive")            recording -> dataset
     mp4ds.unpack("drive", "bag", "again.bag")   dataset -> recording

@@ -1,6 +1,6 @@
 """Every error that mp4ds raises on purpose.
 
-::
+:
 
     Mp4dsError                         exit code 1
     ├── PathError                      1  a file or folder with which something is wrong

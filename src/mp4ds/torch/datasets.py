@@ -162,48 +162,40 @@ def _longer(like: torch.Tensor, rows: int, *, shared: bool = False) -> torch.Ten
 class FrameDataset(Dataset):
     """Frames of datasets by number, for a shuffling DataLoader.
 
-    A sample is a dictionary, here for the topics ``/left`` and ``/right``::
+    ``FrameDataset("drives/*", resize=(224, 224))[7]`` is a dictionary, here of two cameras:
 
-        {"/left": uint8 (T, C, H, W), "/right": ..., "/left_is_pad": bool (T,), ...,
+        {"/left": uint8 (C, H, W), "/right": ..., "/left_is_pad": bool (1,), ...,
          "stamp_ns": int, "index": int, "dataset": int}
 
-    T is the number of offsets; with the default, one, tensors are (C, H, W). C is 1 for grey
-    images. ``is_pad`` marks frames that are padding for missing ones. ``stamp_ns`` is the header
-    stamp of the first topic's frame, ``index`` the sample's number, ``dataset`` that of the path.
-    The samples of a batch are rows of one tensor per camera, which `collate` returns without
-    copying: copy those that you keep.
+    With `offsets`, tensors are (T, C, H, W), and ``is_pad`` marks those frames of T that do not
+    exist and are padding; C is 1 for grey images. `state` and `action` add float32 (D,) or (T, D).
+    ``stamp_ns`` is the header stamp of the first camera's frame, ``index`` the sample's number,
+    ``dataset`` that of its path.
 
-    With `state` and `action`, a sample also has numbers of recorded messages::
+    Frames of several cameras are matched by header stamp (`mp4ds.Dataset.sync`), each at most once;
+    `unmatched` has the others.
 
-        {"state": float32 (D,), "state_is_pad": bool (1,), "action": float32 (T, D), ...}
-
-    They are of the message at the time of the sample's first frame. A message's time is its header
-    stamp; without one, its log time.
-
-    With several cameras, a sample has frames matched by header stamp (`mp4ds.Dataset.sync`), each
-    frame at most once; `unmatched` has the others.
-
-    It may be pickled and forked. Each process opens videos itself when first needed.
+    A batch is decoded as a whole. Its samples are rows of one tensor per camera, which `collate`
+    returns without copying: give it to the DataLoader as ``collate_fn``, and copy samples that
+    you keep. A FrameDataset may be pickled and forked: each process opens videos itself when first
+    needed.
 
     Args:
         paths: Datasets, one or several: folders, sidecars, videos, URLs; or folders of datasets
             and patterns such as ``drives/*``.
         topics: Cameras; None: all of the first dataset. The others must have them, too.
-        rename: What some recordings call a topic -> what it is called here:
-            ``{"/cam_left/image": "/left/image_raw"}``.
-        fps: Samples per second, at a constant rate while all cameras run, each of the frames
-            nearest in time; None: the matched frames.
-        episode_topic: Topic whose value (std_msgs/String, Bool, a number) tells episodes: each
-            counts as a dataset of its own. Samples where it is false, empty, negative or not there
-            are left out. None: a dataset is an episode.
-        state: Topics and their fields, such as ``{"/joint_states": "position"}``. Several are a
-            list: ``["pose.position", "data[0:6]", "position[elbow]"]``. ``"/joint_states"`` alone
-            stands for the positions of a JointState, or the data of an array.
-        action: The same.
-        action_offsets: Those of the action, in the unit of `offsets_in`.
-        message: The ``nearest`` one to the time, or the ``previous``, which is not after it.
-        message_tolerance_ns: How far it may be from the time before it counts as padding; None:
-            twice the median time between the topic's messages.
+        format: ``rgb``, ``bgr``, ``gray``; ``native``: in their ROS encoding; ``depth_m``: depths
+            in metres, float32. A mapping by topic gives each camera its own; so do mappings for
+            `resize` and `crop`.
+        resize: Factor, or width and height in pixels.
+        crop: x, y, width, height in pixels; before `resize`.
+        layer: Of lossless cameras, the ``view`` decodes faster and looks the same, but has only
+            256 levels of 16 bits; ``exact``: the pixels recorded. Cameras without a view have one
+            layer; mono16, which may be depths, is exact in both.
+        dtype: ``native``: as decoded, uint8 except for cameras of more bits. ``uint8``: the same,
+            but refused for those. ``float32``: 0 to 1; native pixels keep their values.
+        channels_first: (C, H, W), not (H, W, C).
+        transform: Called with each sample; its return value replaces the sample.
         offsets: Frames of a sample relative to its own: ``(-1, 0)`` is the previous one and itself.
             A mapping by topic gives each camera, and ``state``, its own.
         offsets_in: ``frames``: samples of the same recording before and after. ``seconds``: in
@@ -211,18 +203,22 @@ class FrameDataset(Dataset):
         tolerance_ns: With seconds, how far a stamp may be from its time before it counts as
             padding; None: half the median time between the camera's frames.
         sync_tolerance_ns: Maximum distance of the stamps of different cameras in a sample.
-        format: ``rgb``, ``bgr``, ``gray``; ``native``: in their ROS encoding; ``depth_m``: depths
-            in metres, float32. A mapping by topic gives each camera its own; so do mappings for
-            `resize` and `crop`.
-        resize: Factor, or width and height in pixels.
-        crop: x, y, width, height in pixels; before `resize`.
-        layer: Of lossless cameras, the ``view`` decodes faster and has the quality of `quality`
-            visual, and 256 levels of 16 bits; ``exact``: the pixels recorded. Cameras
-            without a view have one layer; mono16, which may be depths, is exact in both.
-        dtype: ``native``: as decoded, uint8 except for cameras of more bits. ``uint8``: the same,
-            but refused for those. ``float32``: 0 to 1; native pixels keep their values.
-        channels_first: (C, H, W), not (H, W, C).
-        transform: Called with each sample; its return value replaces the sample.
+        state: Topics and their fields, such as ``{"/joint_states": "position"}``. Several are a
+            list: ``["pose.position", "data[0:6]", "position[elbow]"]``. ``"/joint_states"`` alone
+            stands for the positions of a JointState, or the data of an array. They are of the
+            message at the time of the sample's first frame: its header stamp, or else log time.
+        action: The same.
+        action_offsets: Those of the action, in the unit of `offsets_in`.
+        message: The ``nearest`` one to the time, or the ``previous``, which is not after it.
+        message_tolerance_ns: How far it may be from the time before it counts as padding; None:
+            twice the median time between the topic's messages.
+        fps: Samples per second, at a constant rate while all cameras run, each of the frames
+            nearest in time; None: the matched frames.
+        episode_topic: Topic whose value (std_msgs/String, Bool, a number) tells episodes: each
+            counts as a dataset of its own. Samples where it is false, empty, negative or not there
+            are left out. None: a dataset is an episode.
+        rename: What some recordings call a topic -> what it is called here:
+            ``{"/cam_left/image": "/left/image_raw"}``.
         cache: Where to keep frames as they are returned, for later epochs: a folder that all
             workers and processes of a machine share, or ``ram``. None: nowhere.
         cache_bytes: Maximum size of that, over all cameras; other frames are decoded each time.
@@ -245,18 +241,6 @@ class FrameDataset(Dataset):
         paths: Paths,
         *,
         topics: Sequence[str] | None = None,
-        rename: Mapping[str, str] | None = None,
-        fps: int | None = None,
-        episode_topic: str | None = None,
-        state: Fields | None = None,
-        action: Fields | None = None,
-        action_offsets: Sequence[float] = (0,),
-        message: Pick = "nearest",
-        message_tolerance_ns: int | None = None,
-        offsets: Sequence[float] | Mapping[str, Sequence[float]] = (0,),
-        offsets_in: Unit = "frames",
-        tolerance_ns: int | None = None,
-        sync_tolerance_ns: int = 20_000_000,
         format: str | Mapping[str, str] = "rgb",  # noqa: A002 - as of Stream.read
         resize: Resize | Mapping[str, Resize] = None,
         crop: Crop | Mapping[str, Crop] = None,
@@ -264,6 +248,18 @@ class FrameDataset(Dataset):
         dtype: Dtype = "native",
         channels_first: bool = True,
         transform: Transform | None = None,
+        offsets: Sequence[float] | Mapping[str, Sequence[float]] = (0,),
+        offsets_in: Unit = "frames",
+        tolerance_ns: int | None = None,
+        sync_tolerance_ns: int = 20_000_000,
+        state: Fields | None = None,
+        action: Fields | None = None,
+        action_offsets: Sequence[float] = (0,),
+        message: Pick = "nearest",
+        message_tolerance_ns: int | None = None,
+        fps: int | None = None,
+        episode_topic: str | None = None,
+        rename: Mapping[str, str] | None = None,
         cache: str | Path | None = None,
         cache_bytes: int = CACHE_BYTES,
         cache_files: int = 16,

@@ -114,7 +114,7 @@ class Metadata:
 class LeRobotDataset(FrameDataset):
     """Datasets as LeRobot's training code takes them, without converting anything.
 
-    A sample has what ``lerobot.datasets.LeRobotDataset`` gives for an export of the same datasets::
+    A sample has what ``lerobot.datasets.LeRobotDataset`` gives for an export of the same datasets:
 
         {"observation.images.left_image_raw": float32 (C, H, W), "observation.state": float32 (D,),
          "action": float32 (D,), "timestamp": seconds, "frame_index": ..., "episode_index": ...,
