@@ -36,10 +36,7 @@ Layer = Literal["exact", "view"]
 
 
 def open_stream(path: Path, layer: Layer | None = None, *, jpeg_quality: int = 95) -> Stream:
-    """A stream of a dataset that is read in a layer: see `Stream`.
-
-    What may be depths is exact in both layers, if that is here: a view has 256 levels of it.
-    """
+    """A `Stream` in a layer; what may be depths is exact in both: a view has 256 levels of it."""
     stream = Stream(path, layer=layer, jpeg_quality=jpeg_quality)
     keeps = stream.encoding in depth.DEPTHS and stream.absent is None
     return stream.in_layer("exact") if keeps else stream

@@ -169,8 +169,8 @@ class TorchcodecReader:
     def _check_range(self, topic: Topic) -> None:
         """Refuse a video whose range torchcodec misinterprets.
 
-        On a CPU, torchcodec 0.13 treats full-range AV1 as limited: contrast is then too high by 255
-        / 219, and dark and bright details are clipped.
+        On a CPU, torchcodec 0.13 treats full-range AV1 as limited (0.17 does not): contrast is then
+        too high by 255 / 219, and dark and bright details are clipped.
         """
         with closing(topic):  # it reopens its video when needed
             first = topic.read([0], format="rgb")[0]

@@ -461,7 +461,7 @@ class Types:
     Args:
         world: ``ros1`` or ``ros2``.
         kind: One of `KINDS`.
-        made: What its messages are, if it is none of them.
+        made: The kind itself, for one that is not in `KINDS`.
     """
 
     def __init__(self, world: str, kind: str, made: Kind | None = None) -> None:
