@@ -143,6 +143,7 @@ SERVICES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "GetRate": (_NOTHING, {"rate": float64}),
     "SetRate": ({"rate": float64}, _SUCCESS),
     "PlayNext": (_NOTHING, _SUCCESS),
+    "Snapshot": (_NOTHING, _SUCCESS),
     "Burst": ({"num_messages": uint64}, {"actually_burst": uint64}),
     "Play": (
         {"start_offset": Time, "playback_duration": Duration, "playback_until_timestamp": Time},

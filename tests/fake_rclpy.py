@@ -286,7 +286,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Bus:
     # of services only the events, which are messages
     bus.kinds[EVENT] = SimpleNamespace(type_name=EVENT)
     services = ("Pause", "Resume", "TogglePaused", "IsPaused", "GetRate", "SetRate")
-    services += ("Play", "PlayNext", "Burst", "Seek", "Stop", "SplitBagfile")
+    services += ("Play", "PlayNext", "Burst", "Seek", "Stop", "SplitBagfile", "Snapshot")
     modules: dict[str, dict[str, Any]] = {
         "rclpy": {"init": init, "create_node": partial(Node, bus)},
         "rclpy.context": {"Context": Context},

@@ -51,6 +51,7 @@ class PlayedNode:
     ) -> None:
         self.lost: Counter[str] = Counter()
         self.stop: Callable[[], object] = lambda: None  # called at the end
+        self.time = 0  # of the latest message
         self._paths = list(paths)
         self._rate = rate
         self._before = before
@@ -92,12 +93,16 @@ class PlayedNode:
                 message = alter(record, counts[topic])
                 counts[topic] += 1
                 self._tick(message.log_time)
+                self.time = message.log_time
                 data = bytes(message.data)
                 self._receivers[topic](message.channel, data, message.publish_time)
         self.stop()
 
     def serve(self, services: object) -> None:
         pass
+
+    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
+        self._receivers[topic] = lambda channel, data, time: on_message(None)
 
     def close(self) -> None:
         pass

@@ -31,7 +31,8 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.spool import SpoolFolder
 from mp4ds.plugins.recording import spool
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.recording.record import MessageBuffer, RecordProgress
+from mp4ds.plugins.recording.receiving import MessageBuffer
+from mp4ds.plugins.recording.record import RecordProgress
 from mp4ds.plugins.ros.node import NodeNames
 from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message, Schema
@@ -243,6 +244,16 @@ def test_one_that_may_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert told.code == 130
     found = re.search(r"pack --salvage \S+/mp4ds_[\d_-]+\.recording -o ", told.err)
     assert found, told.err
+
+
+def test_no_trigger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looking back, nothing is saved then, and that is no failure."""
+    Opened(PlayedNode(write(tmp_path, of=scene("mono8", frames=2))), monkeypatch)
+    before = tree(tmp_path)
+    options = ("--ros1", "-a", "-o", tmp_path / "live", "--keep-last", "60s", "--no-progress")
+    told = call("record", *options)
+    assert (told.code, told.out) == (0, "nothing was saved: there was no trigger\n")
+    assert tree(tmp_path) == before
 
 
 def test_nothing_to_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

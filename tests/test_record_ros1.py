@@ -124,6 +124,46 @@ def test_a_clock_that_starts_late(roscore: Core, tmp_path: Path) -> None:
     assert max(times) <= max(due) + 10**9
 
 
+def test_looking_back(roscore: Core, tmp_path: Path) -> None:
+    """Saved by a service, a signal and a message, while nothing comes; with what is latched."""
+    bag = make_drive(tmp_path / "drive.bag")
+    options = ("-a", "--exclude", "/rosout*", "--exclude", "/go", "--trigger", "/go")
+    command = ours(tmp_path / "live", *options, "--keep-last", "10m", "__name:=bag")
+    log = roscore.folder / "python.log"
+    begin = log.stat().st_size if log.exists() else 0
+
+    def is_saved(count: int) -> bool:
+        return log.read_text()[begin:].count("mp4ds: saved ") == count
+
+    recorder = roscore.start(*command)
+    try:
+        until(lambda: "/bag" in roscore.nodes(), recorder)
+        roscore.play([PLAY, "--quiet", str(bag)], {topic for topic, *_ in contents(bag)}, 1)
+        done = roscore.run("rosservice", "call", "/bag/snapshot")
+        assert "success: True" in done[1], done
+        until(lambda: is_saved(1), recorder)
+        recorder.send_signal(signal.SIGUSR1)
+        until(lambda: is_saved(2), recorder)
+        done = roscore.run("rostopic", "pub", "-1", "/go", "std_msgs/Empty")
+        until(lambda: is_saved(3), recorder)
+        recorder.send_signal(signal.SIGINT)
+        assert recorder.wait(WATCHDOG_S) == 0
+    finally:
+        recorder.kill()
+        recorder.wait(WATCHDOG_S)
+    made = sorted(tmp_path.glob("live_*"))
+    assert len(made) == 3
+
+    def payloads(recording: Path) -> list[tuple[str, bytes]]:
+        found = contents(recording)
+        return sorted((key[0], payload) for key, own in found.items() for payload in own)
+
+    for dataset in made:
+        mp4ds.unpack(dataset, None, again := dataset.with_suffix(".bag"))
+        assert payloads(again) == payloads(bag)
+        assert mp4ds.validate(dataset, deep=True) == []
+
+
 def test_without_a_master(tmp_path: Path) -> None:
     if why := missing():
         pytest.skip(why)

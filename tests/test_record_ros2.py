@@ -20,7 +20,8 @@ from mp4ds.bags.formats import open_reader
 from mp4ds.bags.rosbag2_metadata import read_bag_info
 from mp4ds.errors import OptionError
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
-from mp4ds.plugins.recording.record import Source, open_recorder, recorder_services
+from mp4ds.plugins.recording.receiving import Source
+from mp4ds.plugins.recording.record import RecordProgress, open_recorder, recorder_services
 from mp4ds.plugins.ros.node import Node, NodeNames, open_node
 from mp4ds.plugins.ros.qos import Qos, asked_qos, recorded_qos
 from mp4ds.plugins.ros.ros2 import installed_definition, is_hidden, standard_definition
@@ -184,10 +185,49 @@ def test_ros_renames_topics(side: Side) -> None:
 
         assert call("is_paused") == {"paused": True}
         assert [*map(call, ("pause", "resume", "split_bagfile", "stop"))] == [{}] * 4
+        assert call("snapshot") == {"success": True}
         source.close()
-    assert controls.asked == [("pause",), ("resume",), ("split",), ("stop",)]
+    assert controls.asked == [("pause",), ("resume",), ("split",), ("stop",), ("snapshot",)]
     assert {*heard.payloads} == {*source.topics} == {"/robot/name"}
     assert ("bag" in node.address) != node.address.endswith("(Cyclone DDS)")
+
+
+def test_looking_back(side: Side, tmp_path: Path) -> None:
+    """Saved by a service while nothing comes, and by a message; each with what is latched."""
+    strings, trigger = channel("/robot/name", STRING), channel("/robot/go", STRING)
+    latched = channel("/robot/map", STRING, qos=LATCHED)
+    options = RecordOptions(to="ros2", keep_last=600, all=True, trigger=["/robot/go"])
+    saved: list[Path] = []
+    replies: list[Any] = []
+    with side.open() as publisher:
+        for one in (strings, trigger, latched):
+            publisher.advertise(one)
+        publisher.publish(latched, message(STRING, 77), 0)
+
+        def watch(state: RecordProgress) -> None:
+            saved[:] = [path for path, is_complete in state.saved.items() if is_complete]
+
+        with open_recorder((), tmp_path / "live", options, progress=watch) as recorder:
+
+            def publish() -> None:
+                until(lambda: publisher.subscribers(strings) == publisher.subscribers(latched) == 1)
+                until(lambda: publisher.subscribers(trigger) == 2)
+                publisher.publish(strings, message(STRING, 1), 0)
+                until(lambda: recorder.received == 2)
+                name = "/rosbag2_recorder/snapshot"
+                replies.append(side.peer.call(name, "Snapshot", {}))
+                until(lambda: len(saved) == 1)
+                publisher.publish(trigger, message(STRING, 2), 0)
+                until(lambda: len(saved) == 2)
+                recorder.stop()
+
+            threading.Thread(target=publish).start()
+            made = recorder.run().datasets
+    assert replies == [{"success": True}]
+    assert {path.name for path in tmp_path.iterdir()} == {one.dataset.name for one in made}
+    counts = [{item.topic: item.messages for item in one.topics} for one in made]
+    assert counts[0] == {"/robot/name": 1, "/robot/map": 1, "/robot/go": 0}
+    assert {**counts[1], "/robot/go": 0} == counts[0]  # whether the trigger is in it is chance
 
 
 def test_nothing_is_recorded_before_the_clock(side: Side) -> None:

@@ -184,16 +184,21 @@ def take_slice(
     first = max(first, reader.begin or first)
     span = Excerpt(*asked.times(first, last, reader.path))
     if asked.latched and span.start is not None:
-        latched = _latched_before(reader, Excerpt(end=span.start), selected)
+        latched = latched_before(reader, Excerpt(end=span.start), selected)
         reader.slice = RecordingSlice(span, *latched)
     else:
         reader.slice = RecordingSlice(span)
 
 
-def _latched_before(
-    reader: BagReader, before: Excerpt, selected: Callable[[str], bool]
+def latched_before(
+    reader: BagReader, before: Excerpt, selected: Callable[[str], bool] = lambda _: True
 ) -> tuple[Sequence[Message], Sequence[str]]:
     """The latched messages from before a slice, by log time; images are never among them.
+
+    Args:
+        reader: Of the whole recording.
+        before: What is before the slice.
+        selected: Whether a topic's latched messages are wanted.
 
     Returns:
         The messages, and the topics left out since the messages are too large.

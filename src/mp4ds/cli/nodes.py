@@ -102,7 +102,10 @@ def node_progress(
 
 @contextmanager
 def node_controls(
-    options: RosOptions, stop: Callable[[], None], keys: Mapping[str, Callable[[], object]]
+    options: RosOptions,
+    stop: Callable[[], None],
+    keys: Mapping[str, Callable[[], object]],
+    signals: Mapping[str, Callable[[], object]] = {},
 ) -> Iterator[Sequence[int]]:
     """Run actions when keys are pressed, and let a node end in its own time at Ctrl-C and the like.
 
@@ -112,6 +115,7 @@ def node_controls(
         options: Of the node.
         stop: Ends it.
         keys: The action of each key.
+        signals: Action of other signals, by name, which may interrupt anything.
 
     Yields:
         The numbers of the signals that came.
@@ -125,6 +129,9 @@ def node_controls(
         stop()
 
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, *ending_signals())}
+    for name, act in signals.items():
+        if number := getattr(signal, name, None):  # Windows has few
+            before[number] = signal.signal(number, lambda *_, act=act: act())
     try:
         with nullcontext() if options.disable_keyboard_controls else Keyboard(keys):
             yield caught

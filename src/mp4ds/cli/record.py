@@ -29,6 +29,8 @@ from mp4ds.plugins.ros.node import SERVICE_EVENTS
 _SHOWN = 20  # topics
 _UNTIMED = "their log time is negative or too large"
 _MB = 10**6
+_KEPT_S = 60.0
+"""What --snapshot-mode keeps."""
 
 
 @command(
@@ -63,6 +65,7 @@ _MB = 10**6
 @option("--match", is_flag=True, hidden=True)
 @option("--split", is_flag=True, hidden=True)
 @option("--size", type=int, hidden=True)
+@option("--snapshot-mode", "snapshots", is_flag=True, hidden=True)
 @option("--max-cache-size", "cache", type=int, hidden=True)
 @accepted("-j", "--bz2", "--lz4", "--tcpnodelay")
 @accepted("--storage", "--storage-preset-profile", "--storage-config-file", values=1)
@@ -77,6 +80,7 @@ def record_command(
     match: bool,
     split: bool,
     size: int | None,
+    snapshots: bool,
     cache: int | None,
     ros: RosOptions,
     options: RecordOptions,
@@ -85,6 +89,10 @@ def record_command(
 
     Ctrl-C ends the recording. It is lossless by default, with the fastest encoder settings. What
     cannot be packed in time waits on disk. Keys: space pauses and resumes, q ends.
+
+    With --keep-last 60s it looks back instead: the last minute becomes a dataset at each trigger.
+    These are the key s, the signal SIGUSR1, the service ~/snapshot, and messages on a --trigger
+    topic.
     """
     options = replace(options, to=ros.to, names=node_names(ros))
     if match:  # with -e, topics are regular expressions for rosbag record
@@ -97,6 +105,8 @@ def record_command(
         options = replace(options, max_size=f"{size}M")
     if cache is not None:
         options = replace(options, buffer=max(1, cache // _MB))
+    if snapshots and options.keep_last is None:
+        options = replace(options, keep_last=_KEPT_S)
     with ExitStack() as stack:
         report = stack.enter_context(node_progress(_rows, _warnings, is_shown=ros.progress))
         # a launch file cannot leave out an argument: an empty one is none
@@ -104,8 +114,9 @@ def record_command(
         recorder = stack.enter_context(opened)
         if not is_quiet():
             complain(f"recording from {recorder.address}")
-        keys = {" ": recorder.toggle_paused, "q": recorder.stop}
-        stack.enter_context(node_controls(ros, recorder.stop, keys))
+        keys = {" ": recorder.toggle_paused, "q": recorder.stop, "s": recorder.snapshot}
+        signals = {"SIGUSR1": recorder.snapshot} if options.keep_last else {}
+        stack.enter_context(node_controls(ros, recorder.stop, keys, signals))
         try:
             summary = recorder.run()
         except KeyboardInterrupt:  # asked twice, as launch files do when their time is over
@@ -116,6 +127,8 @@ def record_command(
                 else "interrupted; everything recorded is in datasets"
             ) from None
     show(summary, _print)
+    if options.keep_last and not summary.datasets:
+        say("nothing was saved: there was no trigger")
     if summary.dropped or summary.lost or summary.untimed:
         raise click.exceptions.Exit(1)
 
@@ -128,6 +141,10 @@ def _whole(patterns: Sequence[str]) -> str:
 
 def _warnings(state: RecordProgress) -> Iterator[str]:
     yield from state.warnings
+    for path, is_complete in state.saved.items():
+        yield f"saving {path_text(path)}"
+        if is_complete:
+            yield f"saved {path_text(path)}"
     if state.state.startswith("waiting"):
         yield f"{state.state}: recording starts when it publishes a time"
     for topic, item in state.topics.items():

@@ -44,6 +44,8 @@ class SpoolSettings(Model):
     codec: str | None
     preset: str | None
     gop: Gop | None
+    looks_back: bool = False
+    """Only the newest pieces are there, and in piece 0 the latched messages from before them."""
 
     def options(self, *, salvage: bool = False) -> PackOptions:
         """The options of a pack."""
@@ -219,7 +221,8 @@ def recover(
     found = _found(path)
     with folder.locked(), work_folder(target.parent, f".{target.name}.") as place:
         settings = folder.settings()
-        parts, losses = [], _gaps(found)
+        old = range(1, next(iter({*found} - {0}), 1)) if settings.looks_back else ()
+        parts, losses = [], _gaps([*sorted({*found, *old})])
         for number, is_packed in found.items():
             piece, part = folder.piece(number), folder.part(number)
             if not is_packed:
@@ -245,7 +248,7 @@ def recover(
             raise SourceError(path, problem, remedy) from None
 
 
-def _gaps(found: Mapping[int, bool]) -> list[Loss]:
+def _gaps(found: Sequence[int]) -> list[Loss]:
     """What is missing between pieces that are there, which no recorder leaves."""
     losses = []
     for before, after in pairwise([-1, *found]):

@@ -22,11 +22,11 @@ from mp4ds.video.codecs import LOSSLESS, MAX_GOP, QualitySetting, parse_quality
 
 
 def _parse_duration(value: str | float) -> float:
-    """Seconds of ``90``, ``5m`` or ``2h``."""
+    """Seconds of ``90``, ``90s``, ``5m`` or ``2h``."""
     text = str(value)
-    factor = {"m": 60, "h": 3600}.get(text[-1:], 1)
+    factor = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
-        seconds = float(text[:-1] if factor > 1 else text) * factor
+        seconds = float(text[:-1] if factor else text) * (factor or 1)
     except ValueError:
         raise OptionError(f"{value!r} is no duration: give seconds, 5m or 2h.") from None
     if not 0 <= seconds < 1e9:
@@ -85,6 +85,28 @@ class RecordOptions(NodeOptions):
         "--max-bag-size",
         metavar="SIZE",
         parse=parse_size,
+        panel=WHAT,
+    )
+    keep_last: Parsed[float | None] = option(
+        "Look back: keep so many seconds (60s, 5m), and save them as a dataset at each trigger.",
+        None,
+        "--keep-last",
+        panel=WHAT,
+        metavar="SECONDS",
+        parse=_parse_duration,
+    )
+    and_then: Parsed[float | None] = option(
+        "Save so many seconds after a trigger, too.",
+        None,
+        "--and-then",
+        panel=WHAT,
+        metavar="SECONDS",
+        parse=_parse_duration,
+    )
+    trigger: Sequence[str] = option(
+        "Trigger by each message on this topic, recorded or not; repeatable.",
+        (),
+        metavar="TOPIC",
         panel=WHAT,
     )
     buffer: int = option(

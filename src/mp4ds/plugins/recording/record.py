@@ -5,24 +5,26 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from itertools import count
 from pathlib import Path
 
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
-from mp4ds.errors import Mp4dsError, OptionError, Refused
+from mp4ds.errors import OptionError
 from mp4ds.files.outputs import sync
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.packing.options import PackSummary
+from mp4ds.plugins.recording.lookback import LookBack
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
+from mp4ds.plugins.recording.receiving import MessageBuffer, Source, TopicProgress
 from mp4ds.plugins.recording.spool import Split
 from mp4ds.plugins.ros.node import (
-    CLOCK,
     Node,
     Service,
     action,
@@ -30,7 +32,6 @@ from mp4ds.plugins.ros.node import (
     open_node,
     quick_switches,
 )
-from mp4ds.plugins.ros.ros2 import is_hidden
 from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message, MetadataRecord
 from mp4ds.times import INT64_MAX
@@ -38,40 +39,20 @@ from mp4ds.video.codecs import check_codec
 
 _NS = 1_000_000_000
 _REPORT_S = 0.2
-_CLOCK_POLL_S = 0.01
 _FLUSH_S = 0.5
 _BEHIND = 1 / 8
 """Of the buffer: with so much in it, nothing is synced, which would hold up writing."""
 
+_TIME = "%Y_%m_%d-%H_%M_%S"
 _NICE = 10
+_QUIET_S = 1.0
+"""For how long further messages on a trigger's topic mean the same."""
+
 _NODES = {"ros1": "record", "ros2": "rosbag2_recorder"}
 """Node names of ROS's own recorders."""
 
 _LAST_NS = {"ros1": 2**32 * _NS - 1, "ros2": INT64_MAX}
 """The latest time that a bag or rosbag2 can hold."""
-
-
-@dataclass
-class TopicProgress:
-    """What came of a topic.
-
-    Attributes:
-        messages: Messages received.
-        bytes: Their payloads.
-        dropped: Messages dropped because the buffer was full.
-        untimed: Messages left out because their log time is negative or too large.
-        lost: Messages lost, as reported by the middleware.
-        hz: Messages per second, recently.
-        bytes_per_s: Bytes per second, recently.
-    """
-
-    messages: int = 0
-    bytes: int = 0
-    dropped: int = 0
-    untimed: int = 0
-    lost: int = 0
-    hz: float = 0.0
-    bytes_per_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -81,11 +62,12 @@ class RecordProgress:
     Attributes:
         dataset: The dataset being made.
         seconds: Time since the recording began.
-        state: ``recording``, ``paused``, ``finishing`` or ``waiting for /clock``.
+        state: ``recording``, ``looking back``, ``paused``, ``finishing`` or ``waiting for /clock``.
         topics: State of each topic, by name.
         waiting_bytes: Bytes of buffered messages.
         spool_bytes: Bytes of messages on disk that are not packed yet.
         bytes_written: Bytes of this dataset so far, including these.
+        saved: Datasets that a recorder that looks back saves: whether they are complete.
         warnings: Warnings so far, each a sentence.
     """
 
@@ -96,6 +78,7 @@ class RecordProgress:
     waiting_bytes: int
     spool_bytes: int
     bytes_written: int
+    saved: Mapping[Path, bool]
     warnings: Sequence[str]
 
 
@@ -173,7 +156,8 @@ def open_recorder(
     wanted = Wanted(topics, chosen)
     _check(chosen)
     others = _bag_info(chosen.custom_data) if world == "ros2" else []
-    made = dataset if dataset is not None else f"{datetime.now():mp4ds_%Y_%m_%d-%H_%M_%S}"
+    default = "mp4ds" if chosen.keep_last else f"{datetime.now():mp4ds_{_TIME}}"
+    made = dataset if dataset is not None else default
     if node is None:
         node = open_node(world, chosen, chosen.node or _NODES[world])
     with node:
@@ -192,6 +176,12 @@ def _check(options: RecordOptions) -> None:
             f"`quality` {options.quality} takes several tries per video. Record lossless or "
             "visual, then pack the dataset with this quality."
         )
+    if options.keep_last is None and (options.and_then is not None or options.trigger):
+        raise OptionError("`and_then` and `trigger` need `keep_last`.")
+    if options.keep_last is not None and (options.max_duration or options.max_size):
+        raise OptionError("`keep_last` contradicts `max_duration` and `max_size`.")
+    if options.keep_last == 0:
+        raise OptionError("`keep_last` must be more than 0 seconds.")
     if options.about is not None:
         load_about(options.about)
     check_codec(
@@ -216,207 +206,6 @@ def _bag_info(custom_data: Sequence[str]) -> list[MetadataRecord]:
     info = {"version": NEWEST_VERSION, "custom_data": custom or None, "ros_distro": distro}
     content = {"storage": "", "files": "", METADATA_FILE: dump_bag_info(info)}
     return [MetadataRecord(RECORD, content)]
-
-
-# ---------------------------------------------------------------- receiving
-
-
-class Source:
-    """Receives the messages of wanted topics, including topics that appear later.
-
-    Args:
-        node: Closed with this.
-        options: How to record.
-        wanted: Which topics to receive.
-        take: Called with each message, from any thread; it does not block. Each channel has an
-            id of its own.
-
-    Attributes:
-        warnings: Sentences, each to be shown once.
-        topics: Topics subscribed to, with their channel if it is known before the first message.
-        waiting_for: The clock topic that the recording waits for; empty once the clock runs.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        options: RecordOptions,
-        wanted: Wanted,
-        take: Callable[[Message], None],
-    ) -> None:
-        self.warnings: dict[str, None] = {}
-        self.topics: dict[str, Channel | None] = {}
-        self.waiting_for = ""
-        self._node = node
-        self._options = options
-        self._wanted = wanted
-        self._take = take
-        self._failed: Counter[str] = Counter()
-        self._sim_time_ns: int | None = None
-        self._subscribed: set[str] = set()
-        self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    @property
-    def lost(self) -> Counter[str]:
-        """Messages that the middleware reports as lost, or that could not be taken, by topic."""
-        recorded_as = self._wanted.recorded_as
-        by_node = {recorded_as(topic): count for topic, count in self._node.lost.items()}
-        return self._failed + Counter(by_node)
-
-    def warn(self, sentence: str) -> None:
-        """Add a warning."""
-        self.warnings[sentence] = None
-
-    def start(self) -> None:
-        """Start receiving, in threads of its own.
-
-        With a simulated time, it subscribes to topics only once /clock has published a time, as
-        `ros2 bag record` does: earlier messages would have none, and latched ones still arrive.
-
-        Raises:
-            RemoteError: The middleware refuses.
-        """
-        names = self._options.names
-        if self._options.use_sim_time or names.use_sim_time or self._node.wants_clock:
-            self.waiting_for = names.renamed(CLOCK)
-            self._node.follow_clock(self._tick)
-        else:
-            self._look()
-        self._thread = threading.Thread(target=self._keep_looking, name="topics", daemon=True)
-        self._thread.start()
-
-    def _tick(self, time_ns: int) -> None:
-        if time_ns:  # 0 means that the clock has not started
-            self._sim_time_ns, self.waiting_for = time_ns, ""
-
-    def _keep_looking(self) -> None:
-        is_clear = self.waiting_for == ""  # then it has looked once
-        while self.waiting_for:
-            if self._ended.wait(_CLOCK_POLL_S):
-                return
-        poll_s = max(self._options.polling_interval / 1000, self._node.poll_s)
-        end = time.monotonic() + self._node.discovery_s
-        while self._options.discover or not is_clear or time.monotonic() < end:
-            if self._ended.wait(poll_s if is_clear else 0.0):
-                return
-            try:
-                self._look()
-                is_clear = True
-            except Mp4dsError as error:
-                self.warn(f"new topics are not noticed: {error}")
-                self._ended.wait(poll_s)
-
-    def _look(self) -> None:
-        """Subscribe to new topics."""
-        is_ros2, options = self._node.world == "ros2", self._options
-        heard = self._node.subscribed_topics() if is_ros2 and options.ignore_leaf else None
-
-        def is_new(topic: str, kind: str) -> bool:
-            if topic in self._subscribed or (heard is not None and topic not in heard):
-                return False
-            is_shown = options.hidden or not is_ros2 or not is_hidden(topic)
-            return is_shown and self._wanted(topic, kind)
-
-        for topic, kinds in self._node.topics(is_new).items():
-            self._subscribed.add(topic)
-            self._subscribe(topic, kinds)
-
-    def _subscribe(self, topic: str, kinds: Sequence[str]) -> None:
-        name = self._wanted.recorded_as(topic)
-
-        def receive(channel: Channel, data: bytes, sent_ns: int) -> None:
-            # middlewares swallow, or crash on, what a callback raises
-            try:
-                now = time.time_ns() if self._sim_time_ns is None else self._sim_time_ns
-                self._take(Message(channel, now, sent_ns if sent_ns > 0 else now, 0, data))
-            except Exception as error:
-                self._failed[name] += 1
-                self.warn(f"{name}: a message could not be recorded: {error!r}")
-
-        if len(kinds) > 1:
-            self.warn(f"{topic}: has several types: only {kinds[0]} is recorded")
-        try:
-            channel = self._node.subscribe(topic, kinds[0], name, receive)
-        except Refused as reason:
-            self.warn(f"{topic}: not recorded: {reason}")
-            return
-        if channel is not None and channel.schema and not channel.schema.data:
-            self.warn(
-                f"{topic}: recorded without the definition of {kinds[0]}, which was not found"
-            )
-        self.topics[name] = channel
-
-    def close(self) -> None:
-        """Stop receiving."""
-        self._ended.set()
-        if self._thread is not None:
-            self._thread.join()
-        self._node.close()
-
-
-class MessageBuffer:
-    """Messages on their way from the threads that receive them to the one that writes them.
-
-    Args:
-        most_bytes: Limit of buffered payloads; beyond, the oldest messages are dropped and counted.
-        last_ns: The latest log or publish time that the recording can hold; the first one is 0.
-
-    Attributes:
-        topics: What came of each topic.
-        bytes: Buffered payloads.
-    """
-
-    def __init__(self, most_bytes: int, last_ns: int = INT64_MAX) -> None:
-        self.topics: dict[str, TopicProgress] = {}
-        self._most = most_bytes
-        self._last_ns = last_ns
-        self.bytes = 0
-        self._messages: deque[Message] = deque()
-        self._changed = threading.Condition()
-        self._is_closed = False
-
-    def put(self, message: Message) -> None:
-        """Add a message, from any thread; it never waits."""
-        with self._changed:
-            if self._is_closed:
-                return
-            topic = self.topics.setdefault(message.channel.topic, TopicProgress())
-            topic.messages += 1
-            topic.bytes += len(message.data)
-            times = message.log_time, message.publish_time
-            if min(times) < 0 or max(times) > self._last_ns:
-                topic.untimed += 1
-                return
-            while self._messages and self.bytes + len(message.data) > self._most:
-                dropped = self._messages.popleft()
-                self.bytes -= len(dropped.data)
-                self.topics[dropped.channel.topic].dropped += 1
-            self._messages.append(message)
-            self.bytes += len(message.data)
-            self._changed.notify()
-
-    def take(self, wait_s: float) -> Message | None:
-        """The next message; None if none came in time.
-
-        Raises:
-            EOFError: There are no more.
-        """
-        with self._changed:
-            self._changed.wait_for(lambda: self._messages or self._is_closed, wait_s)
-            if self._messages:
-                message = self._messages.popleft()
-                self.bytes -= len(message.data)
-                return message
-            if self._is_closed:
-                raise EOFError
-            return None
-
-    def close(self) -> None:
-        """Take no more messages; buffered ones are still given out."""
-        with self._changed:
-            self._is_closed = True
-            self._changed.notify_all()
 
 
 # ---------------------------------------------------------------- recording
@@ -463,6 +252,9 @@ class Recorder:
         self.is_paused = options.start_paused
         self._is_split_asked = False
         self._splits: list[Split] = []
+        self._look_back: LookBack | None = None
+        self._triggers: deque[tuple[int, int]] = deque()  # times, and how many messages are before
+        self._quiet_until = 0.0
         self._process = ProcessExecutor(1, nice=_NICE)
         self._jobs = ThreadPoolExecutor(1, "packing")  # waits for the process
         self._counted: dict[str, tuple[float, TopicProgress]] = {}  # when, and what
@@ -476,7 +268,13 @@ class Recorder:
     @property
     def unfinished(self) -> list[Path]:
         """Folders of recordings that are not datasets yet."""
-        return [split.folder.path for split in self._splits if split.folder.path.is_dir()]
+        return [split.folder.path for split in self._all_splits if split.folder.path.is_dir()]
+
+    @property
+    def _all_splits(self) -> list[Split]:
+        """All datasets, and what is looked back at."""
+        looks = self._look_back
+        return [looks, *looks.saved] if looks else [*self._splits]
 
     # ------------------------------------------------------------ controls
 
@@ -495,6 +293,18 @@ class Recorder:
     def split(self) -> None:
         """Start a new dataset, with the next message."""
         self._is_split_asked = True
+
+    def snapshot(self) -> bool:
+        """Save what a recorder that looks back has, from any thread or a handler of signals.
+
+        Returns:
+            Whether it does: it looks back, and runs.
+        """
+        is_ready = self._look_back is not None and not self._source.waiting_for
+        if is_ready and not self._is_stopped:
+            self._triggers.append((self._source.now, self._buffer.put_in))
+            return True
+        return False
 
     def stop(self) -> None:
         """Stop; `run` then completes the dataset and returns."""
@@ -515,16 +325,16 @@ class Recorder:
             with quick_switches(), self._jobs, self._process:
                 begun = self._record()
         finally:
-            for split in self._splits:
+            for split in self._all_splits:
                 split.lock.close()
-        for split in self._splits:
+        for split in self._all_splits:
             if error := split.error or (self._error if split.made is None else None):
                 raise split.failure(error)
         if self._error is not None:
             raise self._error
         received = self._buffer.topics
         return RecordSummary(
-            datasets=[split.made for split in self._splits if split.made],
+            datasets=[split.made for split in self._all_splits if split.made],
             seconds=time.monotonic() - begun,
             dropped={name: one.dropped for name, one in received.items() if one.dropped},
             lost=dict(self._source.lost),
@@ -539,8 +349,7 @@ class Recorder:
         writer = threading.Thread(target=self._write, name="spool", daemon=True)
         writer.start()
         try:
-            if self._node.world == "ros2":  # `rosbag record` has no services
-                self._node.serve(recorder_services(self))
+            self._serve()
             self._source.start()
             while not self._is_stopped:
                 self._changed.wait(_REPORT_S)
@@ -550,7 +359,8 @@ class Recorder:
                     begun = time.monotonic()
                 if self._options.duration and time.monotonic() - begun >= self._options.duration:
                     self._is_stopped = True
-                state = f"waiting for {clock}" if clock else "recording"
+                usual = "looking back" if self._look_back else "recording"
+                state = f"waiting for {clock}" if clock else usual
                 self._report(begun, "paused" if self.is_paused else state)
         finally:
             self._source.close()
@@ -567,21 +377,43 @@ class Recorder:
         if not self.is_paused:
             self._buffer.put(message)
 
+    def _serve(self) -> None:
+        unfit = "split_bagfile" if self._look_back else "snapshot"
+        services = [one for one in recorder_services(self) if one.name != unfit]
+        if self._node.world == "ros1":  # `rosbag record` has no services
+            services = [one for one in services if one.name == "snapshot"]
+        self._node.serve(services)
+        for topic in self._options.trigger:
+            resolved = self._options.names.resolved(topic)
+            self._node.listen(self._options.names.renamed(resolved), self._on_trigger)
+
+    def _on_trigger(self, _: object) -> None:
+        """Save because of a message; those that come while what follows is saved belong to it."""
+        now = time.monotonic()
+        if now >= self._quiet_until and self.snapshot():
+            self._quiet_until = now + max(_QUIET_S, self._options.and_then or 0)
+
+    def _new_path(self) -> Path:
+        """The path of the next dataset that is saved, where nothing is."""
+        stem = f"{self._target.name}_{datetime.now():{_TIME}}"
+        for number in count():
+            path = self._target.with_name(f"{stem}_{number}" if number else stem)
+            if not (os.path.lexists(path) or os.path.lexists(f"{path}{UNFINISHED}")):
+                return path
+        raise AssertionError
+
     def _begin_split(self) -> None:
+        node, warn = self._node, self._source.warn
+        spool = self._options, node.world, self._others, self._process, self._jobs, warn
+        if self._options.keep_last:
+            spans = (self._options.keep_last, self._options.and_then or 0)
+            self._look_back = LookBack(self._new_path, *(round(s * _NS) for s in spans), *spool)
+            self._splits.append(self._look_back)
+            return
         number, target = len(self._splits), self._target
         if self._options.max_duration or self._options.max_size or number:
             target = target.with_name(f"{target.name}_{number}")
-        self._splits.append(
-            Split(
-                target,
-                self._options,
-                self._node.world,
-                self._others,
-                self._process,
-                self._jobs,
-                self._source.warn,
-            )
-        )
+        self._splits.append(Split(target, *spool))
         self._is_split_asked = False
 
     def _write(self) -> None:
@@ -602,19 +434,28 @@ class Recorder:
             try:
                 message = self._buffer.take(max(0.0, next_flush - time.monotonic()))
             except EOFError:
+                self._save_snapshots(self._buffer.gone)
                 split.close(self._announced())
                 return
+            self._save_snapshots(self._buffer.gone - (message is not None))
             if message is not None:
-                if self._is_split_asked or split.is_full:
+                if not self._look_back and (self._is_split_asked or split.is_full):
                     split.close(self._announced())
                     self._begin_split()
                 self._splits[-1].write(message)
+            elif self._look_back:
+                self._look_back.advance(self._source.now)
             if time.monotonic() >= next_flush:
                 self._splits[-1].flush()
                 is_behind = self._buffer.bytes > self._options.buffer * 10**6 * _BEHIND
                 if not is_behind and (syncing is None or syncing.done()):
                     syncing = disk.submit(_sync, self._splits[-1].paths)
                 next_flush = time.monotonic() + _FLUSH_S
+
+    def _save_snapshots(self, written: int) -> None:
+        """Begin to save at the triggers that came after so many messages."""
+        while self._look_back and self._triggers and self._triggers[0][1] <= written:
+            self._look_back.save(self._triggers.popleft()[0], self._announced())
 
     def _announced(self) -> list[Channel]:
         """Channels that are in a dataset even if they have no messages."""
@@ -624,6 +465,8 @@ class Recorder:
         if self._progress is None:
             return
         split, now = self._splits[-1], time.monotonic()
+        looks = self._look_back
+        datasets: Sequence[Split] = [*looks.saved] if looks else self._splits
         topics = {
             topic: self._topic(topic, now)
             for topic in sorted({*self._source.topics, *self._buffer.topics})
@@ -635,8 +478,9 @@ class Recorder:
                 state=state,
                 topics=topics,
                 waiting_bytes=self._buffer.bytes,
-                spool_bytes=sum(split.spool_bytes for split in self._splits),
+                spool_bytes=sum(one.spool_bytes for one in datasets),
                 bytes_written=split.size,
+                saved={one.target: one.made is not None for one in datasets} if looks else {},
                 warnings=list(self._source.warnings),
             )
         )
@@ -669,8 +513,9 @@ def _sync(paths: Sequence[Path]) -> None:
 
 
 def recorder_services(recorder: Recorder) -> Sequence[Service]:
-    """Those of `ros2 bag record`, except for snapshots."""
+    """Those of `ros2 bag record`."""
     return (
+        Service("snapshot", "", "bool success", lambda _: {"success": recorder.snapshot()}),
         action("pause", recorder.pause),
         action("resume", recorder.resume),
         Service("is_paused", "", "bool paused", lambda _: {"paused": recorder.is_paused}),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -22,6 +22,7 @@ from mp4ds.files.outputs import check_target
 from mp4ds.files.sources import UNFINISHED, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.messages.serializations import is_camera
+from mp4ds.options import Time
 from mp4ds.packing.inspection import begins_anew, depends_on_others
 from mp4ds.packing.manifest import dataset_files, folder_size
 from mp4ds.packing.options import PackSummary
@@ -31,6 +32,7 @@ from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.ros.node import World
 from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message, MetadataRecord
+from mp4ds.times import INT64_MAX
 
 _NS = 10**9
 WINDOW_NS = 5 * _NS
@@ -42,23 +44,29 @@ _LATE_NS = _NS
 _GROUP_NS = 60 * _NS
 """How long a piece stays open, at most, for the next key frame of a video."""
 
-_FAILURES = (Mp4dsError, CancelledError, OSError)
+FAILURES = (Mp4dsError, CancelledError, OSError)
 
 
 @dataclass
-class _Piece:
+class Piece:
     """A piece that is open.
 
     Attributes:
-        start: Log time, ns, of its first message.
+        start: Log time, ns, at which it was begun.
+        span: Log times, ns, of its first and its last message.
+        bytes: Payloads of its messages.
+        channels: Those of its messages, by id.
+        is_video: Whether it has video packets.
         packets: Channels of video packets in it, which stay in it until their next key frame.
     """
 
     number: int
     writer: McapWriter
     start: int
+    span: tuple[int, int] = (INT64_MAX, -1)
     bytes: int = 0
-    channels: set[int] = field(default_factory=set)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    is_video: bool = False
     packets: set[int] = field(default_factory=set)
 
 
@@ -83,6 +91,8 @@ class Split:
         WriteError: The disk refused.
     """
 
+    looks_back = False
+
     def __init__(
         self,
         target: Path,
@@ -99,6 +109,7 @@ class Split:
         self.folder = SpoolFolder(target.with_name(target.name + UNFINISHED))
         self._options = options
         self._profile = profile
+        self._others = others
         self._process = process
         self._jobs = jobs
         self._warn = warn
@@ -106,7 +117,8 @@ class Split:
         self._raw_bytes: Counter[str] = Counter()  # by topic
         self._bytes = self._packed_bytes = self._parts_bytes = 0
         self._depends: dict[int, bool] = {}
-        self._open: list[_Piece] = []  # all but the newest take what is late
+        self._window_ns = WINDOW_NS
+        self._open: list[Piece] = []  # all but the newest take what is late
         self._count = 0  # of pieces
         check_target(target, force=options.force, owned=dataset_files)
         settings = SpoolSettings(
@@ -116,11 +128,12 @@ class Split:
             codec=options.codec,
             preset=options.preset,
             gop=options.gop,
+            looks_back=self.looks_back,
         )
         try:
             self.lock = self.folder.begin(settings)
             piece = self._begin(0)
-            for record in others:
+            for record in self._others:
                 piece.writer.add_metadata(record)
             self.flush()
         except FileExistsError:
@@ -158,10 +171,10 @@ class Split:
 
     # ------------------------------------------------------------ writing
 
-    def _begin(self, start: int) -> _Piece:
+    def _begin(self, start: int) -> Piece:
         path = self.folder.piece(self._count)
         writer = McapWriter(path, profile=self._profile, compression="none")
-        self._open.append(_Piece(self._count, writer, start))
+        self._open.append(Piece(self._count, writer, start))
         self._count += 1
         return self._open[-1]
 
@@ -174,19 +187,23 @@ class Split:
         time, newest = message.log_time, self._open[-1]
         if self._span is None:
             newest.start = time
-        elif abs(time - newest.start) >= WINDOW_NS:
+        elif abs(time - newest.start) >= self._window_ns:
             self.flush()  # or a kill would leave a gap before what the new piece already has
             self._begin(time)
         start, end = self._span or (time, time)
         self._span = min(start, time), max(end, time)
         self._write(self._piece_for(message), message)
+        self._complete_until(time)
+
+    def _complete_until(self, time: int) -> None:
+        """Close the pieces that get no more at a log time, ns."""
         while len(self._open) > 1:
             age = abs(time - self._open[1].start)
             if age < _LATE_NS or (self._open[0].packets and age < _GROUP_NS):
                 break
             self._complete(self._open.pop(0))
 
-    def _piece_for(self, message: Message) -> _Piece:
+    def _piece_for(self, message: Message) -> Piece:
         channel = message.channel.id
         for piece, later in pairwise(self._open):
             if message.log_time < later.start:
@@ -197,18 +214,20 @@ class Split:
                 piece.packets.remove(channel)
         return self._open[-1]
 
-    def _write(self, piece: _Piece, message: Message) -> None:
+    def _write(self, piece: Piece, message: Message) -> None:
         channel = message.channel
         if channel.id not in piece.channels:
-            piece.channels.add(channel.id)
+            piece.channels[channel.id] = channel
             piece.writer.add_channel(channel)
             if channel.id not in self._depends:
                 is_video = is_camera(channel) and depends_on_others(channel, message)
                 self._depends[channel.id] = is_video
             if self._depends[channel.id]:
+                piece.is_video = True
                 piece.packets.add(channel.id)
         piece.writer.write(message)
-        self._raw_bytes[channel.topic] += len(message.data)
+        first, last = piece.span
+        piece.span = min(first, message.log_time), max(last, message.log_time)
         piece.bytes += len(message.data)
         self._bytes += len(message.data)
 
@@ -221,7 +240,7 @@ class Split:
         for piece in self._open:
             piece.writer.flush()
 
-    def _complete(self, piece: _Piece) -> None:
+    def _complete(self, piece: Piece) -> None:
         piece.writer.finish()
         self._jobs.submit(self._pack, piece)
 
@@ -249,14 +268,17 @@ class Split:
 
     # ------------------------------------------------------------ packing
 
-    def _pack(self, piece: _Piece) -> None:
+    def _pack(self, piece: Piece, start: int | None = None) -> None:
+        """Pack a piece, perhaps without what is before a log time, ns."""
         if self.error is not None:  # what is not packed is kept as it is
             return
         try:
-            self._process.submit(_pack, self.folder.path, piece.number).result()
+            call = _pack if start is None else partial(_pack, start=start)
+            raw_bytes = self._process.submit(call, self.folder.path, piece.number).result()
+            self._raw_bytes.update(raw_bytes)
             self._parts_bytes += folder_size(self.folder.part(piece.number))
             self._packed_bytes += piece.bytes
-        except _FAILURES as error:
+        except FAILURES as error:
             self.error = error
             self._warn(
                 f"{self.folder.path}: no more is packed, what comes is still recorded: {error}"
@@ -271,10 +293,10 @@ class Split:
             made = self._process.submit(join, self.folder.path, self._count, self.target).result()
             raw = self._raw_bytes
             topics = [replace(topic, raw_bytes=raw[topic.topic]) for topic in made.topics]
-            self.made = replace(made, topics=topics, source_bytes=self._bytes, is_copy=False)
+            self.made = replace(made, topics=topics, source_bytes=raw.total(), is_copy=False)
             self.lock.close()
             self.folder.remove(self._count)
-        except _FAILURES as error:
+        except FAILURES as error:
             self.error = error
 
     def failure(self, error: Exception) -> Exception:
@@ -289,12 +311,16 @@ class Split:
 # ---------------------------------------------------------------- in the process
 
 
-def _pack(folder: Path, number: int) -> None:
-    """Make the part of a piece, which is then removed."""
+def _pack(folder: Path, number: int, *, start: int | None = None) -> Mapping[str, int]:
+    """Make the part of a piece, which is then removed; returns payload bytes by topic."""
     spool = SpoolFolder(folder)
     with spool.locked(shared=True):
-        pack(spool.piece(number), spool.part(number), spool.settings().options())
+        options = spool.settings().options()
+        if start is not None:
+            options = replace(options, start=Time(start, from_start=False))
+        made = pack(spool.piece(number), spool.part(number), options)
         spool.piece(number).unlink()
+    return {topic.topic: topic.raw_bytes for topic in made.topics}
 
 
 def _join(folder: Path, count: int, target: Path, *, force: bool, about: str | None) -> PackSummary:

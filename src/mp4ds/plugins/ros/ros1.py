@@ -341,17 +341,43 @@ def _raw_class(name: str, md5sum: str, definition: bytes) -> Any:
     return type(name.rpartition("/")[2], (genpy.Message,), members)
 
 
-def _set_bool_class() -> Any:
-    """A class for std_srvs/SetBool, which may not be installed."""
-    request = "8b94c1b53db61fb6aed406028ad6332a", b"bool data\n"
+_SERVICES = {
+    "SetBool": (
+        "09fb03525b03e7ea1fd3992bafd87e16",
+        ("8b94c1b53db61fb6aed406028ad6332a", b"bool data\n"),
+    ),
+    "Trigger": (
+        "937c9679a518e3a18d831e57125ea522",
+        ("d41d8cd98f00b204e9800998ecf8427e", b""),
+    ),
+}
+"""Of std_srvs: checksum, and that of the request with its definition."""
+
+
+def _serve(name: str, kind: str, answer: Callable[[bytes], tuple[bool, str]]) -> None:
+    """Offer a service of std_srvs, which may not be installed.
+
+    Args:
+        name: Of the service.
+        kind: Its type.
+        answer: Called with a request; returns whether it succeeded, and a message.
+    """
     response = "937c9679a518e3a18d831e57125ea522", b"bool success\nstring message\n"
+    md5sum, request = _SERVICES[kind]
+    response_class = _raw_class(f"std_srvs/{kind}Response", *response)
     members = {
-        "_type": "std_srvs/SetBool",
-        "_md5sum": "09fb03525b03e7ea1fd3992bafd87e16",
-        "_request_class": _raw_class("std_srvs/SetBoolRequest", *request),
-        "_response_class": _raw_class("std_srvs/SetBoolResponse", *response),
+        "_type": f"std_srvs/{kind}",
+        "_md5sum": md5sum,
+        "_request_class": _raw_class(f"std_srvs/{kind}Request", *request),
+        "_response_class": response_class,
     }
-    return type("SetBool", (), members)
+
+    def handle(request: Any) -> Any:
+        is_done, said = answer(request.payload)
+        text = said.encode()
+        return response_class(struct.pack("<BI", is_done, len(text)) + text)
+
+    rospy.Service(name, type(kind, (), members), handle)
 
 
 # ---------------------------------------------------------------- publishing and receiving
@@ -536,22 +562,29 @@ class Ros1Node(Node):
             return self._received[key]
 
     def serve(self, services: Sequence[Service]) -> None:
-        """Offer ``~pause_playback``, a std_srvs/SetBool, as rosbag play does."""
+        """Offer what is usual of these.
+
+        ``~pause_playback``, a std_srvs/SetBool, as rosbag play does; ``~snapshot``, a
+        std_srvs/Trigger.
+        """
         answers = {service.name: service.answer for service in services}
 
-        def handle(request: Any) -> Any:
-            is_wanted = request.payload != b"\0"
+        def pause(request: bytes) -> tuple[bool, str]:
+            is_wanted = request != b"\0"
             is_change = is_wanted != answers["is_paused"](None)["paused"]
             if is_change:
                 answers["pause" if is_wanted else "resume"](None)
-                said = f"Playback is now {'paused' if is_wanted else 'resumed'}"
-            else:
-                said = f"Bag is already {'paused.' if is_wanted else 'running.'}"
-            text = said.encode()
-            return kind._response_class(struct.pack("<BI", is_change, len(text)) + text)
+                return True, f"Playback is now {'paused' if is_wanted else 'resumed'}"
+            return False, f"Bag is already {'paused.' if is_wanted else 'running.'}"
 
-        kind = _set_bool_class()
-        rospy.Service("~pause_playback", kind, handle)
+        def snapshot(_: bytes) -> tuple[bool, str]:
+            is_done = answers["snapshot"](None)["success"]
+            return is_done, "saving" if is_done else "not recording"
+
+        if "is_paused" in answers:
+            _serve("~pause_playback", "SetBool", pause)
+        if "snapshot" in answers:
+            _serve("~snapshot", "Trigger", snapshot)
 
     # ------------------------------------------------------------ the end
 

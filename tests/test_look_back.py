@@ -1,0 +1,217 @@
+"""`mp4ds record --keep-last`: what triggers save, what is removed, what a kill leaves."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mp4ds
+from coded_scenes import CODED
+from mp4ds.bags.formats import open_sources
+from mp4ds.bags.mcap import McapWriter
+from mp4ds.errors import Mp4dsError, WriteError
+from mp4ds.packing.options import PackOptions
+from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.recording.record import Recorder, RecordSummary
+from mp4ds.records import Message
+from player_scenes import make_drive
+from record_scenes import PlayedNode, played
+from sources import SOURCES
+
+S = 10**9
+KEEP, MORE = 2.0, 0.5
+STATIC = "/tf_static"
+Row = tuple[str, int, bytes]
+
+
+def messages(path: Path) -> list[Row]:
+    with open_sources([path]) as reader:
+        found = [one for one in reader.records() if isinstance(one, Message)]
+        return [(one.channel.topic, one.log_time, bytes(one.data)) for one in found]
+
+
+def again(dataset: Path, to: str = "bag") -> list[Row]:
+    """The messages of a dataset."""
+    path = dataset.with_name(f"{dataset.name}_again.{to}")
+    mp4ds.unpack(dataset, to, path)
+    return messages(path)
+
+
+def looked_back(
+    paths: list[Path],
+    target: Path,
+    acts: Mapping[int, Callable[[Recorder], object]],
+    **more: Any,
+) -> tuple[RecordSummary, list[int]]:
+    """Play a recording to a recorder that looks back, and do something before messages of a number.
+
+    Returns its summary, and the times at which that was done.
+    """
+    times: list[int] = []
+
+    def act(number: int) -> None:
+        if number in acts:
+            times.append(node.time)
+            acts[number](recorder)
+
+    node = PlayedNode(paths, before=act, **more.pop("node", {}))
+    options = RecordOptions(**{"all": True, "keep_last": KEEP, **more})
+    with played(node, (), target, options) as recorder:
+        return recorder.run(), times
+
+
+def due(sent: list[Row], time: int, more: float = MORE) -> list[Row]:
+    """What a trigger at a time is to save."""
+    begin, end = time - round(KEEP * S), time + round(more * S)
+    return [one for one in sent if begin <= one[1] < end or (one[0] == STATIC and one[1] < end)]
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """Eight seconds: a camera, transforms, and static ones, latched, at the very beginning."""
+    return make_drive(tmp_path / "drive.bag", frames=160)
+
+
+def test_what_triggers_save(drive: Path, tmp_path: Path) -> None:
+    """Each the last seconds and what follows, whole, with latched messages from long before."""
+    sent = messages(drive)
+    # the second one in the time of the first; the last one is cut off by the end
+    numbers = [len(sent) // 2, len(sent) // 2 + 20, len(sent) - 5]
+    acts = dict.fromkeys(numbers, Recorder.snapshot)
+    summary, times = looked_back([drive], tmp_path / "live", acts, and_then=MORE)
+    made = [one.dataset for one in summary.datasets]
+    assert {path.name for path in tmp_path.iterdir()} == {"drive.bag", *(one.name for one in made)}
+    for time, dataset in zip(times, made, strict=True):
+        assert dataset.name.startswith("live_20")
+        assert mp4ds.validate(dataset, deep=True) == []
+        assert again(dataset) == due(sent, time)
+        with mp4ds.open(dataset) as opened:
+            assert len(opened.streams) == 1
+
+
+def test_video_that_arrives_coded(tmp_path: Path) -> None:
+    """It begins at a key frame, which may be earlier; frames are complete from there on."""
+    paths = SOURCES["rosbag2-mcap-v5"](tmp_path / "source", CODED["video-h264"](frames=120))
+    sent = [one for one in messages(*paths) if one[0] == "/cam/video"]
+    summary, (time,) = looked_back(paths, tmp_path / "live", {200: Recorder.snapshot})
+    (made,) = summary.datasets
+    found = [one for one in again(made.dataset, "rosbag2") if one[0] == "/cam/video"]
+    inside = [one for one in sent if time - KEEP * S <= one[1] < time]
+    assert len(inside) <= len(found) < len(sent)
+    assert set(inside) <= set(found) <= set(sent)
+    assert mp4ds.validate(made.dataset, deep=True) == []
+    with mp4ds.open(made.dataset) as dataset:
+        assert len(dataset.streams) == 1
+
+
+def test_nothing_is_left_without_a_trigger(drive: Path, tmp_path: Path) -> None:
+    """And while it looks back, no more than the last seconds are on disk."""
+    seen: list[int] = []
+
+    def look(_: Recorder) -> None:
+        sizes = [0]
+        for path in tmp_path.glob("live*.recording/*.mcap"):
+            with suppress(FileNotFoundError):  # it was just removed
+                sizes.append(path.stat().st_size)
+        seen.append(sum(sizes))
+
+    acts = dict.fromkeys(range(100, 480, 20), look)
+    summary, _ = looked_back([drive], tmp_path / "live", acts)
+    assert summary.datasets == []
+    assert [*tmp_path.iterdir()] == [drive]
+    assert 0 < max(seen) < drive.stat().st_size
+
+
+def test_a_disk_that_is_full(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was on disk by then is recovered: what was looked back at, and what was being saved."""
+    sent, write = messages(drive), McapWriter.write
+    _, full, _ = sent[3 * len(sent) // 4]
+
+    def refuse(self: McapWriter, message: Message) -> None:
+        if message.log_time >= full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(self, message)
+
+    monkeypatch.setattr(McapWriter, "write", refuse)
+    acts = {len(sent) // 2: Recorder.snapshot}
+    with pytest.raises(WriteError, match=r"No space left.*--salvage .*live_20"):
+        looked_back([drive], tmp_path / "live", acts, and_then=60)
+    folders = [*tmp_path.glob("live*.recording")]
+    assert len(folders) == 2
+    for folder in folders:
+        summary = mp4ds.pack(folder, folder.with_suffix(""), PackOptions(salvage=True))
+        assert {one.problem for one in summary.losses} == {"the file ends before its footer"}
+        found = again(folder.with_suffix(""))
+        assert {topic for topic, *_ in found} == {topic for topic, *_ in sent}
+        begun = next(number for number, one in enumerate(found) if one[0] != STATIC)
+        place = sent.index(found[begun])
+        assert found[begun:] == sent[place : 3 * len(sent) // 4]
+        assert sent[place][1] <= full - round(KEEP * S)
+
+
+def test_a_clock_that_jumps_back(drive: Path, tmp_path: Path) -> None:
+    """As of a simulation that starts over: what is saved ends there, and old pieces go."""
+    sent = messages(drive)
+    first = sent[0][1]
+
+    def altered(message: Message, number: int) -> Message:
+        is_before = message.log_time - first < 4 * S
+        return replace(message, log_time=message.log_time + 3600 * S * is_before)
+
+    topics = {topic for topic, *_ in sent}
+    numbers = [len(sent) // 2 - 20, len(sent) - 1]
+    acts = dict.fromkeys(numbers, Recorder.snapshot)
+    altering = {"altered": dict.fromkeys(topics, altered)}
+    summary, times = looked_back([drive], tmp_path / "live", acts, and_then=60, node=altering)
+    before, after = (again(one.dataset) for one in summary.datasets)
+    begin = times[0] - round(KEEP * S)
+    assert before == [
+        (topic, time + 3600 * S, data)
+        for topic, time, data in sent
+        if time - first < 4 * S and (topic == STATIC or begin <= time + 3600 * S)
+    ]
+    moving = [one for one in after if one[0] != STATIC]
+    assert moving == [one for one in sent if one[1] >= times[1] - round(KEEP * S)]
+    assert len(after) == len(moving) + 2
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"keep_last": None, "and_then": 10}, "need `keep_last`"),
+        ({"keep_last": None, "trigger": ["/go"]}, "need `keep_last`"),
+        ({"max_duration": 60}, "contradicts"),
+        ({"keep_last": 0}, "more than 0"),
+        ({}, "cannot link files"),
+    ],
+)
+def test_what_makes_no_sense(
+    options: dict[str, Any],
+    said: str,
+    drive: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "hardlink_to", refuse)
+    with pytest.raises(Mp4dsError, match=said):
+        looked_back([drive], tmp_path / "live", {}, **options)
+    assert [*tmp_path.iterdir()] == [drive]
+
+
+@pytest.mark.parametrize("and_then", [None, 1.0])
+def test_messages_that_trigger(and_then: float | None, drive: Path, tmp_path: Path) -> None:
+    """Those that come soon after one of them belong to it."""
+    summary, _ = looked_back(
+        [drive], tmp_path / "live", {}, exclude=[STATIC], trigger=[STATIC], and_then=and_then
+    )
+    (made,) = summary.datasets  # one message follows the other in no time
+    assert STATIC not in {topic.topic for topic in made.topics}
