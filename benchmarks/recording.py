@@ -10,6 +10,9 @@ node that publishes, and ROS's own recorder. Sections:
 - overload: four cameras of 2448x2048 at 15 Hz, which no two cores can encode, from a publisher
   that waits for its subscribers: what of that which ``rosbag record`` kept is not there, and how
   much memory it took. What waits to be packed at the end is packed then.
+- look-back: four cameras of 1280x720 at 30 Hz, of which all is recorded, then only looked back at
+  (``--keep-last 60s --and-then 10s``, triggers after 75 and 95 s): memory and disk over time, as
+  CSV, and what the first 30 s cost.
 - kills: N times ``kill -9`` at a random moment: seconds between the last message that is there and
   the end, and whether all before are those that ``rosbag record`` has.
 """
@@ -20,13 +23,14 @@ import json
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +51,7 @@ from waiting import until
 PUBLISHER = str(Path(__file__).with_name("recording_publisher.py"))
 OTHERS = "/rosout.*|/clock"
 STEADY = (2, "640x480", 30, 200, 30)
+LOOK_BACK = (4, "1280x720", 30, 200, 30)
 OVERLOAD = (4, "2448x2048", 15, 0, 0)
 NS = 10**9
 
@@ -205,6 +210,61 @@ def beside(core: Core, folder: Path, seconds: float, *robot: Any) -> None:
     print_table((*columns, "verbatim", "connection"), rows)
 
 
+# ---------------------------------------------------------------- looking back
+
+
+def look_back(core: Core, folder: Path) -> None:
+    """Record all, then look back, and print memory and disk over time."""
+    rows = []
+    looking = ("--keep-last", "60s", "--and-then", "10s")
+    for options, seconds, triggers in ((), 30, []), (looking, 120, [75.0, 95.0]):
+        for path in folder.glob("live*"):
+            shutil.rmtree(path)
+        recorder = core.start(*ours(folder / "live", *options))
+        source = publisher(core, *LOOK_BACK, seconds, 1)
+        assert said(source) == "begun"
+        print(" ".join(("record", *options)), "\n\nseconds,recorder MiB,packing MiB,disk MB")
+        rows.append((" ".join(options), *_watched(recorder, source, folder, triggers)))
+        for path in sorted(folder.glob("live*/dataset.yaml")):
+            frames = [stream.frames for stream in load_manifest(path).streams]
+            print(f"- {path.parent.name}: {size_of(path.parent) / 1e6:.0f} MB, frames {frames}")
+        print()
+    columns = ("", "CPU of a core", "MB/s to disk", "peak MiB", "peak disk MB", "exit code")
+    print_table(columns, rows)
+
+
+def _watched(
+    recorder: Any, source: Any, folder: Path, triggers: list[float]
+) -> tuple[str, str, str, str, int]:
+    """Print a line each second, until all is published and the recorder has ended."""
+    begun, process = time.monotonic(), psutil.Process(recorder.pid)
+    before, told, memory, disk = Cost.of(recorder.pid), False, 0.0, 0.0
+    while recorder.poll() is None:
+        time.sleep(1.0)
+        at = time.monotonic() - begun
+        with suppress(psutil.Error, OSError, IndexError):  # it is ending
+            if at < 31:
+                cost, elapsed = Cost.of(recorder.pid), at
+            sizes = [one.memory_info().rss / 2**20 for one in (process, *process.children())]
+            links = {path.stat().st_ino: path.stat() for path in folder.rglob("live*/**/*.*")}
+            held = sum(one.st_blocks * 512 for one in links.values()) / 1e6
+            memory, disk = max(memory, sum(sizes)), max(disk, held)
+            print(f"{at:.0f},{sizes[0]:.0f},{sum(sizes[1:]):.0f},{held:.0f}", flush=True)
+        if triggers and at >= triggers[0]:
+            triggers.pop(0)
+            recorder.send_signal(signal.SIGUSR1)
+        if source.poll() is not None and not told:
+            recorder.send_signal(signal.SIGINT)
+            told = True
+    return (
+        f"{100 * (cost.cpu - before.cpu) / elapsed:.0f} %",
+        f"{(cost.written - before.written) / 1e6 / elapsed:.0f}",
+        f"{memory:.0f}",
+        f"{disk:.0f}",
+        recorder.returncode,
+    )
+
+
 # ---------------------------------------------------------------- kills
 
 
@@ -261,7 +321,7 @@ def _size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.glob("*"))
 
 
-SECTIONS = ("steady", "overload", "kills")
+SECTIONS = ("steady", "overload", "look-back", "kills")
 
 
 def main() -> None:
@@ -288,6 +348,8 @@ def main() -> None:
                     beside(core, folder, arguments.seconds, *STEADY)
                 elif name == "overload":
                     beside(core, folder, 10.0, *OVERLOAD)
+                elif name == "look-back":
+                    look_back(core, folder)
                 else:
                     kills(core, folder, arguments.kills)
 

@@ -36,6 +36,7 @@ from mp4ds.plugins.recording.record import RecordProgress
 from mp4ds.plugins.ros.node import NodeNames
 from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message, Schema
+from player_scenes import make_drive
 from record_scenes import PlayedNode, fail_to_pack, played, recorded
 from scenes import Scene, scene
 from sources import SOURCES
@@ -307,6 +308,55 @@ def test_datasets_of_a_length_or_size(most: dict[str, Any], tmp_path: Path) -> N
     assert [path.name for path in made] == [f"live_{number}" for number in range(len(made))]
     mp4ds.pack(made, tmp_path / "whole")
     assert compare(paths, again(tmp_path / "whole", tmp_path)) == []
+
+
+def test_the_newest_datasets(tmp_path: Path) -> None:
+    """So many are kept of those that this recorder made; each has the latched messages."""
+    bag = make_drive(tmp_path / "drive.bag", frames=60)
+    (tmp_path / "live_00").mkdir()
+    options = {"max_duration": 0.5, "max_splits": 2, "repeat_latched": True}
+    made = recorded(PlayedNode([bag]), tmp_path / "live", **options).datasets
+    assert [one.dataset.name for one in made] == ["live_4", "live_5"]
+    assert {path.name for path in tmp_path.glob("live*")} == {"live_00", "live_4", "live_5"}
+    static = [one.data for one in messages([bag]) if one.channel.topic == "/tf_static"]
+    for one in made:
+        assert mp4ds.validate(one.dataset, deep=True) == []
+        there = [*messages([again(one.dataset, tmp_path)])]
+        assert [item.data for item in there if item.channel.topic == "/tf_static"] == static
+        assert there[-1].log_time - there[0].log_time <= 500_000_000
+
+
+def test_little_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It stops in time, with a dataset of all that came before, or does not begin."""
+    paths, free = write(tmp_path), [10**9]
+    usage = shutil.disk_usage(tmp_path)
+
+    def after(number: int) -> None:
+        if number == 20:
+            free[0] = 10**6
+            until(lambda: not free)
+
+    def checked(path: Path) -> Any:
+        left = free[-1] if free else 10**6
+        if left == 10**6:
+            free.clear()
+        return usage._replace(free=left)
+
+    monkeypatch.setattr(shutil, "disk_usage", checked)
+    Opened(PlayedNode(paths, before=after), monkeypatch)
+    command = ("record", "--ros1", "-a", "-o", tmp_path / "live", "--no-progress", "--min-space")
+    told = call(*command, "100M")
+    assert told.code == 1
+    assert "stopped: the file system has less free space than asked for" in told.err
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
+    recordings = [again(tmp_path / "live", tmp_path)], paths
+    found, sent = ([bytes(one.data) for one in messages(made)] for made in recordings)
+    assert {*sent[:19]} <= {*found} < {*sent}
+    Opened(PlayedNode(paths), monkeypatch)
+    told = call(*command[:4], tmp_path / "other", "--min-space", "100M")
+    assert told.code == 2
+    assert "less than 104857600 bytes free" in told.err
+    assert not [*tmp_path.glob("other*")]
 
 
 def test_pauses_and_splits_on_demand(tmp_path: Path) -> None:

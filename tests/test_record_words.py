@@ -68,6 +68,14 @@ ALL = {"all": True}
         ("--ros2 -a --max-cache-size 104857600", {"buffer": 104} | ALL),
         ("--ros1 -a --split --duration=60", {"max_duration": 60} | ALL),
         ("--ros1 -a --split --size 1024", {"max_size": 2**30} | ALL),
+        (
+            "--ros1 -a --min-space 2G --repeat-latched",
+            {"min_space": 2**31, "repeat_latched": True} | ALL,
+        ),
+        (
+            "--ros1 -a --split --max-splits 3 --duration 60",
+            {"max_duration": 60, "max_splits": 3} | ALL,
+        ),
         ("--ros1 -a --duration 5m", {"duration": 300} | ALL),
         ("--ros1 --topic /a --topic /b", A_AND_B),
         ("--ros1 -e /cam.* /imu -j", {"regex": "^(?:/cam.*|/imu)$"}),

@@ -129,7 +129,7 @@ def record_command(
     show(summary, _print)
     if options.keep_last and not summary.datasets:
         say("nothing was saved: there was no trigger")
-    if summary.dropped or summary.lost or summary.untimed:
+    if summary.dropped or summary.lost or summary.untimed or summary.is_short_of_space:
         raise click.exceptions.Exit(1)
 
 

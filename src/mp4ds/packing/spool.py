@@ -179,12 +179,16 @@ class SpoolFolder:
     def remove(self, count: int) -> None:
         """Remove the folder with all parts; files that somebody else put there stay."""
         for number in range(count):
-            part = self.part(number)
-            for name in dataset_files(part) or ():
-                (part / name).unlink(missing_ok=True)
-            _remove_empty(part)
+            remove_dataset(self.part(number))
         self._settings_path.unlink()
         _remove_empty(self.path)
+
+
+def remove_dataset(path: Path) -> None:
+    """Remove a dataset; files that somebody else put there stay."""
+    for name in dataset_files(path) or ():
+        (path / name).unlink(missing_ok=True)
+    _remove_empty(path)
 
 
 def _remove_empty(folder: Path) -> None:

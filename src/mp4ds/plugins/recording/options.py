@@ -87,6 +87,19 @@ class RecordOptions(NodeOptions):
         parse=parse_size,
         panel=WHAT,
     )
+    max_splits: int | None = option(
+        "Keep so many of these datasets, and delete the oldest ones that this recorder has made.",
+        panel=WHAT,
+        least=1,
+    )
+    repeat_latched: bool = option(
+        "Begin each of these datasets with the latest latched messages.", False, panel=WHAT
+    )
+    min_space: Parsed[int | None] = option(
+        "Stop when the file system has less free space than this, such as 1G.",
+        metavar="SIZE",
+        parse=parse_size,
+    )
     keep_last: Parsed[float | None] = option(
         "Look back: keep so many seconds (60s, 5m), and save them as a dataset at each trigger.",
         None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 import time
 from collections import deque
@@ -11,15 +12,18 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 
+from mp4ds.bags.latched import MOST_BYTES, LatchedMessages, has_late
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
-from mp4ds.errors import OptionError
+from mp4ds.errors import OptionError, TargetError
 from mp4ds.files.outputs import sync
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
+from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.options import PackSummary
+from mp4ds.packing.spool import remove_dataset
 from mp4ds.plugins.recording.lookback import LookBack
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.receiving import MessageBuffer, Source, TopicProgress
@@ -92,6 +96,7 @@ class RecordSummary:
         dropped: Messages dropped because the buffer was full, by topic.
         lost: Messages lost, as reported by the middleware, by topic.
         untimed: Messages left out because their log time is negative or too large, by topic.
+        is_short_of_space: Whether it stopped because of `min_space`.
         warnings: Warnings, each a sentence.
     """
 
@@ -100,6 +105,7 @@ class RecordSummary:
     dropped: dict[str, int] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
     untimed: dict[str, int] = field(default_factory=dict)
+    is_short_of_space: bool = False
     warnings: list[str] = field(default_factory=list)
 
 
@@ -251,6 +257,8 @@ class Recorder:
         self._is_stopped = False
         self.is_paused = options.start_paused
         self._is_split_asked = False
+        self._is_short_of_space = False
+        self._latched: dict[int, LatchedMessages] = {}  # by channel
         self._splits: list[Split] = []
         self._look_back: LookBack | None = None
         self._triggers: deque[tuple[int, int]] = deque()  # times, and how many messages are before
@@ -274,7 +282,8 @@ class Recorder:
     def _all_splits(self) -> list[Split]:
         """All datasets, and what is looked back at."""
         looks = self._look_back
-        return [looks, *looks.saved] if looks else [*self._splits]
+        made = [looks, *looks.saved] if looks else self._splits
+        return [split for split in made if not split.is_removed]
 
     # ------------------------------------------------------------ controls
 
@@ -320,6 +329,9 @@ class Recorder:
             Mp4dsError: As for `record`.
         """
         self._warn_of_unfinished()
+        if self._has_no_space():
+            problem = f"its file system has less than {self._options.min_space} bytes free"
+            raise TargetError(self._target, problem, "Make room, or choose a smaller `min_space`.")
         try:
             # the process ends before the thread that waits for it
             with quick_switches(), self._jobs, self._process:
@@ -339,8 +351,15 @@ class Recorder:
             dropped={name: one.dropped for name, one in received.items() if one.dropped},
             lost=dict(self._source.lost),
             untimed={name: one.untimed for name, one in received.items() if one.untimed},
+            is_short_of_space=self._is_short_of_space,
             warnings=list(self._source.warnings),
         )
+
+    def _has_no_space(self) -> bool:
+        least = self._options.min_space
+        with suppress(OSError):  # a folder that is not there is told of later
+            return least is not None and shutil.disk_usage(self._target.parent).free < least
+        return False
 
     def _record(self) -> float:
         """Record until stopped, and pack everything; returns when recording began."""
@@ -435,22 +454,59 @@ class Recorder:
                 message = self._buffer.take(max(0.0, next_flush - time.monotonic()))
             except EOFError:
                 self._save_snapshots(self._buffer.gone)
-                split.close(self._announced())
+                self._close_split()
                 return
             self._save_snapshots(self._buffer.gone - (message is not None))
             if message is not None:
                 if not self._look_back and (self._is_split_asked or split.is_full):
-                    split.close(self._announced())
+                    self._close_split()
                     self._begin_split()
+                    self._repeat_latched(message.log_time)
                 self._splits[-1].write(message)
+                if self._options.repeat_latched and has_late(message.channel):
+                    self._keep_latched(message)
             elif self._look_back:
                 self._look_back.advance(self._source.now)
             if time.monotonic() >= next_flush:
                 self._splits[-1].flush()
+                if self._has_no_space() and not self._is_short_of_space:
+                    self._is_short_of_space = True
+                    self._source.warn("stopped: the file system has less free space than asked for")
+                    self.stop()
                 is_behind = self._buffer.bytes > self._options.buffer * 10**6 * _BEHIND
                 if not is_behind and (syncing is None or syncing.done()):
                     syncing = disk.submit(_sync, self._splits[-1].paths)
                 next_flush = time.monotonic() + _FLUSH_S
+
+    def _close_split(self) -> None:
+        self._splits[-1].close(self._announced())
+        if most := self._options.max_splits:
+            self._jobs.submit(self._remove_old, most)  # when it is made
+
+    def _remove_old(self, most: int) -> None:
+        """Remove the oldest datasets that were made but for so many."""
+        for split in [one for one in self._all_splits if one.made][:-most]:
+            split.is_removed = True
+            try:
+                remove_dataset(split.target)
+            except OSError as error:
+                self._source.warn(f"{split.target}: could not be removed: {error.strerror}")
+
+    def _keep_latched(self, message: Message) -> None:
+        known = self._latched
+        if is_camera(message.channel):
+            return
+        known.setdefault(message.channel.id, LatchedMessages(message.channel)).add(message)
+        while sum(one.size for one in known.values()) > MOST_BYTES:
+            largest = max(known, key=lambda key: known[key].size)
+            topic = next(iter(known.pop(largest))).channel.topic
+            self._source.warn(f"{topic}: its latched messages are too large to be repeated")
+
+    def _repeat_latched(self, time: int) -> None:
+        """Begin a dataset with latched messages, as of its first log time."""
+        found = chain.from_iterable(self._latched.values())
+        for message in sorted(found, key=lambda one: one.log_time):
+            self._splits[-1].write(replace(message, log_time=time))
 
     def _save_snapshots(self, written: int) -> None:
         """Begin to save at the triggers that came after so many messages."""

@@ -85,6 +85,7 @@ class Split:
     Attributes:
         made: The dataset, once it is complete.
         error: Why it is not.
+        is_removed: Whether the recorder has removed it again.
 
     Raises:
         TargetError: It cannot be made there.
@@ -106,6 +107,7 @@ class Split:
         self.target = target
         self.made: PackSummary | None = None
         self.error: Exception | None = None
+        self.is_removed = False
         self.folder = SpoolFolder(target.with_name(target.name + UNFINISHED))
         self._options = options
         self._profile = profile
