@@ -13,6 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
+from jsonschema.protocols import Validator
+from jsonschema.validators import extend
 from pydantic import ValidationError
 
 from mp4ds import yamlio
@@ -328,18 +330,17 @@ def load(path: Path, kind: str) -> StreamSidecar | Manifest:
 
 
 def edited(document: Document, path: str, value: Any) -> Document:
-    """A copy with another value at a dotted path; ``...`` removes the key."""
-    document = copy.deepcopy(document)
-    *places, last = path.split(".")
-    node: Any = document
-    for place in places:
-        node = node[int(place) if isinstance(node, list) else place]
-    key = int(last) if isinstance(node, list) else last
+    """One with another value at a dotted path, and the same others; ``...`` removes the key."""
+    key, _, rest = path.partition(".")
+    copied = copy.copy(document)
+    place: Any = int(key) if isinstance(copied, list) else key
+    if rest:
+        value = edited(copied[place], rest, value)
     if value is ...:
-        del node[key]
+        del copied[place]
     else:
-        node[key] = value
-    return document
+        copied[place] = value
+    return copied
 
 
 # ---------------------------------------------------------------- round trip
@@ -579,9 +580,32 @@ def takes(kind: str, document: Document) -> bool:
     return True
 
 
+def remembering(kind: str, whole: Document) -> Validator:
+    """A validator that passes over what documents have in common with a valid one."""
+    known: set[tuple[int, int]] = set()
+
+    def once(check: Callable[..., Iterator[Any]]) -> Callable[..., Iterator[Any]]:
+        def errors(validator: Validator, value: Any, node: Any, schema: Any) -> Iterator[Any]:
+            if (id(value), id(node)) not in known:
+                found = [*check(validator, value, node, schema)]
+                if is_first and not found:
+                    known.add((id(value), id(node)))
+                yield from found
+
+        return errors
+
+    checks = {name: once(Draft202012Validator.VALIDATORS[name]) for name in ("$ref", "properties")}
+    validator: Validator = extend(Draft202012Validator, checks)(schema_of(kind))  # type: ignore[no-untyped-call]
+    is_first = True
+    assert validator.is_valid(whole)
+    is_first = False
+    return validator
+
+
 @pytest.mark.parametrize("kind", WHOLE)
 def test_the_model_takes_nothing_that_the_released_schema_refuses(kind: str) -> None:
-    validator, whole = Draft202012Validator(schema_of(kind)), WHOLE[kind]()
+    whole = WHOLE[kind]()
+    validator = remembering(kind, whole)
     for place in places(whole):
         is_new = place.endswith("surprise")
         for value in [1] if is_new else ODD:
