@@ -43,7 +43,7 @@ def real(name: str) -> Path:
 
 def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
     """Name a case by its argument where the value is no name: bytes, or long text."""
-    is_name = not isinstance(val, bytes) and len(str(val)) <= 40 and str(val).isprintable()
+    is_name = isinstance(val, str) and len(val) <= 40 and val.isprintable()
     return argname if isinstance(val, (str, bytes)) and not is_name else None
 
 

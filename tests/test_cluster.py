@@ -36,7 +36,7 @@ def _settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCluster]:
     """One that no test harms."""
-    with RealCluster(tmp_path_factory.mktemp("cluster"), arguments=WITH_NANNY) as cluster:
+    with RealCluster(tmp_path_factory.mktemp("cluster")) as cluster:
         yield cluster
 
 
@@ -163,7 +163,7 @@ def test_a_call_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
         "DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION": "1.0",
     }
     # more workers than it kills: on a loaded machine a nanny may not bring one back
-    with RealCluster(tmp_path / "dask", workers=4, arguments=WITH_NANNY, config=config) as cluster:
+    with RealCluster(tmp_path / "dask", workers=3, arguments=WITH_NANNY, config=config) as cluster:
         executor = cluster_executor(cluster.address, 7)
         found = errors(executor, clusters.die, tmp_path, "deadly", *numbered(6))
     assert set(found) == {"deadly"}

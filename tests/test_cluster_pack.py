@@ -23,7 +23,7 @@ from round_trips import unpacked
 from sources import SOURCES, scene
 from waiting import WATCHDOG_S, until
 
-FRAMES = 120
+FRAMES = 72
 WINDOW = 3
 PARTS = FRAMES // WINDOW
 WORK = ".dataset.mp4ds-part"

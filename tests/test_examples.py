@@ -26,7 +26,7 @@ def run(*command: object, cwd: Path) -> str:
 @pytest.fixture(scope="module")
 def demo_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo")
-    demo(folder / "demo.mcap", seconds=0.5)
+    demo(folder / "demo.mcap", seconds=0.4)
     mp4ds.pack(folder / "demo.mcap", folder / "demo")
     return folder / "demo"
 
@@ -104,7 +104,7 @@ def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> No
     if not any(re.search(r"-o drive( |$)|pack drive[.]mcap$", line) for line in lines):
         shutil.copytree(demo_dataset, tmp_path / "drive")
     for line in lines:
-        brief = " --seconds 0.5" if line.startswith("mp4ds demo") else ""
+        brief = " --seconds 0.4" if line.startswith("mp4ds demo") else ""
         done = typed(line + brief, tmp_path)
         assert done.code == 0, f"{line}\n{done}"
 

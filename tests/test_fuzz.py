@@ -19,7 +19,7 @@ from mp4ds import Mp4dsError
 from mp4ds.bags.formats import open_sources
 from sources import SOURCES, scene
 
-COUNT = 60
+COUNT = 40
 
 
 @pytest.fixture(scope="module")

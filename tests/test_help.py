@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
-from commands import Result, program, refused
+from commands import Result, call, program, refused
 from mp4ds.cli import COMMANDS, commands
 from mp4ds.cli.pack import import_command
 
@@ -58,15 +59,18 @@ def test_sentences_are_whole(tmp_path: Path) -> None:
     assert "..." not in text.replace("[ARGS]...", "")
 
 
-def test_nothing_is_printed_but_errors(packed_bag: Path, tmp_path: Path) -> None:
-    for place in (0, 1):  # before the command or after it
+def test_nothing_is_printed_but_errors(
+    packed_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    # before the command or after it; of a process also what libraries print
+    for place, asked in enumerate((call, partial(run, folder=tmp_path))):
         for words in (["info"], ["validate"], ["unpack", "-o", f"again{place}.bag"]):
             arguments = [*words, str(packed_bag)]
-            done = run(*arguments[:place], "-q", *arguments[place:], folder=tmp_path)
-            assert done == Result(0, "", "")
+            assert asked(*arguments[:place], "-q", *arguments[place:]) == Result(0, "", "")
         assert (tmp_path / f"again{place}.bag").exists()
-    refused(run("-q", "info", "nothing", folder=tmp_path), 2, "no such file")
-    assert run("-q", "info", str(packed_bag), "--json", folder=tmp_path).out.startswith("{")
+    refused(call("-q", "info", "nothing"), 2, "no such file")
+    assert call("-q", "info", packed_bag, "--json").out.startswith("{")
 
 
 def test_where_errors_come_from(tmp_path: Path) -> None:

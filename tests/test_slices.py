@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 import mp4ds
 from coded_scenes import CODED
 from compare import compare
+from in_parts import InlineExecutor, use
 from mp4ds.errors import FormatError, OptionError, SourceError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
@@ -52,14 +53,17 @@ def hides_frames(dataset: Path) -> bool:
 @pytest.mark.one_in(10)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("way", ["one-pass", "parts", "dataset", "dataset-anew", "unpack"])
-def test_what_is_taken(source: str, way: str, tmp_path: Path) -> None:
+def test_what_is_taken(
+    source: str, way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of a recording in one pass and in parts, and of a dataset of it, copied and anew."""
     paths = SOURCES[source](tmp_path, scene("rgb8", frames=FRAMES))
     dataset, whole = tmp_path / "dataset", tmp_path / "whole"
     if way == "one-pass":
         mp4ds.pack(paths, dataset, PackOptions(**ONLY))
     elif way == "parts":
-        mp4ds.pack(paths, dataset, PackOptions(**ONLY, window=4, jobs=2))
+        use(monkeypatch, InlineExecutor())
+        mp4ds.pack(paths, dataset, PackOptions(**ONLY, window=4))
     else:
         mp4ds.pack(paths, whole, PackOptions(codec="h264", gop=8))
     if way == "dataset":
@@ -356,7 +360,10 @@ def test_of_nothing_there_is_no_slice(tmp_path: Path) -> None:
     assert not (tmp_path / "part").exists()
 
 
-def test_a_share_of_a_dataset_is_encoded(recording: Path, tmp_path: Path) -> None:
+def test_a_share_of_a_dataset_is_encoded(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(monkeypatch, InlineExecutor())
     mp4ds.pack(recording, tmp_path / "whole")
     for number in (1, 2):
         pack_share(tmp_path / "whole", tmp_path / "again", (number, 2), PackOptions(window=10))

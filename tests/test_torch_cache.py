@@ -77,7 +77,7 @@ def test_later_epochs_decode_nothing(
     assert not decoded
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_workers_share_a_cache(
     drive: Path, tmp_path: Path, decoded: list[int], method: str
 ) -> None:

@@ -278,7 +278,7 @@ def test_in_workers_and_streams(drive: Path, method: str | None) -> None:
         frames.load_messages()
     options: dict[str, Any] = {"batch_size": 8, "collate_fn": frames.collate}
     if method:
-        options |= {"num_workers": 2, "multiprocessing_context": method}
+        options |= {"num_workers": 1, "multiprocessing_context": method}
     for number, batch in enumerate(DataLoader(frames, **options)):
         for key in ("state", "state_is_pad", "action", LEFT):
             own = [sample[key] for sample in samples[8 * number : 8 * number + 8]]

@@ -139,7 +139,7 @@ def test_names(suffix: str, tmp_path: Path) -> None:
         assert dataset["clip"].stamps[0] == 0
 
 
-VIDEOS = ["sam2_02_cups", "var_fps_video", "h264_10bits", "lerobot_aloha_insertion_human_yuv444"]
+VIDEOS = ["var_fps_video", "h264_10bits", "lerobot_aloha_insertion_human_yuv444", "sam2_02_cups"]
 
 
 @pytest.mark.one_in(4)
