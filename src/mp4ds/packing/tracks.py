@@ -414,37 +414,26 @@ class _ViewedTrack(Track):
         self.view = _EncodedTrack(view_path, plan.view, size, threads, rate, "")
         self._own = _CopiedTrack(path, seen, rate, plan.note)
         self.note = plan.note
-        self._pictures = PacketPictures(key.codec, layout.pixel_format, size)
+        self._pictures = PacketPictures[int](key.codec, layout.pixel_format, size)
         encoding = layout.encoding
         self._shown: Pixels = np.full(encoding.shape(*size), _GREY, encoding.dtype)
-        self._due: deque[int] = deque()  # ticks of frames that are not in the view yet
-        self._done = 0
 
     def prove(self, seen: CameraMessage) -> CameraMessage:
         return self._own.prove(seen)
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         self._own.write(seen, tick)
-        self._due.append(tick)
         parameters = seen.parameters if seen.keyframe else b""
-        self._show(self._pictures.of(seen.parts.body, parameters))
+        self._show(self._pictures.of(tick, seen.parts.body, parameters))
 
-    def _show(self, pictures: Iterator[tuple[int, Picture]]) -> None:
-        for number, (pixels,) in pictures:
-            if number >= self._done:  # else it is a second one of a packet
-                self._encode(number - self._done)  # no pictures came of these
-                self._shown = pixels
-                self._encode(1)
-
-    def _encode(self, frames: int) -> None:
-        """Encode the last picture as the next so many frames."""
-        for _ in range(frames):
-            self.view.encode(self._shown, self._due.popleft())
-            self._done += 1
+    def _show(self, pictures: Iterator[tuple[int, Picture | None]]) -> None:
+        for tick, picture in pictures:
+            if picture is not None:
+                (self._shown,) = picture
+            self.view.encode(self._shown, tick)
 
     def close(self) -> None:
         self._show(self._pictures.rest())
-        self._encode(len(self._due))
         self.view.close()
         self._own.close()
 

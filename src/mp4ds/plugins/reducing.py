@@ -50,7 +50,6 @@ from mp4ds.video.decoder import PacketPictures
 
 _MOST_LOOKED_AT = 1000  # messages of a topic for an image that can be decoded
 _MOST_BEFORE = 1000  # packets before a slice that are held
-_MOST_WAITING = 64  # packets without a picture: more than any decoder holds back
 _INFO = Kind("sensor_msgs/msg/CameraInfo", "info", "calibrations", None)
 _PACKETS = ("CompressedVideo", "FFMPEGPacket")
 
@@ -317,11 +316,9 @@ class _Camera:
         self._count, self._limit, self._stamp = before, limit, 0
         self._splitter = MessageSplitter(channel)
         self._inspector = MessageInspector(channel) if channel.id in reader.videos else None
-        self._pictures: PacketPictures | None = None
+        # of packets, and whether they are kept
+        self._pictures: PacketPictures[tuple[bool, CameraMessage]] | None = None
         self._kind: _Kind | None = None  # of these pictures
-        self._begun = 0  # packets that were given to them
-        # those without a picture yet: their numbers, and whether they are kept
-        self._waiting: deque[tuple[int, bool, CameraMessage]] = deque()
         self._before: deque[CameraMessage] = deque()  # since the last key frame
 
     def precede(self, message: Message) -> None:
@@ -366,31 +363,20 @@ class _Camera:
         if self._pictures is None or kind != self._kind:
             yield from self.rest()
             self._pictures, self._kind = PacketPictures(kind[0], "rgb24", kind[1]), kind
-            self._begun = 0
-        self._waiting.append((self._begun, is_kept, seen))
-        self._begun += 1
         parameters = seen.parameters if seen.keyframe else b""
-        yield from self._shown(self._pictures.of(seen.parts.body, parameters))
-        if len(self._waiting) > _MOST_WAITING:
-            yield from self._without_pictures(self._waiting[0][0] + 1)
+        yield from self._shown(self._pictures.of((is_kept, seen), seen.parts.body, parameters))
 
-    def _shown(self, pictures: Iterator[tuple[int, Picture]]) -> Iterator[Message]:
-        for number, (pixels, *_) in pictures:
-            yield from self._without_pictures(number)
-            if self._waiting and self._waiting[0][0] == number:
-                _, is_kept, seen = self._waiting.popleft()
-                if is_kept:
-                    shown = Shown("rgb8", pixels)
-                    yield self._reader.image(seen.message, seen.form, seen.parts, shown)
-
-    def _without_pictures(self, until: int) -> Iterator[Message]:
-        while self._waiting and self._waiting[0][0] < until:
-            _, is_kept, seen = self._waiting.popleft()
-            if is_kept:
+    def _shown(
+        self, pictures: Iterator[tuple[tuple[bool, CameraMessage], Picture | None]]
+    ) -> Iterator[Message]:
+        for (is_kept, seen), picture in pictures:
+            if is_kept and picture is None:
                 yield self._reader.as_recorded(seen.message)
+            elif is_kept and picture is not None:
+                shown = Shown("rgb8", picture[0])
+                yield self._reader.image(seen.message, seen.form, seen.parts, shown)
 
     def rest(self) -> Iterator[Message]:
         """What is left at the end."""
         if self._pictures:
             yield from self._shown(self._pictures.rest())
-        yield from self._without_pictures(self._begun)

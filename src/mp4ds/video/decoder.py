@@ -6,12 +6,13 @@ import errno
 import io
 import os
 import struct
+from collections import deque
 from collections.abc import Iterable, Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import av
 import numpy as np
@@ -111,8 +112,15 @@ def open_packet_decoder(codec: str, size: tuple[int, int], configuration: bytes 
     return context
 
 
-class PacketPictures:
+_MOST_WAITING = 64  # packets without a picture: more than any decoder holds back
+_Item = TypeVar("_Item")
+
+
+class PacketPictures(Generic[_Item]):
     """Pictures of packets that come one by one, as messages hold them.
+
+    Each packet comes with an item, which is given back with its picture: in order, when that is
+    complete; or with None for one that cannot be decoded.
 
     Args:
         codec: Name in the registry.
@@ -130,14 +138,16 @@ class PacketPictures:
             picture_size=size,
             matrix=None,
         )
-        self._count = 0
+        self._waiting: deque[_Item] = deque()
+        self._next = 0  # number of the first that waits
 
-    def of(self, body: bytes | memoryview, parameters: bytes) -> Iterator[tuple[int, Picture]]:
-        """The pictures that are complete with one more packet, each with its number.
-
-        Of one that cannot be decoded there is none. The numbers increase.
+    def of(
+        self, item: _Item, body: bytes | memoryview, parameters: bytes
+    ) -> Iterator[tuple[_Item, Picture | None]]:
+        """The items that are done with one more packet, each with its picture.
 
         Args:
+            item: Of the packet.
             body: As the message holds it.
             parameters: What decoding needs first, of a key frame; see `StreamParser.parameters`.
         """
@@ -145,23 +155,36 @@ class PacketPictures:
         if not self._parser.has_parameters(data):
             data = parameters + data
         packet: Any = av.Packet(data)
-        packet.pts = self._count
-        self._count += 1
-        return self._decoded(packet)
+        packet.pts = self._next + len(self._waiting)
+        self._waiting.append(item)
+        yield from self._decoded(packet)
+        yield from self._without_pictures(len(self._waiting) - _MOST_WAITING)
 
-    def rest(self) -> Iterator[tuple[int, Picture]]:
-        """The pictures that are complete with the end."""
-        return self._decoded(None)
+    def rest(self) -> Iterator[tuple[_Item, Picture | None]]:
+        """The items that are left at the end."""
+        yield from self._decoded(None)
+        yield from self._without_pictures(len(self._waiting))
 
-    def _decoded(self, packet: Any) -> Iterator[tuple[int, Picture]]:
+    def _decoded(self, packet: Any) -> Iterator[tuple[_Item, Picture | None]]:
         try:
             frames = self._decoder.decode(packet)
         except FFmpegError as error:
             raise_if_scarce(error)
             return
         for frame in frames:
-            with suppress(VideoError):  # marked as corrupt, or of another size
-                yield frame.pts, self._maker.make(frame, frame.pts)
+            try:
+                picture = self._maker.make(frame, frame.pts)
+            except VideoError:  # marked as corrupt, or of another size
+                continue
+            if frame.pts >= self._next:  # else it is a second one of a packet
+                yield from self._without_pictures(frame.pts - self._next)
+                self._next += 1
+                yield self._waiting.popleft(), picture
+
+    def _without_pictures(self, count: int) -> Iterator[tuple[_Item, None]]:
+        for _ in range(count):
+            self._next += 1
+            yield self._waiting.popleft(), None
 
 
 # ---------------------------------------------------------------- decoder
