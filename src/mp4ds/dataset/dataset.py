@@ -67,7 +67,6 @@ class Dataset:
         manifest: Of the folder; None for one video.
         streams: Its streams; none for a video without a sidecar, see `mp4ds.open`.
         messages_file: Its messages.mcap; without contents where there is none.
-        jpeg_quality: Quality of the JPEG files in messages of transcoded streams.
         is_salvaged: Whether messages may be missing; see `mp4ds.dataset.salvage`.
         damage: Which damaged file was left out, as no selected topic needs it; empty if none was.
 
@@ -94,7 +93,6 @@ class Dataset:
             raise SourceNotFoundError(self.path)
         if self.path.name == MANIFEST_NAME:
             self.path = self.path.parent
-        self.jpeg_quality = jpeg_quality
         self.manifest: Manifest | None = None
         holds_one = (self.path / MANIFEST_NAME).exists()
         if not holds_one and self.path.suffix not in (".yaml", ".yml", ".mp4"):
@@ -119,9 +117,8 @@ class Dataset:
                 problem = f"is a video without its sidecar, {sidecar.name}"
                 raise FormatError("file-missing", self.path, problem)
             sidecars = [sidecar]
-        self.streams = [
-            open_stream(sidecar, layer, jpeg_quality=jpeg_quality) for sidecar in sidecars
-        ]
+        self.streams = [open_stream(sidecar, layer) for sidecar in sidecars]
+        self.jpeg_quality = jpeg_quality
         self.messages_file = MessagesFile(self.path / MESSAGES_NAME if self.manifest else None)
 
     @classmethod
@@ -135,8 +132,8 @@ class Dataset:
     ) -> Dataset:
         """A folder whose sidecars have already been read, or a video without a sidecar."""
         dataset = cls.__new__(cls)
-        dataset.path, dataset.manifest, dataset.jpeg_quality = path, manifest, 95
-        dataset.streams, dataset.messages_file, dataset._video = list(streams), file, video
+        dataset.path, dataset.manifest, dataset.streams = path, manifest, list(streams)
+        dataset.messages_file, dataset._video = file, video
         return dataset
 
     if not TYPE_CHECKING:  # else every name would pass for known
@@ -155,6 +152,16 @@ class Dataset:
                 parts.append(f"{(span.end - span.start) / 1e9:.1f} s")
             parts.append(f"{sum(file.size for file in manifest.files) / 1e6:.1f} MB")
         return f"<Dataset {str(self.path)!r}: {'; '.join(parts)}>"
+
+    @property
+    def jpeg_quality(self) -> int:
+        """Quality of the JPEG files in messages of transcoded streams, 1 to 100; may be set."""
+        return self.streams[0].jpeg_quality if self.streams else Stream.jpeg_quality
+
+    @jpeg_quality.setter
+    def jpeg_quality(self, quality: int) -> None:
+        for stream in self.streams:
+            stream.jpeg_quality = quality
 
     @property
     def parts(self) -> Sequence[Images]:

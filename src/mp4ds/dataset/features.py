@@ -36,27 +36,33 @@ def image_features(topics: Sequence[str]) -> list[str]:
     return [f"observation.images.{names.name_for(topic)}" for topic in topics]
 
 
-def video_feature(size: tuple[int, int], fps: int, info: Mapping[str, str]) -> Feature:
+def video_feature(
+    size: tuple[int, int],
+    fps: int,
+    info: Mapping[str, str],
+    depths: Mapping[str, Any] | None = None,
+) -> Feature:
     """Of a camera.
 
     Args:
         size: Width and height, pixels.
         fps: Frames per second.
         info: More that is known of the videos.
+        depths: What is known of the depths that they show, if they are that.
     """
-    width, height = size
+    (width, height), channels = size, 1 if depths else 3
     return {
         "dtype": "video",
-        "shape": [height, width, 3],
+        "shape": [height, width, channels],
         "names": ["height", "width", "channels"],
         "info": {
             "video.height": height,
             "video.width": width,
-            "video.is_depth_map": False,
             "video.fps": fps,
-            "video.channels": 3,
+            "video.channels": channels,
             "has_audio": False,
             **info,
+            **(depths or {"video.is_depth_map": False}),
         },
     }
 

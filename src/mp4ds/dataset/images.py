@@ -54,6 +54,7 @@ class Images(ABC):
     channel: Channel | None
     path: Path
     video_path: Path
+    _columns: DecodedColumns
     encoding: str
     image_size: tuple[int, int]
     are_jpeg_files = False
@@ -66,9 +67,9 @@ class Images(ABC):
         return f"<{type(self).__name__} {self.topic!r}: {frames}, {size} {encoding}>"
 
     @property
-    @abstractmethod
     def columns(self) -> DecodedColumns:
-        """One value per frame."""
+        """One value per frame; of a third-party video, all times are presentation times."""
+        return self._columns
 
     def __len__(self) -> int:
         return len(self.columns.stamp)
@@ -302,11 +303,6 @@ class VideoImages(Images):
         self.image_size = file.size
         self._columns = DecodedColumns.of_frames(file.times, file.times)
 
-    @property
-    def columns(self) -> DecodedColumns:
-        """One value per frame; all times are presentation times."""
-        return self._columns
-
     def open_reader(self) -> FrameReader:
         """A separate decoder for frames by number."""
         file = self._file
@@ -420,11 +416,6 @@ class VerbatimImages(Images):
         self._columns = DecodedColumns.of_frames(stamps, log_times, ordinal=ordinals)
         self._frame_ids = [entry[4] for entry in entries]
         self._last: tuple[int, Shown] | None = None
-
-    @property
-    def columns(self) -> DecodedColumns:
-        """One value per frame."""
-        return self._columns
 
     @property
     def calibrations(self) -> Sequence[Calibration]:

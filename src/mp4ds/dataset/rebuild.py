@@ -130,7 +130,7 @@ class MessageRebuilder:
         place: str,
         write_pixels: Callable[[Picture, Pixels], None],
         *,
-        jpeg_quality: int = 95,
+        jpeg_quality: int,
     ) -> None:
         self._write_pixels = write_pixels
         self._sidecar = sidecar

@@ -39,7 +39,6 @@ def open_selected(
     selected: Callable[[str], bool],
     *,
     layer: Layer | None = None,
-    jpeg_quality: int = 95,
     verify_messages: bool = False,
 ) -> Dataset:
     """Open a dataset; damage to files with nothing of the selected topics is noted, and no error.
@@ -48,7 +47,6 @@ def open_selected(
         path: See `Dataset`.
         selected: Whether a topic is wanted.
         layer: See `Dataset`.
-        jpeg_quality: See `Dataset`.
         verify_messages: Compare messages.mcap with its SHA-256, too.
 
     Raises:
@@ -56,7 +54,7 @@ def open_selected(
         FormatError: It is damaged, and selected topics have, or may have, something to lose.
     """
     try:
-        dataset = Dataset(path, layer=layer, jpeg_quality=jpeg_quality)
+        dataset = Dataset(path, layer=layer)
         _ = dataset.channels  # opens messages.mcap
         if verify_messages:
             dataset.verify_messages()
@@ -65,9 +63,7 @@ def open_selected(
         raise
     except FormatError as error:
         try:
-            dataset, losses = open_damaged(
-                path, selected=selected, layer=layer, jpeg_quality=jpeg_quality
-            )
+            dataset, losses = open_damaged(path, selected=selected, layer=layer)
         except (SourceError, FormatError):
             raise error from None
         # nothing vouches for what is still there of a damaged messages.mcap
@@ -87,7 +83,6 @@ def open_damaged(
     *,
     selected: Callable[[str], bool],
     layer: Layer | None = None,
-    jpeg_quality: int,
 ) -> tuple[Dataset, list[Loss]]:
     """A dataset, some files of which cannot be read. What can be read of its videos: see `examine`.
 
@@ -95,7 +90,6 @@ def open_damaged(
         path: See `Dataset`.
         selected: Whether a topic is wanted; damage to others is not reported.
         layer: See `Dataset`.
-        jpeg_quality: See `Dataset`.
 
     Returns:
         The dataset, and what is lost by such files and of messages.mcap.
@@ -112,9 +106,9 @@ def open_damaged(
         raise SourceNotFoundError(place)
     folder = place.parent if place.name == MANIFEST_NAME else place
     if folder.is_dir():
-        opening = _Opening(folder, selected, layer, jpeg_quality)
+        opening = _Opening(folder, selected, layer)
         return opening.dataset(), opening.losses
-    dataset = Dataset(folder, layer=layer, jpeg_quality=jpeg_quality)
+    dataset = Dataset(folder, layer=layer)
     dataset.is_salvaged = True
     return dataset, []
 
@@ -176,17 +170,10 @@ class _Opening:
         losses: What is lost by files that cannot be read at all, and of messages.mcap.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        selected: Callable[[str], bool],
-        layer: Layer | None,
-        jpeg_quality: int,
-    ) -> None:
+    def __init__(self, folder: Path, selected: Callable[[str], bool], layer: Layer | None) -> None:
         self._folder = folder
         self._selected = selected
         self._layer: Layer | None = layer
-        self._jpeg_quality = jpeg_quality
         self.losses: list[Loss] = []
 
     def dataset(self) -> Dataset:
@@ -211,7 +198,7 @@ class _Opening:
             raise FormatError("file-missing", self._folder, "has no file that can be read")
         manifest = manifest or self._rebuilt(there, file)
         dataset = Dataset.of(self._folder, manifest, there, file)
-        dataset.jpeg_quality, dataset.is_salvaged = self._jpeg_quality, True
+        dataset.is_salvaged = True
         return dataset
 
     def _compare(self, path: Path, entry: FileEntry | None, topics: Sequence[str]) -> None:
@@ -227,7 +214,7 @@ class _Opening:
     ) -> Stream | None:
         path = self._folder / name
         try:
-            stream = open_stream(path, self._layer, jpeg_quality=self._jpeg_quality)
+            stream = open_stream(path, self._layer)
             if manifest is not None and any(map(self._selected, stream.topics)):
                 self._compare(path, manifest.file(name), stream.topics)
             return stream

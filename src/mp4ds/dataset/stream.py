@@ -35,9 +35,9 @@ Layer = Literal["exact", "view"]
 """Which frames are read of a stream that has a view: those recorded, or those that it shows."""
 
 
-def open_stream(path: Path, layer: Layer | None = None, *, jpeg_quality: int = 95) -> Stream:
+def open_stream(path: Path, layer: Layer | None = None) -> Stream:
     """A `Stream` in a layer; what may be depths is exact in both: a view has 256 levels of it."""
-    stream = Stream(path, layer=layer, jpeg_quality=jpeg_quality)
+    stream = Stream(path, layer=layer)
     keeps = stream.encoding in depth.DEPTHS and stream.absent is None
     return stream.in_layer("exact") if keeps else stream
 
@@ -55,30 +55,25 @@ class Stream(Images):
         videos: Its video, and the view that predicts it if there is one.
         sound: Which frames are read of a damaged video: those that `damages` does not name, shape
             (frames,). None: all, and damage is an error.
+        jpeg_quality: Quality of the JPEG files in messages of a transcoded stream, 1 to 100.
 
     Args:
         path: The sidecar; the video is next to it.
         sidecar: Its contents, if already read.
         layer: Which frames to read; None: the exact ones if they are here, else the view.
-        jpeg_quality: Quality of the JPEG files in messages of a transcoded stream, 1 to 100.
 
     Raises:
         FormatError: The sidecar or its video breaks a rule of the format.
     """
 
     channel: Channel
+    jpeg_quality = 95
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        sidecar: StreamSidecar | None = None,
-        layer: Layer | None = None,
-        jpeg_quality: int = 95,
+        self, path: Path, *, sidecar: StreamSidecar | None = None, layer: Layer | None = None
     ) -> None:
         self.path = path
         self.sound: NDArray[np.bool_] | None = None
-        self._jpeg_quality = jpeg_quality
         self._whole = whole = sidecar or load_stream(path)
         self.exact_path = path.parent / whole.video.file if whole.view else None
         if self.exact_path and layer is None:
@@ -125,8 +120,8 @@ class Stream(Images):
             return self
         if layer == "exact" and not self.exact_path.exists():
             raise self._no_exact()
-        quality = self._jpeg_quality
-        other = Stream(self.path, sidecar=self._whole, layer=layer, jpeg_quality=quality)
+        other = Stream(self.path, sidecar=self._whole, layer=layer)
+        other.jpeg_quality = self.jpeg_quality
         if layer == "view":  # of a damaged one, exact frames are lost as well
             other.sound = self.sound
         return other
@@ -207,7 +202,7 @@ class Stream(Images):
             self.columns,
             str(self.path),
             self.write_pixels,
-            jpeg_quality=self._jpeg_quality,
+            jpeg_quality=self.jpeg_quality,
         )
 
     @property

@@ -11,7 +11,7 @@ from contextlib import closing, contextmanager
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -22,20 +22,17 @@ from mp4ds.dataset.features import Statistics, sampled_statistics
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
-from mp4ds.errors import FormatError, Mp4dsError, OptionError, Refused, SampleError, VideoError
+from mp4ds.errors import FormatError, Mp4dsError, OptionError, SampleError, VideoError
 from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.times import nearest, sound_times
 from mp4ds.torch.cache import FrameCache
 from mp4ds.torch.recordings import CameraSource, Recording, each, one_of, open_source
-from mp4ds.video.mp4 import read_sample_table
+from mp4ds.video.media import Media
 
 Dtype = Literal["native", "uint8", "float32"]
 Backend = Literal["mp4ds", "torchcodec"]
-
-_DTYPES = ("native", "uint8", "float32")
-_BACKENDS = ("mp4ds", "torchcodec")
 
 # A worker must not free what its parent left to the garbage collector: a PyAV container is always
 # in a reference cycle, and freeing its decoder waits for threads that a fork does not copy.
@@ -77,8 +74,8 @@ class Pictures:
     ) -> None:
         self.dtype = str(dtype).removeprefix("torch.")
         self.channels_first, self.backend, self.device = channels_first, backend, device
-        one_of("dtype", self.dtype, _DTYPES)
-        one_of("backend", backend, _BACKENDS)
+        one_of("dtype", self.dtype, get_args(Dtype))
+        one_of("backend", backend, get_args(Backend))
         formats = each("format", format, topics, "rgb")
         sizes = each("resize", resize, topics, None)
         crops = each("crop", crop, topics, None)
@@ -282,19 +279,13 @@ class OpenCamera:
 
     @cached_property
     def key_frames(self) -> NDArray[np.int64]:
-        """Numbers of the frames at which decoding can begin, in order; all if unknown.
+        """Numbers of the frames at which decoding can begin, in order.
 
         Raises:
             VideoError: The video's index is damaged.
         """
-        path = self._topic.parts[0].video_path
-        try:
-            with path.open("rb") as file:
-                table = read_sample_table(file, path.stat().st_size, str(path))
-        except Refused:
-            return np.arange(len(self._topic), dtype=np.int64)
-        except OSError as error:
-            raise VideoError("file-missing", path, f"cannot be read: {error.strerror}") from None
+        with closing(Media(self._topic.parts[0].video_path)) as media:
+            table = media.table
         keys = np.flatnonzero(table.sync[table.order])
         return np.union1d(0, keys).astype(np.int64)  # a slice may begin between two
 

@@ -56,7 +56,7 @@ class Offsets:
         given = tuple(values)
         if not given:
             raise OptionError("offsets is empty; use (0,) for the sample's own frame alone.")
-        one_of("offsets_in", unit, ("frames", "seconds"))
+        one_of("offsets_in", unit, get_args(Unit))
         self._timed = unit == "seconds"
         self._tolerance_ns = tolerance_ns
         if not self._timed:

@@ -222,12 +222,9 @@ class LeRobotDataset(FrameDataset):
                 self._scales[key] = _IN_MM[encoding]
                 self._pictures.views[number]["format"] = "native"
             with self._cameras.using(self.recordings[0], number) as camera:
-                height, width, channels = camera.empty(1).shape[2:]
-            found[key] = video_feature((width, height), fps, {})
-            if key in self._scales:
-                found[key]["shape"][2] = found[key]["info"]["video.channels"] = channels
-                found[key]["info"] |= {"is_depth_map": True, "depth_unit": "mm"}
-                del found[key]["info"]["video.is_depth_map"]
+                height, width = camera.empty(1).shape[2:4]
+            depths = {"is_depth_map": True, "depth_unit": "mm"} if key in self._scales else None
+            found[key] = video_feature((width, height), fps, {}, depths)
         found |= {key: vector_feature(self.names[own]) for key, own in self._keys.items()}
         found |= COLUMNS
         return {key: {**one, "shape": tuple(one["shape"])} for key, one in found.items()}

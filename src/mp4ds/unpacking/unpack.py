@@ -225,14 +225,13 @@ def _opened(
     dataset: Path | str, options: UnpackOptions, *, verify: bool = False
 ) -> tuple[Dataset, list[Loss]]:
     """The dataset, and what is lost of it by files that cannot be read."""
-    selected, quality, layer = options.selected, options.jpeg_quality, options.layer
+    selected, layer = options.selected, options.layer
     losses: list[Loss] = []
     if options.salvage:
-        opened, losses = open_damaged(dataset, selected=selected, layer=layer, jpeg_quality=quality)
+        opened, losses = open_damaged(dataset, selected=selected, layer=layer)
     else:
-        opened = open_selected(
-            dataset, selected, layer=layer, jpeg_quality=quality, verify_messages=verify
-        )
+        opened = open_selected(dataset, selected, layer=layer, verify_messages=verify)
+    opened.jpeg_quality = options.jpeg_quality
     if layer is None:
         opened.require_exact(selected)
     return opened, losses

@@ -20,7 +20,6 @@ from mp4ds.dataset.features import (
     COLUMNS,
     SAMPLES,
     STATE,
-    Feature,
     Statistics,
     image_features,
     merged,
@@ -177,11 +176,12 @@ def _add_videos(
         depths = DepthCodes(camera.view.encoding.name) if _is_depth(camera) else None
         size = _encode(job, camera.at(used), repeats.tolist(), path, fps, depths)
         codec = "h265" if depths else job.options.codec
-        episode.features[feature] = own = _video_feature(path, size, codec, fps)
+        with PacketReader(path, codec=codec) as packets:
+            pixel_format = packets.pixel_format
+        info = {"video.codec": CODECS[codec].ffmpeg, "video.pix_fmt": pixel_format}
+        told = depths.info if depths else None
+        episode.features[feature] = video_feature(size, fps, info, told)
         if depths:
-            own["shape"][2] = own["info"]["video.channels"] = 1
-            del own["info"]["video.is_depth_map"]
-            own["info"] |= depths.info
             job.note(f"{camera.topic}: {depths}")
         view = {
             "resize": job.options.size_of(camera.topic, camera.stream.image_size),
@@ -247,13 +247,6 @@ def _encode(
                 encoder.write((shown,), (written * TIMESCALE + fps // 2) // fps)
                 written += 1
         return encoder.width, encoder.height
-
-
-def _video_feature(path: Path, size: tuple[int, int], codec: str, fps: int) -> Feature:
-    with PacketReader(path, codec=codec) as packets:
-        pixel_format = packets.pixel_format
-    info = {"video.codec": CODECS[codec].ffmpeg, "video.pix_fmt": pixel_format}
-    return video_feature(size, fps, info)
 
 
 # ---------------------------------------------------------------- vectors

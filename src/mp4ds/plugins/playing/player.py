@@ -681,15 +681,15 @@ def open_player(
     """
     chosen = options or PlayOptions()
     world = node.world if node else chosen_world("play", chosen.to)
-    chosen, quality = replace(chosen, names=chosen.names.in_world(world)), chosen.jpeg_quality
+    chosen = replace(chosen, names=chosen.names.in_world(world))
     with ExitStack() as stack:
         stack.enter_context(advising(HOW_TO_SALVAGE))
         opened = [
-            stack.enter_context(
-                open_selected(place, chosen.wants, layer=chosen.layer, jpeg_quality=quality)
-            )
+            stack.enter_context(open_selected(place, chosen.wants, layer=chosen.layer))
             for place in datasets_in(datasets)
         ]
+        for dataset in opened:
+            dataset.jpeg_quality = chosen.jpeg_quality
         timeline = Timeline(opened, chosen, world)
         node = node or stack.enter_context(open_node(world, chosen, _NODES[world]))
         follow = chosen.follow_clock
