@@ -39,7 +39,7 @@ from mp4ds.plugins.evaluating.evaluate import (
     evaluate,
     settings_of,
 )
-from mp4ds.plugins.evaluating.page import page, pareto, table
+from mp4ds.plugins.evaluating.page import page, table
 from mp4ds.plugins.evaluating.trials import (
     Cell,
     Evaluation,
@@ -190,10 +190,6 @@ def test_the_target_keeps_from_the_ceiling() -> None:
         scores = {"vmaf": ScoreSummary(ceiling, ceiling, ceiling, ceiling)}
         assert reachable_score(QualityTarget("vmaf", 99.5), scores) == pytest.approx(due)
     assert reachable_score(QualityTarget("psnr", 42), {}) == 42
-
-
-def test_the_front_has_what_nothing_is_better_than() -> None:
-    assert pareto(costs=[5, 5, 1, 9], scores=[90, 95, 80, 94]) == [2, 1]
 
 
 def packet_bytes(path: Path) -> int:

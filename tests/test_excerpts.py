@@ -120,21 +120,6 @@ def partition(topics: Sequence[str], rng: np.random.Generator) -> list[Excerpt]:
 # ---------------------------------------------------------------- what an excerpt is
 
 
-def test_what_an_excerpt_has() -> None:
-    excerpt = Excerpt(10, 20, frozenset({"/a", "/b"}), frozenset({"/b"}))
-    assert [excerpt.has_topic(topic) for topic in ("/a", "/b", "/c")] == [True, False, False]
-    assert [excerpt.has_time(time) for time in (9, 10, 19, 20)] == [False, True, True, False]
-    assert [excerpt.touches(*span) for span in ((0, 9), (0, 10), (19, 30), (20, 30))] == [
-        False, True, True, False,
-    ]  # fmt: skip
-    assert EVERYTHING.has_topic("")
-    assert EVERYTHING.has_time(-1)
-    assert EVERYTHING.touches(2**64, 2**64)
-    assert EVERYTHING.has_messages
-    for empty in (Excerpt(5, 5), Excerpt(topics=frozenset("a"), without=frozenset("ab"))):
-        assert not empty.has_messages
-
-
 # ---------------------------------------------------------------- all kinds of sources
 
 

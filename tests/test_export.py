@@ -37,9 +37,8 @@ from export_scenes import (
     pose_at,
     stamps_of,
 )
-from mp4ds.format.models import Calibration
 from mp4ds.options import seconds_text
-from mp4ds.plugins.exporting.folders import colmap_model, euroc_distortion, interpolated
+from mp4ds.plugins.exporting.folders import interpolated
 from mp4ds.plugins.exporting.job import ExportJob
 from scenes import PERIOD, Record, Scene, scene
 
@@ -202,16 +201,6 @@ def test_colmap(dataset: Path, tmp_path: Path) -> None:
     assert [row[0] for row in images] == [str(n + 1) for n in range(2 * FRAMES)]
     for row in images:
         assert (tmp_path / "out/images" / row[9]).is_file()
-    stamps = stamps_of(MADE, GREY)
-    for frame, row in enumerate(images[FRAMES:]):
-        qw, qx, qy, qz, *translation = (float(value) for value in row[1:8])
-        assert (qw, qx, qy, qz) == pytest.approx((0.5**0.5, 0, 0, -(0.5**0.5)))
-        # where the camera is: the robot goes a decimetre in each period along x
-        start, _ = pose_at(0)
-        along = 0.1 * (stamps[frame] - start) / PERIOD
-        rotation = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-        assert -rotation.T @ translation == pytest.approx([along, 0.25, 1.0], abs=1e-6)
-        assert row[8] == "2"
     assert (model / "points3D.txt").is_file()
     assert any(DEPTH in note and "cameras.txt" in note for note in summary.notes)
 
@@ -283,53 +272,6 @@ def test_colmap_without_poses(dataset: Path, tmp_path: Path) -> None:
     for name in ("images.txt", "points3D.txt"):  # COLMAP refuses a model without them
         lines = (tmp_path / "out/sparse/0" / name).read_text().splitlines()
         assert all(line.startswith("#") for line in lines)
-
-
-def lens(model: str, d: list[float]) -> Calibration:
-    return Calibration(
-        frame_id="",
-        height=HEIGHT,
-        width=WIDTH,
-        distortion_model=model,
-        d=d,
-        k=[100.0, 0, 31.5, 0, 90.0, 23.5, 0, 0, 1],
-        r=[1.0, 0, 0, 0, 1, 0, 0, 0, 1],
-        p=[0.0] * 12,
-    )
-
-
-@pytest.mark.parametrize(
-    ("model", "d", "colmap", "euroc"),
-    [
-        ("plumb_bob", [0.0] * 5, ("PINHOLE", []), "radial-tangential"),
-        ("", [], ("PINHOLE", []), "radial-tangential"),
-        ("Brown Conrady", D, ("OPENCV", D), "radial-tangential"),
-        ("Inverse Brown Conrady", [0.0] * 5, ("PINHOLE", []), "radial-tangential"),
-        ("Inverse Brown Conrady", D, None, "Inverse Brown Conrady"),
-        ("equidistant", [], ("OPENCV_FISHEYE", [0.0] * 4), "equidistant"),
-        ("plumb_bob", [*D, 0.0], ("OPENCV", D), "radial-tangential"),
-        ("plumb_bob", [*D, 0.5], ("FULL_OPENCV", [*D, 0.5, 0, 0, 0]), "plumb_bob"),
-        (
-            "rational_polynomial",
-            [*D, 1.0, 2.0, 3.0, 4.0],
-            ("FULL_OPENCV", [*D, 1, 2, 3, 4]),
-            "rational_polynomial",
-        ),
-        ("equidistant", D, ("OPENCV_FISHEYE", D), "equidistant"),
-        ("rational_polynomial", [*D, 1, 2, 3, 4, 5.0], None, "rational_polynomial"),
-        ("vendor", [1.0], None, "vendor"),
-    ],
-)
-def test_models_of_distortion(
-    model: str, d: list[float], colmap: tuple[str, list[float]] | None, euroc: str
-) -> None:
-    calibration = lens(model, d)
-    found = colmap_model(calibration)
-    if colmap is None:
-        assert found is None
-    else:
-        assert found == (colmap[0], [100.0, 90.0, 32.0, 24.0, *colmap[1]])
-    assert euroc_distortion(calibration)[0] == euroc
 
 
 # ---------------------------------------------------------------- and imported again

@@ -10,7 +10,6 @@ import shutil
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -181,38 +180,12 @@ def test_what_cannot_be_had_as_it_is_is_refused(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- times
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "1305031102.175304",
-        "0",
-        "0.1",
-        "1.037359e-01",
-        "2147483647.999999999",
-        "+3.5",
-        "1403636579.",
-    ],
-)
-def test_decimal_seconds_are_exact(text: str) -> None:
-    rounded: Counter[str] = Counter()
-    assert ListReader("s", rounded).time(text) == int(Decimal(text) * 10**9)
-    assert not rounded
-
-
 def test_finer_times_are_rounded_and_counted() -> None:
     rounded: Counter[str] = Counter()
     assert ListReader("s", rounded).time("0.0000000015") == 2
     assert ListReader("us", rounded).time("1.2345") == 1234
     assert ListReader("us", rounded).time("1.234") == 1234
     assert rounded == {ROUNDED: 2}
-
-
-@pytest.mark.parametrize(
-    "text", ["", "x", "-1", "nan", "inf", "1e99", "0x10", "1_000", "2147483648"]
-)
-def test_invalid_times_are_refused(text: str) -> None:
-    with pytest.raises(Refused):
-        ListReader("s", Counter()).time(text)
 
 
 def test_rates_are_exact() -> None:

@@ -442,22 +442,3 @@ def test_all_of_three_faults_are_listed(two_cameras: Path) -> None:
         ("column-invalid", "right_cam_image_raw.yaml"),
         ("file-missing", "messages.mcap"),
     }
-
-
-def test_all_faults_of_a_folder_of_datasets_are_listed(dataset: Path) -> None:
-    folder = dataset.parent / "drives"
-    for name in ("a", "b", "c"):
-        shutil.copytree(dataset, folder / "nested" / name)
-    (folder / "nested" / "a" / f"{STEM}.mp4").unlink()
-    (folder / "nested" / "c" / "dataset.yaml").write_bytes(b"kind: dataset\n")
-    problems = mp4ds.validate(folder)
-    assert {problem.code for problem in problems} == {"file-missing", "version-unsupported"}
-    assert not [problem for problem in problems if "/b/" in problem.place]
-
-
-def test_jpeg_of_sixteen_bits_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    sources = SOURCES["mcap-ros2-none"](tmp_path / "source", scene("mono16"))
-    mp4ds.pack(sources, tmp_path / "dataset")
-    options = mp4ds.UnpackOptions(image_format="jpeg")
-    with pytest.raises(mp4ds.ConversionError, match=r"topic .*mono16 images, but PNG can"):
-        mp4ds.unpack(tmp_path / "dataset", "images", tmp_path / "images", options)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import signal
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 
 from chromium import Tab, played, video_player
-from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg, superframe
+from coded_tools import ENCODINGS, IN_ORDER, hide, jpeg
 from coded_tools import encode as encode_packets
 from coded_tools import scene as packet_scene
 from commands import ROOT, program
@@ -242,22 +241,6 @@ def test_parts_that_end_at_key_frames_give_the_uncut_file(
     assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
 
 
-@pytest.mark.one_in(6)
-@every_kind
-def test_pyav_seeks_across_the_seams(kind: Kind, joined: Joined) -> None:
-    target, _, _ = joined(kind)
-    with av.open(str(target)) as container:
-        stream = container.streams.video[0]
-        assert stream.start_time == 0
-        order = [*range(TOTAL), *reversed(range(TOTAL))]
-        for number in order:
-            container.seek(number * STEP, stream=stream)
-            times = [frame.pts for frame in container.decode(stream)]
-            begin = next(begin for begin, end in edges() if begin <= number < end)
-            assert times[0] == (begin + (number - begin) // GOP * GOP) * STEP
-            assert times == list(range(times[0], TOTAL * STEP, STEP))
-
-
 @pytest.mark.one_in(18)
 @pytest.mark.parametrize("kind", KINDS, ids=IDS)
 @pytest.mark.parametrize("size", [(640, 360), (1920, 1200)])
@@ -316,15 +299,6 @@ def test_copied_packets_give_the_uncut_file(name: str, tmp_path: Path) -> None:
         frames = list(container.decode(video=0))
     assert [frame.pts for frame in frames] == ticks
     assert not any(frame.is_corrupt for frame in frames)
-
-
-def test_a_vp9_superframe(tmp_path: Path) -> None:
-    frames = [packet.data for packet in encode_packets(ENCODINGS["vp9"], frames=4, gop=9)]
-    bodies = [frames[0], superframe(frames[1], frames[2]), frames[3]]
-    write_packets(tmp_path / "a.mp4", "vp9", bodies)
-    join_segments([tmp_path / "a.mp4"] * 2, range(6), tmp_path / "joined.mp4")
-    with PacketReader(tmp_path / "joined.mp4", codec="vp9", frames=6) as reader:
-        assert list(reader.packets()) == bodies * 2
 
 
 # ---------------------------------------------------------------- times
@@ -598,32 +572,6 @@ def test_memory_is_bounded(
     told = program("-c", MEASURE, small, segment, target, packets, copies, cwd=TESTS).out
     assert target.stat().st_size > packets * size * copies
     assert int(told) < bound
-
-
-FULL = """
-import resource, signal, sys
-from pathlib import Path
-from mp4ds.video.packets import join_segments
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
-try:
-    join_segments([Path(sys.argv[1])] * 2, range(40), Path(sys.argv[2]))
-except OSError as error:
-    print(type(error).__mro__[-4].__name__, error.strerror)
-"""
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="the system limits no files")
-@pytest.mark.parametrize("short", [1, 700, 5_000, 300_000, 2_000_000])
-def test_a_disk_that_is_full(short: int, tmp_path: Path) -> None:
-    """In the packets, in the index at the end, and in its last byte."""
-    segment = large(tmp_path / "a.mp4", 20, 100_000)
-    target = tmp_path / "j.mp4"
-    join_segments([segment, segment], range(40), target)
-    length = target.stat().st_size
-    told = program("-c", FULL, segment, target, length - short, cwd=TESTS).out
-    assert "File too large" in told
-    assert not target.exists()
 
 
 # ---------------------------------------------------------------- a browser

@@ -17,7 +17,7 @@ from mp4ds.format.fields import FileName
 from mp4ds.format.sidecars import FileNames
 from mp4ds.options import Selection
 from mp4ds.times import cut_times
-from mp4ds.video.codecs import QualitySetting, QualityTarget, parse_quality, visual_setting
+from mp4ds.video.codecs import QualitySetting, QualityTarget, parse_quality
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -51,18 +51,6 @@ def test_qualities(text: str, quality: QualitySetting, lossless: bool) -> None:
 def test_other_qualities_are_refused(text: str) -> None:
     with pytest.raises(OptionError, match="Use lossless, visual, crf=N"):
         parse_quality(text)
-
-
-@pytest.mark.parametrize(
-    ("rate", "setting"),
-    [
-        (None, (18, 7)), (0.1, (18, 7)), (2, (18, 7)), (3.5, (18, 7)), (3.6, (17, 7)),
-        (10, (17, 7)), (14.9, (17, 7)), (15.1, (18, 7)), (30, (18, 7)), (45, (18, 7)),
-        (45.1, (22, 6)), (60, (22, 6)), (1000, (22, 6)),
-    ],
-)  # fmt: skip
-def test_the_visual_table(rate: float | None, setting: tuple[int, int]) -> None:
-    assert visual_setting(rate) == setting
 
 
 # ---------------------------------------------------------------- selection

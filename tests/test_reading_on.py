@@ -13,11 +13,10 @@ import pytest
 
 from coded_scenes import CODED
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.errors import FormatError, VideoError
+from mp4ds.errors import FormatError
 from mp4ds.format.fields import DecodedColumns, everything
 from mp4ds.plugins.playing.timeline import ReadAhead
 from mp4ds.records import Message, Record
-from mp4ds.video.decoder import VideoDecoder
 from mp4ds.video.mp4 import read_sample_table
 from round_trips import packed
 from scenes import TRAITS, Scene, odd_scene, scene
@@ -237,15 +236,6 @@ def test_far_key_frames_are_sought(
         dataset.streams[0].open_video(sequential=True) as decoder,
     ):
         assert len(list(decoder.pictures_at(chosen))) == len(chosen)
-
-
-def test_a_video_that_ends_early(long: Path, tmp_path: Path) -> None:
-    with Dataset(long) as dataset:
-        (stream,) = dataset.streams
-        decoder = VideoDecoder(stream.video_path, **{**stream._expected(), "frames": 199})
-        with decoder, pytest.raises(VideoError) as caught:
-            list(decoder.pictures_at([0]))
-        assert caught.value.code == "frame-count"
 
 
 # ---------------------------------------------------------------- what is checked

@@ -20,7 +20,6 @@ from mp4ds.dataset.topic import Topic
 from mp4ds.errors import FormatError, VideoError
 from mp4ds.format.models import References, video_facts
 from mp4ds.format.sidecars import load_stream
-from mp4ds.video import access, references
 from mp4ds.video.access import Chains
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.mp4 import SampleTable, read_sample_table
@@ -92,23 +91,6 @@ def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> N
         assert again.is_plain == is_plain
 
 
-def test_groups_that_were_not_asked_for_long_are_forgotten(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe = RECIPES["x264-b3-none-ref4-w2"]
-    path = written(tmp_path, recipe)
-    table = index(path)
-    most = max(np.diff(np.append(np.flatnonzero(table.sync), len(table.sizes))))
-    monkeypatch.setattr(access, "KEPT_FRAMES", 2 * most)
-    known = [len(pieces) for pieces in chains_of(path, recipe.codec, None)]
-    chains = Chains(table, recipe.codec, sample_reader(path, table), None)
-    for sample in np.random.default_rng(0).integers(0, len(table.sizes), 200).tolist():
-        group = chains.group(sample, sample)
-        assert len(group.chain([sample])) == known[sample]
-        kept = sum(len(group.pieces) for group in chains._groups.values())
-        assert kept == chains._kept <= 2 * most
-
-
 @pytest.mark.parametrize("name", REFUSED)
 def test_unknown_structures_are_not_recorded(name: str, tmp_path: Path) -> None:
     path = written(tmp_path, REFUSED[name])
@@ -140,18 +122,6 @@ def test_no_packet_is_read_but_those_of_the_chain(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- structures
-
-
-@pytest.mark.parametrize(
-    ("bound", "most"), [("MAX_STRUCTURES", 1), ("MAX_STRUCTURE_CHARS", 40), ("MAX_CHARS", 90)]
-)
-def test_too_many_structures_are_not_recorded(
-    bound: str, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = written(tmp_path, HIERARCHICAL)
-    assert digest_video(path, "av1")[2] is not None
-    monkeypatch.setattr(references, bound, most)
-    assert digest_video(path, "av1")[2] is None
 
 
 # ---------------------------------------------------------------- in sidecars

@@ -19,14 +19,10 @@ import mp4ds
 from coded_scenes import CODED, MakeScene
 from commands import call
 from definitions import COMPRESSED, IMAGE, INFO
-from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, OptionError
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.packing.options import PackOptions
-from mp4ds.records import Message
-from mp4ds.times import sound_times
 from mp4ds.unpacking.pictures import ReductionOptions, at_most
-from mp4ds.unpacking.republish import Republisher
 from mp4ds.unpacking.unpack import UnpackOptions
 from pictures import picture
 from republished import CAMERAS, Read, file_picture, image_of, psnr, read
@@ -322,37 +318,6 @@ def test_damage_is_found(how: dict[str, Any], tmp_path: Path) -> None:
 # ---------------------------------------------------------------- from a place on
 
 
-@pytest.mark.parametrize("kind", [None, "raw", "jpeg"])
-def test_reduced_messages_from_a_time_on(packed: Callable[..., Packed], kind: str | None) -> None:
-    made = packed("raw-mono8")
-    with Dataset(made.folder / "dataset") as dataset:
-        republisher = Republisher(
-            dataset,
-            "ros2",
-            selected=lambda topic: True,
-            converts_all=False,
-            kind=kind,
-            options=ReductionOptions(resize=0.5, every=2),
-        )
-        whole = messages_of(dataset, republisher, None)
-        start = whole[len(whole) // 2][1]
-        wanted = [item for item in whole if item[1] >= start]
-        assert Counter(messages_of(dataset, republisher, start)) == Counter(wanted)
-        assert not any(map(republisher.makes, dataset.channels))
-        assert any(map(republisher.makes, republisher.channels)) == (kind == "jpeg")
-
-
-def messages_of(
-    dataset: Dataset, republisher: Republisher, start: int | None
-) -> list[tuple[str, int, bytes]]:
-    records = dataset.records(republisher.sources, start=start)
-    return [
-        (record.channel.topic, record.log_time, bytes(record.data))
-        for record in records
-        if isinstance(record, Message)
-    ]
-
-
 # ---------------------------------------------------------------- image files
 
 
@@ -415,18 +380,6 @@ def test_gaps_and_clocks_that_are_set_back() -> None:
         assert kept.tolist() == list(range(0, 60, 3))
     assert at_most(10.0, np.array([5, 5, 5, 5])).tolist() == [True, False, False, False]
     assert at_most(10.0, np.array([5])).tolist() == [True]
-
-
-@pytest.mark.parametrize("stamps", ["zero", "backward", "sound", "doubled"])
-def test_times_are_stamps_or_log_times(stamps: str) -> None:
-    log = camera(30.0, 10)
-    stamp = {
-        "zero": np.zeros(10, np.int64),
-        "backward": log[::-1].copy(),
-        "sound": log - 5,
-        "doubled": np.repeat(log[::3], 3)[:10],
-    }[stamps]
-    assert sound_times(stamp, log) is (stamp if stamps == "sound" else log)
 
 
 # ---------------------------------------------------------------- options

@@ -384,25 +384,6 @@ def test_the_view_of_a_lossless_camera_is_read_unless_the_exact_frames_are_asked
         assert (samples[0]["/left/image_raw"].numpy() != other[0]).any()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "layer", "context"),
-    [(FrameDataset, "exact", "forkserver"), (FrameStream, "view", "spawn")],
-)
-def test_workers_read_either_layer(kind: Any, layer: Any, context: str, with_views: Path) -> None:
-    topic = "/left/image_raw"
-    with mp4ds.open(with_views) as dataset:
-        expected = dataset[topic].read(range(len(dataset[topic])), layer=layer)
-    frames = kind(with_views, topics=[topic], layer=layer, channels_first=False)
-    next(iter(frames))  # opens both videos here, too
-    workers: Any = {"num_workers": 2, "multiprocessing_context": context}
-    found = {}
-    for batch in DataLoader(frames, batch_size=4, **workers):
-        found |= dict(zip(batch["index"].tolist(), batch[topic].numpy(), strict=True))
-    assert len(found) == len(expected)
-    assert all((pixels == expected[index]).all() for index, pixels in found.items())
-
-
 def test_exact_frames_that_are_not_here_are_told_at_once(with_views: Path, tmp_path: Path) -> None:
     drive = Path(shutil.copytree(with_views, tmp_path / "drive"))
     (drive / "left_image_raw.exact.mp4").unlink()

@@ -211,20 +211,6 @@ SCENES = {"gray": "mono8", "gray16le": "mono16", "rgb24": "rgb8", "bgr24": "bgr8
           "rgba": "rgba8", "bgra": "bgra8"}  # fmt: skip
 
 
-@pytest.mark.one_in(2)
-@pytest.mark.parametrize(
-    ("codec", "picture_format"), [pair for pair in LOSSLESS if pair[1] in SCENES]
-)
-@pytest.mark.parametrize("threads", [1, 3])
-def test_lossless_of_a_scene_with_threads(
-    codec: str, picture_format: str, threads: int, tmp_path: Path
-) -> None:
-    pictures = scene_pictures(SCENES[picture_format], 96, 66, 10)
-    recipe = recipe_for(picture_format, lossless=True, codec=codec)
-    told = encode(tmp_path / "v.mp4", recipe, pictures, picture_format, threads=threads)
-    assert all(map(same, decode(tmp_path / "v.mp4", told), pictures))
-
-
 # ---------------------------------------------------------------- colour
 
 TAGS = ("color_range", "color_space", "color_transfer", "color_primaries")

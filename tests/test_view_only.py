@@ -7,11 +7,9 @@ import os
 import re
 import shutil
 import warnings
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
@@ -61,20 +59,6 @@ def assert_shows(path: Path, seen: dict[str, Any]) -> None:
 
 
 # ---------------------------------------------------------------- looking
-
-
-def test_it_opens_as_a_dataset_of_visual_quality(views: Path, seen: dict[str, Any]) -> None:
-    with mp4ds.open(views) as dataset:
-        assert [(one.layer, one.sidecar.profile) for one in dataset.streams] == [
-            ("view", "visual")
-        ] * 2
-        for topic in dataset:
-            np.testing.assert_array_equal(topic[3].data, seen[topic.topic][3])
-            np.testing.assert_array_equal(
-                topic.read([5, 2], format="native", layer="view"), seen[topic.topic][[5, 2]]
-            )
-            with pytest.raises(mp4ds.OptionError, match="has no exact frames here"):
-                topic.read([0], layer="exact")
 
 
 @pytest.mark.parametrize(
@@ -198,14 +182,6 @@ def test_lerobot_gets_videos_of_the_views(views: Path, tmp_path: Path) -> None:
     assert len([*(tmp_path / "out").rglob("*.mp4")]) == 2
 
 
-def test_torch_reads_it(views: Path, with_views: Path) -> None:
-    pytest.importorskip("torch")
-    torch = import_module("mp4ds.torch")
-    own, whole = (torch.FrameDataset(path, topics=[LEFT]) for path in (views, with_views))
-    for number in (0, 7, len(own) - 1):
-        assert (own[number][LEFT] == whole[number][LEFT]).all()
-
-
 def test_encoder_settings_are_compared_on_the_views(views: Path, tmp_path: Path) -> None:
     words = ("--frames", "2", "--codecs", "h264", "--presets", "ultrafast", "--crf", "30")
     done = call("evaluate", views, "-o", tmp_path / "out", *words)
@@ -214,53 +190,3 @@ def test_encoder_settings_are_compared_on_the_views(views: Path, tmp_path: Path)
 
 
 # ---------------------------------------------------------------- one of them, and both again
-
-
-def test_a_camera_whose_exact_video_is_there_is_exact(
-    views: Path, with_views: Path, tmp_path: Path
-) -> None:
-    some = Path(shutil.copytree(views, tmp_path / "some"))
-    shutil.copy(with_views / EXACT[1], some)
-    with mp4ds.open(some) as dataset:
-        assert [stream.layer for stream in dataset.streams] == ["view", "exact"]
-    assert mp4ds.validate(some, deep=True) == []
-    refused(call("unpack", some, "-o", tmp_path / "a.mcap"), 2, "exact layer not here: 1 file, ")
-    exact = mp4ds.UnpackOptions(topics=[RIGHT])
-    mp4ds.unpack(some, "mcap", tmp_path / "some.mcap", exact)
-    mp4ds.unpack(with_views, "mcap", tmp_path / "whole.mcap", exact)
-    assert messages_of(tmp_path / "some.mcap") == messages_of(tmp_path / "whole.mcap")
-
-
-def test_with_its_files_put_back_it_is_exact_again(
-    views: Path, with_views: Path, tmp_path: Path
-) -> None:
-    again = Path(shutil.copytree(views, tmp_path / "again"))
-    for name in EXACT:
-        shutil.copy(with_views / name, again)
-    assert mp4ds.validate(again, deep=True) == []  # every message against its digest
-    for source, name in ((with_views, "whole"), (again, "again")):
-        summary = mp4ds.unpack(source, "mcap", tmp_path / f"{name}.mcap")
-        assert summary.notes == []
-    assert messages_of(tmp_path / "again.mcap") == messages_of(tmp_path / "whole.mcap")
-
-
-@pytest.mark.parametrize("change", ["other", "shorter"])
-def test_a_wrong_exact_video_is_told(
-    change: str, views: Path, with_views: Path, tmp_path: Path
-) -> None:
-    wrong = Path(shutil.copytree(views, tmp_path / "wrong"))
-    data = (with_views / EXACT[1]).read_bytes()
-    (wrong / EXACT[0]).write_bytes(data if change == "other" else data[: len(data) // 2])
-    shutil.copy(with_views / EXACT[1], wrong)
-    problems = mp4ds.validate(wrong)
-    assert any(EXACT[0] in str(problem) for problem in problems)
-    with pytest.raises(mp4ds.FormatError):
-        mp4ds.unpack(wrong, "mcap", tmp_path / "out.mcap")
-    assert not (tmp_path / "out.mcap").exists()
-    viewed = mp4ds.UnpackOptions(quality="visual")
-    mp4ds.unpack(wrong, "mcap", tmp_path / "views.mcap", viewed)  # which needs none of it
-
-
-def messages_of(path: Path) -> list[tuple[str, int, bytes]]:
-    with AnyReader([path]) as reader:
-        return [(c.topic, time, bytes(raw)) for c, time, raw in reader.messages()]

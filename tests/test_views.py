@@ -396,15 +396,6 @@ def test_both_videos_are_validated(view: bool, tmp_path: Path) -> None:
             unpacked(tmp_path, "mcap")
 
 
-def test_putting_the_exact_video_back(alone: tuple[Path, str], tmp_path: Path) -> None:
-    dataset, _ = alone
-    mp4ds.pack(tmp_path / "source" / "drive.mcap", tmp_path / "again", PackOptions(view="av1"))
-    (exact,) = (tmp_path / "again").glob("*.exact.mp4")
-    exact.rename(dataset / exact.name)
-    assert mp4ds.validate(dataset, deep=True) == []
-    assert compare([tmp_path / "source" / "drive.mcap"], unpacked(tmp_path, "mcap")) == []
-
-
 # ---------------------------------------------------------------- packed again
 
 LATER: dict[str, tuple[Any, dict[str, Any]]] = {
