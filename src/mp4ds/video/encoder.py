@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ from mp4ds.video.codecs import (
 from mp4ds.video.colour import samples
 from mp4ds.video.decoder import open_packet_decoder
 from mp4ds.video.media import TIME_BASE, new_mp4, raise_if_scarce, rate_hint
-from mp4ds.video.pixels import PictureConverter, PictureMaker, picture_to_frame, plain_frame
+from mp4ds.video.pixels import PictureConverter, PictureMaker, picture_to_frame
 
 _THREADS = Path("/proc/self/task")
 
@@ -118,25 +119,16 @@ class VideoEncoder:
         self.recipe = recipe
         self._coded = coded
         self.frames = 0
-        self._picture_format = picture_format
-        # a camera's own YUV keeps its range
-        self._converter = PictureConverter(
-            source_full_range=recipe.full_range, full_range=recipe.full_range
-        )
+        self._maker = _FrameMaker(recipe, picture_format)
         self.width, self.height = coded_size(recipe, width, height)
         self.options = {**_options(recipe, self.width, self.height), "g": str(gop)}
         self._container = new_mp4(path)
         try:
-            self._open_stream(threads, rate)
-        except MemoryError:  # which FFmpegError may be, too: no fault of the pictures
+            with _refused(recipe, width, height):
+                self._open_stream(threads, rate)
+        except BaseException:
             self._container.close()
             raise
-        except (FFmpegError, ValueError) as error:
-            self._container.close()
-            raise_if_scarce(error)
-            raise EncoderRefusedError(
-                f"{recipe.encoder} does not take pictures of {width}x{height}"
-            ) from None
 
     def _open_stream(self, threads: int, rate: float | None) -> None:
         if self.recipe.codec == "png":
@@ -165,17 +157,7 @@ class VideoEncoder:
         Raises:
             OSError: It cannot be written.
         """
-        frame = picture_to_frame(
-            picture,
-            self._picture_format,
-            self.recipe.pixel_format,
-            self._converter,
-            full_range=self.recipe.full_range,
-        )
-        frame.pts = tick
-        frame.time_base = TIME_BASE
-        frame.color_range = color_range(self.recipe)
-        self._mux(self._encoded(frame))
+        self._mux(self._encoded(self._maker.frame(picture, tick, TIME_BASE)))
         self.frames += 1
 
     def _mux(self, packets: Sequence[Any]) -> None:
@@ -225,6 +207,43 @@ class VideoEncoder:
             self.close()
         else:
             self.abandon()
+
+
+class _FrameMaker:
+    """Makes the frames that the encoder of a recipe takes from pictures of a pixel format."""
+
+    def __init__(self, recipe: Recipe, picture_format: str) -> None:
+        self._recipe, self._format = recipe, picture_format
+        is_full = recipe.full_range  # a camera's own YUV keeps its range
+        self._converter = PictureConverter(source_full_range=is_full, full_range=is_full)
+
+    def frame(self, picture: Picture, pts: int, time_base: Fraction) -> av.VideoFrame:
+        """The frame of a picture that is shown at a time."""
+        recipe = self._recipe
+        frame = picture_to_frame(
+            picture,
+            self._format,
+            recipe.pixel_format,
+            self._converter,
+            full_range=recipe.full_range,
+        )
+        frame.pts, frame.time_base = pts, time_base
+        frame.color_range = color_range(recipe)
+        return frame
+
+
+@contextmanager
+def _refused(recipe: Recipe, width: int, height: int) -> Iterator[None]:
+    """Raise `EncoderRefusedError` where the encoder does not take pictures of a size."""
+    try:
+        yield
+    except MemoryError:  # which FFmpegError may be, too: no fault of the pictures
+        raise
+    except (FFmpegError, ValueError) as error:
+        raise_if_scarce(error)
+        raise EncoderRefusedError(
+            f"{recipe.encoder} does not take pictures of {width}x{height}"
+        ) from None
 
 
 def _png_packet(frame: av.VideoFrame, stream: Any = None) -> Any:
@@ -473,40 +492,17 @@ def _encoded(
     """
     rows, columns = pictures[0][0].shape[:2]
     width, height = coded_size(recipe, columns, rows)
-    converter = PictureConverter(source_full_range=recipe.full_range, full_range=recipe.full_range)
+    maker, time_base = _FrameMaker(recipe, picture_format), Fraction(1, 30)
+    frames = (maker.frame(picture, n, time_base) for n, picture in enumerate(pictures))
     if recipe.codec == "png":
-        frames = (plain_frame(picture, picture_format) for picture in pictures)
-        files = list(map(_png_packet, frames))
-        for number, packet in enumerate(files):
-            packet.pts = number
-        return None, files
+        return None, list(map(_png_packet, frames))
     context: Any = av.CodecContext.create(recipe.encoder, "w")
     context.options = {**recipe.options, "g": str(len(pictures))}
-    context.time_base = Fraction(1, 30)
+    context.time_base = time_base
     context.framerate = Fraction(30)
-    packets: list[Any] = []
-    try:
+    with _refused(recipe, columns, rows):
         open_encoder(context, recipe, width, height, threads=threads)
-        for number, picture in enumerate(pictures):
-            frame = picture_to_frame(
-                picture,
-                picture_format,
-                recipe.pixel_format,
-                converter,
-                full_range=recipe.full_range,
-            )
-            frame.pts = number
-            frame.time_base = context.time_base
-            frame.color_range = color_range(recipe)
-            packets += context.encode(frame)
-        packets += context.encode(None)
-    except MemoryError:
-        raise
-    except (FFmpegError, ValueError) as error:
-        raise_if_scarce(error)
-        raise EncoderRefusedError(
-            f"{recipe.encoder} does not take pictures of {columns}x{rows}"
-        ) from None
+        packets = [packet for f in chain(frames, [None]) for packet in context.encode(f)]
     return context, packets
 
 
