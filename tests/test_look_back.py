@@ -93,21 +93,28 @@ def test_what_triggers_save(drive: Path, tmp_path: Path) -> None:
         assert again(dataset) == due(sent, time)
         with mp4ds.open(dataset) as opened:
             assert len(opened.streams) == 1
+            assert opened.slice_start == time - round(KEEP * S)  # where `play` begins
+            assert opened.latched_before == {STATIC: 2}
 
 
 def test_video_that_arrives_coded(tmp_path: Path) -> None:
     """It begins at a key frame, which may be earlier; frames are complete from there on."""
     paths = SOURCES["rosbag2-mcap-v5"](tmp_path / "source", CODED["video-h264"](frames=120))
-    sent = [one for one in messages(*paths) if one[0] == "/cam/video"]
-    summary, (time,) = looked_back(paths, tmp_path / "live", {200: Recorder.snapshot})
+    everything = messages(*paths)
+    sent = [one for one in everything if one[0] == "/cam/video"]
+    acts = {3 * len(everything) // 4: Recorder.snapshot}
+    summary, (time,) = looked_back(paths, tmp_path / "live", acts)
     (made,) = summary.datasets
-    found = [one for one in again(made.dataset, "rosbag2") if one[0] == "/cam/video"]
+    there = again(made.dataset, "rosbag2")
+    found = [one for one in there if one[0] == "/cam/video"]
     inside = [one for one in sent if time - KEEP * S <= one[1] < time]
     assert len(inside) <= len(found) < len(sent)
     assert set(inside) <= set(found) <= set(sent)
     assert mp4ds.validate(made.dataset, deep=True) == []
     with mp4ds.open(made.dataset) as dataset:
         assert len(dataset.streams) == 1
+        assert dataset.slice_start == min(one[1] for one in there)
+        assert dataset.latched_before == {}
 
 
 def test_nothing_is_left_without_a_trigger(drive: Path, tmp_path: Path) -> None:

@@ -141,7 +141,7 @@ def _whole(patterns: Sequence[str]) -> str:
 
 def _warnings(state: RecordProgress) -> Iterator[str]:
     yield from state.warnings
-    for path, is_complete in state.saved.items():
+    for path, is_complete in state.saved.items() if not is_quiet() else ():
         yield f"saving {path_text(path)}"
         if is_complete:
             yield f"saved {path_text(path)}"

@@ -24,7 +24,7 @@ from mp4ds.errors import FormatError, Refused, SourceError
 from mp4ds.files.outputs import check_target, is_mine, lock, staged, work_folder
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.format.fields import Gop, Model, Profile
-from mp4ds.format.manifest import About, LossEntry
+from mp4ds.format.manifest import About, LossEntry, Source
 from mp4ds.packing.manifest import PartRecord, dataset_files, summarize
 from mp4ds.packing.options import PackOptions, PackSummary
 from mp4ds.records import Loss, bounded
@@ -144,10 +144,20 @@ class SpoolFolder:
         *,
         force: bool,
         about: About | None,
+        sources: Sequence[Source] = (),
         losses: Sequence[Loss] = (),
         is_foreign: bool = False,
     ) -> PackSummary:
         """Make the dataset of all parts, perhaps from somebody else; the spool is no source of it.
+
+        Args:
+            parts: The parts, in order.
+            target: The dataset.
+            force: Replace an existing dataset.
+            about: Description of the recording.
+            sources: What it is a slice of, if any.
+            losses: What could not be read of pieces.
+            is_foreign: Whether parts may be from somebody else.
 
         Raises:
             Mp4dsError: It could not be made; the parts are still there.
@@ -165,7 +175,7 @@ class SpoolFolder:
                 "about": about,
                 "format": self.settings().format,
                 "library": "",
-                "sources": [],
+                "sources": list(sources),
                 "losses": list(map(LossEntry.from_record, lost)),
             }
             try:
@@ -225,7 +235,7 @@ def recover(
     found = _found(path)
     with folder.locked(), work_folder(target.parent, f".{target.name}.") as place:
         settings = folder.settings()
-        old = range(1, next(iter({*found} - {0}), 1)) if settings.looks_back else ()
+        old = range(1, min({*found} - {0}, default=1)) if settings.looks_back else ()
         parts, losses = [], _gaps([*sorted({*found, *old})])
         for number, is_packed in found.items():
             piece, part = folder.piece(number), folder.part(number)

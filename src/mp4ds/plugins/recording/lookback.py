@@ -19,6 +19,8 @@ from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import with_own_payload
 from mp4ds.errors import TargetError
 from mp4ds.files.outputs import sync
+from mp4ds.format.manifest import Excerpt as SourceExcerpt
+from mp4ds.format.manifest import Source
 from mp4ds.plugins.recording.spool import FAILURES, WINDOW_NS, Piece, Split
 from mp4ds.records import Channel, Excerpt, Message
 
@@ -45,6 +47,7 @@ class Saved(Split):
     def __init__(self, start: int, end: int, *spool: Any) -> None:
         super().__init__(*spool)
         self.start, self.end = start, end
+        self._first = start  # log time, ns: earlier are latched messages
         self.is_over = False
         self.awaited: set[int] = set()
         self._numbers: dict[int, int] = {}  # by those of the spool
@@ -84,9 +87,15 @@ class Saved(Split):
         first, last = piece.span
         # a video would begin with frames that are hidden, and could not be joined
         is_cut = first < self.start <= last and not piece.is_video
+        if first < self.start and not is_cut:
+            self._first = min(self._first, first)
         self._bytes += piece.bytes
         piece = replace(piece, number=self._numbers[piece.number])
         self._jobs.submit(self._pack, piece, self.start if is_cut else None)
+
+    def _sources(self) -> list[Source]:
+        excerpt = SourceExcerpt(start=self._first)
+        return [Source(name=self.folder.path.name, size=self._bytes, excerpt=excerpt)]
 
     def finish(self) -> None:
         """Have the dataset made when all is packed."""
@@ -178,7 +187,8 @@ class LookBack(Split):
             Mp4dsError: It cannot be saved.
         """
         self._prune(time)
-        saved = Saved(time - self._keep_ns, time + self._more_ns, self._new_path(), *self._spool)
+        start, end = max(0, time - self._keep_ns), time + self._more_ns
+        saved = Saved(start, end, self._new_path(), *self._spool)
         self.saved.append(saved)
         self._saving.append(saved)
         self._later(saved.begin, self.folder.piece(0), [*self._kept], [*announced])

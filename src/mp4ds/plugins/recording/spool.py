@@ -20,6 +20,7 @@ from mp4ds.bags.mcap import McapWriter
 from mp4ds.errors import Mp4dsError, TargetError, WriteError, path_text
 from mp4ds.files.outputs import check_target
 from mp4ds.files.sources import UNFINISHED, salvage_command
+from mp4ds.format.manifest import Source
 from mp4ds.format.sidecars import load_about
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import Time
@@ -290,7 +291,7 @@ class Split:
         if self.error is not None:
             return
         options = self._options
-        join = partial(_join, force=options.force, about=options.about)
+        join = partial(_join, force=options.force, about=options.about, sources=self._sources())
         try:
             made = self._process.submit(join, self.folder.path, self._count, self.target).result()
             raw = self._raw_bytes
@@ -300,6 +301,10 @@ class Split:
             self.folder.remove(self._count)
         except FAILURES as error:
             self.error = error
+
+    def _sources(self) -> list[Source]:
+        """What the dataset is a slice of."""
+        return []
 
     def failure(self, error: Exception) -> Exception:
         """What to raise because of an error; what was recorded stays where it is."""
@@ -325,10 +330,18 @@ def _pack(folder: Path, number: int, *, start: int | None = None) -> Mapping[str
     return {topic.topic: topic.raw_bytes for topic in made.topics}
 
 
-def _join(folder: Path, count: int, target: Path, *, force: bool, about: str | None) -> PackSummary:
+def _join(
+    folder: Path,
+    count: int,
+    target: Path,
+    *,
+    force: bool,
+    about: str | None,
+    sources: Sequence[Source],
+) -> PackSummary:
     """Make the dataset of all parts, which stay."""
     spool = SpoolFolder(folder)
     told = load_about(about) if about is not None else None
     with spool.locked(shared=True):
         parts = [spool.part(number) for number in range(count)]
-        return spool.join(parts, target, force=force, about=told)
+        return spool.join(parts, target, force=force, about=told, sources=sources)
