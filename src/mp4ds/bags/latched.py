@@ -8,7 +8,14 @@ from dataclasses import replace
 from itertools import chain
 from typing import Any
 
-from mp4ds.bags.protocols import BagReader, RecordingSlice, in_span, stats_of, with_own_payload
+from mp4ds.bags.protocols import (
+    WHOLE,
+    BagReader,
+    RecordingSlice,
+    in_span,
+    stats_of,
+    with_own_payload,
+)
 from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import SourceError
 from mp4ds.messages.serializations import is_camera
@@ -175,19 +182,32 @@ def take_slice(
         OptionError: It is empty, or a time is not valid.
         SourceError: The recording is damaged, or without messages.
     """
-    known = [item for item in reader.stats().values() if item.count]
-    if not known or not reader.is_indexed:
-        known = [item for item in stats_of(reader.times()).values() if item.count]
-    if not known:
-        raise SourceError(reader.path, "has no messages to take a slice of")
-    first, last = min(item.start for item in known), max(item.end for item in known)
-    first = max(first, reader.begin or first)
+    first, last = ends_of(reader)
     span = Excerpt(*asked.times(first, last, reader.path))
     if asked.latched and span.start is not None:
         latched = latched_before(reader, Excerpt(end=span.start), selected)
         reader.slice = RecordingSlice(span, *latched)
     else:
         reader.slice = RecordingSlice(span)
+
+
+def ends_of(reader: BagReader) -> tuple[int, int]:
+    """Where the times of slices begin, and the last log time of a whole recording, nanoseconds.
+
+    Raises:
+        SourceError: The recording is damaged, or without messages.
+    """
+    kept, reader.slice = reader.slice, WHOLE
+    try:
+        known = [item for item in reader.stats().values() if item.count]
+        if not known or not reader.is_indexed:
+            known = [item for item in stats_of(reader.times()).values() if item.count]
+    finally:
+        reader.slice = kept
+    if not known:
+        raise SourceError(reader.path, "has no messages to take a slice of")
+    first, last = min(item.start for item in known), max(item.end for item in known)
+    return max(first, reader.begin or first), last
 
 
 def latched_before(

@@ -72,6 +72,7 @@ class BagReader(ABC):
         slice: What is given of it; all, unless it was set.
         pairs: Calibration channels and those of their images, by id; None: yet to be found.
         reduction: What is done to its images, as manifests have it; empty for nothing.
+        redaction: What the last `records` made unrecognisable, as manifests have it.
     """
 
     format: Format
@@ -84,6 +85,7 @@ class BagReader(ABC):
     slice: RecordingSlice = WHOLE
     pairs: Mapping[int, int] | None = None
     reduction: Mapping[str, Any] = MappingProxyType({})
+    redaction: Mapping[str, Any] = MappingProxyType({})
 
     # what was found so far, which may grow while reading
     _channels: Mapping[Any, Channel] = MappingProxyType({})

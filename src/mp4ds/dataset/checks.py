@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,9 +20,18 @@ from pydantic import ValidationError
 
 from mp4ds.bags.formats import limits_of
 from mp4ds.dataset.dataset import Dataset, datasets_in
+from mp4ds.dataset.images import shown_by
 from mp4ds.dataset.messages import MessagesFile, Part, recorded_storage
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import ConversionError, FormatError, SourceError, SourceNotFoundError, VideoError
+from mp4ds.dataset.untouched import differences, holds_pixels
+from mp4ds.errors import (
+    ConversionError,
+    FormatError,
+    Refused,
+    SourceError,
+    SourceNotFoundError,
+    VideoError,
+)
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import Manifest, StreamEntry, TimeRange
@@ -36,6 +46,8 @@ from mp4ds.format.sidecars import (
     sidecar_of,
     verify_file,
 )
+from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
+from mp4ds.messages.serializations import MessageSplitter, is_camera
 from mp4ds.records import Message, Record
 from mp4ds.video.references import Structures, digest_video, packets_in_groups
 
@@ -211,6 +223,7 @@ def _validate_dataset(folder: Path, deep: bool, report: _Report) -> list[Problem
         if dataset is not None and not problems:
             report(f"reading {MESSAGES_NAME}", 1.0)
             problems += _found(_check_limits(dataset, manifest, _counted(dataset, manifest)))
+            problems += _found(_check_untouched(dataset, manifest, report))
     told = {(problem.code, problem.place) for problem in of_files}
     return [*of_files, *(one for one in problems if (one.code, one.place) not in told)]
 
@@ -360,6 +373,33 @@ def _check_verbatim(dataset: Dataset, manifest: Manifest) -> Iterator[FormatErro
         if problem:
             place = f"{dataset.path / MANIFEST_NAME} at verbatim.{number}"
             yield FormatError("manifest-inconsistent", place, problem)
+
+
+def _check_untouched(
+    dataset: Dataset, manifest: Manifest, report: _Report
+) -> Iterator[FormatError]:
+    """Check what a redaction left as it was against the digests of the originals."""
+    for told in (topic for entry in manifest.redactions for topic in entry.topics):
+        name = told.topic
+        if told.untouched is None or dataset.absence(name.__eq__):
+            continue
+        report(f"comparing untouched blocks of {name}", 1.0)
+        for problem in differences(told.untouched.values, _images(dataset, name)):
+            place = f"{dataset.path / MANIFEST_NAME} at redactions"
+            yield FormatError("redaction-mismatch", place, f"{name} {problem}")
+
+
+def _images(dataset: Dataset, topic: str) -> Iterator[tuple[Encoding, Pixels]]:
+    """The images of a topic of which messages have every sample."""
+    splitters: dict[int, MessageSplitter] = {}
+    for record in dataset.records(topics=[topic]):
+        if isinstance(record, Message) and is_camera(record.channel):
+            channel = record.channel
+            with suppress(Refused):
+                _, parts = splitters.setdefault(channel.id, MessageSplitter(channel)).split(record)
+                if holds_pixels(parts):
+                    shown = shown_by(channel, parts)
+                    yield ENCODINGS[shown.encoding], shown.pixels
 
 
 def _counted(dataset: Dataset, manifest: Manifest) -> Iterator[Record]:

@@ -196,6 +196,10 @@ def copy_part(
         "about": about or old.about,
         "sources": [source.within(part.span) for source in old.sources],
         "derived_from": [*old.derived_from, earlier],
+        "redactions": [
+            entry.proving(selected if part == WHOLE and not is_view else lambda _: False)
+            for entry in old.redactions
+        ],
     }
     concat([dataset], folder, part=part, selected=selected, changes=changes)
 

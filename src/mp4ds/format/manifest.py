@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, model_validator
@@ -103,6 +103,79 @@ class ReductionEntry(Model):
             f"at most {self.max_rate:g} images a second" if self.max_rate else "",
         ]
         return ", ".join(filter(None, told))
+
+
+class UntouchedPart(Model):
+    """Proof of what a redaction left as it was."""
+
+    values: Annotated[str, Field(pattern=r"^([1-9][0-9]{0,7} ([0-9a-f]{2})+ [0-9a-f]{64}\n)+$")] = (
+        Field(description="A line for each span of images.")
+    )
+
+
+class RedactedTopic(Model):
+    """What a redaction did to the images of a topic."""
+
+    topic: str
+    type: str = Field(description="Of their messages before.")
+    images: Size = Field(description="Messages of images that were looked at.")
+    changed: Size = Field(description="Images of these that were changed.")
+    untouched: UntouchedPart | None = Field(
+        None, description="Digests of the blocks without any change; absent: none were made."
+    )
+
+
+class RedactionEntry(Model):
+    """How parts of images were made unrecognisable before they were packed."""
+
+    rules_sha256: Sha256 | None = Field(None, description="Of the file of rules.")
+    function: str | None = Field(
+        None, description="Module and name of the function that found what to change."
+    )
+    rules: list[Size] = Field(
+        default_factory=list, description="Images that each rule of the file changed."
+    )
+    topics: list[RedactedTopic] = Field(
+        default_factory=list, description="Those of which images were looked at."
+    )
+
+    @property
+    def text(self) -> str:
+        """All of it in words."""
+        told = (f"{one.changed} of {one.images} of {one.topic}" for one in self.topics)
+        return ", ".join(told) or "none"
+
+    @property
+    def told(self) -> dict[str, str]:
+        """What was done, by the file of rules or the function."""
+        values = {"rules_sha256": self.rules_sha256, "function": self.function}
+        return {key: value for key, value in values.items() if value}
+
+    def proving(self, is_proven: Callable[[str], bool] = lambda _: False) -> RedactionEntry:
+        """The same, with digests of the topics of which all images are as they were."""
+        topics = [
+            one if is_proven(one.topic) else one.model_copy(update={"untouched": None})
+            for one in self.topics
+        ]
+        return self.model_copy(update={"topics": topics})
+
+    @classmethod
+    def joined(cls, parts: Sequence[RedactionEntry]) -> RedactionEntry:
+        """That of a recording, of those of its parts, at least one."""
+        topics: dict[str, RedactedTopic] = {}
+        for own in (topic for part in parts for topic in part.topics):
+            if before := topics.get(own.topic):
+                values = [one.untouched.values for one in (before, own) if one.untouched]
+                own = before.model_copy(
+                    update={
+                        "images": before.images + own.images,
+                        "changed": before.changed + own.changed,
+                        "untouched": UntouchedPart(values="".join(values)) if values else None,
+                    }
+                )
+            topics[own.topic] = own
+        rules = [sum(counts) for counts in zip(*(part.rules for part in parts), strict=True)]
+        return parts[0].model_copy(update={"rules": rules, "topics": list(topics.values())})
 
 
 class StreamEntry(Model):
@@ -291,6 +364,10 @@ class Manifest(Model):
         default_factory=list,
         description="What was done to the images before they were packed, the oldest first.",
     )
+    redactions: list[RedactionEntry] = Field(
+        default_factory=list,
+        description="What was made unrecognisable before they were packed, the oldest first.",
+    )
     messages: Size = Field(description="Messages of the recording that were packed.")
     losses: Annotated[list[LossEntry], Field(max_length=MAX_LOSSES)] = Field(
         default_factory=list, description="What of the recording could not be read."
@@ -315,8 +392,16 @@ class Manifest(Model):
     @property
     def reduced(self) -> str:
         """What was done to the images before they were packed, in words; empty for nothing."""
-        told = "; then ".join(entry.text for entry in self.reductions)
-        return told and f"images were reduced before they were packed: {told}"
+        redacted, reduced = (
+            "; then ".join(entry.text for entry in entries)
+            for entries in (self.redactions, self.reductions)
+        )
+        told = {"redacted": redacted, "reduced": reduced}
+        return "; ".join(
+            f"images were {what} before they were packed: {text}"
+            for what, text in told.items()
+            if text
+        )
 
     @model_validator(mode="after")
     def _once(self) -> Manifest:

@@ -240,6 +240,7 @@ class PartedPack:
                     if manifest:
                         whole.losses += [entry.to_record() for entry in manifest.losses]
                         whole.left_out |= dict.fromkeys(manifest.topics_left_out)
+                        whole.redactions += manifest.redactions
                 concat(
                     parts,
                     made,

@@ -10,7 +10,7 @@ from typing import Any
 from mp4ds._version import __version__
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.errors import FormatError, SourceError, advising, size_text
+from mp4ds.errors import FormatError, SourceError, advising, counted, size_text
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.sources import source_name, source_size
 from mp4ds.files.urls import spelled
@@ -21,6 +21,7 @@ from mp4ds.format.manifest import (
     FileEntry,
     LossEntry,
     Manifest,
+    RedactionEntry,
     ReductionEntry,
     Source,
     StreamEntry,
@@ -38,6 +39,7 @@ from mp4ds.format.sidecars import (
     verify_file,
 )
 from mp4ds.messages.png import zlib_build
+from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.transforms import Transform
 from mp4ds.packing.options import PackSummary, TopicSummary
 from mp4ds.records import Channel, Loss, bounded
@@ -63,6 +65,7 @@ class PartRecord:
         skipped: What the source holds and no dataset can: a phrase -> how many.
         transforms: Static transforms, the latest of each child frame.
         losses: What could not be read of a damaged recording.
+        redactions: What was made unrecognisable, of each part.
     """
 
     folder: Path
@@ -73,6 +76,7 @@ class PartRecord:
     skipped: dict[str, int] = field(default_factory=dict)
     transforms: list[Transform] = field(default_factory=list)
     losses: list[Loss] = field(default_factory=list)
+    redactions: list[RedactionEntry] = field(default_factory=list)
 
     @property
     def messages_path(self) -> Path:
@@ -135,6 +139,10 @@ def origin_of(
     reductions = [entry for one in manifests.values() for entry in one.reductions]
     if reader.reduction:
         reductions.append(ReductionEntry.model_validate(reader.reduction))
+    before = [entry for one in manifests.values() for entry in one.redactions]
+    redactions = [entry.proving() for entry in before]
+    if part.redactions:
+        redactions.append(RedactionEntry.joined(part.redactions))
     return {
         "about": about,
         "format": reader.format,
@@ -143,6 +151,7 @@ def origin_of(
         "sources": [source.within(reader.slice.span) for source in sources],
         "derived_from": earlier,
         "reductions": reductions,
+        "redactions": redactions,
         "losses": list(map(LossEntry.from_record, bounded([*losses, *part.losses]))),
         "topics_left_out": list(dict.fromkeys([*left_out, *part.left_out])),
     }
@@ -252,6 +261,13 @@ def _topics_in(made: Dataset, known: Mapping[str, TopicSummary]) -> dict[str, To
             topic.notes.append(str(video.quality))
         if stream.path.stem != FileNames().name_for(stream.topic):
             topic.notes.append(f"stored as {video.file}: its usual name was taken")
+    for done in made.manifest.redactions[-1:] if made.manifest else ():
+        found = {one.topic: one for one in done.topics}
+        for channel in filter(is_camera, made.channels):
+            own, notes = found.get(channel.topic), topics[channel.topic].notes
+            note = f"{own.changed} of {counted(own.images, 'image')}" if own else "no image"
+            if (note := f"{note} redacted") not in notes:
+                notes.append(note)
     for entry in made.manifest.verbatim if made.manifest else ():
         topics[entry.topic].verbatim[entry.reason] = (entry.messages, entry.first)
     return {name: topics[name] for name in dict.fromkeys((*order, *topics))}

@@ -30,6 +30,7 @@ from mp4ds.options import (
     option,
     parse_time,
 )
+from mp4ds.packing.redaction import Find, Redaction, parse_redaction
 from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
 from mp4ds.video.codecs import (
     ARCHIVE,
@@ -150,6 +151,13 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
         panel=WHAT,
         changes=ENCODING,
     )
+    redact: Parsed[Redaction | Find | Path | None] = option(
+        "YAML file of boxes to fill or blur in images, by topic and time; in Python also a "
+        "function that finds them.",
+        metavar="FILE",
+        parse=parse_redaction,
+        changes=ENCODING,
+    )
     crop: Parsed[tuple[int, int, int, int] | None] = option(
         "Keep this part of the images, in pixels; before `resize`.",
         metavar="X,Y,W,H",
@@ -239,6 +247,11 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
             raise OptionError("`nearest` says how images are resized: give `resize`, too.")
         if self.derives and self.purpose is None and self.gop is None:
             object.__setattr__(self, "purpose", TRAINING)
+
+    @property
+    def redaction(self) -> Redaction | None:
+        """What to redact, parsed."""
+        return None if self.redact is None else parse_redaction(self.redact)
 
     @property
     def derives(self) -> bool:

@@ -408,9 +408,11 @@ def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
         span = reader.slice.span
         sizes = sorted(map(source_size, reader.files))
     reductions = [ReductionEntry.model_validate(options.reduction)] if options.derives else []
+    hidden = [options.redaction.told] if options.redaction else []
     if folder:
         known = load_manifest(folder / MANIFEST_NAME)
         reductions = [*known.reductions, *reductions]
+        hidden = [*(one.told for one in known.redactions), *hidden]
         due = [item.within(span) for item in known.sources]
         earlier = [item.sha256 for item in manifest.derived_from[-1:]]
         is_same = earlier == [digest_file(folder / MANIFEST_NAME)[1]] and manifest.sources == due
@@ -421,7 +423,7 @@ def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
         )
     done = [entry.model_copy(update={"images": []}) for entry in manifest.reductions]
     asked = [entry.model_copy(update={"images": []}) for entry in reductions]
-    if not is_same or done != asked:
+    if not is_same or done != asked or [one.told for one in manifest.redactions] != hidden:
         raise TargetExistsError(target)
     return True
 

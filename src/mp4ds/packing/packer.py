@@ -17,6 +17,7 @@ from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import Refused
 from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, digests_model, exceeds_padding
+from mp4ds.format.manifest import RedactionEntry
 from mp4ds.format.models import (
     EXACT_SUFFIX,
     CameraInfo,
@@ -517,6 +518,8 @@ class Packer:
                 stream.abandon()
             raise
         part.transforms = self._transforms.transforms
+        if self.reader.redaction:
+            part.redactions = [RedactionEntry.model_validate(self.reader.redaction)]
         return part
 
     def _read(self) -> None:

@@ -504,8 +504,8 @@ def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagR
     try:
         if options.slice:
             take_slice(reader, options.slice, options.selected)
-        if options.derives:
-            reader = plugin("reduce")(reader, options)
+        for name, is_asked in {"redact": options.redact, "reduce": options.derives}.items():
+            reader = plugin(name)(reader, options) if is_asked else reader
     except BaseException:
         reader.close()
         raise
@@ -575,8 +575,7 @@ def divide(
         threads = max(1, spare // workers)
     else:
         pieces = [Piece("all", EVERYTHING)]
-        if recordings == 1:
-            cores = options.jobs or cores
+        cores = options.jobs or cores if recordings == 1 else cores
         workers = min(cores, len(list(filter(is_camera, reader.channels))) or 1)
         threads = max(1, -(-cores // workers))
     return Plan(
@@ -690,6 +689,7 @@ _PLUGINS = {
     "images": "importing.layouts:open_images",
     "cluster": "cluster:cluster_executor",
     "reduce": "reducing:ReducedReader",
+    "redact": "redacting:RedactedReader",
 }
 """What the core asks for -> module of `mp4ds.plugins`, and its name there."""
 

@@ -51,13 +51,59 @@ from mp4ds.video.decoder import PacketPictures
 _MOST_LOOKED_AT = 1000  # messages of a topic for an image that can be decoded
 _MOST_BEFORE = 1000  # packets before a slice that are held
 _INFO = Kind("sensor_msgs/msg/CameraInfo", "info", "calibrations", None)
-_PACKETS = ("CompressedVideo", "FFMPEGPacket")
+PACKETS = ("CompressedVideo", "FFMPEGPacket")
+"""Ends of the names of types of video packets."""
 
 _Kind = tuple[str, tuple[int, int]]
 """Encoding, or codec, and width and height of images."""
 
 
-class ReducedReader(BagReader):
+class ChangedReader(BagReader):
+    """A recording of which some messages are changed while it is read.
+
+    Args:
+        reader: The recording; closed with this one.
+    """
+
+    is_indexed: bool = False
+
+    def __init__(self, reader: BagReader) -> None:
+        self._reader = reader
+        self.path, self.files, self.format = reader.path, reader.files, reader.format
+        self.profile, self.library, self.tables = reader.profile, reader.library, reader.tables
+        self.begin, self.slice = reader.begin, reader.slice
+        known = reader.stats().keys()
+        if not (reader.is_indexed or (known and known <= {one.id for one in reader.channels})):
+            deque(reader.records(Excerpt(others=False)), maxlen=0)  # which declares them
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """All channels, as their messages are given."""
+        return self._reader.channels
+
+    unused_schemas = property(lambda self: self._reader.unused_schemas)
+    skipped = property(lambda self: self._reader.skipped)
+    losses = property(lambda self: self._reader.losses)
+    position = property(lambda self: self._reader.position)
+    redaction = property(lambda self: self._reader.redaction)
+
+    def times(self) -> Mapping[int, NDArray[np.int64]]:
+        """Log times of the messages that are given, nanoseconds, sorted, by channel id."""
+        return self._reader.times()
+
+    def stats(self) -> Mapping[int, ChannelStats]:
+        """Counts and time spans by channel id, of channels of which they are known."""
+        return self._reader.stats()
+
+    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
+        return self.records(excerpt)
+
+    def close(self) -> None:
+        """Close the recording."""
+        self._reader.close()
+
+
+class ReducedReader(ChangedReader):
     """A recording with smaller or fewer images.
 
     Coded images that change become raw ones, on their topic. A message without a picture that can
@@ -71,16 +117,9 @@ class ReducedReader(BagReader):
         OptionError: A pair of calibrations and images, or a pattern of topics, is not possible.
     """
 
-    is_indexed: bool = False
-
     def __init__(self, reader: BagReader, options: PackOptions) -> None:
-        self._reader, self.options = reader, options
-        self.path, self.files, self.format = reader.path, reader.files, reader.format
-        self.profile, self.library, self.tables = reader.profile, reader.library, reader.tables
-        self.begin, self.slice = reader.begin, reader.slice
-        counted = reader.stats().keys()
-        if not (reader.is_indexed or (counted and counted <= {one.id for one in reader.channels})):
-            deque(reader.records(Excerpt(others=False)), maxlen=0)  # which declares them
+        super().__init__(reader)
+        self.options = options
         chosen = [channel for channel in reader.channels if options.selected(channel.topic)]
         self._cameras = {channel.id: channel for channel in filter(is_camera, chosen)}
         for pattern in options.nearest:
@@ -89,9 +128,7 @@ class ReducedReader(BagReader):
                 listed = ", ".join(topics) or "none"
                 problem = f"`nearest` {pattern!r} matches no topic of images"
                 raise OptionError(f"{problem}. Topics of images: {listed}.")
-        self.videos = {
-            key for key, one in self._cameras.items() if one.type_name.endswith(_PACKETS)
-        }
+        self.videos = {key for key, one in self._cameras.items() if one.type_name.endswith(PACKETS)}
         self.remade = set(self.videos)
         if options.resize is not None or options.crop is not None:
             self.remade |= self._cameras.keys() | {one.id for one in chosen if is_calibration(one)}
@@ -146,11 +183,6 @@ class ReducedReader(BagReader):
         """All channels, as their messages are given."""
         return [self._given.get(channel.id, channel) for channel in self._reader.channels]
 
-    unused_schemas = property(lambda self: self._reader.unused_schemas)
-    skipped = property(lambda self: self._reader.skipped)
-    losses = property(lambda self: self._reader.losses)
-    position = property(lambda self: self._reader.position)
-
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times of the messages that are given, nanoseconds, sorted, by channel id."""
         if self.options.max_rate is not None:
@@ -166,9 +198,6 @@ class ReducedReader(BagReader):
             if self.options.max_rate is None:
                 known[key] = replace(own, count=-(-own.count // self.options.every))
         return known
-
-    def _records(self, excerpt: Excerpt) -> Iterator[Record]:
-        return self.records(excerpt)
 
     def _videos_in(self, excerpt: Excerpt) -> list[str]:
         """Topics of packets, of which those before a slice may be needed to decode those in it."""
@@ -209,10 +238,6 @@ class ReducedReader(BagReader):
             before = 0 if start is None else int(np.searchsorted(times, start))
             usual = usual_interval(intervals(times[:: self.options.every]))
         return _Camera(self, channel, before, None if rate is None else RateLimit(rate, usual))
-
-    def close(self) -> None:
-        """Close the recording."""
-        self._reader.close()
 
     # ------------------------------------------------------------ messages
 

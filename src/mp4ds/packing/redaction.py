@@ -1,0 +1,241 @@
+"""Rules of what to redact in images, and what becomes of their pixels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mp4ds.dataset.untouched import Rectangle, regions
+from mp4ds.errors import OptionError
+from mp4ds.files.urls import location
+from mp4ds.format.redaction import LEAST_SQUARE, PROVEN_TOGETHER, Rule, load_rules
+from mp4ds.messages.encodings import Encoding, Pixels
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A part of an image, and what becomes of it.
+
+    Attributes:
+        x: Columns to its left, pixels; a fraction is rounded so that the box gets larger.
+        y: Rows above it.
+        width: Its columns.
+        height: Its rows.
+        fill: A value for all its samples, or a value per channel, in the order red, green, blue
+            where they are colours.
+        blur: Side of the squares that get their mean, pixels, at least 8; None to fill it.
+    """
+
+    x: float
+    y: float
+    width: float
+    height: float
+    fill: float | Sequence[float] = 0
+    blur: int | None = None
+
+
+Find = Callable[[str, int, Pixels], Iterable[Box | Sequence[float]]]
+"""Finds what to redact in an image: topic, log time in ns, and pixels -> boxes, or x, y, width and
+height of those to fill with 0."""
+
+
+@dataclass(frozen=True)
+class Redaction:
+    """What to redact.
+
+    Attributes:
+        name: Of the file, or of the function.
+        sha256: Of the file; None of a function.
+        rules: Of the file.
+        find: The function.
+        proof: Changed images of which untouched blocks are proven together; 0 for no proof.
+    """
+
+    name: str
+    sha256: str | None = None
+    rules: Sequence[Rule] = ()
+    find: Find | None = None
+    proof: int = PROVEN_TOGETHER
+
+    def __str__(self) -> str:  # as the note of a plan has it: a file may have moved
+        return f"rules with SHA-256 {self.sha256}" if self.sha256 else f"function {self.name}"
+
+    def called(self, number: int) -> str:
+        """A rule as errors call it, by its number from 0."""
+        return f"{self.name}: rule {number + 1} ({self.rules[number].topic})"
+
+    @property
+    def told(self) -> dict[str, str]:
+        """What a manifest says of it."""
+        return {"rules_sha256": self.sha256} if self.sha256 else {"function": self.name}
+
+
+def parse_redaction(value: Redaction | Find | Path | str) -> Redaction:
+    """The redaction by a function, or by the rules of a file.
+
+    Raises:
+        OptionError: The file cannot be read, or is none of rules; says where.
+    """
+    if isinstance(value, Redaction):
+        return value
+    if callable(value):
+        kind = value if hasattr(value, "__qualname__") else type(value)
+        return Redaction(f"{kind.__module__}:{kind.__qualname__}", find=value)
+    place = location(value)
+    found, digest = load_rules(place)
+    return Redaction(str(place), digest, tuple(found.rules), proof=found.proof)
+
+
+# ---------------------------------------------------------------- pixels
+
+
+def placed(
+    box: Box, encoding: Encoding, size: tuple[int, int], *, widened: bool
+) -> Rectangle | None:
+    """Where a box is in an image.
+
+    Args:
+        box: The box.
+        encoding: Of the image.
+        size: Its width and height.
+        widened: Limit it to the image, and widen it to whole pixels, and to all that share their
+            colours with some in it; None if it is outside.
+
+    Raises:
+        OptionError: It is not as it would be made by `widened`; says what is wrong.
+    """
+    numbers = box.x, box.y, box.width, box.height
+    if not all(map(math.isfinite, numbers)) or min(box.width, box.height) <= 0:
+        raise OptionError(f"box {list(numbers)} has no area")
+    ends = []
+    for start, length, side, step in zip(
+        numbers[:2], numbers[2:], size, encoding.even, strict=True
+    ):
+        first = max(0, math.floor(start) // step * step)
+        last = min(side, -(-math.ceil(start + length) // step) * step)
+        ends.append((first, last - first))
+    (x, width), (y, height) = ends
+    made = x, y, width, height
+    if widened:
+        return made if min(width, height) > 0 else None
+    if numbers[0] + numbers[2] > size[0] or numbers[1] + numbers[3] > size[1]:
+        raise OptionError(f"box {list(numbers)} is not inside the {size[0]}x{size[1]} image")
+    if made != numbers:
+        raise OptionError(
+            f"box {list(numbers)} divides pixels that share their colours: {encoding.name} images "
+            f"need {list(made)}"
+        )
+    return made
+
+
+def check_change(box: Box, encoding: Encoding, *, is_depth: bool) -> None:
+    """Refuse what cannot become of a part of an image.
+
+    Raises:
+        OptionError: Says why.
+    """
+    if box.blur is None:
+        _values(encoding, box.fill, 0, 0, 0)
+    elif is_depth:
+        raise OptionError(
+            f"blur of {encoding.name} images would make up distances: give fill, where 0 is none"
+        )
+    elif box.blur < LEAST_SQUARE:
+        raise OptionError(f"blur {box.blur} is below {LEAST_SQUARE}")
+
+
+def redact(pixels: Pixels, encoding: Encoding, box: Box, part: Rectangle) -> None:
+    """Change a part of an image.
+
+    Args:
+        pixels: Contiguous, in native byte order.
+        encoding: Of the image.
+        box: What becomes of it.
+        part: Where it is; see `placed`.
+    """
+    x, y, *_ = part
+    for number, region in enumerate(regions(encoding, pixels, part)):
+        # samples of one colour are this many rows and columns apart
+        is_packed = encoding.rows == 1 and encoding.even != (1, 1)
+        down = 2 if encoding.mosaic else 1
+        across = 2 if encoding.mosaic or number or is_packed else 1
+        for row in range(down):
+            for column in range(across):
+                own = region[row::down, column::across]
+                if box.blur:
+                    _pixelate(own, box.blur // down, box.blur // across)
+                else:
+                    phase = (y + row) % down, (column if number else x + column) % across
+                    own[...] = _values(encoding, box.fill, number, *phase)
+
+
+def _pixelate(pixels: Pixels, rows: int, columns: int) -> None:
+    """Give each rectangle of so many rows and columns its mean."""
+    height, width = pixels.shape[:2]
+    if not pixels.size:
+        return
+    tops, lefts = np.arange(0, height, rows), np.arange(0, width, columns)
+    sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float64), tops, 0), lefts, 1)
+    heights, widths = np.diff(tops, append=height), np.diff(lefts, append=width)
+    areas = np.outer(heights, widths)
+    means = sums / (areas if sums.ndim == 2 else areas[..., None])
+    if pixels.dtype.kind != "f":
+        means = np.rint(means)
+    pixels[...] = means.repeat(heights, 0).repeat(widths, 1)
+
+
+def _values(
+    encoding: Encoding, fill: float | Sequence[float], number: int, row: int, column: int
+) -> NDArray[Any]:
+    """The samples of a filled pixel.
+
+    Args:
+        encoding: Of the image.
+        fill: As of a box.
+        number: Of its region.
+        row: Its number modulo that of rows between those of one colour.
+        column: As of rows.
+
+    Raises:
+        OptionError: They do not exist.
+    """
+    name, channels = encoding.name, encoding.channels
+    given = list(fill) if isinstance(fill, Sequence) else None
+    is_yuv = encoding.even != (1, 1) or encoding.rows != Fraction(1)
+    is_coloured = is_yuv or bool(encoding.mosaic) or name[:3] in ("rgb", "bgr")
+    due = 3 if is_coloured else channels
+    if given is not None and len(given) != due:
+        numbers = f"{due} values" if due > 1 else "a single value"
+        raise OptionError(f"fill {given} does not fit: {name} images need {numbers}")
+    colour = [fill] * due if given is None else given
+    made: Any = colour
+    if is_yuv:
+        matrix = [[65.481, 128.553, 24.966], [-37.797, -74.203, 112.0], [112.0, -93.786, -18.214]]
+        y, u, v = np.rint(np.array(matrix) @ np.array(colour, float) / 255 + [16, 128, 128])
+        chroma = ((v, u) if name == "nv21" else (u, v))[column % 2]
+        if encoding.rows != 1:
+            made = chroma if number else y
+        else:
+            made = [chroma, y] if name in ("uyvy", "yuv422") else [y, chroma]
+    elif encoding.mosaic:
+        made = colour["rgb".index(encoding.mosaic[2 * row + column])]
+    elif name[:3] in ("rgb", "bgr"):
+        made = colour[::-1] if name.startswith("bgr") else colour
+        made = [*made, np.iinfo(encoding.dtype).max][:channels] if channels == 4 else made
+    elif channels == 1:
+        made = colour[0]
+    values = np.array(made, np.float64)
+    if not encoding.is_float:
+        bounds = np.iinfo(encoding.dtype)
+        wanted = np.array(colour, np.float64)
+        low, high = (0, 255) if is_yuv else (bounds.min, bounds.max)
+        if not ((wanted >= low) & (wanted <= high) & (wanted == np.rint(wanted))).all():
+            raise OptionError(f"fill {fill} is no value of {name} images: {low} to {high}")
+    return values.astype(encoding.dtype)
