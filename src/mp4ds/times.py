@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import index as as_integer
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,18 +208,21 @@ def nearest(times: Integers, wanted: Integers) -> Integers:
     return found
 
 
-def constant_rate(columns: Sequence[Integers], fps: int) -> Integers:
+def constant_rate(columns: Sequence[Integers], fps: int, path: Path | str) -> Integers:
     """Times at a constant rate, from when all columns have begun until one ends.
 
     Args:
         columns: Sorted times of cameras, nanoseconds, at least one each.
         fps: Times per second.
+        path: The dataset, for the error.
 
-    Returns:
-        Nanoseconds; none if the columns do not overlap.
+    Raises:
+        OptionError: The columns do not overlap.
     """
     start, end = max(int(times[0]) for times in columns), min(int(times[-1]) for times in columns)
-    length = ((end - start) * fps + _NS // 2) // _NS + 1 if end >= start else 0
+    if end < start:
+        raise OptionError(f"{path}: its cameras do not overlap in time. Select some with `topics`.")
+    length = ((end - start) * fps + _NS // 2) // _NS + 1
     # integers throughout: floats would shift late frames
     found: Integers = start + (np.arange(length, dtype=np.int64) * _NS + fps // 2) // fps
     return found

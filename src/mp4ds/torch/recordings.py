@@ -202,9 +202,7 @@ def _at_rate(
         order = order[order >= np.maximum.accumulate(order)]  # without those that go back in time
         numbers.append(order)
         columns.append(times[order])
-    rows = constant_rate(columns, fps)
-    if not len(rows):
-        raise OptionError(f"{path}: its cameras do not overlap in time. Select some with `topics`.")
+    rows = constant_rate(columns, fps, path)
     found = [own[nearest(times, rows)] for own, times in zip(numbers, columns, strict=True)]
     return Recording.of(str(path), sources, topics, np.column_stack(found).astype(np.int64), rows)
 

@@ -19,7 +19,7 @@ from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import AV_VERSION, CODECS, check_pyav
-from mp4ds.video.mp4 import SampleEntry, SampleTable, read_sample_table, why_unreadable
+from mp4ds.video.mp4 import SampleEntry, SampleTable, sample_table_of, why_unreadable
 
 _FILES = (errno.EMFILE, errno.ENFILE)
 _ENOUGH_BYTES = 32 * 2**20
@@ -145,9 +145,7 @@ class Media:
         try:
             if not self._is_mp4:
                 raise Refused("it is no mp4")
-            with self._path.open("rb") as file:
-                size = self._path.stat().st_size
-                return read_sample_table(file, size, str(self._path), self._number)
+            return sample_table_of(self._path, self._number)
         except Refused:  # ffmpeg reads more, though only by all packets
             return self._table_of_packets()
         except OSError as error:

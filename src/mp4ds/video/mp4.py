@@ -402,6 +402,12 @@ class _Movie:
         return np.frombuffer(self._data, row, count, box.start + at)
 
 
+def sample_table_of(path: Path, track: int | None = None) -> SampleTable:
+    """The index of a video track of a file: see `read_sample_table`."""
+    with path.open("rb") as file:
+        return read_sample_table(file, path.stat().st_size, str(path), track)
+
+
 def read_sample_table(
     stream: BinaryIO, size: int, place: str, track: int | None = None
 ) -> SampleTable:

@@ -17,7 +17,7 @@ from mp4ds.errors import Refused, VideoError
 from mp4ds.files.outputs import digest_file
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded import CodedFrame, StreamParser, UnknownStructure
-from mp4ds.video.mp4 import SampleTable, read_sample_table
+from mp4ds.video.mp4 import SampleTable, sample_table_of
 
 MAX_STRUCTURES = 256
 """Maximum number of distinct ones in a video; one that has more is not described."""
@@ -251,8 +251,7 @@ def packets_in_groups(path: Path) -> NDArray[np.int64]:
         Refused: Its index is not read.
         OSError: It cannot be read.
     """
-    with path.open("rb") as file:
-        return packets_of_groups(read_sample_table(file, path.stat().st_size, str(path)))
+    return packets_of_groups(sample_table_of(path))
 
 
 def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:
@@ -263,8 +262,7 @@ def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:
 def _table(path: Path) -> SampleTable | None:
     """The index of a video whose packets are contiguous; None if that is unknown."""
     try:
-        with path.open("rb") as file:
-            table = read_sample_table(file, path.stat().st_size, str(path))
+        table = sample_table_of(path)
     except (VideoError, Refused):
         return None
     ends = table.places + table.sizes

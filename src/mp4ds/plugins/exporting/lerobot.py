@@ -92,7 +92,8 @@ def write(*jobs: ExportJob) -> None:
     first = 0
     for number, (job, own) in enumerate(zip(jobs, cameras, strict=True)):
         job.tell(f"episode {number + 1} of {len(jobs)}", number / len(jobs))
-        episode = Episode(number, first, _grid(job, own, fps))
+        times = constant_rate([camera.times for camera in own], fps, job.dataset.path)
+        episode = Episode(number, first, times)
         episode.tasks = _tasks(job, episode.times, fps)
         for task in episode.tasks:
             tasks.setdefault(task, len(tasks))
@@ -146,16 +147,6 @@ def _shown(job: ExportJob) -> list[ExportedCamera]:
 
 def _is_depth(camera: ExportedCamera) -> bool:
     return DepthCodes.suit(camera.view.encoding.name)
-
-
-def _grid(job: ExportJob, cameras: Sequence[ExportedCamera], fps: int) -> Integers:
-    """The times of an episode's frames: while all cameras run."""
-    times = constant_rate([camera.times for camera in cameras], fps)
-    if not len(times):
-        raise OptionError(
-            f"{job.dataset.path}: its cameras do not overlap in time. Select some with `topics`."
-        )
-    return times
 
 
 # ---------------------------------------------------------------- videos

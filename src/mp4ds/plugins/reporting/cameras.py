@@ -20,7 +20,7 @@ from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.plugins.info import calibration_changes
 from mp4ds.times import Floats, Integers, differences, intervals
 from mp4ds.video.media import Media, pixel_format_of
-from mp4ds.video.mp4 import read_sample_table
+from mp4ds.video.mp4 import sample_table_of
 
 # ---------------------------------------------------------------- videos
 
@@ -74,8 +74,7 @@ def presentation_times(stream: Stream) -> NDArray[np.int64]:
     if not path.is_file():
         raise VideoError("file-missing", path, "does not exist")
     try:
-        with path.open("rb") as file:
-            table = read_sample_table(file, path.stat().st_size, str(path))
+        table = sample_table_of(path)
     except Refused as reason:
         raise VideoError("video-unreadable", path, f"has no plain index: {reason}") from None
     except OSError as error:
