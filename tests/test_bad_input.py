@@ -490,17 +490,6 @@ def test_a_disk_that_is_full_of_coded_pictures(kind: str, to: str, tmp_path: Pat
         assert tree(disk) == {}
 
 
-@pytest.mark.parametrize("job", ["pack", "images"])
-def test_a_disk_without_room_for_another_file(job: str, demo: Path, tmp_path: Path) -> None:
-    with disk_of(tmp_path / "disk", "size=64m,nr_inodes=6") as disk:
-        if job == "pack":
-            result = call("pack", demo / "drive.bag", "-o", disk / "x")
-        else:
-            result = call("unpack", demo / "drive", "--to", "images", "-o", disk / "x")
-        refused(result, 1, str(disk / "x"), "No space left")
-        assert tree(disk) == {}
-
-
 # ---------------------------------------------------------------- an interruption
 
 

@@ -24,7 +24,7 @@ from mp4ds.bags.formats import open_reader
 from mp4ds.errors import ScoringError
 from mp4ds.format.quality import Quality
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.windows import CrfControl, window_frames
+from mp4ds.packing.windows import CrfControl
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
 from mp4ds.records import Excerpt, Message
@@ -121,12 +121,6 @@ def check_psnr(dataset: Path, noises: list[float], target: float) -> Quality:
     assert own.mean() >= target - 0.005
     assert windows.min() >= target - 0.505
     return found
-
-
-def test_windows_are_whole_groups_of_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()
-    frames = {1: 60, 10: 60, 25: 50, 60: 60, 120: 120, 1000: 240}
-    assert {gop: window_frames(gop) for gop in frames} == frames
 
 
 # ---------------------------------------------------------------- which crf

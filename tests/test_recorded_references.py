@@ -22,7 +22,7 @@ from mp4ds.format.models import References, video_facts
 from mp4ds.format.sidecars import load_stream
 from mp4ds.video.access import Chains
 from mp4ds.video.codecs import CODECS
-from mp4ds.video.mp4 import SampleTable, read_sample_table
+from mp4ds.video.mp4 import SampleTable, sample_table_of
 from mp4ds.video.references import (
     Structures,
     digest_video,
@@ -39,11 +39,6 @@ HIERARCHICAL = svt(10, gop=20)
 Pieces = list[tuple[int, bytes]]
 
 
-def index(path: Path) -> SampleTable:
-    with path.open("rb") as file:
-        return read_sample_table(file, path.stat().st_size, str(path))
-
-
 def sample_reader(path: Path, table: SampleTable) -> Callable[[int], bytes]:
     data = path.read_bytes()
     return lambda sample: data[table.places[sample] :][: table.sizes[sample]]
@@ -51,7 +46,7 @@ def sample_reader(path: Path, table: SampleTable) -> Callable[[int], bytes]:
 
 def chains_of(path: Path, codec: str, recorded: Structures | None) -> list[Pieces]:
     """For every packet the bytes that a decoder is given to show its picture."""
-    table = index(path)
+    table = sample_table_of(path)
     read = sample_reader(path, table)
     chains = Chains(table, codec, read, recorded)
     found = []
@@ -72,7 +67,7 @@ def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> N
     assert digest == [len(data), hashlib.sha256(data).hexdigest()]
     assert (found is not None) == CODECS[recipe.codec].is_free
     if found is not None:
-        packets = packets_of_groups(index(path))
+        packets = packets_of_groups(sample_table_of(path))
         assert packets.sum() == FRAMES
         again = References.from_structures(found).decode(packets)
         assert list(again.texts) == list(found.texts)
@@ -323,7 +318,7 @@ def test_lies_are_found_and_do_no_harm(name: str, packed: Path, tmp_path: Path) 
 
 def test_damage_is_told_as_such(packed: Path, tmp_path: Path) -> None:
     path = edited(packed, tmp_path, lambda _: None)
-    table = index(path.with_suffix(".mp4"))
+    table = sample_table_of(path.with_suffix(".mp4"))
     data = bytearray(path.with_suffix(".mp4").read_bytes())
     data[table.places[17]] ^= 0x80
     path.with_suffix(".mp4").write_bytes(data)
@@ -361,5 +356,5 @@ def test_what_is_fetched_of_a_remote_video(tmp_path: Path) -> None:
             fetched[name] = sum(end - start for start, end in ranges)
     assert np.array_equal(*pictures)
     assert fetched["with"] < 0.65 * fetched["without"]
-    table = index(tmp_path / "with" / "cam_image_raw.mp4")
+    table = sample_table_of(tmp_path / "with" / "cam_image_raw.mp4")
     assert fetched["without"] < 1.1 * table.sizes[:60].sum()  # nothing is fetched twice

@@ -30,7 +30,7 @@ from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
 from mp4ds.errors import ConversionError, FormatError, OptionError
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.pictures import KINDS
-from mp4ds.unpacking.republish import Republished, free_topic, republished_topic
+from mp4ds.unpacking.republish import Republished, republished_topic
 from mp4ds.unpacking.unpack import UnpackOptions, UnpackSummary
 from pictures import YUV, picture, sample_format
 from republished import (
@@ -938,13 +938,6 @@ def test_topics_are_those_of_image_transport(
     topic: str, type_name: str, kind: str, expected: str
 ) -> None:
     assert republished_topic(topic, type_name, kind) == expected
-
-
-def test_no_topic_is_taken_twice() -> None:
-    taken = {"/a", "/a_compressed_video", "/b"}
-    assert free_topic("/a", "compressed-video", taken) == "/a_compressed_video_compressed_video"
-    assert free_topic("/b", "raw", taken) == "/b_raw"
-    assert free_topic("/c", "raw", taken) == "/c"
 
 
 # ---------------------------------------------------------------- options, errors, command line

@@ -22,7 +22,7 @@ from conftest import DATA, real
 from mp4ds.errors import Refused, VideoError
 from mp4ds.times import MAX_GAP_NS, NS_PER_TICK
 from mp4ds.video.codecs import recipe_for
-from mp4ds.video.mp4 import SampleTable, read_sample_table
+from mp4ds.video.mp4 import SampleTable, read_sample_table, sample_table_of
 from test_packets import write as write_packets
 from test_video import LOSSLESS, LOSSY, encode, noise
 
@@ -30,11 +30,6 @@ Change = Callable[[bytes], bytes]
 STEP = 33_333
 TABLES = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
 EDITS = (b"moov", b"trak", b"edts", b"elst")
-
-
-def read(path: Path) -> SampleTable:
-    with path.open("rb") as file:
-        return read_sample_table(file, path.stat().st_size, str(path))
 
 
 def read_bytes(data: bytes) -> SampleTable:
@@ -46,7 +41,7 @@ def read_bytes(data: bytes) -> SampleTable:
 
 def check(path: Path) -> SampleTable:
     """Compare with the packets that ffmpeg finds, and with the frames that it shows."""
-    table = read(path)
+    table = sample_table_of(path)
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         packets = [packet for packet in container.demux(stream) if packet.size]
@@ -195,7 +190,7 @@ def test_files_of_others(name: str) -> None:
     path = real(f"video/{name}")
     if name in UNREADABLE:
         with pytest.raises(VideoError, match=UNREADABLE[name]) as caught:
-            read(path)
+            sample_table_of(path)
         assert caught.value.code == "video-unreadable"
         assert caught.value.place == str(path)
     else:
@@ -291,7 +286,7 @@ def test_edit_lists(name: str, b_frames: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     edits, first, hidden = EDIT_LISTS[name]
     path.write_bytes(changed(b_frames, EDITS, lambda _: edits))
-    table = read(path)
+    table = sample_table_of(path)
     check_frames(path, table)  # of what is not shown, ffmpeg makes up the times
     if not hidden:
         check(path)
@@ -350,13 +345,13 @@ def test_more_than_four_gigabytes(at_end: bool, b_frames: bytes, tmp_path: Path)
 
 def test_a_last_box_without_a_size(tmp_path: Path) -> None:
     path = muxed(tmp_path / "a.mp4", mux={"movflags": "faststart"})
-    data, before = path.read_bytes(), read(path)
+    data, before = path.read_bytes(), sample_table_of(path)
     at = data.index(b"mdat") - 4
     path.write_bytes(data[:at] + bytes(4) + data[at + 4 :])
     assert same(before, check(path))
     at = data.index(b"moov") - 4  # it cannot be the one without
     path.write_bytes(data[:at] + bytes(4) + data[at + 4 :])
-    assert same(before, read(path))
+    assert same(before, sample_table_of(path))
 
 
 def test_bytes_behind_the_boxes(b_frames: bytes, tmp_path: Path) -> None:
@@ -428,7 +423,7 @@ def test_fragments(tmp_path: Path) -> None:
     for flags in ("frag_keyframe+empty_moov", "frag_keyframe", "frag_keyframe+dash"):
         path = muxed(tmp_path / "a.mp4", mux={"movflags": flags})
         with pytest.raises(Refused, match="fragments"):
-            read(path)
+            sample_table_of(path)
     data = box(b"ftyp", b"isom") + box(b"moof", bytes(8))
     with pytest.raises(Refused, match="fragments"):
         read_bytes(data)
