@@ -85,6 +85,7 @@ def test_it_is_the_same_dataset(
     assert done[-1] == PARTS
 
 
+@pytest.mark.slow
 def test_the_command_line_says_nothing_of_dask(
     cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -47,7 +47,7 @@ def test_other_topics(tmp_path: Path) -> None:
     assert "/cam/image_raw" not in out
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", ["euroc", "tum", "images", "mcap"])
 def test_public_data(kind: str, demo_dataset: Path, tmp_path: Path) -> None:
     """The demonstration in the layout of each public data set."""

@@ -663,7 +663,7 @@ def side_by_side(kind: str, folder: Path) -> list[Path]:
     return paths
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", ["bag", "mcap", "rosbag2-sqlite3", "rosbag2-mcap"])
 def test_recordings_side_by_side(kind: str, tmp_path: Path) -> None:
     paths = side_by_side(kind, tmp_path)

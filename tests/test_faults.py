@@ -128,7 +128,7 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     return states
 
 
-@pytest.mark.parametrize("limit", REACHED)
+@pytest.mark.parametrize("limit", ["pages", pytest.param("files", marks=pytest.mark.slow)])
 def test_a_disk_that_is_full_at_any_moment(
     limit: str, pack: Pack, tmp_path: Path, reached: set[str]
 ) -> None:

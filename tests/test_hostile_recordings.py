@@ -333,6 +333,7 @@ DEFINITIONS: dict[str, tuple[str, str, bytes]] = {
 REFUSALS = "contains itself|has more fields|has more than .* fields|takes too long|cannot be"
 
 
+@pytest.mark.slow
 def test_definitions_that_claim_much(tmp_path: Path) -> None:
     for name, (encoding, definition, payload) in DEFINITIONS.items():
         path = recording(tmp_path / f"{name}.mcap", encoding, "a/msg/A", definition, payload)

@@ -140,7 +140,7 @@ def jobs(draw: st.DrawFn) -> list[tuple[float, PackProgress]]:
     return found
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(jobs(), st.integers(20, 200), st.integers(1, 60))
 def test_contradictory_progress_is_shown_sensibly(
     reports: list[tuple[float, PackProgress]], width: int, height: int

@@ -342,6 +342,7 @@ def test_without_libvmaf_it_is_said_how_to_get_it(
 
 
 @needs_vmaf
+@pytest.mark.slow
 def test_vmaf_of_a_noisy_camera_is_measured_against_its_ceiling(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
