@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -463,6 +464,18 @@ def test_rules_for_what_is_not_packed(kind: str, tmp_path: Path) -> None:
     packed(source, tmp_path / "without", rules(tmp_path), exclude=[TOPIC])
     (entry,) = load_manifest(tmp_path / "without" / "dataset.yaml").redactions
     assert entry.topics == []
+
+
+def test_no_time_is_out_of_reach(tmp_path: Path) -> None:
+    """Images whose times no column holds are kept in messages.mcap, without what was in boxes."""
+    made = scene("mono8", frames=4)
+    last = max(place for place, one in enumerate(made.messages) if one.topic == TOPIC)
+    made.messages.append(replace(made.messages.pop(last), log_time=2**64 - 1))
+    source = recorded(tmp_path, made)
+    packed(source, tmp_path / "out", rules(tmp_path, {"topic": TOPIC, "box": BOX, "fill": 7}))
+    found = [pixels(parsed(one)) for one in _images(unpacked(tmp_path / "out"))]
+    assert len(found) == 4
+    assert all((one[INSIDE] == 7).all() for one in found)
 
 
 @pytest.mark.parametrize("name", ["jpeg-cut-one", "video-h264-mid-gop", "video-empty"])

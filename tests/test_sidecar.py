@@ -264,6 +264,22 @@ def dataset() -> Document:
                 ],
             }
         ],
+        "redactions": [
+            {
+                "rules_sha256": "c" * 64,
+                "function": "faces:find",
+                "rules": [2],
+                "topics": [
+                    {
+                        "topic": "/cam/image_raw",
+                        "type": "sensor_msgs/Image",
+                        "images": 3,
+                        "changed": 2,
+                        "untouched": {"values": f"3 40 {'d' * 64}\n"},
+                    }
+                ],
+            }
+        ],
         "messages": 9,
         "losses": [
             {

@@ -43,6 +43,7 @@ _PNG = png.PngRecipe("2", 1, 0, 8, 15, "7801", 0, "", "AAAAAElFTkSuQmCC")
 """Fast, and found at once when the file is to be rebuilt; no chunks besides the image."""
 _FILES = re.compile(r"jpe?g|webp|bmp|tiff?|ppm", re.IGNORECASE)
 _ALL = (None, None)
+_LATEST = INT64_MAX - 1  # rules without an end apply to it
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,8 @@ class _Topic:
         self._starts, self._ends = np.array([rule[2:] for rule in rules], np.int64).reshape(-1, 2).T
 
     def due(self, time: int) -> list[tuple[int, Box]]:
-        """The rules for an image of a log time, ns, by their numbers."""
+        """The rules for an image of a log time, ns, by their numbers; no time is out of reach."""
+        time = min(max(time, 0), _LATEST)
         found = np.flatnonzero((self._starts <= time) & (time < self._ends))
         return [self.rules[place][:2] for place in found.tolist()]
 
@@ -197,7 +199,8 @@ class RedactedReader(ChangedReader):
         first, _ = ends_of(self._recorded)
         found: dict[str, list[tuple[int, Box, int, int]]] = {}
         self._due: list[int] = []
-        times = self._recorded.times() if self._recorded.is_indexed else None
+        is_indexed = self._recorded.is_indexed
+        times = self._recorded.times() if is_indexed else {}
         for number, rule in enumerate(self._redaction.rules):
             start = 0 if rule.start is None else rule.start.after(first)
             end = INT64_MAX if rule.end is None else rule.end.after(first)
@@ -208,8 +211,8 @@ class RedactedReader(ChangedReader):
             if not topics or not span.has_messages:
                 continue  # none of its images are packed
             self._due.append(number)
-            own = [times[one.id] for one in topics if one.id in times] if times else []
-            if times is not None and not any(((at >= start) & (at < end)).any() for at in own):
+            own = [times[one.id].clip(0, _LATEST) for one in topics if one.id in times]
+            if is_indexed and not any(((at >= start) & (at < end)).any() for at in own):
                 raise self._no_image(number)
             for one in topics:
                 box = Box(*rule.box, fill=rule.fill, blur=rule.blur)
