@@ -59,7 +59,7 @@ def proven(source: Path, dataset: Path, told: Path) -> dict[str, int]:
     """What differs, by a script that shares no code with the package."""
     problems, counts = compare(source, unpacked(dataset), told)
     assert problems == []
-    assert counts["samples outside"] == 0 < counts["samples inside"]
+    assert counts["pixels outside"] == 0 < counts["pixels inside"]
     assert mp4ds.validate(dataset, deep=True) == []
     return counts
 

@@ -126,7 +126,7 @@ def compare(original: Path, redacted: Path, rules: Path) -> tuple[list[str], dic
     """What is not as it should be, and counts of what is."""
     told = yaml.safe_load(rules.read_text())["rules"]
     begin = min(message.time for message in islice(read(original), 1))
-    counts = {"equal messages": 0, "changed images": 0, "samples inside": 0, "samples outside": 0}
+    counts = {"equal messages": 0, "changed images": 0, "pixels inside": 0, "pixels outside": 0}
     problems = []
     for old, new in pairs(original, redacted):
         if old is None or new is None:
@@ -150,8 +150,8 @@ def compare(original: Path, redacted: Path, rules: Path) -> tuple[list[str], dic
             inside[y : y + height, x : x + width] = True
         differs = (one.view(f"u{one.itemsize}") != other.view(f"u{one.itemsize}")).any(2)
         counts["changed images"] += 1
-        counts["samples inside"] += int((differs & inside).sum())
-        counts["samples outside"] += int((differs & ~inside).sum())
+        counts["pixels inside"] += int((differs & inside).sum())
+        counts["pixels outside"] += int((differs & ~inside).sum())
         if (differs & ~inside).any() or not (differs & inside).any():
             problems.append(f"{place}: pixels outside differ, or none inside")
     return problems, counts

@@ -317,7 +317,7 @@ class RedactedReader(ChangedReader):
             image = _Image.of(message.channel, form, parts)
         except Refused as reason:
             if is_looked_at:
-                raise self._failure(message, reason) from None
+                raise self._undecodable(message, reason) from None
             return message
         found = self._found(message, image)
         for number, box in due:
@@ -335,10 +335,10 @@ class RedactedReader(ChangedReader):
         data = _message(message.channel, image, made, found)
         _, now = splitter.split(replace(message, data=data))
         if (now.stamp, now.frame_id) != (image.parts.stamp, image.parts.frame_id):
-            raise self._failure(message, "its header cannot be kept")
+            raise self._undecodable(message, "its header cannot be kept")
         return replace(message, data=data)
 
-    def _failure(self, message: Message, reason: object) -> SourceError:
+    def _undecodable(self, message: Message, reason: object) -> SourceError:
         problem = f"the message of {message.channel.topic} logged at {message.log_time} ns"
         return SourceError(
             self.path,
