@@ -372,20 +372,14 @@ class RedactedReader(ChangedReader):
         return found
 
     def _colours(self, topic: str, image: _Image) -> Pixels:
-        """RGB of 8 bits of an image that shows colours or grey; else its pixels."""
+        """RGB of an image that shows colours or grey, of as many bits; else its pixels."""
         kind = image.encoding.name, image.size
-        if image.is_depth:
-            return image.shown.pixels.copy()
-        if kind not in self._views:
-            try:
-                view = view_of(
-                    topic, image.encoding, image.size, format="rgb", resize=None, crop=None
-                )
-            except OptionError:
-                view = view_of(
-                    topic, image.encoding, image.size, format="native", resize=None, crop=None
-                )
-            self._views[kind] = view
+        for name in ("native",) if image.is_depth else ("rgb", "native"):
+            with suppress(OptionError):  # it does not show colours
+                if kind not in self._views:
+                    self._views[kind] = view_of(
+                        topic, image.encoding, image.size, format=name, resize=None, crop=None
+                    )
         view = self._views[kind]
         made: Pixels = np.empty(view.shape, view.dtype)
         view.give(np.ascontiguousarray(image.shown.pixels), made)
