@@ -374,7 +374,7 @@ _TICKS = ((5, 10, 20, 50, 100, 200, 500, 1000, 2000), (10, 20, 50, 100, 200, 500
 def curves_of(
     cells: Cells, sizes: Mapping[str, float], drawn: str
 ) -> dict[tuple[str, str], dict[float, tuple[float, str]]]:
-    """Of each codec and reader, by bytes a frame: frames per CPU second, and the GOP.
+    """Of each codec and reader, by bytes a frame: frames per CPU second, and the GOP or the way.
 
     Of torchcodec's modes the best at each point.
     """
@@ -385,7 +385,8 @@ def curves_of(
             continue
         codec, _, gop = way.partition("-")
         curve = curves[codec, "" if way in ("lerobot", *STILLS) else peer.partition(" ")[0]]
-        curve[sizes[way]] = max(curve.get(sizes[way], (0.0, gop)), (cell.rate, gop))
+        label = gop or codec
+        curve[sizes[way]] = max(curve.get(sizes[way], (0.0, label)), (cell.rate, label))
     return curves
 
 

@@ -480,8 +480,10 @@ class Loader:
         """Numbers of the frames, and what is read."""
         from torch.utils.data import DataLoader
 
-        shuffled = {} if hasattr(self._frames, "set_epoch") else {"shuffle": True}
-        for batch in DataLoader(self._frames, batch_size=BATCH, **shuffled):
+        how: dict[str, Any] = {"batch_size": BATCH}
+        if not hasattr(self._frames, "set_epoch"):
+            how |= {"shuffle": True, "collate_fn": self._frames.collate}
+        for batch in DataLoader(self._frames, **how):
             yield batch["index"].tolist(), batch[self._key].numpy()
 
 
