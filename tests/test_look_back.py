@@ -194,6 +194,7 @@ def test_a_clock_that_jumps_back(drive: Path, tmp_path: Path) -> None:
         ({"keep_last": None, "and_then": 10}, "need `keep_last`"),
         ({"keep_last": None, "trigger": ["/go"]}, "need `keep_last`"),
         ({"max_duration": 60}, "contradicts"),
+        ({"max_splits": 2}, "contradicts"),  # it would delete what was saved
         ({"keep_last": 0}, "more than 0"),
         ({}, "cannot link files"),
     ],

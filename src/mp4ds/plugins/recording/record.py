@@ -184,8 +184,10 @@ def _check(options: RecordOptions) -> None:
         )
     if options.keep_last is None and (options.and_then is not None or options.trigger):
         raise OptionError("`and_then` and `trigger` need `keep_last`.")
-    if options.keep_last is not None and (options.max_duration or options.max_size):
-        raise OptionError("`keep_last` contradicts `max_duration` and `max_size`.")
+    if options.keep_last is not None and (
+        options.max_duration or options.max_size or options.max_splits
+    ):
+        raise OptionError("`keep_last` contradicts `max_duration`, `max_size` and `max_splits`.")
     if options.keep_last == 0:
         raise OptionError("`keep_last` must be more than 0 seconds.")
     if options.about is not None:
