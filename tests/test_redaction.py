@@ -23,6 +23,8 @@ from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds import Box, PackOptions
 from mp4ds.errors import Mp4dsError, OptionError, SourceError
 from mp4ds.format.sidecars import dump_document, load_manifest
+from mp4ds.messages.encodings import ENCODINGS
+from mp4ds.packing.redaction import placed, redact
 from pictures import GENERIC
 from scenes import Scene, scene
 from sources import SOURCES
@@ -175,6 +177,24 @@ def test_mosaics_stay_mosaics(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- nothing of it is left
+
+
+@pytest.mark.parametrize("name", ["mono8", "bayer_grbg8", "nv12"])
+@pytest.mark.parametrize(("width", "height"), [(34, 18), (10, 34), (2, 2)])
+def test_blur_has_no_small_squares(name: str, width: int, height: int) -> None:
+    """What remains beside whole squares is part of the last ones; a tiny box is widened."""
+    encoding = ENCODINGS[name]
+    image = np.random.default_rng(0).integers(0, 256, encoding.shape(64, 64), np.uint8)
+    made, box = image.copy(), Box(62 - width, 62 - height, width, height, blur=16)
+    part = placed(box, encoding, (64, 64), widened=True)
+    assert part is not None
+    redact(made, encoding, box, part)
+    x, y, width, height = part
+    assert min(width, height) >= 8
+    step = 2 if encoding.mosaic else 1
+    corner = made[:64][y + height - 8 : y + height, x + width - 8 : x + width]
+    for place in np.ndindex(step, step):
+        assert np.unique(corner[place[0] :: step, place[1] :: step]).size == 1
 
 
 @pytest.mark.parametrize("name", ["jpeg-exif-trailing", "png-rgba-cv2", "video-h264", "padded"])
@@ -339,12 +359,18 @@ def test_a_function_finds_boxes(name: str, tmp_path: Path) -> None:
                 assert frame.data[44:, 54:].min() > 240
 
 
-@pytest.mark.parametrize("given", [(1, 2, 3), (1, 2, 3, 4, 0.9), Box(0, 0, 9, 9, fill=[1]), "face"])
+@pytest.mark.parametrize(
+    "given",
+    [
+        *((1, 2, 3), (1, 2, 3, 4, 0.9), (1e308, 0, 1e308, 1), "face", None),
+        *(Box(0, 0, 9, 9, fill=[1]), Box(0, 0, 9, 9, fill=10**400), Box(0, 0, 9, 9, blur=8.5)),  # type: ignore[arg-type]
+    ],
+)
 def test_a_function_that_finds_no_boxes(given: Any, tmp_path: Path) -> None:
     source = recorded(tmp_path, scene("rgb8", frames=2))
 
-    def nested(*_: Any) -> list[Any]:
-        return [given]
+    def nested(*_: Any) -> Any:
+        return [given] if given else None
 
     with pytest.raises(OptionError, match=r"`redact`, .*nested.* for /cam/image_raw at \d+ ns: "):
         packed(source, tmp_path / "out", nested)
@@ -426,6 +452,9 @@ HOSTILE = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ({**RULE, "fill": [1, 2, 3]}, "mono8 images need a single value"),
         ({**RULE, "fill": 1, "blur": 9}, "rule 1: give blur or fill, not both"),
         ({**RULE, "blur": 2}, "rule 1, blur: Input should be greater than or equal to 8"),
+        ({**RULE, "blur": 2**70}, "rule 1, blur: Input should be less than"),
+        ({**RULE, "box": [1, 2, 9, 10**400]}, "rule 1, box, 3: Input should be less than"),
+        ({**RULE, "box": [1, 2, 9, 7], "blur": 8}, "box [1, 2, 9, 7] is smaller than 8x8 pixels"),
         ({**RULE, "colour": 2}, "rule 1, colour: Extra inputs are not permitted"),
         ({"topic": TOPIC}, "rule 1, box: Field required"),
         ("rules: []", "rules: List should have at least 1 item"),

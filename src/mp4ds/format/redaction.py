@@ -27,8 +27,8 @@ def _time(text: Any) -> Time | None:
 
 
 _TimeText = Annotated[Time | None, BeforeValidator(_time)]
-_Place = Annotated[int, Field(ge=0)]
-_Side = Annotated[int, Field(ge=1)]
+_Place = Annotated[int, Field(ge=0, lt=2**31)]
+_Side = Annotated[int, Field(ge=1, lt=2**31)]
 
 
 class Rule(BaseModel):
@@ -41,7 +41,7 @@ class Rule(BaseModel):
     end: _TimeText = None
     box: tuple[_Place, _Place, _Side, _Side]
     fill: float | tuple[float, ...] = 0.0
-    blur: Annotated[int, Field(ge=LEAST_SQUARE)] | None = None
+    blur: Annotated[int, Field(ge=LEAST_SQUARE, lt=2**31)] | None = None
 
     @model_validator(mode="after")
     def _one(self) -> Rule:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -105,8 +106,8 @@ def placed(
         box: The box.
         encoding: Of the image.
         size: Its width and height.
-        widened: Limit it to the image, and widen it to whole pixels, and to all that share their
-            colours with some in it; None if it is outside.
+        widened: Limit it to the image, and widen it to whole pixels, to all that share their
+            colours with some in it, and to the least square of a blur; None if it is outside.
 
     Raises:
         OptionError: It is not as it would be made by `widened`; says what is wrong.
@@ -120,11 +121,18 @@ def placed(
     ):
         first = max(0, math.floor(start) // step * step)
         last = min(side, -(-math.ceil(start + length) // step) * step)
+        if box.blur is not None and first < last < first + LEAST_SQUARE:
+            first = max(0, min(first, side - LEAST_SQUARE))
+            last = min(side, first + LEAST_SQUARE)
         ends.append((first, last - first))
     (x, width), (y, height) = ends
     made = x, y, width, height
     if widened:
         return made if min(width, height) > 0 else None
+    if box.blur is not None and min(box.width, box.height) < LEAST_SQUARE:
+        raise OptionError(
+            f"box {list(numbers)} is smaller than {LEAST_SQUARE}x{LEAST_SQUARE} pixels: give fill"
+        )
     if numbers[0] + numbers[2] > size[0] or numbers[1] + numbers[3] > size[1]:
         raise OptionError(f"box {list(numbers)} is not inside the {size[0]}x{size[1]} image")
     if made != numbers:
@@ -147,7 +155,7 @@ def check_change(box: Box, encoding: Encoding, *, is_depth: bool) -> None:
         raise OptionError(
             f"blur of {encoding.name} images would make up distances: give fill, where 0 is none"
         )
-    elif box.blur < LEAST_SQUARE:
+    elif operator.index(box.blur) < LEAST_SQUARE:
         raise OptionError(f"blur {box.blur} is below {LEAST_SQUARE}")
 
 
@@ -177,11 +185,15 @@ def redact(pixels: Pixels, encoding: Encoding, box: Box, part: Rectangle) -> Non
 
 
 def _pixelate(pixels: Pixels, rows: int, columns: int) -> None:
-    """Give each rectangle of so many rows and columns its mean."""
+    """Give each rectangle of so many rows and columns its mean; the last ones have what remains."""
     height, width = pixels.shape[:2]
     if not pixels.size:
         return
-    tops, lefts = np.arange(0, height, rows), np.arange(0, width, columns)
+    # a rectangle of its own for the rest might be a single pixel, which is its own mean
+    tops, lefts = (
+        np.arange(max(1, length // side)) * min(side, length)
+        for length, side in ((height, rows), (width, columns))
+    )
     sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float64), tops, 0), lefts, 1)
     heights, widths = np.diff(tops, append=height), np.diff(lefts, append=width)
     areas = np.outer(heights, widths)
@@ -215,6 +227,15 @@ def _values(
         numbers = f"{due} values" if due > 1 else "a single value"
         raise OptionError(f"fill {given} does not fit: {name} images need {numbers}")
     colour = [fill] * due if given is None else given
+    wanted = np.array(colour, np.float64)
+    bounds: Any = (np.finfo if encoding.is_float else np.iinfo)(encoding.dtype)
+    low, high = (0, 255) if is_yuv else (bounds.min, bounds.max)
+    is_special = encoding.is_float & ~np.isfinite(wanted)
+    is_value = (
+        (wanted >= low) & (wanted <= high) & (encoding.is_float | (wanted == np.rint(wanted)))
+    )
+    if not (is_special | is_value).all():
+        raise OptionError(f"fill {fill} is no value of {name} images: {low} to {high}")
     made: Any = colour
     if is_yuv:
         matrix = [[65.481, 128.553, 24.966], [-37.797, -74.203, 112.0], [112.0, -93.786, -18.214]]
@@ -228,14 +249,7 @@ def _values(
         made = colour["rgb".index(encoding.mosaic[2 * row + column])]
     elif name[:3] in ("rgb", "bgr"):
         made = colour[::-1] if name.startswith("bgr") else colour
-        made = [*made, np.iinfo(encoding.dtype).max][:channels] if channels == 4 else made
+        made = [*made, bounds.max][:channels] if channels == 4 else made
     elif channels == 1:
         made = colour[0]
-    values = np.array(made, np.float64)
-    if not encoding.is_float:
-        bounds = np.iinfo(encoding.dtype)
-        wanted = np.array(colour, np.float64)
-        low, high = (0, 255) if is_yuv else (bounds.min, bounds.max)
-        if not ((wanted >= low) & (wanted <= high) & (wanted == np.rint(wanted))).all():
-            raise OptionError(f"fill {fill} is no value of {name} images: {low} to {high}")
-    return values.astype(encoding.dtype)
+    return np.array(made, np.float64).astype(encoding.dtype)

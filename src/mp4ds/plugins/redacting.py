@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import pickle
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -356,13 +356,19 @@ class RedactedReader(ChangedReader):
         if self._redaction.find is None:
             return found
         topic, time = message.channel.topic, message.log_time
-        for given in self._redaction.find(topic, time, self._colours(topic, image)):
+        boxes: Any = self._redaction.find(topic, time, self._colours(topic, image))
+        if not isinstance(boxes, Iterable):
+            raise OptionError(
+                f"`redact`, {self._redaction.name} for {topic} at {time} ns: gave {boxes!r}, not "
+                "a list of boxes."
+            )
+        for given in boxes:
             try:
                 if not isinstance(given, Box):
                     x, y, width, height = map(float, given)
                 box = given if isinstance(given, Box) else Box(x, y, width, height)
                 part = image.place(box, widened=True)
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise OptionError(
                     f"`redact`, {self._redaction.name} for {topic} at {time} ns: {given!r}: "
                     f"{str(error).rstrip('.')}."
