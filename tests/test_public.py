@@ -18,7 +18,7 @@ from mp4ds.plugins.demo import demo
 
 ROOT = Path(__file__).parents[1]
 NAMES = [
-    "ConversionError", "Dataset", "EncoderRefusedError", "EvaluateOptions",
+    "Box", "ConversionError", "Dataset", "EncoderRefusedError", "EvaluateOptions",
     "Evaluation", "ExportOptions", "ExportSummary", "FormatError", "Frame",
     "FrameNotFoundError", "ImportOptions", "Mp4dsError", "OptionError", "PackOptions",
     "PackSummary", "PartsFailedError", "PathError", "PlayOptions", "PlaySummary", "Problem",
