@@ -26,7 +26,7 @@ from mp4ds.format.sidecars import dump_document, load_manifest
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.packing.redaction import placed, redact
 from pictures import GENERIC
-from scenes import Scene, scene
+from scenes import Scene, odd_scene, scene
 from sources import SOURCES
 
 TOPIC = "/cam/image_raw"
@@ -242,6 +242,19 @@ def _own(data: bytes, others: bytes) -> bytes:
         for at in (*range(middle, len(data), 40), *range(0, middle, 40))
         if len(found := data[at : at + 40]) == 40 and found not in others
     )
+
+
+@pytest.mark.parametrize("kind", ["mcap-ros2-zstd", "bag-none"])
+def test_nothing_after_a_message_is_left(kind: str, tmp_path: Path) -> None:
+    """What a reused buffer held before may be there, such as another image."""
+    source = recorded(tmp_path, odd_scene("tail-bytes"), kind)
+    told = rules(tmp_path, {"topic": "/odd/*", "box": [2, 2, 8, 8]})
+    due = [one.data for one in _images(source)]
+    found = [one.data for one in _images(unpacked(packed(source, tmp_path / "out", told)))]
+    for number, (before, after) in enumerate(zip(due, found, strict=True)):
+        tail = 3 if number % 2 else 4
+        assert len(after) == len(before)
+        assert before[-tail:] != after[-tail:] == bytes(tail)
 
 
 # ---------------------------------------------------------------- how it is packed

@@ -425,7 +425,14 @@ def _message(
                 blank = blank.replace(old, new)
     template = form.template(blank)
     head, tail = template.around(slots, len(body))
-    return b"".join((head, body, bytes(template.padding(len(body))), tail))
+    data = b"".join((head, body, bytes(template.padding(len(body))), tail))
+    if form.wire != "protobuf":
+        # bytes after the last field may be what a buffer held before, such as an earlier image
+        name, view = channel.type_name, memoryview(body)
+        plain = plain_message(form.wire, name, parts.frame_id, fields, slots, view)
+        surplus = max(0, len(data) - len(plain))
+        data = data[: len(data) - surplus] + bytes(surplus)
+    return data
 
 
 def _raw(
