@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -283,6 +284,33 @@ def test_in_parts_shards_and_resumed(tmp_path: Path) -> None:
     (before,), (after,) = one.redactions, other_one.redactions
     assert (before.rules, before.proving()) == (after.rules, after.proving())
     assert len(after.topics[0].untouched.values.splitlines()) == 4  # type: ignore[union-attr]
+
+
+def find_told(topic: str, time_ns: int, pixels: Any) -> list[tuple[int, int, int, int]]:
+    """Nothing up to a time, where it fails; without a time, a box."""
+    if time_ns > int(os.environ.get("FAILS_AFTER", time_ns)):
+        raise ValueError("no model")
+    return [] if "FAILS_AFTER" in os.environ else [(8, 8, 16, 16)]
+
+
+def test_a_function_that_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It looks the same: nothing that it made before is used."""
+    source = recorded(tmp_path, scene("rgb8", frames=24))
+    times = sorted(one.time for one in read(source))
+    target = tmp_path / "all" / source.stem
+    target.parent.mkdir()
+    options = PackOptions(redact=find_told, window=6, jobs=1)
+    monkeypatch.setenv("FAILS_AFTER", str(times[len(times) // 2]))
+    with pytest.raises((ValueError, Mp4dsError), match="no model"):
+        mp4ds.pack(source, target, options)
+    monkeypatch.delenv("FAILS_AFTER")
+    mp4ds.pack(source, target, options)
+    with mp4ds.open(target, layer="exact") as made:
+        assert all(not frame.data[8:24, 8:24].any() for frame in made[TOPIC])
+    with pytest.raises(Mp4dsError, match="already exists"):
+        mp4ds.pack_each([source], target.parent, options)
+    with pytest.raises(OptionError, match="`redact` is a function"):
+        mp4ds.pack_share(source, tmp_path / "parts", (1, 2), options)
 
 
 def test_datasets_and_reductions(tmp_path: Path) -> None:

@@ -247,6 +247,8 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
             raise OptionError("`nearest` says how images are resized: give `resize`, too.")
         if self.derives and self.purpose is None and self.gop is None:
             object.__setattr__(self, "purpose", TRAINING)
+        if self.redaction and self.redaction.find:  # which may have changed since, or its model
+            object.__setattr__(self, "restart", True)
 
     @property
     def redaction(self) -> Redaction | None:

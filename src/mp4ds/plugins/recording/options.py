@@ -109,7 +109,7 @@ class RecordOptions(NodeOptions):
         parse=_parse_duration,
     )
     and_then: Parsed[float | None] = option(
-        "Save so many seconds after a trigger, too.",
+        "Also save this many seconds after a trigger.",
         None,
         "--and-then",
         panel=WHAT,
