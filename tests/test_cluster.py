@@ -157,6 +157,7 @@ def test_calls_of_a_killed_worker_are_made_on_another(tmp_path: Path) -> None:
         assert len(list(tmp_path.glob(f"{name}.by-*"))) == 2
 
 
+@pytest.mark.slow
 def test_a_call_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
     config = {
         "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",

@@ -90,7 +90,10 @@ def test_quickstart(tmp_path: Path) -> None:
         assert out.rstrip().endswith("EQUAL")
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/commands.md", "docs/conversions.md"])
+@pytest.mark.parametrize(
+    "page",
+    ["README.md", pytest.param("docs/commands.md", marks=pytest.mark.slow), "docs/conversions.md"],
+)
 def test_commands_of_a_page(page: str, demo_dataset: Path, tmp_path: Path) -> None:
     """Each mp4ds line of its shell blocks, on the demo under the names that the page has."""
     text = "".join(block for kind, block in blocks_of(ROOT / page) if kind == "sh")

@@ -193,7 +193,8 @@ def failing_open(
         yield
 
 
-@pytest.mark.parametrize("size", [pytest.param("300k", marks=pytest.mark.slow), "700k"])
+@pytest.mark.parametrize("size", ["300k", "700k"])
+@pytest.mark.slow
 def test_the_real_command_on_a_full_disk(size: str, tmp_path: Path) -> None:
     (tmp_path / "source").mkdir()
     bag = tmp_path / "source" / "drive.bag"

@@ -351,7 +351,7 @@ def test_little_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert mp4ds.validate(tmp_path / "live", deep=True) == []
     recordings = [again(tmp_path / "live", tmp_path)], paths
     found, sent = ([bytes(one.data) for one in messages(made)] for made in recordings)
-    assert {*sent[:19]} <= {*found} < {*sent}
+    assert {*sent[:19]} <= {*found} <= {*sent}  # it may stop after the last one
     Opened(PlayedNode(paths), monkeypatch)
     told = call(*command[:4], tmp_path / "other", "--min-space", "100M")
     assert told.code == 2

@@ -881,6 +881,7 @@ def test_two_readings_at_a_time_are_not_mixed(intact: Intact, tmp_path: Path) ->
             list(first)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     write_mcap(path, scene("mono8", frames=1500, width=160, height=120, noisy=False))

@@ -270,7 +270,7 @@ def test_a_robot_that_was_recorded(tmp_path: Path) -> None:
     assert (found.values == np.array(rows, np.float32)).all()
 
 
-@pytest.mark.parametrize("method", [None, "fork", "spawn"])
+@pytest.mark.parametrize("method", [None, "fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_in_workers_and_streams(drive: Path, method: str | None) -> None:
     frames = FrameDataset(drive, topics=[LEFT], state=JOINTS, action=COMMAND)
     samples = [frames[n] for n in range(FRAMES)]
