@@ -69,7 +69,7 @@ def load_rules(path: Path) -> tuple[Rules, str]:
         The rules, and the SHA-256 of the file.
 
     Raises:
-        OptionError: It cannot be read, or is none of rules; says where.
+        OptionError: It cannot be read, or is not valid; says where.
     """
     most = yamlio.MAX_STRUCTURE_BYTES
     try:

@@ -82,7 +82,7 @@ def parse_redaction(value: Redaction | Find | Path | str) -> Redaction:
     """The redaction by a function, or by the rules of a file.
 
     Raises:
-        OptionError: The file cannot be read, or is none of rules; says where.
+        OptionError: The file cannot be read, or is not valid; says where.
     """
     if isinstance(value, Redaction):
         return value
