@@ -1,7 +1,8 @@
-"""The packages of ros/: they are where ROS looks for them, and their launch files start nodes."""
+"""The package of ros/: it is where ROS looks for it, and its launch files start nodes."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -15,6 +16,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 
 import mp4ds
 from mp4ds.bags.formats import open_sources
@@ -30,13 +32,39 @@ from test_examples import ROOT
 from test_record_ros1 import contents
 from waiting import WATCHDOG_S, until
 
-ROS1, ROS2 = ROOT / "ros" / "ros1", ROOT / "ros" / "ros2"
+PACKAGE = ROOT / "ros" / "mp4ds"
 LAUNCHED = {
-    "ros1 play": ROS1 / "launch" / "play.launch",
-    "ros1 record": ROS1 / "launch" / "record.launch",
-    "ros2 play": ROS2 / "launch" / "play.launch.xml",
-    "ros2 record": ROS2 / "launch" / "record.launch.xml",
+    "ros1 play": PACKAGE / "launch" / "play.launch",
+    "ros1 record": PACKAGE / "launch" / "record.launch",
+    "ros2 play": PACKAGE / "launch" / "play.launch.xml",
+    "ros2 record": PACKAGE / "launch" / "record.launch.xml",
 }
+DESCRIBE = """
+import json, os, sys
+from catkin_pkg.changelog import get_changelog_from_path
+from catkin_pkg.package import parse_package
+package = parse_package(sys.argv[1])
+package.validate()
+package.evaluate_conditions(os.environ)
+changelog = get_changelog_from_path(os.path.join(sys.argv[1], "CHANGELOG.rst"))
+needs = [*package.buildtool_depends, *package.exec_depends]
+print(json.dumps({
+    "build_type": package.get_build_type(),
+    "needs": sorted(one.name for one in needs if one.evaluated_condition),
+    "changes": [str(version) for version, *_ in changelog.foreach_version()],
+}))
+"""
+"""What catkin_pkg, which catkin, rosdep, bloom and the ROS index use, makes of a package."""
+
+NEEDS = {
+    "": ("catkin", ["catkin", "roslaunch", "rospy"]),  # Debian's ROS 1 sets no version
+    "1": ("catkin", ["catkin", "roslaunch", "rospy"]),
+    "2": ("ament_python", ["launch_xml", "rclpy", "ros2launch"]),
+}
+"""Version of ROS -> build type, and what only this version needs."""
+
+UNSET = "unset@mp4ds.invalid"
+"""In package.xml, which must have one, while pyproject.toml has no address of mail."""
 
 
 def done(command: Sequence[str], **options: Any) -> str:
@@ -48,11 +76,86 @@ def done(command: Sequence[str], **options: Any) -> str:
 # ---------------------------------------------------------------- what the files say
 
 
-@pytest.mark.parametrize("package", [ROS1, ROS2], ids=lambda path: path.name)
-def test_versions(package: Path) -> None:
-    found = ElementTree.parse(package / "package.xml")
+def test_it_says_what_the_project_says() -> None:
+    """Version, license, addresses, and the maintainer, who may have no address of mail yet."""
+    found = ElementTree.parse(PACKAGE / "package.xml")
+    pyproject = (ROOT / "pyproject.toml").read_text()
+
+    def told(key: str) -> str:
+        match = re.search(rf'^{key} = "(.*)"$', pyproject, re.M)
+        assert match, key
+        return match[1]
+
     assert found.findtext("version") == mp4ds.__version__
-    assert found.findtext("name") == "mp4ds"
+    assert (found.findtext("name"), found.findtext("license")) == ("mp4ds", told("license"))
+    assert (PACKAGE / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+    assert {one.attrib["type"]: one.text for one in found.findall("url")} == {
+        "website": told("Documentation"),
+        "repository": told("Repository"),
+        "bugtracker": told("Issues"),
+    }
+    (maintainer,) = found.findall("maintainer")
+    listed = re.search(
+        r'^maintainers = \[{ name = "(.*?)"(?:, email = "(.*)")? }\]$', pyproject, re.M
+    )
+    assert listed, "maintainers of pyproject.toml"
+    assert (maintainer.text, maintainer.attrib["email"]) == (listed[1], listed[2] or UNSET)
+
+
+def release(path: Path, email: str = UNSET) -> None:
+    """Change a file as one does to release."""
+    text = path.read_text().replace("## [Unreleased]", f"## [{mp4ds.__version__}]")
+    heading = f"{mp4ds.__version__} (2026-12-01)"
+    text = text.replace("Forthcoming\n-----------", f"{heading}\n{'-' * len(heading)}")
+    path.write_text(re.sub(r'email="[^"]*"', f'email="{email}"', text))
+
+
+@pytest.mark.parametrize("email", [UNSET, "somebody@robots.example"])
+def test_no_release_without_an_address(email: str, tmp_path: Path) -> None:
+    """What the workflow runs on a tag: ROS wants the address of somebody who reads it."""
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())
+    script = workflow["jobs"]["version"]["steps"][-1]["run"]
+    version = mp4ds.__version__
+    names = ["src/mp4ds/_version.py", "CITATION.cff", "CHANGELOG.md"]
+    names += ["ros/mp4ds/package.xml", "ros/mp4ds/CHANGELOG.rst"]
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+        release(tmp_path / name, email)
+    command = ["bash", "-e", "-c", script]
+    environment = {"PATH": "/usr/bin:/bin", "GITHUB_REF_NAME": f"v{version}"}
+    result = subprocess.run(command, cwd=tmp_path, env=environment, check=False)
+    assert (result.returncode == 0) == (email != UNSET)
+
+
+@pytest.mark.parametrize("version", NEEDS)
+def test_catkin_pkg_takes_it(version: str, tmp_path: Path) -> None:
+    python = shutil.which("python3", path="/usr/bin")
+    if not python or subprocess.run([python, "-c", "import catkin_pkg"], check=False).returncode:
+        pytest.skip("catkin_pkg is not installed")
+    environment = {"PATH": "/usr/bin:/bin", **({"ROS_VERSION": version} if version else {})}
+    shutil.copytree(PACKAGE, tmp_path / "mp4ds")
+    release(tmp_path / "mp4ds" / "CHANGELOG.rst")
+    command = [python, "-c", DESCRIBE, str(tmp_path / "mp4ds")]
+    found = json.loads(done(command, env=environment))
+    build_type, needs = NEEDS[version]
+    assert found["build_type"] == build_type
+    assert found["needs"] == sorted([*needs, "python3-mp4ds-pip", "ros_environment"])
+    assert found["changes"][0] == mp4ds.__version__
+
+
+def test_entries_of_the_ros_index() -> None:
+    package = ElementTree.parse(PACKAGE / "package.xml")
+    rules = yaml.safe_load((ROOT / "ros" / "rosdep.yaml").read_text())
+    assert {*rules} <= {one.text for one in package.findall("exec_depend")}
+    for system in ("debian", "ubuntu"):  # which the index asks for
+        assert rules["python3-mp4ds-pip"][system] == {"pip": {"packages": ["mp4ds"]}}
+    index = yaml.safe_load((ROOT / "ros" / "distribution.yaml").read_text())
+    (url,) = (one.text for one in package.findall("url") if one.get("type") == "repository")
+    source = {"type": "git", "url": f"{url}.git", "version": "main"}
+    assert index["repositories"] == {
+        "mp4ds": {"doc": source, "source": source, "status": "maintained"}
+    }
 
 
 @pytest.mark.parametrize("kind", LAUNCHED)
@@ -88,7 +191,7 @@ def test_launch_files_of_ros2(command: str, tmp_path: Path) -> None:
         assert {*let.attrib} <= {"name", "value", "if", "unless"}
     (node,) = root.iter("node")
     assert node.attrib["pkg"] == "mp4ds"
-    program = ROS2 / "scripts" / node.attrib["exec"]
+    program = PACKAGE / "scripts" / node.attrib["exec"]
     assert os.access(program, os.X_OK)
     words = substituted(node.attrib["args"], values).split()
     environment = {
@@ -99,7 +202,7 @@ def test_launch_files_of_ros2(command: str, tmp_path: Path) -> None:
     (tmp_path / "camera").mkdir()  # no file is taken for a topic
     told = done(
         [str(program), *words, "--ros-args", "-r", "__node:=x", "-p", "use_sim_time:=true"],
-        env={"PATH": f"{tmp_path}:/usr/bin:/bin", **environment},
+        env={"PATH": f"{tmp_path}:/usr/bin:/bin", "ROS_VERSION": "2", **environment},
         cwd=tmp_path,
     ).splitlines()
     assert told[:4] == ["-m", "mp4ds", command, "--ros2"]
@@ -121,7 +224,7 @@ def test_launch_files_of_ros2(command: str, tmp_path: Path) -> None:
 def test_ros2_finds_it(tmp_path: Path) -> None:
     """As colcon installs it: with setuptools, under a prefix."""
     pytest.importorskip("setuptools")
-    shutil.copytree(ROS2, tmp_path / "source")
+    shutil.copytree(PACKAGE, tmp_path / "source")
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps"]
     command += ["--no-build-isolation", "--ignore-installed", "--prefix", str(tmp_path / "prefix")]
     done([*command, str(tmp_path / "source")])
@@ -129,7 +232,7 @@ def test_ros2_finds_it(tmp_path: Path) -> None:
     index = prefix / "share" / "ament_index" / "resource_index" / "packages" / "mp4ds"
     assert index.exists()
     share = prefix / "share" / "mp4ds"
-    assert (share / "package.xml").read_bytes() == (ROS2 / "package.xml").read_bytes()
+    assert (share / "package.xml").read_bytes() == (PACKAGE / "package.xml").read_bytes()
     for name in ("play", "record"):
         assert (share / "launch" / f"{name}.launch.xml").exists()
         assert os.access(prefix / "lib" / "mp4ds" / name, os.X_OK)
@@ -152,7 +255,7 @@ class Workspace:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        shutil.copytree(ROS1, folder / "src" / "mp4ds")
+        shutil.copytree(PACKAGE, folder / "src" / "mp4ds")
         environment = {"PATH": "/usr/bin:/bin", "HOME": str(folder)}
         done(["/usr/bin/catkin_make", "install"], cwd=folder, env=environment)
         # the Python of the tests, with ROS's packages behind its own

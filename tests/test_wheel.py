@@ -156,6 +156,7 @@ def test_links_on_pypi_are_absolute(pure: zipfile.ZipFile) -> None:
 def texts() -> Iterator[tuple[Path, str]]:
     """Files that name addresses of the project."""
     patterns = ("*.md", "*.toml", "*.cff", "*.yml", "Dockerfile*", "conda/*", ".github/**/*.yml")
+    patterns += ("ros/*.yaml", "ros/mp4ds/*.xml")
     for pattern in (*patterns, "docs/**/*.md", "spec/*.md"):
         for path in ROOT.glob(pattern):
             yield path, path.read_text()
