@@ -10,18 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zstandard
 from mcap import records as mcap_records
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from mcap.writer import IndexType, Writer
 
 from conftest import real
-from mp4ds.bags.files import DamageError, unzstd
 from mp4ds.bags.mcap import McapReader, McapWriter
 from mp4ds.bags.protocols import write_record
-from mp4ds.bags.rosbag2 import Rosbag2Reader
-from mp4ds.errors import Mp4dsError, SourceError
+from mp4ds.errors import SourceError
 from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Record, Schema
 
 REAL_FILES = (
@@ -197,99 +193,6 @@ def test_round_trip(tmp_path: Path, compression: str, chunk_size: int) -> None:
         assert sum(1 for _ in make_reader(stream).iter_messages()) == 201
 
 
-@pytest.mark.parametrize("chunked", [True, False])
-def test_without_an_index_the_file_is_read(tmp_path: Path, chunked: bool) -> None:
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer: Any = Writer(
-            stream,
-            index_types=IndexType.NONE,
-            use_chunking=chunked,
-            use_statistics=False,
-            repeat_channels=False,
-            repeat_schemas=False,
-            use_summary_offsets=False,
-        )
-        writer.start()
-        channel = writer.register_channel("/a", "cdr", 0)
-        for time in (5, 3, 9, 3):
-            writer.add_message(channel, time, bytes([time]), time)
-        writer.finish()
-    reader = McapReader(path)
-    assert reader.channels == []
-    assert reader.stats() == {}
-    assert [m.log_time for m in messages(reader.records())] == [5, 3, 9, 3]
-    assert reader.times()[1].tolist() == [3, 3, 5, 9]
-    first = reader.first(reader.channels[0])
-    assert first is not None
-    assert first.log_time == 3
-    assert isinstance(first.data, bytes)
-    check_against_library(path)
-
-
-def test_a_summary_that_begins_among_the_data_tells_nothing(tmp_path: Path) -> None:
-    """Else a channel that stands behind its messages would be known before them."""
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer: Any = Writer(stream, use_chunking=False, enable_crcs=False)
-        writer.start()
-        channel = writer.register_channel("/a", "cdr", 0)
-        writer.add_message(channel, 5, b"x", 5)
-        writer.finish()
-    data = bytearray(path.read_bytes())
-    header = struct.unpack_from("<Q", data, 9)[0]
-    place = 17 + header
-    assert data[place] == 4  # the channel
-    data[place] = 0x90  # a private record
-    struct.pack_into("<Q", data, len(data) - 28, place)
-    path.write_bytes(data)
-    assert McapReader(path).channels == []
-    with pytest.raises(SourceError, match="message 1 belongs to channel 1, which is not defined"):
-        messages(McapReader(path).records())
-
-
-def test_times_past_int64_are_shortened(tmp_path: Path) -> None:
-    channel = Channel(1, "/a", "cdr", None)
-    write_all(
-        tmp_path / "a.mcap",
-        [Message(channel, 2**64 - 1, 0, 0, b""), Message(channel, 1, 0, 0, b"")],
-    )
-    reader, records = read(tmp_path / "a.mcap")
-    assert reader.times()[1].tolist() == [1, 2**63 - 1]
-    assert [m.log_time for m in messages(records)] == [1, 2**64 - 1]
-
-
-def test_a_decompressed_copy(tmp_path: Path) -> None:
-    """Errors and progress are those of the compressed file."""
-    written = messages(write_all(tmp_path / "a.mcap", scene()))
-    packed = tmp_path / "a.mcap.zstd"
-    packed.write_bytes(zstandard.compress((tmp_path / "a.mcap").read_bytes()))
-    with Rosbag2Reader(packed) as reader:
-        got = messages(reader.records())
-        assert list(map(fields, got)) == list(map(fields, written))
-        assert reader.position == packed.stat().st_size
-        assert sum(map(len, reader.times().values())) == len(written)
-    packed.write_bytes(packed.read_bytes()[:-50])
-    with pytest.raises(SourceError, match=r"a.mcap.zstd: its zstd data is cut short"):
-        Rosbag2Reader(packed)
-
-
-@pytest.mark.parametrize(
-    ("data", "problem"),
-    [
-        (zstandard.compress(b"abc")[:-1], "damaged"),
-        (zstandard.compress(b"abc") + b"x", "damaged"),
-        (zstandard.ZstdCompressor().compressobj().compress(b""), "damaged"),
-        (zstandard.ZstdCompressor(write_content_size=False).compress(b"abc") + b"x", "more than"),
-        (zstandard.ZstdCompressor(write_content_size=False).compress(b"abc")[:-2], "cut short"),
-    ],
-)
-def test_damaged_payloads(data: bytes, problem: str) -> None:
-    with pytest.raises(DamageError, match=problem):
-        unzstd(data)
-    assert unzstd(zstandard.ZstdCompressor(write_content_size=False).compress(b"abc")) == b"abc"
-
-
 # Damage -----------------------------------------------------------------------------------
 
 
@@ -400,26 +303,3 @@ def test_an_attachment_is_verified(tmp_path: Path) -> None:
     write_all(path, [Attachment("name", "", 0, 0, b"content")])
     path.write_bytes(path.read_bytes().replace(b"content", b"Content"))
     refuse(path, "attachment 'name' does not match its checksum")
-
-
-def test_a_huge_record_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    data = file_of()
-    path.write_bytes(data[:-37] + struct.pack("<BQ", 5, 2**40) + data[-37:])
-    refuse(path, "ends before its footer|bytes at byte")
-
-
-# Writing ----------------------------------------------------------------------------------
-
-
-def test_a_release_of_mcap_without_what_is_set_in_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Later(Writer):
-        def __init__(self, *args: Any, **options: Any) -> None:
-            super().__init__(*args, **options)
-            del self._Writer__compression
-
-    monkeypatch.setattr("mp4ds.bags.mcap.Writer", Later)
-    with pytest.raises(Mp4dsError, match=r"a\.mcap: mcap \S+ is newer .* 'mcap<"):
-        McapWriter(tmp_path / "a.mcap", profile="")

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader
 
-from conftest import DATA, real
+from conftest import real
 from damage import bag_fields, bag_records
-from mp4ds.bags import ros1
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.ros1 import Ros1Reader
 from mp4ds.bags.ros1_writer import Ros1Writer
@@ -24,7 +23,7 @@ from mp4ds.errors import (
     SourceError,
 )
 from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Schema
-from sources import START, scene, write_bag
+from sources import START
 
 COMPRESSIONS = ("none", "bz2", "lz4")
 REAL_BAGS = (
@@ -204,12 +203,6 @@ def test_real_bags(name: str) -> None:
         assert sum(item.count for item in reader.stats().values()) == len(found)
 
 
-def test_all_real_bags_are_known() -> None:
-    if DATA.is_dir():
-        found = {str(p.relative_to(DATA)) for p in (DATA / "bags").glob("*.bag")}
-        assert found <= set(REAL_BAGS)
-
-
 def test_messages_come_in_log_time_order_then_file_order(tmp_path: Path) -> None:
     chunks = [
         [(1, 5, b"b5"), (0, 5, b"a5"), (0, 9, b"a9"), (0, 5, b"a5 again")],
@@ -226,38 +219,6 @@ def test_messages_come_in_log_time_order_then_file_order(tmp_path: Path) -> None
         first = reader.first(reader.channels[1])
         assert first
         assert (bytes(first.data), first.publish_time, first.sequence) == (b"b5", 5, 0)
-
-
-def test_chunks_that_overlap_in_time_are_unpacked_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chunks = [[(0, 10 * n + c, b"%d" % n) for n in range(50)] for c in range(4)]
-    path = make_bag(tmp_path / "a.bag", [plain()], chunks, compression="bz2")
-    unpacked = []
-
-    def unpack(compression: str, data: bytes, size: int) -> bytes:
-        unpacked.append(size)
-        return real_unpack(compression, data, size)
-
-    real_unpack = ros1.unpack
-    monkeypatch.setattr(ros1, "unpack", unpack)
-    with Ros1Reader(path) as reader:
-        assert len(rows(reader)) == 200
-    assert len(unpacked) == 4
-    monkeypatch.setattr(ros1, "CACHED_BYTES", 1)
-    with Ros1Reader(path) as reader:
-        assert max(len(reader._unpacked) for _ in reader.records()) == 2
-    assert len(unpacked) > 100
-
-
-def test_progress_is_monotone(tmp_path: Path) -> None:
-    path = tmp_path / "a.bag"
-    write_bag(path, scene("mono8", frames=40))
-    with Ros1Reader(path) as reader:
-        positions = [reader.position for _ in reader.records()]
-        assert positions == sorted(positions)
-        assert len(set(positions)) > 3
-        assert positions[-1] <= reader.position == path.stat().st_size
 
 
 def test_connection_headers_stay_as_recorded(tmp_path: Path) -> None:
@@ -297,22 +258,6 @@ def test_connection_headers_stay_as_recorded(tmp_path: Path) -> None:
     with Ros1Reader(copied) as reader:
         assert identities(reader) == own
         assert [data for _, _, data in rows(reader)] == [b"%d" % n for n in range(len(headers))]
-
-
-def test_the_index_may_point_to_a_connection_record(tmp_path: Path) -> None:
-    topic, header = plain()
-    path = make_bag(tmp_path / "a.bag", [(topic, header)], [[(0, 1, b"one")]])
-    data = path.read_bytes()
-    size = data.index(b"size=") + 5
-    before = connection(0, topic, header)
-    content = data.index(b"\4\0\0\0op=\2") - 4
-    (length,) = struct.unpack_from("<I", data, size)
-    longer = number(length + len(before))
-    data = data[:size] + longer + longer + before + data[content:]
-    index = struct.unpack_from("<Q", data, data.index(b"index_pos=") + 10)[0] + len(before)
-    path.write_bytes(data.replace(data[:4109], bag_header(index, 1, 1)))
-    with Ros1Reader(path) as reader:
-        assert rows(reader) == [(0, 1, b"one")]
 
 
 # ---------------------------------------------------------------- what cannot be read
@@ -370,16 +315,6 @@ def test_messages_that_the_index_does_not_list_are_not_lost(tmp_path: Path) -> N
     end = two[two.index(b"\4\0\0\0op=\6") - 4 :]
     path.write_bytes(bag_header(index, 1, 2) + two[4109:] + end)
     refuse(path, "its index lists a chunk twice")
-
-
-def test_a_time_that_ros_does_not_have_is_refused(tmp_path: Path) -> None:
-    late = 77 * 10**9 + 7
-    path = make_bag(tmp_path / "a.bag", [plain()], [[(0, 1, b"one"), (0, late, b"two")]])
-    path.write_bytes(path.read_bytes().replace(stamp(late), b"\xff" * 8))
-    refuse(path, "a time past 2^32 seconds")
-    with open_sources([path], salvage=True) as reader:
-        assert [bytes(record.data) for record in reader.records()] == [b"one"]
-        assert [loss.messages for loss in reader.losses] == [1]
 
 
 def test_damage_has_a_sentence(tmp_path: Path) -> None:

@@ -20,10 +20,10 @@ from conftest import real
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.protocols import write_record
 from mp4ds.bags.rosbag2 import Rosbag2Reader, Rosbag2Writer
-from mp4ds.bags.rosbag2_metadata import RECORD, TABLES_RECORD, native_qos, parse_bag_info
-from mp4ds.bags.rosbag2_sqlite import SqliteReader, SqliteWriter
+from mp4ds.bags.rosbag2_metadata import RECORD, TABLES_RECORD, parse_bag_info
+from mp4ds.bags.rosbag2_sqlite import SqliteWriter
 from mp4ds.errors import SourceError
-from mp4ds.records import Attachment, Channel, ChannelStats, Message, MetadataRecord, Record, Schema
+from mp4ds.records import Attachment, Channel, Message, MetadataRecord, Record, Schema
 from scenes import scene as camera
 from sources import write_rosbag2
 from test_bags_mcap import check_index, messages
@@ -249,20 +249,6 @@ def check_layout(folder: Path, version: int, told: bool) -> None:
         assert topic["offered_qos_profiles"] == OLD_QOS
 
 
-def test_the_version_follows_the_style_of_the_qos(tmp_path: Path) -> None:
-    for number, (qos, version) in enumerate([(OLD_QOS, 8), (NEW_QOS, 9), ("", 9), ("[]", 9)]):
-        folder = tmp_path / str(number)
-        write(folder, "mcap", scene(qos), qos)
-        check_version = yaml.safe_load((folder / "metadata.yaml").read_text())
-        assert check_version["rosbag2_bagfile_information"]["version"] == version
-
-
-def test_qos_policies_by_number_and_by_name() -> None:
-    assert native_qos(OLD_QOS) == yaml.safe_load(NEW_QOS) == native_qos(NEW_QOS)
-    assert native_qos("") == native_qos("{") == native_qos("text") == []
-    assert native_qos("- history: 99\n  depth: true") == [{"history": "unknown", "depth": True}]
-
-
 def test_mcap_storage_keeps_everything(tmp_path: Path) -> None:
     channel = channels()[0]
     records: list[Record] = [
@@ -400,32 +386,6 @@ def test_compressed_files(
     assert list(work.iterdir()) == []
 
 
-def test_a_first_file_that_was_not_read_is_removed_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = split(tmp_path, "sqlite3", [scene()])
-    compress_files(folder)
-    (tmp_path / "work").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "work"))
-    with Rosbag2Reader(folder) as reader:
-        assert len(list((tmp_path / "work").iterdir())) == 1
-        assert reader.stats() != {}
-    assert list((tmp_path / "work").iterdir()) == []
-
-
-def test_damaged_compressed_files(tmp_path: Path) -> None:
-    folder = split(tmp_path, "sqlite3", [scene()])
-    compress_files(folder)
-    (file,) = folder.glob("*.zstd")
-    data = file.read_bytes()
-    file.write_bytes(data[:-9])
-    with pytest.raises(SourceError, match="zstd data is cut short"):
-        Rosbag2Reader(folder)
-    file.write_bytes(data[:100] + bytes(100) + data[200:])
-    with pytest.raises(SourceError, match="zstd data is damaged"):
-        Rosbag2Reader(folder)
-
-
 def test_a_database_alone_tells_that_its_payloads_are_compressed(tmp_path: Path) -> None:
     write_rosbag2(tmp_path / "a", camera("mono8"), compression="message")
     expected = list(map(fields, messages(read(tmp_path / "a")[1])))
@@ -433,66 +393,13 @@ def test_a_database_alone_tells_that_its_payloads_are_compressed(tmp_path: Path)
     assert list(map(fields, messages(read(tmp_path / "a" / "a_0.db3")[1]))) == expected
 
 
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_payloads_that_are_not_compressed_as_told(tmp_path: Path, storage: str) -> None:
-    write(tmp_path / "a", storage, scene()[1:])
-    told = {"compression_mode": "message", "compression_format": "zstd"}
-    edit(tmp_path / "a", lambda info: info.update(told))
-    with pytest.raises(
-        SourceError, match=r"message of log time \d+, topic /on: zstd data is damaged"
-    ):
-        read(tmp_path / "a")
-
-
 # What a metadata.yaml may say ---------------------------------------------------------------
-
-
-def test_topics_without_messages_may_stand_in_the_metadata_alone(tmp_path: Path) -> None:
-    write(tmp_path / "a", "mcap", scene())
-    topic = {
-        "name": "12:30",
-        "type": "on",
-        "serialization_format": "cdr",
-        "offered_qos_profiles": yaml.safe_load(NEW_QOS),
-    }
-
-    def change(info: dict[str, Any]) -> None:
-        info["topics_with_message_count"].append({"topic_metadata": topic, "message_count": 0})
-
-    edit(tmp_path / "a", change)
-    text = (tmp_path / "a" / "metadata.yaml").read_text()
-    (tmp_path / "a" / "metadata.yaml").write_text(
-        text.replace("'12:30'", "12:30").replace("'on'", "on")
-    )
-    reader, _ = read(tmp_path / "a")
-    assert len(reader.channels) == 5
-    assert reader.channels[-1] == Channel(
-        4, "12:30", "cdr", Schema("on", "", b""), {"offered_qos_profiles": NEW_QOS}
-    )
-    assert reader.stats()[4] == ChannelStats(0, 0, 0)
-
-
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-def test_a_storage_without_a_name_is_told_by_its_files(tmp_path: Path, storage: str) -> None:
-    write(tmp_path / "a", storage, scene())
-    edit(tmp_path / "a", lambda info: info.update(storage_identifier=""))
-    assert len(messages(read(tmp_path / "a")[1])) == 60
-
-
-def test_a_recording_may_have_no_files(tmp_path: Path) -> None:
-    info = {"version": 4, "storage_identifier": "", "relative_file_paths": []}
-    (tmp_path / "metadata.yaml").write_text(yaml.dump({"rosbag2_bagfile_information": info}))
-    reader, records = read(tmp_path)
-    assert len(records) == 1
-    assert (reader.channels, reader.stats(), reader.times()) == ([], {}, {})
 
 
 METADATA_FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "newer": ({"version": 10}, "metadata version 10"),
     "storage": ({"storage_identifier": "bolt"}, "storage 'bolt'"),
-    "no storage": ({"storage_identifier": "", "relative_file_paths": ["a.xyz"]}, "storage ''"),
     "format": ({"compression_mode": "file", "compression_format": "lz4"}, "'lz4'"),
-    "mode": ({"compression_mode": "bits", "compression_format": "zstd"}, "'bits'"),
     "outside": ({"relative_file_paths": [".."]}, r"lists '\.\.' as a file"),
     "topics": ({"topics_with_message_count": [{"message_count": 1}]}, "not? as expected|expected"),
     "number": ({"version": "new"}, "expected"),
@@ -506,24 +413,6 @@ def test_metadata_that_cannot_be_followed(tmp_path: Path, name: str) -> None:
     edit(tmp_path / "a", lambda info: info.update(change))
     with pytest.raises(SourceError, match=problem):
         Rosbag2Reader(tmp_path / "a")
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        (b"", "is empty"),
-        (b"a: [", "is not valid YAML"),
-        (b"[" * 5000, "is not valid YAML"),
-        (b"a: &a [*a, !!python/object:os.system b]", "is not valid YAML"),
-        (b"\xff\xfe", "UTF-8"),
-        (b"other: 1", "no rosbag2_bagfile_information"),
-        (b"- 1", "no rosbag2_bagfile_information"),
-    ],
-)
-def test_a_file_that_is_no_metadata(tmp_path: Path, text: bytes, problem: str) -> None:
-    (tmp_path / "metadata.yaml").write_bytes(text)
-    with pytest.raises(SourceError, match=problem):
-        Rosbag2Reader(tmp_path)
 
 
 def test_paths_stay_inside_the_folder(tmp_path: Path) -> None:
@@ -565,22 +454,13 @@ DATABASE_FAULTS = {
         [*REBUILT, "UPDATE messages SET data = NULL WHERE id = 3"],
         "message 3, topic /image: .* null",
     ),
-    "text": (
-        [*REBUILT, "UPDATE messages SET data = 'x' WHERE id = 3"],
-        "message 3, topic /image: .* text",
-    ),
     "negative": (
         ["UPDATE messages SET timestamp = -5 WHERE id = 3"],
         "message 1, topic /image: -5 is not a valid time",
     ),
-    "no time": (
-        [*REBUILT, "UPDATE messages SET timestamp = 'x' WHERE id = 3"],
-        "message 5, topic /image: .* is not a valid time",
-    ),
     "orphan": (["UPDATE messages SET topic_id = 7 WHERE id = 3"], "message 3 has topic id 7"),
     "column": (["ALTER TABLE messages ADD COLUMN sent INTEGER"], "an unknown column 'sent'"),
     "no table": (["DROP TABLE topics"], "not of rosbag2"),
-    "no column": (["ALTER TABLE topics DROP COLUMN type"], "not of rosbag2"),
     "not UTF-8": (
         ["UPDATE topics SET name = CAST(x'ff' AS TEXT)"],
         "table topics that is not UTF-8",
@@ -619,23 +499,6 @@ def test_tables_of_older_and_stranger_databases(tmp_path: Path) -> None:
             "db3:a.db3:ros_distro": "humble",
             "db3:a.db3:other_table:notes": "left out",
         }
-    ]
-
-
-def test_definitions_by_type_and_hash(tmp_path: Path) -> None:
-    path = database(
-        tmp_path / "a.db3",
-        "INSERT INTO message_definitions SELECT 9, topic_type, encoding, 'older', 'old'"
-        " FROM message_definitions",
-        "INSERT INTO topics SELECT 2, '/old', type, serialization_format, '', 'old' FROM topics",
-        "INSERT INTO topics SELECT 3, '/new', type, serialization_format, '', 'new' FROM topics"
-        " WHERE id = 1",
-    )
-    reader = SqliteReader(path)
-    assert [c.schema.data for c in reader.channels if c.schema] == [
-        IMAGE.data,
-        b"older",
-        IMAGE.data,
     ]
 
 

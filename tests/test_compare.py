@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
-import sqlite3
-import struct
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import mcap.records as records
 import pytest
-import yaml
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 import compare as witness
-import compare_digest as digests
 from sources import (
     IMAGE,
     SOURCES,
     START,
     Scene,
-    image_cdr,
-    image_ros1,
     raw_scene,
     scene,
     typestore,
@@ -47,24 +38,15 @@ WRITERS: dict[str, Callable[..., Any]] = {
 ENDINGS = {"bag": ".bag", "sqlite3": "", "mcap": ".mcap"}
 EQUAL = [
     ("bag-none", "bag-bz2"),
-    ("bag-none", "bag-lz4"),
     ("bag-none", "bag-split"),
-    ("bag-lz4", "mcap-ros1-zstd"),
     ("rosbag2-sqlite3-v9", "rosbag2-sqlite3-v4"),
-    ("rosbag2-sqlite3-v8", "rosbag2-sqlite3-v9"),
     ("rosbag2-sqlite3-v9", "rosbag2-sqlite3-split"),
     ("rosbag2-sqlite3-v9", "rosbag2-sqlite3-zstd-file"),
-    ("rosbag2-sqlite3-v9", "rosbag2-sqlite3-zstd-message"),
     ("rosbag2-sqlite3-v9", "rosbag2-mcap-v9"),
     ("rosbag2-mcap-v9", "rosbag2-mcap-split"),
-    ("rosbag2-mcap-v9", "rosbag2-mcap-zstd-file"),
     ("rosbag2-mcap-v9", "rosbag2-mcap-zstd-message"),
-    ("mcap-ros2-none", "mcap-ros2-lz4"),
     ("mcap-ros2-none", "mcap-ros2-zstd"),
-    ("mcap-ros2-none", "mcap-unchunked"),
     ("mcap-ros2-none", "mcap-unindexed"),
-    ("bag-none", "rosbag2-sqlite3-v9"),
-    ("bag-none", "rosbag2-mcap-v5"),
     ("mcap-ros1-zstd", "rosbag2-sqlite3-v6"),
 ]
 
@@ -112,37 +94,6 @@ def test_equal_across_compression_and_format(a: str, b: str, written: Any) -> No
     report = witness.examine(written(a), written(b))
     assert report.differences == []
     assert all(row.equal == row.a == row.b for row in report.rows.values())
-
-
-def test_qos_of_same_meaning_is_equal(tmp_path: Path) -> None:
-    what = scene("mono8", frames=2)
-    for name in ("a", "b"):
-        write_rosbag2(tmp_path / name, what, "mcap", 8)
-    file = tmp_path / "b" / "b_0.mcap"
-
-    def respell(record: Any) -> Any:
-        if isinstance(record, records.Channel):
-            profiles = yaml.safe_load(record.metadata["offered_qos_profiles"] or "[]")
-            for profile in profiles:
-                profile["history"] = "keep_last"
-                profile["lifespan"] = {"sec": 2147483647, "nsec": 2147483647}
-            record.metadata["offered_qos_profiles"] = json.dumps(profiles)
-        return record
-
-    rewrite(file, respell)
-    assert witness.compare(tmp_path / "a", tmp_path / "b") == []
-
-
-def test_channels_that_nothing_tells_apart_are_one(tmp_path: Path) -> None:
-    for name, channels in (("one.mcap", 1), ("two.mcap", 2)):
-        with (tmp_path / name).open("wb") as stream:
-            writer = Writer(stream)
-            writer.start("", "test")
-            ids = [writer.register_channel("/t", "json", 0) for _ in range(channels)]
-            for n in range(6):
-                writer.add_message(ids[n % channels], n, b"%d" % n, n, n)
-            writer.finish()  # type: ignore[no-untyped-call]
-    assert witness.compare(tmp_path / "one.mcap", tmp_path / "two.mcap") == []
 
 
 # ---------------------------------------------------------------- different messages
@@ -207,16 +158,6 @@ def test_changed_message_is_seen(change: str, kind: str, tmp_path: Path) -> None
     assert witness.compare(*reversed(paths))
 
 
-def test_calibration_is_seen_between_ros1_and_ros2(tmp_path: Path) -> None:
-    what = scene("mono8", frames=2, frame_id="left")
-    index = next(i for i, m in enumerate(what.messages) if m.topic == "/cam/camera_info")
-    values = dict(what.messages[index].values)
-    values["d"] = [0.1, *values["d"][1:]]
-    write_bag(tmp_path / "a.bag", what)
-    write_rosbag2(tmp_path / "b", changed(what, index, values=values))
-    one(witness.compare(tmp_path / "a.bag", tmp_path / "b"), "^/cam/camera_info message 0: payload")
-
-
 def test_order_of_equal_times_is_seen(tmp_path: Path) -> None:
     payloads = [(START, b"\1\0\0\0" + x, b"\0\1\0\0\2\0\0\0" + x + b"\0") for x in (b"a", b"b")]
     for name, messages in (("a.bag", payloads), ("b.bag", payloads[::-1])):
@@ -245,53 +186,6 @@ def test_changed_bag_is_seen(change: str, tmp_path: Path) -> None:
     assert old in data
     (tmp_path / "b.bag").write_bytes(data.replace(old, new))
     one(witness.compare(tmp_path / "a.bag", tmp_path / "b.bag"), pattern)
-
-
-SQLITE_CHANGES = {
-    "type hash": ("UPDATE topics SET type_description_hash = 'RIHS01_00' WHERE name = '/tf'",
-                  r"^/tf: topic_type_hash"),
-    "QoS": ("UPDATE topics SET offered_qos_profiles = replace(offered_qos_profiles, 'depth: 10', "
-            "'depth: 11') WHERE name = '/imu'", r"^/imu: offered_qos_profiles"),
-    "definition": ("UPDATE message_definitions SET encoded_message_definition = 'string text' "
-                   "WHERE topic_type = 'std_msgs/msg/String'",
-                   r"^/(chatter|diagnostics): definition"),
-    "no definition": ("DELETE FROM message_definitions WHERE topic_type = 'sensor_msgs/msg/Imu'",
-                      r"^/imu: definition .* None in B"),
-    "serialization": ("UPDATE topics SET serialization_format = 'xcdr' WHERE name = '/imu'",
-                      r"^/imu: message encoding 'cdr' in A, 'xcdr' in B"),
-    "time": ("UPDATE messages SET timestamp = timestamp - 1 WHERE id = 1", r"message 0: log time"),
-    "topic": ("DELETE FROM topics WHERE name = '/diagnostics'", r"^/diagnostics: .* missing in B"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("change", SQLITE_CHANGES)
-def test_changed_sqlite_is_seen(change: str, tmp_path: Path) -> None:
-    statement, pattern = SQLITE_CHANGES[change]
-    write_rosbag2(tmp_path / "a", scene("mono8", frames=3))
-    shutil.copy(tmp_path / "a" / "a_0.db3", tmp_path / "b.db3")
-    assert witness.compare(tmp_path / "a" / "a_0.db3", tmp_path / "b.db3") == []
-    with closing(sqlite3.connect(tmp_path / "b.db3")) as database, database:
-        assert database.execute(statement).rowcount == 1
-    one(witness.compare(tmp_path / "a" / "a_0.db3", tmp_path / "b.db3"), pattern)
-
-
-YAML_CHANGES = {
-    "custom data": ("operator: kim", "operator: lee", r"custom_data .*'kim'.* in A, .*'lee'"),
-    "QoS": ("depth: 100", "depth: 101", r"^metadata.yaml: topic /tf "),
-    "type hash": ("hash: RIHS01_", "hash: RIHS01_0", r"^metadata.yaml: topic "),
-    "silent topic": ("/diagnostics", "/diagnosis", r"^metadata.yaml: topic /diagnos"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("change", YAML_CHANGES)
-def test_changed_metadata_yaml_is_seen(change: str, tmp_path: Path) -> None:
-    old, new, pattern = YAML_CHANGES[change]
-    write_rosbag2(tmp_path / "a", scene("mono8", frames=3), "mcap")
-    shutil.copytree(tmp_path / "a", tmp_path / "b")
-    text = (tmp_path / "a" / "metadata.yaml").read_text("utf-8")
-    assert old in text
-    (tmp_path / "b" / "metadata.yaml").write_text(text.replace(old, new), "utf-8")
-    one(witness.compare(tmp_path / "a", tmp_path / "b"), pattern)
 
 
 def rewrite(path: Path, change: Callable[[Any], Any]) -> None:
@@ -374,63 +268,6 @@ def test_changed_mcap_is_seen(change: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- pixels left out
 
 
-def _two_images(encoding: str, **changes: Any) -> Iterator[Any]:
-    base = {"width": 4, "height": 2, "encoding": "mono8", "data": b"12345678"}
-    make = image_ros1 if encoding == "ros1" else image_cdr
-    channel = digests.Channel("/t", "sensor_msgs/Image", encoding, None, ())
-    digester = digests.Digester(ignore=["/t*"])
-    return (digester.digest(channel, make(**{**base, **c})) for c in ({}, changes))
-
-
-@pytest.mark.parametrize("encoding", ["ros1", "cdr"])
-def test_only_pixels_are_ignored(encoding: str) -> None:
-    a, b = _two_images(encoding, data=b"8765.321")
-    assert a == b
-    for change in (
-        {"stamp": 1},
-        {"is_bigendian": 1},
-        {"step": 3},
-        {"tail": b"x"},
-        {"frame_id": ""},
-    ):
-        a, b = _two_images(encoding, **change)
-        assert a != b, change
-    a, b = _two_images(encoding, data=b"123456")
-    assert a != b
-
-
-def test_pixels_of_big_endian_cdr_and_compressed_images() -> None:
-    a, b = _two_images("cdr", little_endian=False, data=b"8765.321")
-    assert a != b  # the byte order is part of the head
-    digester = digests.Digester(ignore=["*"])
-    channel = digests.Channel("/t", "sensor_msgs/msg/CompressedImage", "ros1", None, ())
-    head = struct.pack("<IIII", 1, 2, 3, 1) + b"c" + struct.pack("<I", 4) + b"jpeg"
-    long, short = (head + struct.pack("<I", len(x)) + x for x in (b"abcdef", b"gh"))
-    assert digester.digest(channel, long) == digester.digest(channel, short)
-    assert digester.digest(channel, long) != digester.digest(
-        channel, long.replace(b"jpeg", b"png ")
-    )
-
-
-def test_pixels_of_protobuf_are_found_by_name() -> None:
-    files = FileDescriptorSet()
-    message = files.file.add(name="a.proto", package="foxglove").message_type.add(name="RawImage")
-    message.field.add(name="width", number=2, label=1, type=13)
-    message.field.add(name="data", number=9, label=1, type=12)
-    definition = "protobuf", files.SerializeToString()
-    channel = digests.Channel("/t", "foxglove.RawImage", "protobuf", definition, ())
-    digester = digests.Digester(ignore=["/t"])
-    plain, pixels, width, unknown = (
-        digester.digest(channel, bytes([2 << 3, w, 9 << 3 | 2, len(data)]) + data + rest)
-        for w, data, rest in (
-            *((4, b"abcd", b"\x38\1"), (4, b"xyz", b"\x38\1")),
-            *((5, b"abcd", b"\x38\1"), (4, b"abcd", b"\x38\2")),
-        )
-    )
-    assert plain == pixels
-    assert len({plain, width, unknown}) == 3
-
-
 def test_ignored_pixels_of_whole_recordings(tmp_path: Path) -> None:
     what = scene("rgb8", frames=4)
     write_bag(tmp_path / "a.bag", what)
@@ -458,29 +295,3 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert witness.main([a, b]) == 1
     assert re.search(r"/cam/image_raw +4 +4 +3 +DIFFERS \(1\)", capsys.readouterr().out)
     assert witness.main([a, b, "--ignore-pixels", "/cam/*_raw"]) == 0
-
-
-def _cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-3000])
-
-
-@pytest.mark.parametrize("name", ["bag-lz4", "rosbag2-sqlite3-v9", "rosbag2-mcap-v9",
-                                  "mcap-ros2-none", "rosbag2-sqlite3-zstd-file"])  # fmt: skip
-def test_damaged_recordings_are_told(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (path,) = SOURCES[name](tmp_path, scene("mono8"))
-    file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
-    _cut(file)
-    assert witness.main([str(path), str(path)]) == 2
-    assert file.stem.split(".")[0] in capsys.readouterr().err
-    file.unlink()
-    assert witness.main([str(path), str(path)]) == 2
-
-
-def test_damaged_chunk_is_told(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "a.mcap", scene("mono8"), compression="none")
-    data = (tmp_path / "a.mcap").read_bytes()
-    (tmp_path / "a.mcap").write_bytes(data.replace(b"frame 1", b"frame 7"))
-    with pytest.raises(witness.UnreadableError, match=r"a\.mcap: CRC"):
-        witness.compare(tmp_path / "a.mcap", tmp_path / "a.mcap")

@@ -10,9 +10,7 @@ import sqlite3
 import struct
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import lz4.frame
 import pytest
@@ -21,11 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 import jail
 import mp4ds
-from commands import program
-from mp4ds import yamlio
 from mp4ds.bags import files
-from mp4ds.bags.convert import Converter
-from mp4ds.bags.files import DamageError, unzstd
 from mp4ds.bags.mcap import McapReader, McapWriter
 from mp4ds.bags.rosbag2_metadata import parse_qos
 from mp4ds.errors import RemoteError
@@ -193,35 +187,6 @@ def test_rows_that_share_their_pages(tmp_path: Path) -> None:
     assert "messages of /a with damaged or missing pages" in outcome.problems
 
 
-INTERRUPTED = """
-import signal, sys
-from pathlib import Path
-from mp4ds.bags import rosbag2_sqlite as sqlite_open
-
-class Stop(BaseException):
-    pass
-
-def stop(*_):
-    raise Stop
-
-sqlite_open._LEAST_STEPS = 10**15
-path = Path(sys.argv[1])
-signal.signal(signal.SIGVTALRM, stop)
-try:
-    with sqlite_open.open_tables(path) as tables:
-        signal.setitimer(signal.ITIMER_VIRTUAL, 0.05)
-        tables.select(sys.argv[2]).fetchone()
-except Stop:
-    print("stopped")
-"""
-
-
-def test_a_query_hears_signals(tmp_path: Path) -> None:
-    path = database(tmp_path / "a.db3", TOPICS, MESSAGES)
-    done = program("-c", INTERRUPTED, path, f"{ENDLESS} SELECT COUNT(1) FROM n")
-    assert done.out == "stopped\n", done.err
-
-
 # ---------------------------------------------------------------- YAML
 
 BRACKETS = "[" * 50_000
@@ -245,19 +210,6 @@ def test_yaml_that_grows(text: str, tmp_path: Path) -> None:
     outcome = jail.unpacked(path, "rosbag2")
     assert not outcome.error
     assert parse_qos(text) is None
-
-
-def test_aliases_that_a_writer_may_have_left(tmp_path: Path) -> None:
-    def scalar(event: Any) -> Any:
-        return event.value
-
-    text = "a: &a {sec: 1, nsec: 2}\nb: [*a, *a]\nc: &c !!str 5\nd: *c\n5: null\n"
-    duration = {"sec": "1", "nsec": "2"}
-    expected = {"a": duration, "b": [duration, duration], "c": "5", "d": "5", "5": "null"}
-    assert yamlio.build(text, scalar) == expected
-    for wrong in ("a: &a [*a]", "a: *a", "? [a]\n: 1", "a: 1\na: 2", "a: !x 1", "a\n---\nb"):
-        with pytest.raises(ValueError, match=r"alias|key|tag|document"):
-            yamlio.build(wrong, scalar)
 
 
 # ---------------------------------------------------------------- definitions
@@ -344,27 +296,6 @@ def test_definitions_that_claim_much(tmp_path: Path) -> None:
         assert outcome.error in ("OptionError", "SourceError"), (name, outcome.text)
 
 
-def test_some_messages_without_bytes_are_converted() -> None:
-    definition = f"B[2] x\nB[] y{NEXT}a/B\nstd_msgs/Empty z\n"
-    for encoding, payload, expected in (
-        ("ros1", struct.pack("<I", 3), CDR + bytes(4) + struct.pack("<I", 3) + bytes(3)),
-        ("cdr", CDR + bytes(4) + struct.pack("<I", 3) + bytes(3), struct.pack("<I", 3)),
-    ):
-        schema = Schema("a/msg/A", "ros1msg" if encoding == "ros1" else "ros2msg", b"")
-        channel = Channel(1, "/a", encoding, replace(schema, data=definition.encode()), {})
-        converter = Converter("ros2" if encoding == "ros1" else "ros1")
-        assert bytes(converter.payload(channel, payload)) == expected
-
-
-def test_what_a_definition_does_not_bound_is_packed(tmp_path: Path) -> None:
-    path = recording(tmp_path / "a.mcap", *("cdr", "a/msg/A"), *DEFINITIONS["cdr-array"][1:])
-    outcome = jail.unpacked(path, "bag")
-    assert "a message cannot be parsed as a/msg/A" in outcome.text
-    with mp4ds.open(f"{path}.packed") as dataset:
-        (message,) = dataset.messages()
-        assert message.raw == DEFINITIONS["cdr-array"][2]
-
-
 # ---------------------------------------------------------------- compression
 
 
@@ -440,13 +371,6 @@ def test_a_file_that_unpacks_to_much(name: str, tmp_path: Path) -> None:
     problem = "it unpacks to more than 134217728 bytes, too many for its size"
     assert problem in outcome.text
     jail.records(tmp_path, salvage=True)
-
-
-def test_a_message_that_unpacks_to_much() -> None:
-    for told in (True, False):
-        with pytest.raises(DamageError, match=r"declares|unpacks to \d+, over the limit"):
-            unzstd(zstd_bomb(2**30, told=told))
-    assert unzstd(zstd_bomb(2**20, told=False)) == bytes(2**20)
 
 
 GIB = 2**30

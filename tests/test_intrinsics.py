@@ -146,31 +146,6 @@ def test_what_belongs_to_no_other_is_listed_too(packed: bool, tmp_path: Path) ->
     assert [(item.message, item.frame_id) for item in second.calibrations] == [(0, "lens")]
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_calibrations_without_end_are_counted(
-    packed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mp4ds.plugins.info.MAX_LISTED", 3)
-    path = recorded(tmp_path, focused(scene("mono8"), range(100, 108)), packed=packed)
-    camera = camera_of(intrinsics(path))
-    assert [item.message for item in camera.calibrations] == [0, 1, 2]
-    assert camera.more == 5
-
-
-def test_unreadable_messages_are_passed_over(tmp_path: Path) -> None:
-    made = focused(scene("mono8"))
-    broken = [
-        replace(record, ros1=b"\x01", cdr=b"\x00\x01\x00\x00\x01") if record in infos(made)[:2] or (
-            record.topic == "/cam/image_raw" and n < 20) else record
-        for n, record in enumerate(made.messages)
-    ]  # fmt: skip
-    for path in (SOURCES["bag-none"](tmp_path, Scene(broken))[0],
-                 SOURCES["mcap-ros2-none"](tmp_path, Scene(broken))[0]):  # fmt: skip
-        camera = camera_of(intrinsics(path))
-        assert [item.message for item in camera.calibrations] == [2, *CHANGES[1:]]
-        assert camera.sizes == [(64, 48)]
-
-
 # ---------------------------------------------------------------- transforms
 
 PATH = [Transform(*link) for link in LINKS[:2]]
@@ -222,45 +197,6 @@ def test_effective_matrices_project_into_the_recorded_image(
         scale = np.maximum(1, binning)
         expected = (full[:2] / full[2] - np.array(offset)) / scale
         np.testing.assert_allclose(seen[:2] / seen[2], expected, rtol=1e-9, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("binning", "roi", "same"),
-    [
-        ((0, 0), (0, 0, 0, 0), True),
-        ((1, 1), (0, 0, 480, 640), True),
-        ((1, 0), (0, 0, 0, 0), True),
-        ((2, 1), (0, 0, 0, 0), False),
-        ((1, 2), (0, 0, 0, 0), False),
-        ((1, 1), (1, 0, 0, 0), False),
-        ((1, 1), (0, 1, 0, 0), False),
-    ],
-)
-def test_effective_matrices_are_told_where_they_differ(
-    binning: tuple[int, int], roi: tuple[int, int, int, int], same: bool, tmp_path: Path
-) -> None:
-    names = ("x_offset", "y_offset", "height", "width")
-    values = {
-        **calibration(64, 48),
-        "width": 64,
-        "height": 48,
-        "header": {"frame_id": "lens"},
-        "binning_x": binning[0],
-        "binning_y": binning[1],
-        "roi": dict(zip(names, roi, strict=True)),
-    }
-    write_bag(tmp_path / "drive.bag", Scene([Record("/cam/camera_info", INFO, START, values)]))
-    (item,) = camera_of(intrinsics(tmp_path / "drive.bag")).calibrations
-    assert (item.k_effective is None) is same
-    assert (item.p_effective is None) is same
-    assert item.binning == (binning if any(binning) else None)
-    expected = {**dict(zip(names, roi, strict=True)), "do_rectify": 0}
-    assert item.roi == (expected if any(roi) else None)
-    text, _ = command(tmp_path / "drive.bag")
-    assert ("K_effective = " in text) is not same
-    assert ("P_effective = " in text) is not same
-    assert ("binning = " in text) is any(binning)
-    assert ("roi = " in text) is any(roi)
 
 
 # ---------------------------------------------------------------- the command
@@ -321,16 +257,3 @@ def test_nothing_that_a_recording_says_becomes_code(tmp_path: Path) -> None:
     assert names.get("transforms", []) == [
         (item.parent, item.child, list(item.translation), list(item.rotation)) for item in found
     ]
-
-
-def test_a_camera_without_calibration_and_one_that_is_not_calibrated(tmp_path: Path) -> None:
-    blank = {"width": 64, "height": 48, "header": {"frame_id": "lens"}}
-    made = scene("mono8", with_info=False)
-    path = tmp_path / "drive.bag"
-    write_bag(path, Scene([*made.messages, Record("/lens", INFO, START, blank)]))
-    text, names = command(path)
-    assert "# /cam/image_raw: 64x48, frame 'cam'\n# no calibration\n" in text
-    assert "# /lens: calibrations without an image topic\n" in text
-    assert "no distortion model" in text
-    assert "# not calibrated: K is zero\n" in text
-    assert names["D"].shape == (0,)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import random
-import resource
 import shutil
 import sqlite3
 import struct
@@ -24,18 +23,14 @@ from conftest import DATA, real
 from damage import INJURIES, Key, Piece, all_messages, pieces_of, sound_messages
 from mp4ds import SourceError
 from mp4ds.bags.formats import open_sources
-from mp4ds.bags.salvage.scan import LossLog
-from mp4ds.format.manifest import LossEntry
 from mp4ds.records import (
     EVERYTHING,
     MAX_LOSSES,
-    MAX_LOST_TOPICS,
     Channel,
     Excerpt,
     Loss,
     Message,
     Record,
-    bounded,
 )
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2, write_split_bags
 
@@ -254,25 +249,6 @@ def covers(loss: Loss, piece: Piece) -> bool:
     return loss.offset < piece.end and piece.start < loss.offset + loss.size
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_file_cut_anywhere(kind: str, intact: Intact, salvaged_as: SalvagedAs) -> None:
-    """Up to a chunk or message that is whole everything is there, byte for byte."""
-    data, pieces = intact(kind)
-    everything = Counter(all_messages(pieces))
-    for length in random.Random(kind).sample(range(1, len(data)), 25):
-        whole = [piece for piece in pieces if piece.end <= length]
-        try:
-            records, losses = salvaged_as(kind, data[:length])
-        except SourceError:  # not even a header is whole
-            assert not any(piece.messages for piece in whole)
-            continue
-        found = keys(records)
-        assert not Counter(sound_messages(whole, [])) - found
-        assert not found - everything
-        assert losses or kind.endswith("unindexed")
-        check_ranges(losses, length)
-
-
 # ---------------------------------------------------------------- counts and words
 
 
@@ -316,21 +292,6 @@ def test_messages_without_their_channel(intact: Intact, salvaged_as: SalvagedAs)
         (loss,) = (x for x in losses if f"{word} {number}," in x.problem)
         count = sum(m[0] == number for p in pieces for m in p.messages)
         assert loss.messages in (count, count - 1)  # one may be taken for part of the damage
-
-
-def test_a_damaged_summary_tells_of_channels_as_a_last_resort(
-    intact: Intact, salvaged_as: SalvagedAs
-) -> None:
-    data, pieces = intact("mcap-unchunked")
-    piece = next(p for p in pieces if "/imu" in p.defines.values() and not p.is_index)
-    damaged = bytearray(data)
-    damaged[piece.start : piece.end] = bytes(piece.end - piece.start)
-    damaged[-12] ^= 1  # of the summary's checksum
-    records, _ = salvaged_as("mcap-unchunked", bytes(damaged))
-    (number,) = piece.defines
-    count = sum(m[0] == number for p in pieces for m in p.messages)
-    found = sum(count for key, count in keys(records).items() if key[0] == "/imu")
-    assert found in (count, count - 1)  # one may be taken for part of the damage
 
 
 def test_messages_without_their_schema_are_kept(intact: Intact, salvaged_as: SalvagedAs) -> None:
@@ -377,23 +338,6 @@ def test_there_are_not_more_losses_than_a_manifest_holds(tmp_path: Path) -> None
     assert sum(loss.messages or 0 for loss in losses) == damaged
 
 
-def test_losses_of_several_files_are_summed_up() -> None:
-    log = LossLog("a")
-    for number in range(3000):
-        log.lost(10 * number, 5, "bad").add(1, [f"/t{number % 70}"])
-    one = log.finish()
-    assert len(one) == MAX_LOSSES
-    assert len(one[-1].topics) == MAX_LOST_TOPICS
-    assert one[-1].topics[-1] == "... and 7 more"
-    both = bounded([*one, *one])
-    assert len(both) == MAX_LOSSES
-    assert both[-1].problem == f"{6000 - MAX_LOSSES + 1} more places that could not be read"
-    assert both[-1].messages == 6000 - MAX_LOSSES + 1
-    assert sum(loss.size or 0 for loss in both) == 6000 * 5
-    for loss in both:
-        LossEntry.from_record(loss)
-
-
 # ---------------------------------------------------------------- the usual reader
 
 
@@ -412,19 +356,6 @@ def test_the_usual_error_names_the_option(name: str, tmp_path: Path) -> None:
     records, losses = salvaged(*paths)
     assert losses
     assert keys(records) or name.startswith("mcap") or "zstd" in name
-
-
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "bag-none"])
-def test_it_names_the_option_for_damage_in_the_middle(
-    kind: str, intact: Intact, tmp_path: Path
-) -> None:
-    data, _ = intact(kind)
-    path = tmp_path / f"drive.{kind.partition('-')[0]}"
-    middle = len(data) // 2
-    path.write_bytes(data[:middle] + bytes(9000) + data[middle + 9000 :])
-    with pytest.raises(SourceError, match=r"`mp4ds pack --salvage`"):
-        usual(path)
-    assert keys(salvaged(path)[0])
 
 
 def test_the_damaged_files_of_others() -> None:
@@ -547,30 +478,6 @@ def test_a_length_that_lies_takes_no_memory(name: str, intact: Intact, tmp_path:
     total = sum(len(piece.messages) for piece in pieces)
     largest = max(len(piece.messages) for piece in pieces)
     assert records >= total - largest - 1
-    assert peak < 200
-
-
-@pytest.mark.one_in(2)
-@pytest.mark.parametrize("kind", ["bag-none", "bag-bz2", "mcap-zstd", "mcap-none"])
-def test_a_long_gap_takes_no_memory(kind: str, intact: Intact, tmp_path: Path) -> None:
-    """A chunk that claims to be as long as the zeros that follow, where the disk was full."""
-    data, pieces = intact(kind)
-    suffix = kind.partition("-")[0]
-    chunk = [p for p in pieces if p.messages][5 if "none" in kind else 1]
-    length = 700 * 2**20
-    path = tmp_path / f"drive.{suffix}"
-    with path.open("wb") as stream:
-        stream.write(data[: chunk.start + (chunk.end - chunk.start) // 2])
-        stream.seek(length, os.SEEK_CUR)
-        stream.write(data[chunk.end :])
-    if suffix == "mcap":
-        with path.open("r+b") as stream:
-            stream.seek(chunk.start + 1)
-            stream.write(struct.pack("<Q", length))
-    records, losses, peak = read_confined(path)
-    later = sum(len(p.messages) for p in pieces if p.start >= chunk.end and p.messages)
-    assert records >= later > 0
-    assert losses
     assert peak < 200
 
 
@@ -818,19 +725,6 @@ def test_what_a_write_ahead_log_committed_is_read(
     assert (len(rows) > len(scene("mono8").messages)) == (keep > 0.01)
 
 
-@pytest.mark.parametrize("size", [512, 1024, 8192, 65536])
-def test_other_sizes_of_pages(size: int, database: Path) -> None:
-    with closing(sqlite3.connect(database, isolation_level=None)) as connection:
-        connection.execute(f"PRAGMA page_size = {size}")
-        connection.execute("VACUUM")
-    expected = keys(usual(database))
-    assert keys(salvaged(database)[0]) == expected
-    with database.open("r+b") as stream:
-        stream.write(bytes(100))
-    with pytest.raises(SourceError, match=r"not an sqlite3 database.*\.recover"):
-        salvaged(database)
-
-
 # ---------------------------------------------------------------- several files
 
 
@@ -849,46 +743,3 @@ def test_of_a_split_recording_only_the_damaged_part_loses(tmp_path: Path) -> Non
     for topic in {key[0] for key in found}:
         times = [r.log_time for r in records if isinstance(r, Message) and r.channel.topic == topic]
         assert times == sorted(times)
-
-
-def test_what_is_asked_apart_changes_no_losses(intact: Intact, tmp_path: Path) -> None:
-    data, _ = intact("mcap-zstd")
-    path = tmp_path / "drive.mcap"
-    path.write_bytes(data[: len(data) // 2])
-    with open_sources([path], salvage=True) as reader:
-        records = [r for r in reader.records() if isinstance(r, Message)]
-        losses = list(reader.losses)
-        assert losses
-        times = reader.times()
-        for channel in reader.channels:
-            own = [r for r in records if r.channel.id == channel.id]
-            assert times.get(channel.id, []) == pytest.approx(sorted(r.log_time for r in own))
-            first = reader.first(channel)
-            assert (first is None) == (not own)
-            assert first is None or first.log_time == min(r.log_time for r in own)
-        assert list(reader.losses) == losses
-
-
-def test_two_readings_at_a_time_are_not_mixed(intact: Intact, tmp_path: Path) -> None:
-    path = tmp_path / "drive.mcap"
-    path.write_bytes(intact("mcap-zstd")[0])
-    with open_sources([path], salvage=True) as reader:
-        first = reader.records()
-        next(first)
-        whole = len(list(reader.records()))
-        assert whole > 20
-        with pytest.raises(RuntimeError, match="salvaged once at a time"):
-            list(first)
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
-    path = tmp_path / "drive.mcap"
-    write_mcap(path, scene("mono8", frames=1500, width=160, height=120, noisy=False))
-    with path.open("r+b") as stream:
-        stream.seek(path.stat().st_size // 3)
-        stream.write(bytes(10**5))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with open_sources([path], salvage=True) as reader:
-        assert sum(1 for _ in reader.records()) > 5000
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 40 * 1024
