@@ -133,9 +133,3 @@ def test_it_counts_the_frames(tmp_path: Path) -> None:
     reader = FrameReader(written(tmp_path, RECIPES["svt-8"]), codec="av1", frames=3, maker=maker)
     with closing(reader), pytest.raises(VideoError, match=rf"has {FRAMES} frames, not 3"):
         list(reader.pictures_of([0]))
-
-
-def test_another_codec_is_refused(tmp_path: Path) -> None:
-    maker: Any = Samples()
-    with pytest.raises(VideoError, match="coded as av1"):
-        FrameReader(written(tmp_path, RECIPES["svt-8"]), codec="h264", frames=FRAMES, maker=maker)

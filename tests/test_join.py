@@ -6,7 +6,6 @@ import itertools
 import os
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from coded_tools import scene as packet_scene
 from commands import ROOT, program
 from mp4ds.errors import Mp4dsError, VideoError
 from mp4ds.video.codecs import Recipe, recipe_for
-from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.mp4 import read_sample_entry
 from mp4ds.video.packets import PacketReader, PacketWriter, join_segments
 from pictures import blocks as means_of_blocks
@@ -137,11 +135,6 @@ def differing(a: Path, b: Path) -> set[str]:
     return {kind.rpartition("/")[2] for kind in kinds}
 
 
-# What does not come out alike: of x264 and x265 the greatest bit rate is 0, for unknown, and of a
-# copy the mean one; SVT-AV1 calls frames dispensable, not all of them rightly, which no copy has.
-LEFT_OUT = {"h264": {"btrt"}, "h265": {"btrt"}, "av1": {"sdtp"}, "ffv1": set()}
-
-
 # ---------------------------------------------------------------- videos that are encoded here
 
 
@@ -210,53 +203,6 @@ def test_the_file_is_as_one_encoder_writes_it(kind: Kind, joined: Joined, tmp_pa
     assert keys == expected
 
 
-@pytest.mark.one_in(4)
-@every_kind
-def test_one_segment_is_the_file_itself(kind: Kind, joined: Joined, tmp_path: Path) -> None:
-    segment = joined(kind)[1][0]
-    target = tmp_path / "alone.mp4"
-    join_segments([segment], [n * STEP for n in range(LENGTHS[0])], target)
-    left_out = LEFT_OUT[recipe_of(kind).codec]
-    assert differing(segment, target) <= left_out
-    if not left_out:
-        assert target.read_bytes() == segment.read_bytes()
-
-
-@pytest.mark.one_in(3)
-@pytest.mark.parametrize("picture_format", [f for codec, f in LOSSLESS if codec == "ffv1"])
-def test_parts_that_end_at_key_frames_give_the_uncut_file(
-    picture_format: str, tmp_path: Path
-) -> None:
-    """FFV1 has nothing in a packet that depends on those before the key frame."""
-    recipe = recipe_for(picture_format, lossless=True, codec="ffv1")
-    pictures = noise(picture_format, WIDTH, HEIGHT, 10)
-    ticks = [0, 1, 40_000, 90_001, 90_002, 5_000_000, 5_000_001, 6_000_000, 6_100_000, 6_200_000]
-    segments = []
-    for begin in range(0, 10, GOP):
-        part = slice(begin, begin + GOP)
-        segments.append(tmp_path / f"{begin}.mp4")
-        encode(segments[-1], recipe, pictures[part], picture_format, ticks=ticks[part], gop=GOP)
-    encode(tmp_path / "uncut.mp4", recipe, pictures, picture_format, ticks=ticks, gop=GOP)
-    join_segments(segments, ticks, tmp_path / "joined.mp4")
-    assert (tmp_path / "joined.mp4").read_bytes() == (tmp_path / "uncut.mp4").read_bytes()
-
-
-@pytest.mark.one_in(18)
-@pytest.mark.parametrize("kind", KINDS, ids=IDS)
-@pytest.mark.parametrize("size", [(640, 360), (1920, 1200)])
-def test_what_a_track_says_does_not_hang_on_threads(
-    kind: tuple[str, str, bool], size: tuple[int, int], tmp_path: Path
-) -> None:
-    width, height = size
-    entries = set()
-    picture = noise(kind[1], width, height, 1)[0]
-    for threads in (1, 2, 5):
-        encode(tmp_path / "v.mp4", recipe_of(kind), [picture], kind[1], gop=GOP, threads=threads)
-        entries.add(read_sample_entry(tmp_path / "v.mp4"))
-    (entry,) = entries
-    assert not any(b"thread" in body or b"cpu" in body for _, body in entry.boxes)
-
-
 # ---------------------------------------------------------------- packets that are copied
 
 
@@ -299,28 +245,6 @@ def test_copied_packets_give_the_uncut_file(name: str, tmp_path: Path) -> None:
         frames = list(container.decode(video=0))
     assert [frame.pts for frame in frames] == ticks
     assert not any(frame.is_corrupt for frame in frames)
-
-
-# ---------------------------------------------------------------- times
-
-
-@pytest.mark.parametrize("rate", [0.5, 10.0, 30.0, 120.0, None])
-def test_the_last_frame_lasts_as_the_rate_says(rate: float | None, tmp_path: Path) -> None:
-    bodies = [jpeg(picture) for picture in packet_scene(6)]
-
-    def part(path: Path, begin: int, end: int) -> Path:
-        with PacketWriter(path, "mjpeg", width=64, height=48, rate=rate) as writer:
-            for number in range(begin, end):
-                writer.write(bodies[number], (number - begin) * 7, keyframe=True)
-        return path
-
-    uncut = part(tmp_path / "uncut.mp4", 0, 6)
-    segments = [part(tmp_path / f"{n}.mp4", 2 * n, 2 * n + 2) for n in range(3)]
-    join_segments(segments, range(0, 42, 7), tmp_path / "joined.mp4")
-    assert (tmp_path / "joined.mp4").read_bytes() == uncut.read_bytes()
-    with av.open(str(tmp_path / "joined.mp4")) as container:
-        expected = 35 + 1_000_000 / (rate or 30.0)
-        assert container.streams.video[0].duration == pytest.approx(expected, abs=1)
 
 
 # ---------------------------------------------------------------- refusals and faults
@@ -373,51 +297,6 @@ def test_videos_that_cannot_be_one(name: str, tmp_path: Path) -> None:
     assert str(caught.value).endswith(".")
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
-def test_rates_that_change_between_segments(codec: str, tmp_path: Path) -> None:
-    """Encoders derive a level from it, and x265 tells it."""
-    recipe = recipe_for("yuv420p", lossless=False, codec=codec, crf=30)
-    size = {"width": 1920, "height": 1200}
-    for name, rate in (("a", 30.0), ("b", 30.0), ("c", 240.0)):
-        encoder = VideoEncoder(
-            tmp_path / f"{name}.mp4", recipe, picture_format="yuv420p", **size,
-            gop=GOP, threads=2, rate=rate,
-        )  # fmt: skip
-        encoder.write(noise("yuv420p", *size.values(), 1)[0], 0)
-        encoder.close()
-    paths = {name: tmp_path / f"{name}.mp4" for name in "abc"}
-    join_segments([paths["a"], paths["b"]], range(2), tmp_path / "j.mp4")
-    with pytest.raises(Mp4dsError, match=r"avcC|hvcC|av1C"):
-        join_segments([paths["a"], paths["c"]], range(2), tmp_path / "j.mp4")
-
-
-X265 = "bframes=0:log-level=none:repeat-headers=1:min-keyint=5:ref=1"
-
-
-@pytest.mark.parametrize(
-    ("codec", "options", "width", "match"),
-    [
-        ("h264", {"x264-params": "ref=4:8x8dct=0"}, 64, "avcC"),
-        ("h265", {"x265-params": X265}, 64, "hvcC"),
-        *((codec, {}, 80, "their size") for codec in ("vp9", "av1")),
-    ],
-)
-def test_parameter_sets_that_change_between_segments(
-    codec: str, options: dict[str, str], width: int, match: str, tmp_path: Path
-) -> None:
-    a, b = ENCODINGS[codec], replace(ENCODINGS[codec], options=ENCODINGS[codec].options | options)
-    for name, packets in (
-        ("a", encode_packets(a, frames=4, width=64)),
-        ("b", encode_packets(b, frames=4, width=width)),
-    ):
-        write_packets(tmp_path / f"{name}.mp4", codec, [packet.data for packet in packets])
-        join_segments([tmp_path / f"{name}.mp4"] * 2, range(8), tmp_path / "j.mp4")
-    (tmp_path / "j.mp4").unlink()
-    with pytest.raises(Mp4dsError, match=match):
-        join_segments([tmp_path / "a.mp4", tmp_path / "b.mp4"], range(8), tmp_path / "j.mp4")
-    assert not (tmp_path / "j.mp4").exists()
-
-
 @pytest.mark.parametrize(("count", "match"), [(9, "5 frames, but 4 are needed"), (11, "10 frames"),
                                               (0, "5 frames, but 0 are needed")])  # fmt: skip
 def test_ticks_for_other_frames(count: int, match: str, tmp_path: Path) -> None:
@@ -425,13 +304,6 @@ def test_ticks_for_other_frames(count: int, match: str, tmp_path: Path) -> None:
     with pytest.raises(VideoError, match=match) as caught:
         join_segments([segment, segment], iter(range(count)), tmp_path / "j.mp4")
     assert caught.value.code == "frame-count"
-    assert not (tmp_path / "j.mp4").exists()
-
-
-@pytest.mark.parametrize("ticks", [[0, 1, 2, 3, 3], [5, 4, 3, 2, 1], [0, 1, -1, 2, 3]])
-def test_ticks_that_do_not_increase(ticks: list[int], tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="does not follow"):
-        join_segments([small(tmp_path / "a.mp4")], ticks, tmp_path / "j.mp4")
     assert not (tmp_path / "j.mp4").exists()
 
 
@@ -481,13 +353,6 @@ def test_a_segment_that_cannot_be_read(fault: str, place: int, tmp_path: Path) -
             join_segments([segments[place]], range(5), tmp_path / "j.mp4")
 
 
-def test_a_segment_that_is_missing(tmp_path: Path) -> None:
-    for paths in ([tmp_path / "b.mp4"], [small(tmp_path / "a.mp4"), tmp_path / "b.mp4"]):
-        with pytest.raises(VideoError, match="does not exist") as caught:
-            join_segments(paths, range(10), tmp_path / "j.mp4")
-        assert caught.value.code == "file-missing"
-
-
 def rewrite(path: Path, codec: str, number: int, damaged: bytes) -> None:
     """Change a packet where it stands."""
     with PacketReader(path, codec=codec) as reader:
@@ -519,16 +384,6 @@ def test_packets_that_the_muxer_mistakes(tmp_path: Path) -> None:
     with pytest.raises(VideoError, match="a packet is damaged"):
         join_segments([path], range(3), tmp_path / "j.mp4")
     assert not (tmp_path / "j.mp4").exists()
-
-
-def test_packets_that_the_muxer_joins(tmp_path: Path) -> None:
-    """A VP9 frame that is not shown and the next one."""
-    path = tmp_path / "a.mp4"
-    bodies = [p.data for p in encode_packets(ENCODINGS["vp9"], frames=4, gop=20)]
-    write_packets(path, "vp9", bodies)
-    rewrite(path, "vp9", 1, hide(bodies[1]))
-    with pytest.raises(VideoError, match="a packet is damaged"):
-        join_segments([path], range(4), tmp_path / "j.mp4")
 
 
 # ---------------------------------------------------------------- large files

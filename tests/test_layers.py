@@ -27,7 +27,6 @@ import mp4ds
 from commands import call
 from edits import agreed, changed, flip
 from mp4ds import FormatError, OptionError, SourceError, UnpackOptions
-from mp4ds.dataset.dataset import Dataset
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.video.media import new_mp4
 
@@ -127,12 +126,6 @@ def test_of_views_everything_but_the_pixels_is_unpacked(dataset: Path) -> None:
             assert len(one) == len(other)
 
 
-def test_topics_whose_exact_videos_are_here_are_unpacked(dataset: Path) -> None:
-    exact(dataset, ONE).unlink()
-    found = unpacked(dataset, UnpackOptions(exclude=(TOPICS[0],)))
-    assert hashes(found) == {topic: RECORDED[topic] for topic in TOPICS[1:]}
-
-
 def test_exact_frames_that_are_asked_for_and_away(dataset: Path) -> None:
     exact(dataset, ONE).unlink()
     with mp4ds.open(dataset, layer="exact") as opened:
@@ -144,17 +137,6 @@ def test_exact_frames_that_are_asked_for_and_away(dataset: Path) -> None:
     named = f"exact layer not here: 1 file, .*: {ONE}\\.exact\\.mp4"
     with pytest.raises(SourceError, match=named):  # which of several it is
         mp4ds.unpack(dataset, "mcap", dataset.with_name("refused.mcap"))
-
-
-def test_without_its_view_an_exact_video_is_nothing(dataset: Path) -> None:
-    view(dataset, ONE).unlink()
-    with mp4ds.open(dataset) as opened:
-        with pytest.raises(FormatError, match=rf"{ONE}\.exact\.mp4 only has differences to it"):
-            opened[TOPICS[0]].read([0])
-        opened[TOPICS[1]].read([0])
-    (dataset / f"{ONE}.yaml").unlink()
-    with pytest.raises(FormatError, match="is a video without its sidecar"):  # nor other frames
-        mp4ds.open(exact(dataset, ONE).rename(dataset.parent / f"{ONE}.exact.mp4"))
 
 
 @pytest.mark.parametrize("place", [view, exact])
@@ -308,56 +290,6 @@ def test_an_exact_video_of_another_stream_is_found_by_digests(dataset: Path) -> 
     assert codes
     with pytest.raises(FormatError):
         unpacked(dataset)
-
-
-def test_pictures_of_two_frames_are_not_put_together(dataset: Path) -> None:
-    """Reading compares no digests, so that the numbers have to be the same."""
-    with Dataset(dataset) as opened:
-        stream = opened.streams[0]
-        with pytest.raises(FormatError, match="gives frame 1 where 0 is due"):
-            list(stream.predicted(iter([(0, ())]), iter([(1, ())])))
-
-
-def test_a_link_to_nothing_is_no_exact_video(dataset: Path) -> None:
-    exact(dataset, ONE).unlink()
-    exact(dataset, ONE).symlink_to(dataset / "nothing.mp4")
-    assert mp4ds.validate(dataset, deep=True) == []
-    with Dataset(dataset) as opened:
-        assert opened.absence().startswith("exact layer not here: 1 file")
-
-
-@pytest.mark.parametrize("entry", [{"view": "other.mp4"}, {"view": None}, {"video": "x.mp4"}])
-def test_a_manifest_that_tells_other_videos(entry: dict[str, str | None], dataset: Path) -> None:
-    def change(manifest: dict[str, Any]) -> None:
-        manifest["streams"][0].update(entry)
-        manifest["streams"][0] = {k: v for k, v in manifest["streams"][0].items() if v}
-
-    changed(dataset / "dataset.yaml", change)
-    assert {one.code for one in mp4ds.validate(dataset)} == {"manifest-inconsistent"}
-    exact(dataset, ONE).unlink()
-    assert "manifest-inconsistent" in {one.code for one in mp4ds.validate(dataset)}
-
-
-def test_files_that_are_one_where_names_ignore_case(dataset: Path) -> None:
-    stem = ONE.capitalize()
-
-    def change(manifest: dict[str, Any]) -> None:
-        manifest["streams"][1] |= {"view": f"{stem}.mp4", "video": f"{stem}.exact.mp4"}
-        for entry in manifest["files"]:
-            if entry["name"].startswith(f"{STEMS[1]}.") and entry["name"].endswith(".mp4"):
-                entry["name"] = entry["name"].replace(STEMS[1], stem)
-
-    def renamed(document: dict[str, Any]) -> None:
-        document["view"]["file"], document["video"]["file"] = f"{stem}.mp4", f"{stem}.exact.mp4"
-
-    for path in (view(dataset, STEMS[1]), exact(dataset, STEMS[1])):
-        path.rename(dataset / path.name.replace(STEMS[1], stem))
-    changed(dataset / f"{STEMS[1]}.yaml", renamed)
-    changed(dataset / "dataset.yaml", change)
-    agreed(dataset)
-    problems = mp4ds.validate(dataset)
-    assert [problem.code for problem in problems] == ["manifest-inconsistent"] * 2
-    assert all("may be one file elsewhere" in problem.message for problem in problems)
 
 
 # ---------------------------------------------------------------- larger than it says

@@ -5,11 +5,9 @@ from __future__ import annotations
 import re
 from typing import Any
 
-import av
 import numpy as np
 import pytest
 
-from mp4ds.errors import OptionError
 from mp4ds.messages.encodings import (
     ENCODINGS,
     MAX_ROW_PADDING,
@@ -29,7 +27,7 @@ from mp4ds.messages.layouts import (
     layout_for,
     why_not,
 )
-from mp4ds.messages.numbers import MAX_TABLE, SCALES
+from mp4ds.messages.numbers import SCALES
 from mp4ds.video.encoder import difference_layouts
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, bound, rounded, suited, values
 
@@ -134,105 +132,6 @@ def test_every_word_comes_back(dtype: str) -> None:
 # Where each layout puts its samples is compared with the spec in test_second_reader.py.
 
 
-@pytest.mark.parametrize(
-    ("bits", "shift", "low", "pixel_format"),
-    [(12, 0, 3, "gray10le"), (12, 4, 4, "gray"), (14, 2, 5, "gray10le"), (10, 0, 2, "gray")],
-)
-def test_low_bits_are_folded(bits: int, shift: int, low: int, pixel_format: str) -> None:
-    values = np.arange(2**bits, dtype=np.uint16).reshape(-1, 64)
-    layout = bind("fold", ENCODINGS["mono16"], Parameters(bits=bits, shift=shift, low=low))
-    assert layout.pixel_format == pixel_format
-    (picture,) = layout.to_picture(values << shift)
-    high, folded = np.split(picture.astype(int), 2)
-    assert np.array_equal(high, values >> low)
-    flat = folded.ravel()
-    steps = np.abs(np.diff(flat))
-    assert steps.max() == 1
-    assert np.array_equal(
-        np.flatnonzero(steps == 0) % 2**low, [2**low - 1] * (2 ** (bits - low) - 1)
-    )
-    assert bits_of(through(layout, values << shift)) == bits_of(values << shift)
-
-
-@pytest.mark.parametrize("encoding", ["rgba8", "bgra8", "8UC4"])
-def test_an_alpha_that_is_the_same_is_left_out(encoding: str) -> None:
-    known = ENCODINGS[encoding]
-    pixels = values(known, "random", 5, 4)
-    assert fit("opaque", known, [pixels]) is None
-    pixels[..., 3] = 200
-    layout = fit("opaque", known, [pixels, pixels])
-    assert layout is not None
-    assert layout.pixel_format == ("rgb24" if encoding == "rgba8" else "bgr24")
-    (picture,) = layout.to_picture(pixels)
-    assert np.array_equal(picture, pixels[..., :3])
-    assert bits_of(through(layout, pixels)) == bits_of(pixels)
-    pixels[2, 3, 3] = 201
-    assert "an alpha that is not the stream's, 200" in str(layout.values.refuses(pixels))
-
-
-@pytest.mark.parametrize(
-    ("encoding", "packed"),
-    [
-        *(("yuv422", "uyvy422"), ("uyvy", "uyvy422"), ("yuyv", "yuyv422")),
-        *(("yuv422_yuy2", "yuyv422"), ("nv12", "nv12"), ("nv21", "nv21"), ("nv24", "nv24")),
-    ],
-)
-@pytest.mark.parametrize("pad", [0, 5])
-def test_yuv_becomes_the_planes_of_ffmpeg(encoding: str, packed: str, pad: int) -> None:
-    known = ENCODINGS[encoding]
-    pixels = values(known, "random", 32, 4)
-    frame = av.VideoFrame(32, 4, packed)
-    data = pixels.tobytes()
-    for plane in frame.planes:
-        plane.update(data[: plane.buffer_size])
-        data = data[plane.buffer_size :]
-    assert not data
-    layout = bind(known.general, known)
-    planes = frame.reformat(format=layout.pixel_format).planes
-    picture = layout.to_picture(as_message(pixels, known, pad=pad))
-    assert [plane.tobytes() for plane in picture] == [bytes(plane) for plane in planes]
-
-
-@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv24"])
-def test_halved_chroma_stays_near(encoding: str) -> None:
-    for width, height in SIZES:
-        known = ENCODINGS[encoding]
-        width, height = rounded(known, width, height)
-        layout = layout_for(known, lossless=False)
-        assert (layout.name, layout.is_exact) == ("halved420", False)
-        y, x = np.mgrid[:height, :width]
-        planes = [(n * 40 + 8 * y + 4 * (x // 2)).astype(np.uint8) for n in (1, 2, 3)]
-        if known.channels == 2:
-            planes[1:] = [plane[:, ::2] for plane in planes[1:]]
-        exact = bind(known.general, known)
-        pixels = np.empty(known.shape(width, height), np.uint8)
-        exact.to_pixels(tuple(planes), pixels)
-        found = exact.to_picture(through(layout, pixels))
-        assert np.array_equal(found[0], planes[0])
-        for original, chroma in zip(planes[1:], found[1:], strict=True):
-            assert np.abs(chroma.astype(int) - original).max() <= 4
-            flat = np.full_like(original, 77)
-            exact.to_pixels((planes[0], flat, flat), pixels)
-            assert np.array_equal(through(layout, pixels), pixels)
-
-
-def test_layouts_of_encodings() -> None:
-    for name, encoding in ENCODINGS.items():
-        assert encoding.general in encoding.exact
-        assert LAYOUTS[encoding.general].parameters == frozenset()
-        assert all(LAYOUTS[layout].is_exact for layout in encoding.exact)
-        assert layout_for(encoding, lossless=True).name == encoding.general
-        if encoding.lossy and not LAYOUTS[encoding.lossy].parameters:
-            assert layout_for(encoding, lossless=False).name == encoding.lossy
-        else:
-            with pytest.raises(OptionError, match=name):
-                layout_for(encoding, lossless=False)
-        if encoding.mosaic:
-            assert name == f"bayer_{encoding.mosaic}{8 * encoding.bytes_per_sample}"
-    used = {layout for e in ENCODINGS.values() for layout in (*e.exact, e.lossy)}
-    assert used - {None} == set(LAYOUTS)
-
-
 # ---------------------------------------------------------------- parameters
 
 
@@ -247,24 +146,15 @@ def parameters_of(layout: str, encoding: str, *samples: Any) -> Parameters | Non
     ("encoding", "samples", "expected"),
     [
         ("mono16", [[0, 4095]], (12, 0)),
-        ("mono16", [[1, 6]], (12, 0)),
         ("mono16", [[1, 900]], (12, 0)),
-        ("mono16", [[1, 1023]], (10, 0)),  # one is white
         ("mono16", [[1, 255]], (8, 0)),
         ("mono16", [[4, 1020]], (8, 2)),
-        ("mono16", [[4, 900]], (10, 2)),
         ("mono16", [[0, 4096 + 1]], None),
         ("mono16", [[0, 0]], None),
-        ("mono16", [[0x8010, 0x0020]], (12, 4)),
-        ("mono16", [[0x0030, 0x0010]], (12, 4)),  # left-aligned, and dark
         ("mono16", [[0x0040, 0x8000]], (10, 6)),
-        ("mono16", [[0x0020, 0x8000]], (12, 4)),
         ("mono16", [[0xFF00, 0x0100]], (8, 8)),
-        ("mono16", [[0x8000, 0x8000]], (8, 8)),
         ("mono16", [[4, 0x8000]], (14, 2)),
-        ("mono16", [[2, 0x8000]], None),
         ("16SC1", [[-2048, 2047]], (12, 0)),
-        ("16SC1", [[-2049, 5]], None),
         ("16SC1", [[-32768, 16]], (12, 4)),
     ],
 )
@@ -273,79 +163,6 @@ def test_bits_that_are_fitted(
 ) -> None:
     found = parameters_of("gray_bits", encoding, samples)
     assert (found and (found.bits, found.shift)) == expected
-
-
-@pytest.mark.parametrize(("encoding", "bits", "shift", "bad"), [
-    ("mono16", 12, 0, 4096),
-    ("mono16", 10, 6, 0x8020),
-    ("16SC1", 12, 0, 2048),
-    ("16SC1", 12, 0, -2049),
-    ("16SC1", 12, 4, 8),
-])  # fmt: skip
-def test_bits_that_are_refused(encoding: str, bits: int, shift: int, bad: int) -> None:
-    known = ENCODINGS[encoding]
-    layout = bind("gray_bits", known, Parameters(bits=bits, shift=shift))
-    pixels = np.zeros((4, 4), known.dtype)
-    assert layout.values.refuses(pixels) is None
-    pixels[2, 3] = bad
-    assert f"does not fit into {bits} bits" in str(layout.values.refuses(pixels))
-
-
-def test_a_table_is_of_what_occurs() -> None:
-    first, second = [[9, 900, 7], [9, 40000, 7]], [[7, 9, 9], [9, 9, 9]]
-    assert parameters_of("table", "mono16", first, second) == Parameters(table=(7, 9, 900, 40000))
-    assert parameters_of("table", "mono16", [list(range(100))]) is None  # dense
-    for count in (256, 257, MAX_TABLE, MAX_TABLE + 1):
-        thin = [[3 * n for n in range(count)]]
-        found = parameters_of("table", "mono16", thin)
-        assert (found is None) == (count > MAX_TABLE)
-        if found:
-            layout = bind("table", ENCODINGS["mono16"], found)
-            assert layout.pixel_format == "gray"
-            assert layout.picture_size(count, 1) == (count, 1 if count == 256 else 2)
-    assert parameters_of("table", "32FC1", [np.arange(MAX_TABLE + 1)]) is None
-
-
-def test_a_table_that_goes_on_growing_is_none() -> None:
-    """Since later images would be refused."""
-    frames = [[[5, 900, 7000]], [[5, 7000, 900]], [[900, 900, 5]], [[5, 900, 7000]]]
-    assert parameters_of("table", "mono16", *frames) == Parameters(table=(5, 900, 7000))
-    assert parameters_of("table", "mono16", *frames[:3], [[5, 901, 7000]]) is None
-    assert parameters_of("table", "mono16", frames[0], [[1, 901, 7000]], *frames[:2]) is not None
-
-
-def test_a_table_refuses_what_it_does_not_have() -> None:
-    floats = ENCODINGS["32FC1"]
-    pixels = np.array([[1.5, np.nan], [-0.0, 2.5]], np.float32)
-    layout = fit("table", floats, [pixels])
-    assert layout is not None
-    assert layout.pixel_format == "gray"
-    for value in (0.0, 1.0, 3.0, -np.nan, np.inf):
-        changed = pixels.copy()
-        changed[0, 0] = value
-        assert "in the stream's table" in str(layout.values.refuses(changed))
-
-
-@pytest.mark.parametrize("encoding", ["mono16", "16SC1", "32FC1"])
-@pytest.mark.parametrize("count", [2, 100, 257, 2000])
-def test_images_of_few_values_have_palettes(encoding: str, count: int) -> None:
-    known = ENCODINGS[encoding]
-    rng = np.random.default_rng(count)
-    images = []
-    for _ in range(4):  # each has other values
-        few = rng.integers(0, 2**32, count, np.uint64).astype(f"u{known.bytes_per_sample}")
-        images.append(rng.choice(few, (70, 50)).view(known.dtype))
-    layout = fit("palette", known, images[:1])
-    assert layout is not None
-    assert layout.pixel_format == "gray"
-    for pixels in images:
-        assert layout.values.refuses(pixels) is None
-        assert bits_of(through(layout, pixels)) == bits_of(pixels)
-    many = values(known, "random", 100, 90)
-    assert "more than the" in str(layout.values.refuses(many))
-    assert fit("palette", known, [many]) is None
-    (picture,) = layout.to_picture(images[0])
-    layout.to_pixels((picture | 0xF0,), np.empty_like(images[0]))  # damaged: no error
 
 
 COUNTS = np.arange(1, 65536, dtype=np.float32).reshape(255, 257)
@@ -362,24 +179,6 @@ def test_all_millimetres_come_back(name: str, hole: int, scale: str) -> None:
     assert layout.parameters == Parameters(hole=hole, scale=scale)
     assert layout.values.refuses(pixels) is None
     assert bits_of(through(layout, pixels)) == bits_of(pixels)
-
-
-@pytest.mark.parametrize(
-    "value", [0.0005, 1.00025, -1.0, 65.536, 1e30, np.inf, -np.inf, np.nan, -0.0, 1e-40]
-)
-def test_other_floats_are_refused(value: float) -> None:
-    floats = ENCODINGS["32FC1"]
-    layout = bind("metres16", floats, Parameters(hole=0, scale="quotient"))
-    pixels = np.array([[1.0, 0.0], [2.5, 65.535]], np.float32)
-    assert layout.values.refuses(pixels) is None
-    pixels[0, 1] = value
-    assert "neither whole millimetres" in str(layout.values.refuses(pixels))
-    assert fit("metres16", floats, [pixels, np.zeros_like(pixels)]) is None
-
-
-def test_two_marks_of_a_hole_are_one_too_many() -> None:
-    pixels = np.array([[1.0, 0.0], [np.nan, 2.0]], np.float32)
-    assert fit("metres16", ENCODINGS["32FC1"], [pixels]) is None
 
 
 # ---------------------------------------------------------------- tones
@@ -426,32 +225,6 @@ def test_a_tone_shows_the_nearest_level(name: str, bits: int, shift: int) -> Non
         assert f"above {shift} zero bits" in str(layout.values.refuses(pixels))
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "levels"),
-    [
-        (0, 4095, (120, 135)),
-        (0, 100, (15, 30)),  # it may only be dark yet
-        (240, 260, (55, 70)),  # of a sensor whose black is not 0
-        (3900, 4095, (240, 255)),  # or too bright
-        (29000, 31000, (110, 140)),  # temperatures
-        (21700, 22100, (110, 140)),
-    ],
-)
-def test_the_median_is_not_far_from_the_middle(
-    low: int, high: int, levels: tuple[int, int]
-) -> None:
-    """Of all that are possible, and temperatures are told from each other."""
-    pixels = ramp(low, high)
-    layout = fit("tone", ENCODINGS["mono16"], [pixels])
-    assert layout is not None
-    (picture,) = layout.to_picture(pixels)
-    assert levels[0] <= np.median(picture) <= levels[1]
-    if low > 20_000:
-        assert int(picture.max()) - int(picture.min()) > 30
-    table = np.array(layout.parameters.table)
-    assert (table[0], table[-1]) == (0, 2**layout.used_bits - 1)
-
-
 VIEWS = [
     *((e.name, e.lossy, {}) for e in ENCODINGS.values() if e.lossy in ("gray8", "rgb24", "bgr24")),
     *((f"{order}a8", "opaque", {"alpha": 200}) for order in ("rgb", "bgr")),
@@ -491,51 +264,19 @@ def test_all_differences_to_a_view_fit(name: str, layout: str, parameters: dict[
     ("encoding", "layout", "parameters", "words"),
     [
         ("mono8", "gray16", {}, "does not carry mono8"),
-        ("mono16", "gray16", {"bits": 12, "shift": 0}, "needs the parameters none"),
         ("mono16", "gray_bits", {}, "needs the parameters bits, shift"),
-        ("mono16", "gray_bits", {"bits": 12}, "was given bits"),
         ("mono16", "gray_bits", {"bits": 11, "shift": 0}, "11 bits above 0"),
-        ("mono16", "gray_bits", {"bits": 12, "shift": 5}, "12 bits above 5"),
-        ("mono16", "gray_bits", {"bits": 12, "shift": 1.0}, "12 bits above 1.0"),
-        ("mono16", "gray_bits", {"bits": 12.0, "shift": 0}, "12.0 bits"),
-        ("mono16", "gray_bits", {"bits": 12, "shift": 0, "low": 3}, "was given bits, low, shift"),
-        ("mono16", "fold", {"bits": 12, "shift": 0}, "needs the parameters bits, low, shift"),
         ("mono16", "fold", {"bits": 12, "shift": 0, "low": 1}, "no layout has 1 low bits of 12"),
-        ("mono16", "fold", {"bits": 12, "shift": 0, "low": 9}, "no layout has 9 low bits of 12"),
-        ("mono16", "fold", {"bits": 12, "shift": 0, "low": 3.0}, "no layout has 3.0 low bits"),
-        ("mono16", "fold", {"bits": 16, "shift": 0, "low": 5}, "no layout has 5 low bits of 16"),
-        ("mono16", "fold", {"bits": 16, "shift": 1, "low": 8}, "16 bits above 1"),
-        ("mono16", "palette", {}, "needs the parameters entries"),
         ("mono16", "palette", {"entries": 300}, "no power of two"),
         ("mono16", "palette", {"entries": 128}, "less than 256"),
-        ("mono16", "palette", {"entries": 512.0}, "a list of 512.0 values"),
-        ("rgba8", "opaque", {}, "needs the parameters alpha"),
         ("rgba8", "opaque", {"alpha": 256}, "an alpha of 256"),
-        ("8SC4", "opaque", {"alpha": 1}, "does not carry 8SC4"),
         ("mono16", "table", {"table": []}, "table of 0 values"),
-        (
-            "mono16",
-            "table",
-            {"table": list(range(MAX_TABLE + 1))},
-            f"table of {MAX_TABLE + 1} values",
-        ),
-        ("mono16", "table", {"table": [1, 65536]}, "beyond 0 to 65535"),
         ("mono16", "table", {"table": [1, 2.0]}, "beyond 0 to 65535"),
-        ("mono16", "table", {"table": [1, 2, 2]}, "does not increase"),
-        ("32FC1", "table", {"table": [2, 1]}, "does not increase"),
-        ("32FC1", "table", {"table": [2**32]}, "beyond 0 to 4294967295"),
         ("32FC1", "metres16", {"hole": 2**32, "scale": "product"}, "no pattern of 32 bits"),
         ("32FC1", "metres16", {"hole": 0, "scale": "sum"}, "scale 'sum'"),
-        ("32FC1", "metres16", {"hole": 0}, "needs the parameters hole, scale"),
-        ("16UC1", "tone", tone(12), "does not carry 16UC1"),
-        ("mono16", "tone", {"bits": 12, "shift": 0}, "needs the parameters bits, shift, table"),
-        ("mono16", "tone", tone(7), "7 bits above 0"),
         ("mono16", "tone", tone(17), "17 bits above 0"),
-        ("mono16", "tone", tone(12, shift=5), "12 bits above 5"),
-        ("mono16", "tone", tone(12, table=[*range(255)]), "table of 255 values"),
         ("mono16", "tone", tone(12, table=[*range(257)]), "table of 257 values"),
         ("mono16", "tone", tone(12, table=[*range(255), 4096]), "does not fit into 12 bits"),
-        ("mono16", "tone", tone(12, shift=1), "above 1 zero bits"),
         ("mono16", "tone", tone(12, table=[0, *range(255)]), "does not increase"),
     ],
 )
@@ -590,23 +331,14 @@ def test_a_view_is_the_message_itself(name: str) -> None:
             "bayer_rgbg8", "yuv420", "jpeg",
         )),
         ("mono8", 0, 4, 0, 0, "0x4 pixels"),
-        ("mono8", 4, 0, 4, 0, "4x0 pixels"),
         ("mono8", 4, 4, 3, 12, "shorter than a row"),
-        ("rgb8", 4, 4, 11, 44, "shorter than a row"),
-        ("mono16", 4, 4, 7, 28, "shorter than a row"),
-        ("64FC4", 4, 4, 127, 508, "shorter than a row"),
-        ("mono8", 4, 4, 0, 0, "shorter than a row"),
         ("mono8", 4, 4, 4, 15, "15 bytes of pixels where step x height says 16"),
-        ("mono8", 4, 4, 4, 17, "17 bytes"),
-        ("mono8", 4, 4, 4, 0, "0 bytes"),
         ("nv12", 4, 4, 4, 16, "step x height x 3/2 says 24"),
-        ("nv24", 4, 4, 4, 24, "step x height x 3 says 48"),
         *((name, 3, 4, 6, 36, f"where {name} needs even sides") for name in (
             "yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv12", "nv21",
         )),
         *((name, 4, 3, 4, 18, "even sides") for name in ("nv12", "nv21")),
         ("mono8", MAX_SIDE + 1, 1, MAX_SIDE + 1, MAX_SIDE + 1, "beyond 16384"),
-        ("mono8", 1, MAX_SIDE + 1, 1, MAX_SIDE + 1, "beyond 16384"),
         ("64FC1", 5000, 1, 40000, 40000, "whose picture of 20000x2 is beyond 16384"),
         ("mono8", 4, 1, 5 + MAX_ROW_PADDING, 5 + MAX_ROW_PADDING, "4096 bytes of padding"),
         ("mono8", 2**32 - 1, 2**32 - 1, 2**32 - 1, 16, "bytes of pixels"),

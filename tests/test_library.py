@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 import pytest
-from PIL import Image
 from rosbags.highlevel import AnyReader
 
 import mp4ds
@@ -61,50 +59,11 @@ def colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
     return packed(tmp_path_factory.mktemp("colour"), source, gop=5), source
 
 
-@pytest.mark.parametrize("name", ["lossy-av1", "lossy-h264", "lossy-h265"])
-def test_smaller_frames_have_the_same_colours(name: str) -> None:
-    """Matrix and range are those of the video, as in full size."""
-    with mp4ds.open(Path(__file__).parents[1] / "conformance/cases/datasets" / name) as dataset:
-        for topic in ("rgb8", "bgr8"):
-            frames = dataset[f"/{topic}/cam/image_raw"]
-            (whole,), (small,) = (frames.read([0], format="rgb", resize=x) for x in (None, 0.5))
-            due = Image.fromarray(whole).resize(small.shape[1::-1], Image.Resampling.BOX)
-            assert np.abs(np.asarray(due).astype(int) - small).mean() < 3
-
-
 # ---------------------------------------------------------------- frames of coded messages
 
 
 def camera(source: Scene) -> list[Any]:
     return [message for message in source.messages if message.msgtype in PICTURES]
-
-
-PNG_ENCODINGS = {
-    "png-gray-cv2": "mono8",
-    "png-16-bit-cv2-9": "16UC1",
-    "png-rgba-cv2": "rgba8",
-    "depth-16UC1-png": "16UC1",
-    "depth-32FC1-png": "16UC1",  # the inverse depths as they are coded
-}
-
-
-@pytest.mark.parametrize("name", PNG_ENCODINGS)
-def test_frames_of_png_files_are_their_pixels(name: str, tmp_path: Path) -> None:
-    source = CODED[name](frames=6)
-    with mp4ds.open(packed(tmp_path, source)) as dataset:
-        (stream,) = dataset
-        for number, (frame, message) in enumerate(zip(stream, camera(source), strict=True)):
-            data = bytes(message.values["data"])
-            data = data[data.index(b"\x89PNG") :]
-            expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-            if expected.ndim == 3:
-                expected = expected[..., [2, 1, 0, 3]]
-            assert frame.encoding == PNG_ENCODINGS[name]
-            assert np.array_equal(frame.data, expected)
-            assert np.array_equal(stream[number].data, expected)
-            assert frame.stamp_ns == message.values["header"]["stamp"]
-            assert frame.log_time_ns == message.log_time
-            assert frame.intrinsics is not None
 
 
 def as_rgb(frame: av.VideoFrame) -> np.ndarray[Any, Any]:
@@ -177,14 +136,6 @@ def test_all_that_can_be_opened(
 def test_a_wrong_topic_lists_the_right_ones(topic: str, colour: tuple[Path, Scene]) -> None:
     with mp4ds.open(colour[0]) as dataset, pytest.raises(KeyError, match="there are: /cam/image_r"):
         dataset[topic]
-
-
-def test_a_dataset_without_streams(tmp_path: Path) -> None:
-    dataset = packed(tmp_path, scene("mono8"), exclude=["/cam/*"])
-    with mp4ds.open(dataset) as opened:
-        assert opened.topics == []
-        with pytest.raises(KeyError, match="there are: none"):
-            opened[TOPIC]
 
 
 def test_what_cannot_be_opened(tmp_path: Path, colour: tuple[Path, Scene]) -> None:
@@ -286,14 +237,6 @@ def test_the_calibration_that_held(
             assert stream[number].intrinsics is calibration
 
 
-def test_a_camera_without_calibration(tmp_path: Path) -> None:
-    with mp4ds.open(packed(tmp_path, scene("mono8", with_info=False))) as dataset:
-        stream = dataset[TOPIC]
-        assert list(stream.calibrations) == []
-        assert stream.intrinsics_at(0) is None
-        assert stream[0].intrinsics is None
-
-
 # ---------------------------------------------------------------- several geometries
 
 
@@ -375,13 +318,6 @@ def test_frames_of_a_topic_that_changes_come_as_recorded(publishers: int, tmp_pa
                 ask()
 
 
-def test_frame_ids_that_change(tmp_path: Path) -> None:
-    with mp4ds.open(packed(tmp_path, odd_scene("frame-id-change"))) as dataset:
-        names = [frame.frame_id for frame in dataset["/odd/image"]]
-        assert names == ["/cam/optical \u00e4", ""] * 4
-        assert dataset["/odd/image"][3].frame_id == ""
-
-
 # ---------------------------------------------------------------- pairs on their own
 
 
@@ -428,20 +364,6 @@ def test_a_pair_alone(encoding: str, tmp_path: Path) -> None:
     assert payloads(own, topics) == again
 
 
-def test_a_pair_of_a_topic_with_other_places(tmp_path: Path) -> None:
-    """A pair alone has only its own messages, and that is no error."""
-    dataset = packed(tmp_path, odd_scene("encoding-change"))
-    pair = tmp_path / "pair"
-    pair.mkdir()
-    for suffix in ("mp4", "yaml"):
-        shutil.copy(dataset / f"odd_image-2.{suffix}", pair)
-    assert mp4ds.validate(pair / "odd_image-2.yaml", deep=True) == []
-    summary = mp4ds.unpack(pair / "odd_image-2.mp4", "bag", tmp_path / "again.bag")
-    assert summary.messages == {"/odd/image": 2}
-    everything = payloads(tmp_path / "source" / "drive.bag", {"/odd/image"})
-    assert set(payloads(tmp_path / "again.bag", {"/odd/image"})) < set(everything)
-
-
 def test_a_pair_without_its_video(tmp_path: Path, colour: tuple[Path, Scene]) -> None:
     shutil.copy(colour[0] / "cam_image_raw.yaml", tmp_path)
     problems = mp4ds.validate(tmp_path / "cam_image_raw.yaml")
@@ -450,23 +372,6 @@ def test_a_pair_without_its_video(tmp_path: Path, colour: tuple[Path, Scene]) ->
         assert len(pair[TOPIC]) == 12
         with pytest.raises(mp4ds.FormatError, match=r"cam_image_raw\.mp4"):
             pair[TOPIC][0]
-
-
-def test_several_topics_and_a_choice_of_them(tmp_path: Path) -> None:
-    names = ("/a/image", "/b/image", "/A/image")
-    recorded = images(scene("mono8", frames=5))
-    source = Scene([replace(message, topic=name) for message in recorded for name in names])
-    dataset = packed(tmp_path, source)
-    with mp4ds.open(dataset) as opened:
-        assert opened.topics == [*names]
-        stems = [stream.path.stem for stream in opened.streams]
-        assert stems == ["a_image", "b_image", "A_image-2"]
-        for stream in opened:
-            for frame, message in zip(stream, recorded, strict=True):
-                assert np.array_equal(frame.data, expected_pixels(message.values))
-    mp4ds.unpack(dataset, "bag", tmp_path / "b.bag", UnpackOptions(topics=["/[bA]/*"]))
-    found = [topic for topic, _, _ in payloads(tmp_path / "b.bag", {*names})]
-    assert found == ["/A/image"] * 5 + ["/b/image"] * 5
 
 
 @pytest.mark.parametrize("kind", [str, Path])

@@ -14,15 +14,14 @@ import mp4ds
 import reader
 from compare import compare
 from mp4ds.messages.encodings import ENCODINGS, Parameters
-from mp4ds.messages.layouts import bind, fit
-from mp4ds.messages.sources import CONVERSIONS, MOSAICS
+from mp4ds.messages.layouts import bind
+from mp4ds.messages.sources import MOSAICS
 from pixel_kinds import made_of
 from round_trips import unpacked
 from scenes import raw_image, raw_scene
 from sources import SOURCES
 
 RGB = ENCODINGS["rgb8"]
-SOURCE_LAYOUTS = ("from_mosaic8", "from_yuv420", "from_yuv422")
 
 # ---------------------------------------------------------------- the rules
 
@@ -89,18 +88,6 @@ def shades(kind: str, width: int, height: int, seed: int) -> tuple[NDArray[Any],
 
 
 @pytest.mark.parametrize("kind", ["dark", "bright", "all"])
-@pytest.mark.parametrize("rule", CONVERSIONS)
-def test_yuv_is_found_where_colours_are_cut_off(rule: str, kind: str) -> None:
-    layout = bind("from_yuv422", RGB, Parameters(rule=rule))
-    for seed in range(4):
-        made, again = np.empty((2, 48, 64, 3), np.uint8)
-        layout.to_pixels(shades(kind, 64, 48, seed), made)
-        assert ((made == 0) | (made == 255)).any()
-        layout.to_pixels(layout.arrange(layout.values.prove(made)), again)
-        assert np.array_equal(made, again)
-
-
-@pytest.mark.parametrize("kind", ["dark", "bright", "all"])
 @pytest.mark.parametrize("mosaic", MOSAICS)
 def test_the_edges_of_a_mosaic_are_found(mosaic: str, kind: str) -> None:
     layout = bind("from_mosaic8", RGB, Parameters(mosaic=mosaic))
@@ -110,36 +97,6 @@ def test_the_edges_of_a_mosaic_are_found(mosaic: str, kind: str) -> None:
         layout.to_pixels(tiles.to_picture(shades(kind, width, height, 0)[0]), made)
         layout.to_pixels(layout.arrange(layout.values.prove(made)), again)
         assert np.array_equal(made, again)
-
-
-@pytest.mark.parametrize("name", SOURCE_LAYOUTS)
-def test_grey_and_flat_images_tell_of_no_source(name: str) -> None:
-    """Too many rules explain them, and would refuse what comes next."""
-    for value in (0, 100, 255):
-        assert fit(name, RGB, [np.full((48, 64, 3), value, np.uint8)]) is None
-
-
-@pytest.mark.parametrize("name", SOURCE_LAYOUTS)
-def test_the_smallest_images(name: str) -> None:
-    for width in range(1, 5):
-        for height in range(1, 5):
-            fit(name, RGB, [np.full((height, width, 3), 7, np.uint8)])
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters"),
-    [("from_mosaic8", {"mosaic": "rgbg"}), ("from_yuv420", {"rule": "rggb"})],
-)
-def test_unknown_sources_are_refused(name: str, parameters: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="is not one of"):
-        bind(name, RGB, Parameters(**parameters))
-
-
-@pytest.mark.parametrize(("name", "size"), [("from_yuv422", (7, 6)), ("from_yuv420", (6, 7))])
-def test_halved_chroma_needs_even_sides(name: str, size: tuple[int, int]) -> None:
-    layout = bind(name, RGB, Parameters(rule="opencv"))
-    with pytest.raises(ValueError, match="even sides"):
-        layout.picture_size(*size)
 
 
 # ---------------------------------------------------------------- recordings

@@ -20,7 +20,6 @@ from coded_tools import (
     jpeg,
     refusal,
     scene,
-    superframe,
 )
 from mp4ds.errors import VideoError
 from mp4ds.video import av1
@@ -84,16 +83,6 @@ def test_packets_come_back(name: str, tmp_path: Path) -> None:
             assert reader.packet(index) == everything[index]
 
 
-@pytest.mark.parametrize("name", ["h264", "h265", "av1", "vp9"])
-@pytest.mark.parametrize(("width", "height"), [(66, 50), (322, 178)])
-def test_sizes_that_are_cropped(name: str, width: int, height: int, tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    packets = encode(ENCODINGS[name], frames=3, width=width, height=height)
-    check(path, ENCODINGS[name].codec, [packet.data for packet in packets])
-    with PacketReader(path, codec=ENCODINGS[name].codec, coded_size=(width, height)):
-        pass
-
-
 # ---------------------------------------------------------------- framing
 
 
@@ -127,11 +116,6 @@ def test_temporal_delimiters_and_metadata(
         bare = metadata + packet.data.removeprefix(av1.DELIMITER)
         bodies.append(av1.DELIMITER + bare if keep else bare)
     check(tmp_path / "a.mp4", "av1", bodies)
-
-
-def test_a_vp9_superframe(tmp_path: Path) -> None:
-    frames = [packet.data for packet in encode(ENCODINGS["vp9"], frames=4, gop=9)]
-    check(tmp_path / "a.mp4", "vp9", [frames[0], superframe(frames[1], frames[2]), frames[3]])
 
 
 @pytest.mark.parametrize("codec", ["h264", "h265"])
@@ -175,19 +159,6 @@ def test_a_first_picture_that_cannot_be_used(codec: str, tmp_path: Path) -> None
     assert not path.exists()
 
 
-def test_a_writer_that_was_given_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    with PacketWriter(path, "mjpeg", width=WIDTH, height=HEIGHT):
-        pass
-    assert not path.exists()
-    writer = PacketWriter(path, "mjpeg", width=WIDTH, height=HEIGHT)
-    writer.begin(jpeg(next(scene(1))))
-    writer.close()
-    writer.abandon()
-    with pytest.raises(RuntimeError), PacketWriter(path, "mjpeg", width=1, height=1):
-        raise RuntimeError
-
-
 def test_packets_that_a_muxer_joins_are_missed(tmp_path: Path) -> None:
     """The muxer joins a VP9 frame that is not shown with the next; the parser refuses it."""
     frames = [packet.data for packet in encode(ENCODINGS["vp9"], frames=4, gop=9)]
@@ -197,16 +168,6 @@ def test_packets_that_a_muxer_joins_are_missed(tmp_path: Path) -> None:
     with pytest.raises(VideoError) as caught:
         writer.close()
     assert caught.value.code == "frame-count"
-
-
-def test_bytes_that_a_muxer_drops_are_missed(tmp_path: Path) -> None:
-    bodies = [packet.data for packet in encode(ENCODINGS["av1"], frames=3)]
-    writer = PacketWriter(tmp_path / "a.mp4", "av1", width=WIDTH, height=HEIGHT)
-    for number, body in enumerate(bodies):
-        padding = b"\x7a\x02\0\x80" if number == 1 else b""
-        writer.write(body + padding, number * STEP, keyframe=not number)
-    with pytest.raises(VideoError, match="as written"):
-        writer.close()
 
 
 @pytest.mark.parametrize("fault", ["tick", "size", "content"])
@@ -252,32 +213,6 @@ def test_what_a_reader_expects(code: str, options: dict[str, Any], video: Path) 
     assert str(video) in str(caught.value)
 
 
-def patched(video: Path, box: bytes, offset: int, value: int) -> Path:
-    """The video with a 32-bit field of a box changed, counted from the box's type."""
-    data = bytearray(video.read_bytes())
-    at = data.rindex(box) + offset
-    data[at : at + 4] = value.to_bytes(4, "big")
-    forged = video.with_name("forged.mp4")
-    forged.write_bytes(data)
-    return forged
-
-
-@pytest.mark.parametrize("size", [2**31 - 1, 2**28, 0xFFFFFFFF])
-def test_sizes_beyond_the_file(video: Path, size: int) -> None:
-    """Of one packet in the table of sizes: version, size of all, count, sizes."""
-    with pytest.raises(VideoError) as caught:
-        PacketReader(patched(video, b"stsz", 16, size), codec="mjpeg")
-    assert caught.value.code == "video-unreadable"
-
-
-def test_a_file_that_shrinks_while_it_is_read(video: Path) -> None:
-    with PacketReader(video, codec="mjpeg") as reader:
-        video.write_bytes(video.read_bytes()[:500])
-        with pytest.raises(VideoError) as caught:
-            reader.packet(4)
-    assert caught.value.code == "decode-failed"
-
-
 # ---------------------------------------------------------------- standing alone
 
 
@@ -300,14 +235,3 @@ def test_packets_stand_alone(name: str, tmp_path: Path) -> None:
     assert [parser.picture(body).keyframe for body in given] == [
         packet.is_key or codec == "mjpeg" for packet in packets
     ]
-
-
-def test_damaged_parameters(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    write(path, "h264", [packet.data for packet in encode(ENCODINGS["h264"], frames=2)])
-    data = bytearray(path.read_bytes())
-    data[data.index(b"avcC") + 8] = 0xFD  # lengths of two bytes
-    path.write_bytes(data)
-    with pytest.raises(VideoError) as caught:
-        standing_alone(path, "h264")
-    assert caught.value.code in ("decode-failed", "video-unreadable")

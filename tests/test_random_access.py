@@ -26,7 +26,7 @@ from mp4ds.plugins.demo import demo
 from mp4ds.times import StampIndex
 from mp4ds.unpacking.unpack import UnpackOptions
 from mp4ds.video.images import Renderer
-from pictures import YUV, picture, pixels
+from pictures import YUV, pixels
 from republished import psnr
 from round_trips import packed
 from sources import ENCODINGS, Scene, odd_scene, scene
@@ -125,13 +125,6 @@ def test_numbers_out_of_range(index: int, colour: mp4ds.Topic) -> None:
             ask([0, index])
 
 
-def test_frames_are_ones_own(colour: mp4ds.Topic) -> None:
-    one, other = colour.get([4, 4])
-    one.data[...] = 0
-    assert np.array_equal(other.data, colour[4].data)
-    assert other.data.any()
-
-
 def test_reading_amid_reading(colour: mp4ds.Topic) -> None:
     """Each has its own order, whatever else is asked of the stream meanwhile."""
     every = [frame.data for frame in colour]
@@ -157,25 +150,6 @@ def test_into_an_array_of_ones_own(colour: mp4ds.Topic) -> None:
     small = np.zeros((3, 12, 16, 3), np.uint8)
     colour.read([2, 9, 2], resize=(16, 12), out=small)
     assert np.array_equal(small, colour.read([2, 9, 2], resize=0.25))
-
-
-@pytest.mark.parametrize(
-    ("out", "problem"),
-    [
-        (
-            np.zeros((3, 48, 64, 3), np.uint8),
-            r"uint8 \(3, 48, 64, 3\), not an array of uint8 \(2, 48, 64, 3\)",
-        ),
-        (np.zeros((2, 48, 64), np.uint8), r"\(2, 48, 64\), not an array"),
-        (np.zeros((2, 48, 64, 3), np.float32), "float32"),
-        (np.zeros((2, 48, 64, 3), np.int8), "int8"),
-        ([[0]], "out is list"),
-        (np.broadcast_to(np.zeros(3, np.uint8), (2, 48, 64, 3)), "not writeable"),
-    ],
-)
-def test_an_array_that_does_not_suit(out: Any, problem: str, colour: mp4ds.Topic) -> None:
-    with pytest.raises(mp4ds.OptionError, match=problem):
-        colour.read([0, 1], out=out)
 
 
 # ---------------------------------------------------------------- formats
@@ -278,17 +252,6 @@ def test_depths_in_metres(encoding: str, tmp_path: Path) -> None:
         assert same(frame.data, expected[1][3:20:2, 5:28:2].astype(np.float32))
 
 
-def test_colours_are_no_depths(colour: mp4ds.Topic) -> None:
-    with pytest.raises(mp4ds.OptionError, match=r"rgb8 images, which are not depths.*16UC1"):
-        colour.read([0], format="depth_m")
-
-
-@pytest.mark.parametrize("name", ["BGR", "", "rgb8", None])
-def test_no_such_format(name: Any, colour: mp4ds.Topic) -> None:
-    with pytest.raises(mp4ds.OptionError, match="native, rgb, bgr, gray"):
-        colour.get([0], format=name)
-
-
 # ---------------------------------------------------------------- sizes
 
 
@@ -328,24 +291,6 @@ def test_a_lossy_video_gives_sizes_at_once(
                 renderer.render(whole, expected)
                 near = psnr(other, expected)  # of strong colours in few pixels
                 assert same(other, expected) if codec == "lossless" else near > 36
-
-
-@pytest.mark.parametrize("factor", [2, 1.5, 3.25])
-def test_larger(factor: float, colour: mp4ds.Topic) -> None:
-    (whole,), (large,) = colour.read([3]), colour.read([3], resize=factor)
-    assert large.shape == (round(48 * factor), round(64 * factor), 3)
-    expected = cv2.resize(whole, large.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-    assert distance(large, expected) < 0.01  # their cubics differ a little
-
-
-def test_sixteen_bits_are_resized_as_such(tmp_path: Path) -> None:
-    source = scene("rgb16", frames=4)
-    data = recorded(source)[0]
-    with mp4ds.open(packed(tmp_path, source)) as dataset:
-        (small,) = dataset[TOPIC].read([0], resize=0.5)
-    expected = cv2.resize(data, (32, 24), interpolation=cv2.INTER_AREA)
-    assert small.dtype == np.uint16
-    assert np.abs(small.astype(int) - expected).max() < 64
 
 
 def test_parts(colour: mp4ds.Topic) -> None:
@@ -396,20 +341,6 @@ def test_camera_yuv_is_not_cut(encoding: str, tmp_path: Path) -> None:
         assert np.array_equal(part, stream.read([0])[0][3:10, 1:10])
 
 
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 4), (5, 1), (2, 2), (3, 3), (63, 47)])
-@pytest.mark.parametrize("encoding", [name for name in ENCODINGS if name.startswith("bayer")])
-def test_mosaics_of_odd_sizes(encoding: str, width: int, height: int) -> None:
-    rng = np.random.default_rng(0)
-    data = picture(encoding, frame=0, width=width, height=height, rng=rng)
-    whole = Renderer(KNOWN[encoding], f"rgb{encoding[10:]}", crop=None, size=(width, height))
-    rgb = np.zeros((height, width, 3), data.dtype)
-    whole.render(data, rgb)
-    for row, column in product(range(2, height - 2), range(2, width - 2)):
-        channel = "rgb".index(encoding[6:10][2 * (row % 2) + column % 2])
-        assert rgb[row, column, channel] == data[row, column]
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -429,26 +360,17 @@ def test_no_such_size_or_part(options: Any, colour: mp4ds.Topic) -> None:
 
 MISTAKES: dict[str, tuple[type[Exception], str]] = {
     "stream[[1, 2]]": (TypeError, r"not [1, 2]: read([0, 5]) and get([0, 5]) take several"),
-    "stream[np.arange(9)]": (TypeError, r"read([0, 5]) and get([0, 5]) take several"),
     "stream[1.0]": (TypeError, "at(stamp_ns) a time"),
     "stream.read(5)": (TypeError, "use [5]"),
-    "stream.get(np.array([True, False]))": (TypeError, "for a mask, give np.flatnonzero(mask)"),
-    "stream.get([None])": (TypeError, "selected by integers, not None"),
     "stream.read([0], resize=224)": (mp4ds.OptionError, "is a factor; for pixels, use (224, 224)"),
     "stream.at(0, tolerance_ns=9)": (mp4ds.FrameNotFoundError, "has no frame within 9 ns near 0 "),
     "stream.at(7, mode='exact')": (mp4ds.FrameNotFoundError, "of exactly 7 ns; the nearest"),
-    "stream.at(2**62, mode='after')": (mp4ds.FrameNotFoundError, "at or after"),
     "stream.at(7, mode='first')": (mp4ds.OptionError, "nearest, before, after, exact"),
-    "stream.at(7, tolerance_ns=-1)": (mp4ds.OptionError, "-1 ns"),
     "stream.at(0.5)": (TypeError, "an integer, in nanoseconds, not 0.5: half a second after"),
-    "stream.between(0, 1.5)": (TypeError, "an integer, in nanoseconds, not 1.5"),
-    "stream.at(0, tolerance_ns=0.1)": (TypeError, "tolerance_ns is an integer, in nanoseconds"),
     "dataset.sync(tolerance_ns=1e6)": (TypeError, "tolerance_ns is an integer, in nanoseconds"),
     "stream.get_frames_at([1])": (AttributeError, "here it is dataset[topic].get([0, 5])"),
-    "stream.get_batch([1])": (AttributeError, "here it is dataset[topic].read([0, 5])"),
     "dataset.get_frame_at(1)": (AttributeError, "here it is dataset[topic][7]"),
     "stream.frames": (AttributeError, "'Topic' object has no attribute 'frames'"),
-    "dataset.frames": (AttributeError, "'Dataset' object has no attribute 'frames'"),
 }
 
 
@@ -457,30 +379,6 @@ def test_what_to_write_instead(code: str, colour: mp4ds.Topic) -> None:
     kind, words = MISTAKES[code]
     with mp4ds.open(colour.streams[0].path) as dataset, pytest.raises(kind, match=re.escape(words)):
         eval(code, {"stream": colour, "dataset": dataset, "np": np})
-
-
-def test_what_it_is_in_a_line(tmp_path: Path) -> None:
-    dataset = packed(tmp_path, scene("rgb8", frames=FRAMES))
-    with mp4ds.open(dataset) as found:
-        assert re.fullmatch(
-            rf"<Dataset '{dataset}': {TOPIC}; 9 frames; \d+ messages; 0\.\d s; \d\.\d MB>",
-            repr(found),
-        )
-        assert repr(found[TOPIC]) == f"<Topic '{TOPIC}': 9 frames, 64x48 rgb8, 0.3 s>"
-        (stream,) = found.streams
-        assert repr(stream) == f"<Stream '{TOPIC}': 9 frames, 64x48 rgb8>"
-        pair = mp4ds.open(stream.path)
-        assert repr(pair) == f"<Dataset '{stream.path}': {TOPIC}; 9 frames>"
-        video = shutil.copy(stream.video_path, tmp_path / "clip.mp4")
-    with mp4ds.open(video) as found:
-        assert repr(found) == f"<Dataset '{video}': clip; 9 frames>"
-        assert repr(found["clip"]) == "<Topic 'clip': 9 frames, 64x48 rgb8, 0.3 s>"
-    with mp4ds.open(packed(tmp_path / "odd", odd_scene("size-change"))) as found:
-        assert re.fullmatch(r"<Topic '/odd/image': 8 frames, \d\.\d s>", repr(found["/odd/image"]))
-        first = found.streams[0]
-        first.video_path.unlink()
-    damaged = mp4ds.Topic([mp4ds.Stream(first.path)])
-    assert repr(damaged) == "<Topic '/odd/image': 4 frames, 32x24 mono8>"
 
 
 # ---------------------------------------------------------------- intrinsics

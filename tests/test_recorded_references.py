@@ -29,12 +29,9 @@ from mp4ds.video.references import (
     packets_of_groups,
     read_structure,
 )
-from remote_servers import web_server
 from sources import SOURCES, scene
-from test_access import Counting, Samples, written
-from test_references import FRAMES, RECIPES, REFUSED, svt
-
-HIERARCHICAL = svt(10, gop=20)
+from test_access import written
+from test_references import FRAMES, RECIPES
 
 Pieces = list[tuple[int, bytes]]
 
@@ -86,39 +83,6 @@ def test_recorded_and_parsed_chains_are_the_same(name: str, tmp_path: Path) -> N
         assert again.is_plain == is_plain
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_unknown_structures_are_not_recorded(name: str, tmp_path: Path) -> None:
-    path = written(tmp_path, REFUSED[name])
-    assert digest_video(path, REFUSED[name].codec)[2] is None
-
-
-def test_other_files_are_hashed(tmp_path: Path) -> None:
-    path = tmp_path / "v.mp4"
-    path.write_bytes(b"\0\0\0\x08moov" * 3)
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    assert digest_video(path, "av1") == (24, sha256, None)
-
-
-def test_no_packet_is_read_but_those_of_the_chain(tmp_path: Path) -> None:
-    path = written(tmp_path, HIERARCHICAL)
-    recorded = video_facts(path, "av1")["references"].decode
-    chains = chains_of(path, "av1", None)
-    maker: Any = Samples()
-    for number in range(FRAMES):
-        pictures = []
-        for told in (recorded, None):
-            access = Counting(path, codec="av1", frames=FRAMES, maker=maker, references=told)
-            pictures.append(list(access.pictures_of([number])))
-            assert access.seeking is None
-            if told is not None:
-                assert access.reads == len({sample for sample, _ in chains[number]})
-            access.close()
-        assert pictures[0] == pictures[1]
-
-
-# ---------------------------------------------------------------- structures
-
-
 # ---------------------------------------------------------------- in sidecars
 
 
@@ -143,13 +107,6 @@ def test_a_dataset_with_references(packed: Path) -> None:
     assert references.groups.decode(4).tolist() == [0, 0, 0, 1]
     assert references.split
     assert mp4ds.validate(packed, deep=True) == []
-
-
-@pytest.mark.parametrize("encoding", ["mono8", "rgb8", "16UC1"])
-def test_lossless_streams_have_nothing_to_tell(encoding: str, tmp_path: Path) -> None:
-    (path,) = SOURCES["mcap-ros2-none"](tmp_path, scene(encoding, frames=12))
-    mp4ds.pack(path, tmp_path / "d")
-    assert load_stream(stream_of(tmp_path / "d")).video.references is None
 
 
 def test_joined_parts_tell_what_the_joined_packets_tell(
@@ -200,10 +157,6 @@ def replacing(old: str, new: str) -> Change:
         structures[0] = structures[0].replace(old, new, 1)
 
     return change
-
-
-def without(video: dict[str, Any]) -> None:
-    del video["references"]
 
 
 @pytest.mark.one_in(2)
@@ -314,47 +267,3 @@ def test_lies_are_found_and_do_no_harm(name: str, packed: Path, tmp_path: Path) 
     assert codes <= {"decode-failed"}
     assert right == 48 or name != "too-much"
     assert right < 48 or name not in ("all-key", "more-frames", "fewer-frames", "many")
-
-
-def test_damage_is_told_as_such(packed: Path, tmp_path: Path) -> None:
-    path = edited(packed, tmp_path, lambda _: None)
-    table = sample_table_of(path.with_suffix(".mp4"))
-    data = bytearray(path.with_suffix(".mp4").read_bytes())
-    data[table.places[17]] ^= 0x80
-    path.with_suffix(".mp4").write_bytes(data)
-    codes = [problem.code for problem in mp4ds.validate(path, deep=True)]
-    assert codes[0] == "hash-mismatch"
-    assert "references-invalid" not in codes
-    with (
-        closing(Topic([Stream(path)])) as stream,
-        pytest.raises(FormatError, match=r"frame 17 of /cam/image_raw .*: is damaged") as raised,
-    ):
-        stream.get([17])
-    assert raised.value.code == "decode-failed"
-
-
-# ---------------------------------------------------------------- at URLs
-
-
-@pytest.mark.slow
-def test_what_is_fetched_of_a_remote_video(tmp_path: Path) -> None:
-    """One frame of a group of 60: a fraction of what has to be fetched without references."""
-    recorded = scene("mono8", frames=64, width=640, height=480)
-    (path,) = SOURCES["mcap-ros2-none"](tmp_path, recorded)
-    options = mp4ds.PackOptions(quality="crf=2", codec="av1", gop=60)
-    mp4ds.pack(path, tmp_path / "with", options)
-    (tmp_path / "without").mkdir()
-    edited(tmp_path / "with", tmp_path / "without", without)
-    fetched: dict[str, int] = {}
-    pictures = []
-    with web_server(tmp_path) as server:
-        for name in ("with", "without"):
-            server.forget()
-            with mp4ds.open(f"{server.url}/{name}/cam_image_raw.yaml") as dataset:
-                pictures.append(next(iter(dataset))[59].data)
-            ranges = server.fetched("cam_image_raw.mp4")
-            fetched[name] = sum(end - start for start, end in ranges)
-    assert np.array_equal(*pictures)
-    assert fetched["with"] < 0.65 * fetched["without"]
-    table = sample_table_of(tmp_path / "with" / "cam_image_raw.mp4")
-    assert fetched["without"] < 1.1 * table.sizes[:60].sum()  # nothing is fetched twice

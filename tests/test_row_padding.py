@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import warnings
 import zlib
 from pathlib import Path
@@ -18,7 +17,6 @@ from compare import compare
 from in_parts import InlineExecutor, use
 from mp4ds import yamlio
 from mp4ds.bags.formats import open_reader
-from mp4ds.format.fields import FORMAT_VERSION
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import Message
 from round_trips import unpacked
@@ -140,16 +138,3 @@ def test_datasets_of_version_1_0_are_read() -> None:
         assert mp4ds.validate(folder, deep=True) == []
     with mp4ds.open(folder) as dataset:
         assert sum(len(stream) for stream in dataset.streams) > 0
-
-
-def test_padding_is_no_key_of_version_1_0(tmp_path: Path) -> None:
-    paths = recording(tmp_path, "row-padding-garbage")
-    mp4ds.pack(paths, tmp_path / "dataset")
-    path = tmp_path / "dataset" / "odd_image.yaml"
-    document = yamlio.load(path.read_bytes(), "it")
-    assert document["mp4ds"] == FORMAT_VERSION
-    path.write_bytes(yamlio.dump({**document, "mp4ds": "1.0"}))
-    (problem,) = mp4ds.validate(path)
-    assert problem.code == "migration-failed"
-    schema = json.loads((ROOT / "schemas/v1.0/stream.schema.json").read_text())
-    assert "padding" not in schema["$defs"]["Header"]["properties"]

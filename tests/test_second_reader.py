@@ -16,11 +16,9 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-import yaml
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-import documents
 import images
 import mp4ds
 import reader
@@ -28,8 +26,6 @@ import run
 from coded_scenes import CODED
 from commands import program
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
-from mp4ds import yamlio
-from mp4ds.errors import FormatError
 from mp4ds.messages.encodings import ENCODINGS, Encoding
 from mp4ds.messages.layouts import LAYOUTS, fit
 from mp4ds.video.colour import MATRICES, samples
@@ -57,10 +53,6 @@ def test_the_suite(case: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> 
     assert not left_out
 
 
-def test_the_readme_says_what_is_not_read() -> None:
-    assert f"--without {','.join(NOT_READ)}" in (SUITE / "README.md").read_text()
-
-
 @pytest.mark.parametrize("path", sorted(SUITE.glob("*.py")), ids=lambda path: path.name)
 def test_it_shares_no_code_with_mp4ds(path: Path) -> None:
     for node in ast.walk(ast.parse(path.read_text())):
@@ -68,19 +60,6 @@ def test_it_shares_no_code_with_mp4ds(path: Path) -> None:
             assert "mp4ds" not in {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert (node.module or "").split(".")[0] != "mp4ds"
-
-
-@pytest.mark.parametrize(("inside", "is_taken"), [(31, True), (32, False)])
-def test_both_readers_limit_nesting_alike(inside: int, is_taken: bool) -> None:
-    """32 maps and lists within one another, the top being the first."""
-    text = "a: " + "[" * inside + "1" + "]" * inside + "\n"
-    if is_taken:
-        assert yaml.load(text, documents.Loader).keys() == yamlio.load(text.encode(), "").keys()
-        return
-    with pytest.raises(yaml.YAMLError, match="nested too deeply"):
-        yaml.load(text, documents.Loader)
-    with pytest.raises(FormatError, match="nested"):
-        yamlio.load(text.encode(), "some.yaml")
 
 
 # ---------------------------------------------------------------- layouts

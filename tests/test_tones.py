@@ -85,15 +85,6 @@ def test_a_deep_camera_has_a_view(case: str, tmp_path: Path) -> None:
     assert compare(done.sources, [output], ignore_pixels=[CAMERA]) == []
 
 
-@pytest.mark.parametrize("encoding", ["rgb16", "bayer_grbg16"])
-def test_less_quality_says_what_is_lost(encoding: str, tmp_path: Path) -> None:
-    options = {"quality": "visual", "ignore_pixels": [CAMERA]}
-    done = journey(tmp_path, SOURCES["bag-none"], recorded(encoding, 12), "bag", **options)
-    (topic,) = (one for one in done.summary.topics if one.topic == CAMERA)
-    assert "12 bits are kept as 8" in str(topic)
-    assert sidecar(done.dataset).profile == "visual"
-
-
 def test_what_may_be_depth_stays_exact(tmp_path: Path) -> None:
     """Of mono16, whatever quality is asked for; other cameras are copied as their views."""
     made = recorded("mono16", 12)

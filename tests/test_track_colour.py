@@ -15,8 +15,7 @@ from conftest import real
 from mp4ds.dataset.images import VideoImages
 from mp4ds.dataset.topic import Topic
 from mp4ds.video.access import FrameReader
-from mp4ds.video.mp4 import SampleEntry, TrackColour, read_sample_entry
-from test_access import opened
+from mp4ds.video.mp4 import TrackColour, read_sample_entry
 from test_references import FRAMES, HEIGHT, RECIPES, WIDTH, encoded_file
 
 NAMES = ("x264-b0-none-ref4-w2", "x265-b0", "svt-8", "vp9", "ffv1", "mjpeg")
@@ -81,14 +80,6 @@ def test_decoders_know_what_the_track_says(
     video.close()
 
 
-def test_a_track_without_colours(tmp_path: Path) -> None:
-    path = tmp_path / "v.mp4"
-    path.write_bytes(encoded_file(RECIPES["ffv1"]))
-    assert read_sample_entry(path).colour is None
-    with closing(opened(path, RECIPES["ffv1"])) as access:
-        assert access.table.entry.colour is None
-
-
 def test_a_real_one() -> None:
     path = real("video/bt709_full_range.mp4")
     colour = read_sample_entry(path).colour
@@ -98,32 +89,3 @@ def test_a_real_one() -> None:
     assert np.array_equal(video.read(numbers), [every[number] for number in numbers])
     video.close()
     assert colour == TrackColour(1, 1, 1, full_range=True)
-
-
-def entry(*boxes: tuple[str, bytes]) -> SampleEntry:
-    return SampleEntry("avc1", bytes(78), boxes)
-
-
-def colr(kind: bytes, *numbers: int, flags: bytes = b"") -> tuple[str, bytes]:
-    return "colr", kind + b"".join(number.to_bytes(2, "big") for number in numbers) + flags
-
-
-@pytest.mark.parametrize(
-    ("boxes", "expected"),
-    [
-        ([], None),
-        ([("avcC", bytes(20))], None),
-        ([colr(b"nclx", 9, 16, 9, flags=b"\x80")], TrackColour(9, 16, 9, True)),
-        ([colr(b"nclx", 9, 16, 9, flags=b"\x7f")], TrackColour(9, 16, 9, False)),
-        ([colr(b"nclx", 9, 16, 9)], TrackColour(9, 16, 9, None)),
-        ([colr(b"nclc", 1, 1, 6, flags=b"\x80")], TrackColour(1, 1, 6, None)),
-        ([colr(b"nclx", 65535, 255, 99, flags=b"\0")], TrackColour(2, 2, 2, False)),
-        ([colr(b"nclx", 1, 1)], None),
-        ([("colr", b"")], None),
-        ([("colr", b"prof" + bytes(200))], None),
-        ([colr(b"nclc", 1, 1, 1), ("colr", b"prof" + bytes(200))], TrackColour(1, 1, 1, None)),
-        ([colr(b"nclc", 1, 1, 1), colr(b"nclc", 6, 6, 6)], TrackColour(6, 6, 6, None)),
-    ],
-)
-def test_boxes(boxes: list[tuple[str, bytes]], expected: TrackColour | None) -> None:
-    assert entry(*boxes).colour == expected

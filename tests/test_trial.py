@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 import mp4ds
 from compare import compare
-from mp4ds.errors import EncoderRefusedError, OptionError
-from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE
+from mp4ds.errors import OptionError
+from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import fit
 from mp4ds.packing.options import PackOptions
 from mp4ds.video.codecs import lossless_codecs
@@ -39,10 +39,6 @@ def scene(encoding: str, frames: int = 6, width: int = 96, height: int = 66) -> 
         np.ascontiguousarray(picture(encoding, frame=n, width=width, height=height, rng=rng))
         for n in range(frames)
     ]
-
-
-def texture(rng: np.random.Generator, top: int) -> Pixels:
-    return rng.integers(0, top, (64, 96), np.uint16, endpoint=True)
 
 
 def video_size(path: Path, samples: Sequence[Pixels], encoding: str, choice: Coding) -> int:
@@ -77,57 +73,6 @@ def test_the_estimate_is_near_the_truth(encoding: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- choices
 
 
-def test_inter_coding_is_chosen_for_what_stays() -> None:
-    rng = np.random.default_rng(0)
-    still = [texture(rng, 255).astype(np.uint8)] * 6
-    assert chosen(still, "mono8").recipe.codec == "h264"
-    assert chosen([still[0]] * 6, "mono8", gop=1).recipe.codec == "ffv1"
-    noise = [texture(rng, 255).astype(np.uint8) for _ in range(6)]
-    assert chosen(noise, "mono8").recipe.codec == "ffv1"
-
-
-def test_noise_below_the_signal_is_folded_away() -> None:
-    """What inter coding finds again is in the high bits."""
-    rng = np.random.default_rng(0)
-    still = texture(rng, 4095)
-    samples = [still + rng.integers(0, 4, still.shape, np.uint16) for _ in range(6)]
-    samples = [np.minimum(pixels, 4095) for pixels in samples]
-    choice = chosen(samples, "mono16")
-    assert (choice.layout.name, choice.recipe.codec) == ("fold", "h264")
-    assert (choice.layout.parameters.bits, choice.layout.parameters.low) == (12, 3)
-
-
-def test_values_that_change_are_listed_in_each_picture() -> None:
-    """As of a stereo camera that moves: depth is f * B / disparity."""
-    y, x = np.mgrid[:256, :320]
-    samples = []
-    for n in range(6):
-        disparity = np.rint(400 + 180 * np.sin((x + n) / 90) + 100 * np.cos(y / 40) + 3 * n)
-        samples.append((np.float32(70.123) / disparity).astype(np.float32))
-    choice = chosen(samples, "32FC1")
-    assert choice.layout.name == "palette"
-    assert choice.bytes_per_frame < samples[0].nbytes / 8
-
-
-@pytest.mark.parametrize("scale", ["product", "quotient"])
-def test_metres_are_stored_as_millimetres(scale: str) -> None:
-    rng = np.random.default_rng(0)
-    y, x = np.mgrid[:64, :96]
-    samples = []
-    for n in range(6):
-        counts = (2000 + 10 * x + 5 * y + 3 * n + rng.integers(0, 9, x.shape)).astype(np.float32)
-        metres = counts * np.float32(0.001) if scale == "product" else counts / np.float32(1000)
-        metres[(x + n) % 13 == 0] = np.nan
-        samples.append(metres)
-    choice = chosen(samples, "32FC1")
-    assert choice.layout.name in ("metres16", "metres_fold")
-    assert choice.layout.parameters.scale == scale
-    samples[3][5, 5] = 1.00025  # one is no whole number of millimetres
-    assert chosen(samples, "32FC1").layout.name == "palette"
-    noise = [s + rng.normal(0, 0.01, s.shape).astype(np.float32) for s in samples]
-    assert chosen(noise, "32FC1").layout.name == "bytes"
-
-
 @pytest.mark.one_in(5)
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_codec_that_was_asked_for(encoding: str) -> None:
@@ -146,22 +91,6 @@ def test_a_codec_that_was_asked_for(encoding: str) -> None:
             continue
         with pytest.raises(OptionError, match=f"codec {codec} has no lossless form for .*ffv1"):
             chosen(samples, encoding, codec=codec)
-
-
-def test_one_sample_and_tiny_images() -> None:
-    for width, height in ((2, 2), (3, 5), (301, 2)):
-        samples = [np.full((height, width), 9, np.uint8)]
-        assert chosen(samples, "mono8").bytes_per_frame > 0
-    with pytest.raises(EncoderRefusedError, match="does not take pictures of 1x1"):
-        chosen([np.zeros((1, 1), np.uint16)], "mono16", codec="ffv1")
-
-
-def test_pictures_beyond_the_bounds_are_not_tried() -> None:
-    """Twice the height of this image is more than a video may have."""
-    rng = np.random.default_rng(0)
-    ramp = np.cumsum(rng.integers(0, 3, (MAX_SIDE // 2 + 2, 4)), axis=0).astype(np.uint16)
-    assert chosen([ramp], "mono16").layout.name != "fold"
-    assert chosen([ramp], "mono16", codec="ffv1").recipe.pixel_format == "gray16le"
 
 
 @pytest.mark.one_in(3)
@@ -236,15 +165,6 @@ def test_key_frames_of_differences(asked: dict[str, Any], gop: str, tmp_path: Pa
     assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
-def test_an_archive_has_the_smallest() -> None:
-    samples = scene("mono8", width=320, height=240)
-    archive = chosen(samples, "mono8", purpose="archive")
-    assert archive.bytes_per_frame <= chosen(samples, "mono8").bytes_per_frame
-    assert archive.bytes_per_frame == min(
-        chosen(samples, "mono8", codec=codec).bytes_per_frame for codec in lossless_codecs("gray")
-    )
-
-
 def test_lossy_videos_for_a_purpose(tmp_path: Path) -> None:
     paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("rgb8", frames=3))
     found = {}
@@ -282,25 +202,10 @@ def test_packing_at_speed(encoding: str, codec: str, tmp_path: Path) -> None:
     assert codec == "ffv1" or found[0]["options"]["preset"] == "ultrafast"
 
 
-@pytest.mark.parametrize("text", ["fast", "training=15"])
-def test_a_purpose_that_is_none(text: str, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="`purpose`"):
-        mp4ds.pack(tmp_path / "no.bag", tmp_path / "dataset", PackOptions(purpose=text))
-
-
 @pytest.mark.parametrize("size", [(70, 20), (20, 70), (320, 16)])
 def test_views_of_narrow_images_end(size: tuple[int, int], tmp_path: Path) -> None:
     """SVT-AV1 with several threads waits forever on them."""
     made = source_scene("mono8", frames=3, width=size[0], height=size[1])
     paths = SOURCES["mcap-ros2-none"](tmp_path, made)
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(view="av1"))
-    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
-
-
-def test_groups_of_two_frames_end(tmp_path: Path) -> None:
-    """SVT-AV1 with an own number of levels waits forever on them."""
-    made = source_scene("rgb8", frames=60, width=160, height=96)
-    paths = SOURCES["mcap-ros2-none"](tmp_path, made)
-    options = PackOptions(quality="crf=30", codec="av1", preset="4", gop=2, window=60)
-    mp4ds.pack(paths, tmp_path / "dataset", options)
     assert mp4ds.validate(tmp_path / "dataset", deep=True) == []

@@ -6,9 +6,7 @@ import io
 import itertools
 import os
 import random
-import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from commands import ffprobe
 from mp4ds.errors import EncoderRefusedError, OptionError, Refused, VideoError
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import CHROMA_SHIFTS, bind, fit, layout_for
-from mp4ds.video.codecs import Recipe, check_codec, recipe_for
+from mp4ds.video.codecs import Recipe, recipe_for
 from mp4ds.video.decoder import VideoDecoder, jpeg_pixels
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.images import ImageFile
@@ -174,30 +172,6 @@ def test_lossless_is_exact(codec: str, picture_format: str, tmp_path: Path) -> N
     assert codec == "h265" or all(min(size) < 4 for size in refused)
 
 
-@pytest.mark.parametrize(
-    ("picture_format", "width", "height"),
-    [
-        ("rgb24", 5472, 3648),
-        ("rgba", 4096, 3648),
-        ("gbrp16le", 4096, 3000),
-        ("gbrap16le", 4096, 3000),
-        ("gbrap16le", 16384, 12000),
-        ("yuv420p", 5472, 3648),
-        ("gray", 16384, 16000),
-    ],
-)
-def test_large_pictures_have_more_slices(
-    picture_format: str, width: int, height: int, tmp_path: Path
-) -> None:
-    recipe = recipe_for(picture_format, lossless=True, codec="ffv1")
-    encoder = VideoEncoder(
-        tmp_path / "v.mp4", recipe, picture_format=picture_format, width=width, height=height,
-        gop=1, threads=1, rate=None,
-    )  # fmt: skip
-    encoder.abandon()
-    assert int(encoder.options["slices"]) > 4
-
-
 @pytest.mark.slow
 def test_a_large_picture_is_exact(tmp_path: Path) -> None:
     large = np.zeros((3648, 4096, 4), np.uint8)
@@ -205,10 +179,6 @@ def test_a_large_picture_is_exact(tmp_path: Path) -> None:
     recipe = recipe_for("rgba", lossless=True)
     told = encode(tmp_path / "v.mp4", recipe, [large], "rgba", threads=2)
     assert same(decode(tmp_path / "v.mp4", told)[0], large)
-
-
-SCENES = {"gray": "mono8", "gray16le": "mono16", "rgb24": "rgb8", "bgr24": "bgr8",
-          "rgba": "rgba8", "bgra": "bgra8"}  # fmt: skip
 
 
 # ---------------------------------------------------------------- colour
@@ -318,45 +288,6 @@ def test_times_in_the_file_are_the_ticks(codec: str, tmp_path: Path) -> None:
     assert packets[0].is_keyframe
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_parameters_of_a_recipe_reach_svt_av1(threads: int, tmp_path: Path) -> None:
-    """Beside the threads, which are parameters of it, too."""
-    pictures = scene_pictures("mono8", 64, 48, 3)
-    recipe = recipe_for("gray", lossless=False, codec="av1", crf=50)
-    exact = replace(recipe, options={**recipe.options, "svtav1-params": "lossless=1"})
-    came_back = []
-    for number, item in enumerate((recipe, exact)):
-        path = tmp_path / f"{number}.mp4"
-        told = encode(path, item, pictures, "gray", threads=threads)
-        came_back.append(all(map(same, decode(path, told), pictures)))
-    assert came_back == [False, True]
-
-
-def test_a_recipe_has_the_last_word(tmp_path: Path) -> None:
-    """Such as that of av1-10bit on levels, of which there is a default."""
-    pictures = scene_pictures("mono8", 64, 48, 20)
-    recipe = recipe_for("gray", lossless=False, codec="av1", crf=30)
-    other = replace(recipe, options={**recipe.options, "svtav1-params": "hierarchical-levels=2"})
-    for name, item in (("usual", recipe), ("other", other)):
-        encode(tmp_path / name, item, pictures, "gray", threads=1)
-    assert (tmp_path / "usual").read_bytes() != (tmp_path / "other").read_bytes()
-
-
-@pytest.mark.parametrize("rate", [None, 0.0, 1e-9, 0.3, 29.97, 1e9])
-def test_any_rate_and_a_single_frame(rate: float | None, tmp_path: Path) -> None:
-    pixels = scene_pictures("mono8", 64, 48, 1)[0]
-    for lossless, codec in ((True, "h264"), (True, "ffv1"), (False, "av1"), (False, "h265")):
-        recipe = recipe_for("gray", lossless=lossless, codec=codec, crf=20)
-        encoder = VideoEncoder(
-            tmp_path / "v.mp4", recipe, picture_format="gray", width=64, height=48,
-            gop=60, threads=1, rate=rate,
-        )  # fmt: skip
-        encoder.write((pixels,), 0)
-        encoder.close()
-        told = {"codec": codec, "coded_size": (64, 48), "frames": 1, "picture_format": "gray"}
-        assert len(decode(tmp_path / "v.mp4", {**told, "picture_size": (64, 48)})) == 1
-
-
 def scheduling() -> list[int]:
     """The scheduling classes of the threads of this process."""
     return [os.sched_getscheduler(int(p.name)) for p in Path("/proc/self/task").iterdir()]
@@ -386,18 +317,6 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     pictures = scene_pictures("mono8", 32, 24, 8)
     recipe = recipe_for("gray", lossless=True)
     return path, encode(path, recipe, pictures, "gray", gop=4), pictures
-
-
-def test_two_video_tracks_are_one_too_many(tmp_path: Path, plain: Any) -> None:
-    with av.open(str(tmp_path / "two.mp4"), "w") as container:
-        streams = [container.add_stream("libx264", rate=30) for _ in range(2)]
-        for stream in streams:
-            stream.width, stream.height, stream.pix_fmt = 32, 24, "gray"
-        for stream in streams:
-            frame = av.VideoFrame.from_ndarray(np.zeros((24, 32), np.uint8), format="gray")
-            container.mux([*stream.encode(frame), *stream.encode(None)])
-    with pytest.raises(VideoError, match="2 video tracks"):
-        video_decoder(tmp_path / "two.mp4", **plain[1])
 
 
 def read_all(path: Path, told: dict[str, Any]) -> list[Pixels] | VideoError:
@@ -445,44 +364,6 @@ def test_a_damaged_video_is_a_clear_error_at_worst(codec: str, tmp_path: Path) -
         if isinstance(found, VideoError) and ("\n" in str(found) or str(damaged) not in str(found)):
             unclear.append(f"{seed}: {found}")
     assert unclear == []
-
-
-@pytest.mark.parametrize(
-    ("codec", "preset", "crf"),
-    [
-        *((codec, None, None) for codec in ("vp9", "", "av1", "H264")),
-        *((codec, None, 20) for codec in ("vp9", "", "ffv1")),
-        *((None, preset, None) for preset in ("6", "warp", "", "Medium")),
-        *((None, preset, 20) for preset in ("14", "-1", "medium", "")),
-        *(("h265", preset, 20) for preset in ("6", "warp")),
-        ("ffv1", "6", None),
-        *((None, None, 0), (None, "11", 1), ("av1", "13", 1), ("av1", None, 64)),
-        *(("h264", None, 52), ("h265", "medium", 60)),
-    ],
-)
-def test_others_are_refused(codec: str | None, preset: str | None, crf: int | None) -> None:
-    with pytest.raises(OptionError, match=r"Use (one of )?\w+|no presets") as caught:
-        check_codec(codec, preset, lossless=crf is None, crf=crf)
-    if crf in (None, 20):
-        assert repr(codec if preset is None else preset) in str(caught.value)
-    else:
-        assert re.search(rf"crf={crf} is out of range for .*Use \d+ to (63|51)", str(caught.value))
-
-
-@pytest.mark.parametrize(
-    ("codec", "preset", "crf"),
-    [(None, None, 1), ("av1", "10", 1), ("av1", "12", 2), ("h264", None, 0), ("h265", None, 51)],
-)
-def test_the_ends_of_crf_look_like_the_pictures(
-    codec: str | None, preset: str | None, crf: int, tmp_path: Path
-) -> None:
-    check_codec(codec, preset, lossless=False, crf=crf)
-    recipe = recipe_for("gray", lossless=False, codec=codec, crf=crf, preset=preset)
-    pictures = scene_pictures("mono8", 128, 96, 6)
-    info = encode(tmp_path / "v.mp4", recipe, pictures, "gray")
-    for found, expected in zip(decode(tmp_path / "v.mp4", info), pictures, strict=True):
-        away = np.asarray(found, float).reshape(96, 128) - np.asarray(expected).reshape(96, 128)
-        assert np.sqrt(np.mean(away**2)) < (3 if crf <= 2 else 60)
 
 
 # ---------------------------------------------------------------- single images

@@ -11,7 +11,6 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from av.stream import Disposition
 from numpy.typing import NDArray
 
 import mp4ds
@@ -132,13 +131,6 @@ def test_times_and_sizes(tmp_path: Path) -> None:
         assert dataset.profile == ""
 
 
-@pytest.mark.parametrize("suffix", ["mov", "m4v", "MP4"])
-def test_names(suffix: str, tmp_path: Path) -> None:
-    write_video(tmp_path / f"clip.{suffix}", "h264")
-    with mp4ds.open(str(tmp_path / f"clip.{suffix}")) as dataset:
-        assert dataset["clip"].stamps[0] == 0
-
-
 VIDEOS = ["var_fps_video", "h264_10bits", "lerobot_aloha_insertion_human_yuv444", "sam2_02_cups"]
 
 
@@ -169,14 +161,6 @@ def test_videos_of_a_dataset_need_their_sidecars(tmp_path: Path) -> None:
         assert len(dataset.streams) == 1
         with pytest.raises(mp4ds.FormatError, match=r"cam_image_raw\.mp4.* \[file-missing\]"):
             dataset["/cam/image_raw"][0]
-
-
-def test_only_frames_are_read_without_a_sidecar(tmp_path: Path) -> None:
-    write_video(tmp_path / "clip.mp4", "h264")
-    for call in (mp4ds.Dataset, lambda path: mp4ds.unpack(path, "bag", tmp_path / "again.bag")):
-        with pytest.raises(mp4ds.FormatError, match=r"sidecar, clip\.yaml \[file-missing\]"):
-            call(tmp_path / "clip.mp4")
-    assert [item.code for item in mp4ds.validate(tmp_path / "clip.mp4")] == ["file-missing"]
 
 
 def write_tracks(path: Path, encoders: list[str], *, in_fragments: bool = False) -> None:
@@ -227,36 +211,6 @@ def test_one_of_several_tracks(encoders: list[str], in_fragments: bool, tmp_path
             mp4ds.open(path, track=track)
 
 
-def test_a_track_is_of_a_video_without_a_sidecar(tmp_path: Path) -> None:
-    mp4ds.pack(SOURCES["bag-none"](tmp_path, scene("rgb8", frames=2)), tmp_path / "ds")
-    with pytest.raises(mp4ds.OptionError, match="`track` is for videos without a sidecar"):
-        mp4ds.open(tmp_path / "ds", track=0)
-    with pytest.raises(mp4ds.SourceNotFoundError):
-        mp4ds.open(tmp_path / "none.mp4", track=0)
-
-
-def test_a_picture_of_the_cover_is_no_track(tmp_path: Path) -> None:
-    write_video(tmp_path / "clip.mp4", "h264")
-    with (
-        av.open(str(tmp_path / "clip.mp4")) as source,
-        av.open(str(tmp_path / "cover.mp4"), "w") as target,
-    ):
-        copied = target.add_stream_from_template(source.streams.video[0])
-        cover: Any = target.add_stream("mjpeg", rate=1)
-        cover.width, cover.height, cover.pix_fmt = 64, 48, "yuvj420p"
-        cover.disposition = Disposition.attached_pic
-        for packet in source.demux(video=0):
-            if packet.dts is not None:
-                packet.stream = copied
-                target.mux(packet)
-        target.mux(cover.encode(frame_of(0, 0)))
-        target.mux(cover.encode(None))
-    with av.open(str(tmp_path / "cover.mp4")) as container:
-        assert len(container.streams.video) == 2
-    with mp4ds.open(tmp_path / "cover.mp4") as dataset:
-        assert len(dataset["cover"]) == FRAMES
-
-
 @pytest.mark.parametrize(
     "content", [b"", b"no video at all", b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + bytes(64)]
 )
@@ -264,15 +218,6 @@ def test_not_a_video(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(content)
     with pytest.raises(mp4ds.VideoError, match=r"clip\.mp4.*\[video-unreadable\]"):
         mp4ds.open(tmp_path / "clip.mp4")
-
-
-def test_a_title_that_is_no_utf8(tmp_path: Path) -> None:
-    write_video(tmp_path / "clip.mp4", "h264", title="latin-1")
-    data = (tmp_path / "clip.mp4").read_bytes()
-    assert data.count(b"latin-1") == 1
-    (tmp_path / "clip.mp4").write_bytes(data.replace(b"latin-1", b"caf\xe9\xff.."))
-    with mp4ds.open(tmp_path / "clip.mp4") as dataset:
-        assert len(dataset["clip"]) == FRAMES
 
 
 def test_damage_is_told(tmp_path: Path) -> None:
@@ -293,29 +238,3 @@ def test_damage_is_told(tmp_path: Path) -> None:
         except mp4ds.Mp4dsError:
             raised += 1
     assert raised
-
-
-def test_closing_and_opening_again(tmp_path: Path) -> None:
-    write_video(tmp_path / "clip.mp4", "h264")
-    with mp4ds.open(tmp_path / "clip.mp4") as dataset:
-        expected = dataset["clip"][5].data
-    assert np.array_equal(dataset["clip"][5].data, expected)
-    dataset.close()
-
-
-@pytest.mark.parametrize("kind", ["matroska", "playlist"])
-def test_nothing_but_an_mp4_is_read(kind: str, tmp_path: Path) -> None:
-    """Ffmpeg would guess what it is, and open what a playlist names."""
-    path = tmp_path / "video.mp4"
-    if kind == "playlist":
-        path.write_text(f"#EXTM3U\n#EXTINF:1,\n{tmp_path / 'other.mp4'}\n#EXT-X-ENDLIST\n")
-    else:
-        with av.open(str(path), "w", format=kind) as output:
-            stream = output.add_stream("ffv1", rate=30)
-            stream.width, stream.height, stream.pix_fmt = 16, 16, "gray"
-            frame = av.VideoFrame(16, 16, "gray")
-            frame.pts = 0
-            output.mux(stream.encode(frame))
-            output.mux(stream.encode(None))
-    with pytest.raises(mp4ds.VideoError, match="is not an mp4 "):
-        mp4ds.open(path)

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import itertools
-import struct
-import tracemalloc
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
 from mcap.writer import Writer
 
 import mp4ds
 from coded_tools import mutations
 from compare import compare
-from foxglove_wire import SERIALIZATIONS, message_class
+from foxglove_wire import SERIALIZATIONS
 from mp4ds.messages.serializations import ProtobufForm
 from mp4ds.messages.wire import (
     MAX_BLANK,
@@ -133,88 +130,6 @@ def test_a_message_splits_and_returns(source: str, kind: str) -> None:
         assert len(blanks) <= 1
 
 
-@pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("source", SOURCES)
-def test_a_blank_is_a_blank_message(source: str, kind: str) -> None:
-    of = form(source, kind)
-    message = payload(source, kind, STAMPS[-1], b"something" * (kind in BODIED))
-    blank = of.split(memoryview(message)).blank
-    again = of.split(memoryview(blank))
-    assert (again.stamp, bytes(again.body), again.blank) == (0, b"", blank)
-    assert (again.frame_id, again.fields) == (VALUES[kind]["frame_id"], FIELDS[kind])
-    assert of.plain(again.frame_id, again.fields) is None
-    if source in ("protobuf", "protobuf-stamp-last"):
-        read = message_class(f"x/{kind}").FromString(blank)
-        assert read.HasField("timestamp")
-        assert read.timestamp.ToNanoseconds() == 0
-        assert read.frame_id == VALUES[kind]["frame_id"]
-        assert kind not in BODIED or read.data == b""
-
-
-@pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("source", SOURCES)
-def test_a_message_that_is_not_blank_makes_no_template(source: str, kind: str) -> None:
-    of = form(source, kind)
-    cases = [payload(source, kind, 7, b"x")]
-    if kind in BODIED:
-        cases.append(payload(source, kind, 0, b"x"))
-    for message in cases:
-        with pytest.raises(WireError, match="blank message"):
-            of.template(message)
-
-
-def test_a_blank_is_not_large() -> None:
-    of = form("protobuf", "RawImage")
-    blank = of.split(memoryview(payload("protobuf", "RawImage", 1, b"abcd"))).blank
-    assert of.template(blank)
-    with pytest.raises(WireError, match="besides its data"):
-        of.template(blank + b"\xba\x3e\xff\xff\x03" + bytes(MAX_BLANK - 1))
-
-
-@pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("source", SOURCES)
-def test_every_cut_is_refused(source: str, kind: str) -> None:
-    message = payload(source, kind, STAMPS[-1], b"something")
-    if source == "protobuf-unknown-field":
-        message = message[:-7]  # a cut before the unknown field is a whole message
-    for end in range(len(message)):
-        try:
-            parts = form(source, kind).split(memoryview(message)[:end])
-        except WireError:
-            continue
-        # it may end after each field
-        assert proven(form(source, kind), message[:end])
-        assert parts.stamp == STAMPS[-1]
-
-
-@pytest.mark.parametrize("type_name", ["foxglove.PointCloud", "RawImage", "", "sensor_msgs/Image"])
-def test_other_types_are_refused(type_name: str) -> None:
-    with pytest.raises(WireError, match="is not modelled"):
-        ProtobufForm(type_name, b"")
-
-
-def test_calibrations_that_cannot_be_modelled() -> None:
-    of = form("protobuf", "CameraCalibration")
-    for key, value, reason in (
-        ("k", [1.0] * 8, "8 values in K, not 9"),
-        ("r", [], "0 values in R, not 9"),
-        ("p", [1.0] * 13, "13 values in P, not 12"),
-        ("d", [1.0] * 1025, "1025 distortion parameters"),
-        ("d", [float("nan")], "not finite"),
-        ("k", [float("inf")] * 9, "not finite"),
-    ):
-        values = {**VALUES["CameraCalibration"], "timestamp": 1, key: value}
-        record = Record("/topic", "foxglove_msgs/msg/CameraCalibration", 0, values)
-        assert reason in refused(of, SERIALIZATIONS["protobuf"].payload(record))
-    none = {**VALUES["CameraCalibration"], "timestamp": 1, "d": []}
-    record = Record("/topic", "foxglove_msgs/msg/CameraCalibration", 0, none)
-    message = SERIALIZATIONS["protobuf"].payload(record)
-    assert proven(of, message)
-    fields = of.split(memoryview(message)).fields
-    assert isinstance(fields, CalibrationFields)
-    assert fields.d == ()
-
-
 # ---------------------------------------------------------------- protobuf
 
 
@@ -250,42 +165,6 @@ def test_protobuf_fields_in_any_order() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stamp", "content"),
-    [
-        (-1, b"\x08" + b"\xff" * 9 + b"\x01" + b"\x10" + varint(999_999_999)),
-        (-(10**9), b"\x08" + b"\xff" * 9 + b"\x01"),
-        (2**63 - 1, b"\x08" + varint(9_223_372_036) + b"\x10" + varint(854_775_807)),
-        (
-            -(2**63),
-            b"\x08" + varint(2**64 - 9_223_372_037) + b"\x10" + varint(145_224_192),
-        ),
-    ],
-)
-def test_protobuf_stamps_of_64_bits(stamp: int, content: bytes) -> None:
-    of = form("protobuf", "CompressedImage")
-    message = block(1, content) + DATA
-    assert of.split(memoryview(message)).stamp == stamp
-    assert proven(of, message)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"\x08" + varint(9_223_372_036) + b"\x10" + varint(854_775_808),
-        b"\x08" + varint(2**63 - 1),
-        b"\x08" + varint(2**63),
-        b"\x10" + varint(10**9),
-        b"\x10" + b"\xff" * 9 + b"\x01",
-        b"\x0d" + bytes(4),
-        b"\x08",
-        b"\x08" + b"\xff" * 10,
-    ],
-)
-def test_protobuf_stamps_that_have_no_value(content: bytes) -> None:
-    assert refused(form("protobuf", "CompressedImage"), block(1, content) + DATA)
-
-
-@pytest.mark.parametrize(
     "message",
     [
         block(1, b"\x08\x05\x10\x00") + DATA,  # a zero that serializers leave out
@@ -302,133 +181,22 @@ def test_protobuf_that_is_not_as_serializers_write_it_is_not_proven(message: byt
 
 
 @pytest.mark.parametrize(
-    ("more", "frame_id"),
-    [
-        (b"\x22\x83\x00cam", "cam"),  # its length in two bytes
-        (b"\xa2\x00\x03cam", "cam"),  # its tag in two
-        (b"\x22\x03cam\x22\x03map", "map"),  # twice: the last one counts
-        (tag(50, 1) + bytes(8), ""),
-        (tag(50, 5) + bytes(4), ""),
-        (tag(50, 0) + b"\xff" * 9 + b"\x01", ""),
-        (tag(2**29 - 1, 2) + b"\x00", ""),
-        (block(51, b"\x0a" * 2000), ""),
-    ],
-)
-def test_protobuf_that_is_odd_elsewhere_is_proven(more: bytes, frame_id: str) -> None:
-    of = form("protobuf", "CompressedImage")
-    for message in (more + STAMP + DATA, STAMP + more + DATA, STAMP + DATA + more):
-        assert proven(of, message)
-        assert of.split(memoryview(message)).frame_id == frame_id
-
-
-@pytest.mark.parametrize(
     ("message", "reason"),
     [
         (DATA, "it has no timestamp"),
         (STAMP, "it has no data"),
-        (b"", "it has no timestamp"),
         (STAMP + STAMP + DATA, "it has its timestamp twice"),
-        (STAMP + DATA + DATA, "it has its data twice"),
         (STAMP + b"\x10\x01", "its field data is not of the declared type"),
-        (STAMP + DATA + b"\x20\x01", "its field frame_id is not of the declared type"),
         (STAMP + DATA + b"\x22\x01\xff", "not UTF-8"),
         (STAMP + DATA + b"\x00\x00", "it has an invalid tag"),
-        (STAMP + DATA + varint(2**32) + b"\x00", "it has an invalid tag"),
         (STAMP + DATA + b"\xff" * 9 + b"\x02", "a number in it is cut short"),
         (STAMP + DATA + tag(9, 3) + tag(9, 4), "wire type 3"),
-        (STAMP + DATA + tag(9, 7), "wire type 7"),
         (STAMP + b"\x12" + varint(2**63) + b"x", "but a field extends to byte"),
         (STAMP + DATA + block(9, bytes(MAX_BLANK)), "bytes besides its data"),
     ],
 )
 def test_protobuf_refusals_say_why(message: bytes, reason: str) -> None:
     assert reason in refused(form("protobuf", "CompressedImage"), message)
-
-
-def test_protobuf_lists_packed_or_not() -> None:
-    of = form("protobuf", "CameraCalibration")
-    message = payload("protobuf", "CameraCalibration", 1)
-    packed = block(6, struct.pack("<9d", *MATRICES["k"]))
-    assert packed in message
-    loose = b"".join(tag(6, 1) + struct.pack("<d", value) for value in MATRICES["k"])
-    halves = block(6, packed[2:34]) + block(6, packed[34:])
-    for other in (loose, halves):
-        assert (
-            of.split(memoryview(message.replace(packed, other))).fields
-            == FIELDS["CameraCalibration"]
-        )
-        assert proven(of, message.replace(packed, other))
-    assert "a list of numbers in it is cut short" in refused(of, message + block(5, bytes(7)))
-
-
-def image_schema() -> tuple[FileDescriptorSet, dict[str, FieldDescriptorProto]]:
-    """Foxglove's schema of RawImage, to be changed."""
-    described = FileDescriptorSet.FromString(
-        SERIALIZATIONS["protobuf"].schema("foxglove_msgs/msg/RawImage")[1]
-    )
-    (message,) = (m for file in described.file for m in file.message_type if m.name == "RawImage")
-    return described, {field.name: field for field in message.field}
-
-
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("timestamp", {"type": FieldDescriptorProto.TYPE_INT64}),
-        ("timestamp", {"type_name": ".google.protobuf.Duration"}),
-        ("data", {"type": FieldDescriptorProto.TYPE_STRING}),
-        ("data", {"label": FieldDescriptorProto.LABEL_REPEATED}),
-        ("width", {"type": FieldDescriptorProto.TYPE_DOUBLE}),
-        ("encoding", {"type": FieldDescriptorProto.TYPE_ENUM}),
-        ("step", {"name": "row_step"}),
-        ("timestamp", {"name": "time"}),
-    ],
-)
-def test_protobuf_schemas_of_other_types_are_refused(name: str, change: dict[str, Any]) -> None:
-    described, fields = image_schema()
-    for key, value in change.items():
-        setattr(fields[name], key, value)
-    with pytest.raises(WireError, match=f"field '{name}'"):
-        ProtobufForm("foxglove.RawImage", described.SerializeToString())
-
-
-def test_protobuf_schemas_that_do_not_declare_the_type() -> None:
-    described, _ = image_schema()
-    for type_name, schema in (
-        ("foxglove.CompressedImage", described.SerializeToString()),
-        ("foxglove.RawImage", described.SerializeToString() * 2),
-        ("foxglove.RawImage", b""),
-        ("foxglove.RawImage", b"\xff\xff"),
-        ("foxglove.RawImage", b"syntax"),
-    ):
-        with pytest.raises(WireError, match="its schema"):
-            ProtobufForm(type_name, schema)
-
-
-def test_protobuf_numbers_may_be_varints_and_a_frame_absent() -> None:
-    described, fields = image_schema()
-    fields["width"].type = FieldDescriptorProto.TYPE_UINT32
-    fields["frame_id"].name = "frame"
-    of = ProtobufForm("foxglove.RawImage", described.SerializeToString())
-    # 320 and a bit beyond the 32 that count
-    message = (
-        STAMP
-        + b"\x10"
-        + varint(2**32 + 320)
-        + block(4, b"rgb8")
-        + block(6, b"x")
-        + block(7, b"\xff")
-    )
-    parts = of.split(memoryview(message))
-    assert parts.fields == ImageFields("rgb8", 320, 0, 0, 0)
-    assert parts.frame_id == ""
-    assert proven(of, message)
-
-
-def test_a_protobuf_has_signed_64_bit_seconds() -> None:
-    of = form("protobuf", "RawImage")
-    blank = of.split(memoryview(payload("protobuf", "RawImage", 1, b"abcd"))).blank
-    with pytest.raises(WireError, match="has bits for"):
-        of.template(blank).around(Slots(2**63 * 10**9), 4)
 
 
 # ---------------------------------------------------------------- hostile bytes
@@ -493,20 +261,6 @@ def test_large_hostile_messages_take_little_work(case: str, kind: str) -> None:
     message = first + repeated * (LARGE // len(repeated))
     of = form("protobuf", kind)
     assert lines_run(lambda: refused(of, message)) < 5_000_000  # some 0.1 s
-
-
-def test_a_large_message_takes_no_copy() -> None:
-    of, body = form("protobuf", "RawImage"), noise(LARGE)
-    message = payload("protobuf", "RawImage", STAMPS[-1], body)
-    tracemalloc.start()
-    try:
-        parts = of.split(memoryview(message))
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert parts.body == body
-    assert peak < 1 << 20
-    assert prove(of.template(parts.blank), parts, memoryview(message))
 
 
 # ---------------------------------------------------------------- other serializations

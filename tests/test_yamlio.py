@@ -132,38 +132,6 @@ def test_columns_are_literal_blocks_and_return(columns: list[list[int]], text: s
             assert b"values: |\n" in data
 
 
-def test_a_column_line_stands_in_no_other_block() -> None:
-    """Or a reader that cuts columns out by their lines would cut into the text."""
-    document = {
-        "text": "a message definition\n  values: |\n    1 2\n",
-        "column": {"values": "1 2\n3\n"},
-    }
-    lines = yamlio.dump(document).decode().splitlines()
-    assert [line.strip() for line in lines].count("values: |") == 1
-
-
-@pytest.mark.parametrize(
-    "document",
-    [
-        {"values": "mp4ds column 0\n", "text": "x\n  values: |\n    5\n"},
-        {"a": {"values": "mp4ds column 0"}, "text": "x\n  values: |\n    5\n"},
-        {"a": {"values": "mp4ds column 1\n2\n"}, "b": {"values": "mp4ds column 0\n1\n"}},
-        {"a": {"values": "mp4ds column 0"}, "b": {"values": "1\n2\n"}},
-    ],
-)
-def test_text_that_looks_like_a_placeholder_is_only_text(document: dict[str, Any]) -> None:
-    assert same(load_back(document), document)
-
-
-def test_layout_for_human_readers() -> None:
-    text = yamlio.dump(
-        {"a": {"b": [1, 2.5], "c": ["p", "q"], "d": {}, "e": []}, "t": "one\ntwo\n"}, comment="Hi."
-    ).decode()
-    assert text.startswith(
-        "# Hi.\na:\n  b: [1, 2.5]\n  c:\n    - p\n    - q\n  d: {}\n  e: []\nt: |\n  one\n  two\n"
-    )
-
-
 # ---------------------------------------------------------------- reading
 
 
@@ -196,27 +164,17 @@ def test_plain_scalars(text: str, value: Any) -> None:
         ("a: &x 1\nb: *x\n", "anchors"),
         ("a: *x\n", "anchors"),
         ("a: !!str 1\n", "tags"),
-        ("a: ! 1\n", "tags"),
         ("a: !!python/object/apply:os.system [x]\n", "tags"),
-        ("!!map {a: 1}\n", "tags"),
         ("a: 1\na: 2\n", "is repeated"),
-        ("a: {b: 1, 'b': 2}\n", "is repeated"),
         ("1: a\n", "not a string"),
-        ("true: a\n", "not a string"),
         ("? [a]\n: b\n", "not a string"),
-        ("? {a: b}\n: c\n", "not a string"),
-        ("~: a\n", "not a string"),
         ("- a\n", "not a map"),
-        ("a\n", "not a map"),
         ("a: 1\n---\nb: 1\n", "several"),
         ("", "no document"),
-        ("# nothing\n", "no document"),
         ("a: 1e999\n", "finite"),
         ("a: " + "9" * 5000 + "\n", "integer"),
         ("a: [1\n", "subset, perhaps cut short: line 2: did not find expected"),
-        ("a: 'b\n", "subset, perhaps cut short: line 2: found unexpected end"),
         ("a: \x00\n", "not valid"),
-        ("a:\n\t- b\n", "not valid"),
         ("[" * 100_000, "nest"),  # PyYAML may refuse it itself, before it gives us 32 levels
         ("a: " + "{a: " * 100_000, "nest"),
         ("a:\n" + "".join(" " * n + "-\n" for n in range(1, 60)), "deeper than 32"),
@@ -229,34 +187,6 @@ def test_refused(text: str, words: str) -> None:
     assert words in str(caught.value)
     assert str(caught.value).startswith("some.yaml: ")
     assert "\n" not in str(caught.value)
-
-
-def test_refuses_what_is_not_utf8() -> None:
-    for data in (b"a: \xff\n", b"a: \xed\xa0\x80\n", "a: b\n".encode("utf-16")):
-        with pytest.raises(FormatError) as caught:
-            yamlio.load(data, "some.yaml")
-        assert caught.value.code == "yaml-invalid"
-
-
-def test_refuses_too_much_structure_before_parsing() -> None:
-    with pytest.raises(FormatError, match="too many values"):
-        yamlio.load(b"a: [" + b"1, " * (yamlio.MAX_STRUCTURE_BYTES // 3) + b"1]\n", "some.yaml")
-
-
-def test_columns_do_not_count_as_structure() -> None:
-    line = b"    " + b"1 " * 40 + b"\n"
-    data = b"c:\n  values: |\n" + line * (yamlio.MAX_STRUCTURE_BYTES // len(line) + 10)
-    document = yamlio.load(data, "some.yaml")
-    assert len(document["c"]["values"]) > yamlio.MAX_STRUCTURE_BYTES * 0.9
-
-
-def test_depth_just_allowed() -> None:
-    document: dict[str, Any] = {"a": 1}
-    for _ in range(yamlio.MAX_DEPTH - 1):
-        document = {"a": document}
-    assert same(load_back(document), document)
-    with pytest.raises(FormatError, match="nested deeper than 32 levels"):
-        load_back({"a": document})
 
 
 @pytest.mark.parametrize(
@@ -307,10 +237,3 @@ def test_without_its_line_an_edited_file_is_read() -> None:
     assert caught.value.code == "checksum-mismatch"
     assert "remove that line" in str(caught.value)
     assert yamlio.load(raw[: raw.index(b"checksum")], "some.yaml") == {"a": 2}
-
-
-def test_a_checksum_elsewhere_is_a_key() -> None:
-    assert load('checksum: "xxh64:0123456789abcdef"\na: 1\n') == {
-        "checksum": "xxh64:0123456789abcdef",
-        "a": 1,
-    }
