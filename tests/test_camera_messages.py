@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import mp4ds
-from coded_scenes import CODED, ODD, VERBATIM
+from coded_scenes import CODED, VERBATIM
 from compare import compare
 from definitions import PICTURES
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
@@ -180,12 +180,6 @@ def body_of(name: str) -> str:
     return "packet"
 
 
-def test_the_place_of_an_odd_one(tmp_path: Path) -> None:
-    done = journey(tmp_path, SOURCES["bag-none"], CODED["jpeg-empty-one"](), "bag")
-    (entry,) = mp4ds.open(done.dataset).manifest.verbatim  # type: ignore[union-attr]
-    assert (entry.messages, entry.first) == (1, ODD)
-
-
 # ---------------------------------------------------------------- Foxglove's schemas
 
 FOXGLOVE_EXPECTED: Mapping[str, tuple[int, int]] = {
@@ -292,16 +286,6 @@ def test_narrow_images_in_a_lossy_profile(
     assert 37 < least_psnr(done, TOPIC) < 90  # 37.3 of 10 bits by the SVT-AV1 of PyAV 19
 
 
-def test_narrow_images_in_a_lossless_h265_video_become_another(tmp_path: Path) -> None:
-    """Its lossless pictures of 16 columns are wrong, too."""
-    recorded = scene("mono16", frames=6, width=16, height=64, content="12-bit")
-    done = journey(tmp_path, SOURCES["bag-none"], recorded, "bag", codec="h265")
-    assert done.frames(TOPIC) == (6, 6)
-    (summary,) = (entry for entry in done.summary.topics if entry.topic == TOPIC)
-    assert any("libx265 does not take pictures of 16x64" in note for note in summary.notes)
-    assert compare(done.sources, done.output) == []
-
-
 TRANSCODED = [
     name
     for name in CODED
@@ -397,13 +381,6 @@ def test_what_grows_is_explained(tmp_path: Path) -> None:
         summary = mp4ds.pack(paths, tmp_path / name / "dataset")
         assert (summary.dataset_bytes > 1.05 * summary.source_bytes) == grows
         assert ("including repeated ones" in summary.larger) == grows
-
-
-def test_transcoding_without_loss_is_refused(tmp_path: Path) -> None:
-    paths = SOURCES["bag-none"](tmp_path, CODED["jpeg-rgb"](frames=2))
-    with pytest.raises(mp4ds.OptionError, match="`transcode`"):
-        mp4ds.pack(paths, tmp_path / "dataset", mp4ds.PackOptions(transcode=True))
-    assert not (tmp_path / "dataset").exists()
 
 
 # ---------------------------------------------------------------- all of it at once

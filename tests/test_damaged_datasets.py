@@ -19,8 +19,7 @@ from coded_scenes import CODED
 from commands import call
 from damage import Key, all_messages, pieces_of
 from edits import flip
-from mp4ds import FormatError, OptionError, SourceError, UnpackOptions
-from mp4ds.errors import VideoError
+from mp4ds import FormatError, SourceError, UnpackOptions
 from mp4ds.plugins.playing.player import open_player
 from mp4ds.records import Loss
 from player_scenes import RecordingPublisher
@@ -58,18 +57,6 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def dataset(packed: tuple[Path, Path], tmp_path: Path) -> Path:
     """The dataset, to be damaged."""
     return Path(shutil.copytree(packed[1], tmp_path / "dataset"))
-
-
-def test_an_error_of_a_frame_beyond_the_sidecar(packed: tuple[Path, Path]) -> None:
-    """A damaged video may seem to have more frames than were recorded."""
-    with mp4ds.open(packed[1]) as opened:
-        stream = opened.streams[0]
-        path = stream.video_path
-        with (
-            pytest.raises(VideoError, match=f"frame {FRAMES} was not found"),
-            stream.naming_frames(),
-        ):
-            raise VideoError("decode-failed", path, "was not found", frame=len(stream))
 
 
 def file_of(dataset: Path, name: str) -> Path:
@@ -327,19 +314,6 @@ def test_images_of_a_damaged_video(
     assert len(rows) == 1 + FRAMES - len(lost)
 
 
-@pytest.mark.parametrize("kind", ["raw", "jpeg", "compressed-video"])
-def test_converted_images_of_a_damaged_video(kind: str, dataset: Path, tmp_path: Path) -> None:
-    flip(file_of(dataset, "left.mp4"), 0.3)
-    options = replace(SALVAGE, images=kind, topics=["/left/*", "/front/*"])
-    summary = mp4ds.unpack(dataset, "mcap", tmp_path / "out.mcap", options)
-    lost = sum(loss.messages or 0 for loss in summary.losses)
-    assert lost
-    assert sum(summary.messages.values()) == 4 * FRAMES - lost
-    every = replace(options, every=2, images="raw")
-    thinned = mp4ds.unpack(dataset, "mcap", tmp_path / "few.mcap", every)
-    assert thinned.losses == summary.losses
-
-
 def test_a_lossy_video_has_no_digests(packed: tuple[Path, Path], tmp_path: Path) -> None:
     """So its frames are restored as they decode, and nothing is said to be exact."""
     dataset = tmp_path / "visual"
@@ -375,21 +349,6 @@ def test_a_pair_on_its_own(
     seen = mp4ds.unpack(video, "bag", tmp_path / "seen.bag", replace(SALVAGE, quality="visual"))
     assert bool(seen.losses) == (damaged == "left.mp4")
     assert seen.messages["/left/camera_info"] == FRAMES
-
-
-def test_nothing_is_left(dataset: Path, tmp_path: Path) -> None:
-    for path in dataset.iterdir():
-        zero(path, 0, 10**9)
-    with pytest.raises(FormatError, match="has no file that can be read"):
-        mp4ds.unpack(dataset, "bag", tmp_path / "x.bag", SALVAGE)
-    assert not (tmp_path / "x.bag").exists()
-
-
-def test_what_cannot_be_salvaged(dataset: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="`salvage` restores a whole dataset"):
-        mp4ds.unpack(dataset, "bag", tmp_path / "x", UnpackOptions(salvage=True, start=1.0))
-    with pytest.raises(SourceError, match="Download it first"):
-        mp4ds.unpack("http://127.0.0.1:1/x", "bag", tmp_path / "x", SALVAGE)
 
 
 def test_on_the_command_line(dataset: Path, tmp_path: Path) -> None:

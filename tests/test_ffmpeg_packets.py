@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import av
@@ -13,7 +12,6 @@ from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-import mp4ds
 from definitions import PACKET
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.format.fields import Choice, DecodedColumns, everything
@@ -226,12 +224,3 @@ def test_a_video_is_joined_at_a_key_frame(
     values = [store.deserialize_cdr(bytes(record.data), PACKET) for record in images]
     for number, image in subscribed(values, ros1=False).items():
         assert np.array_equal(image, original("mono8", number, "mono8"))
-
-
-def test_the_recording_may_be_packed_again(packed: Callable[[str], Packed], tmp_path: Path) -> None:
-    made = packed("lossless-rgb8")
-    made.unpack("rosbag2", "ffmpeg")
-    again = tmp_path / "again"
-    summary = mp4ds.pack(made.folder / "again", again, PackOptions())
-    (topic,) = (entry for entry in summary.topics if entry.topic == TOPIC)
-    assert (topic.messages, topic.frames) == (FRAMES, FRAMES)

@@ -93,14 +93,6 @@ def test_it_begins_with_them(way: str, kind: str, tmp_path: Path) -> None:
     assert [note for note in info(dataset).notes if words in note]
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_without_them(way: str, tmp_path: Path) -> None:
-    source = made("bag", tmp_path)
-    summary, output = sliced(way, source, tmp_path, latched=False)
-    assert recorded(output) == [message for message in due(source) if message[2] >= FIRST]
-    assert summary.latched == {}
-
-
 def test_a_slice_of_a_slice_and_its_beginning(tmp_path: Path) -> None:
     """Seconds count from where the slice begins, not from a latched message, which stay in it."""
     source = made("bag", tmp_path)

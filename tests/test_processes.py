@@ -15,9 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from mp4ds.errors import Mp4dsError, OptionError
 from mp4ds.packing.packer import StreamThreads
-from mp4ds.processes import ProcessExecutor, each
+from mp4ds.processes import ProcessExecutor
 from waiting import WATCHDOG_S, is_alive, until
 
 COUNTS = [0, 1, 2, 5]
@@ -60,14 +59,6 @@ def test_jobs_of_a_stream_run_in_order_and_all_run(count: int) -> None:
     assert [len(found) for found in used.values()] == [1] * 7  # each on one thread
     assert (threading.get_ident() in set().union(*used.values())) == (count == 0)
     assert threads() == before
-
-
-def test_different_streams_run_side_by_side() -> None:
-    barrier = threading.Barrier(2, timeout=WATCHDOG_S)  # passed only by two at once
-    with StreamThreads(2) as workers:
-        workers.submit(0, lambda: (barrier.wait(), None)[1])
-        workers.submit(1, lambda: (barrier.wait(), None)[1])
-    assert not barrier.broken
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -132,50 +123,6 @@ def test_an_error_of_the_caller_drops_what_has_not_begun(monkeypatch: pytest.Mon
 
 # ---------------------------------------------------------------- processes
 
-CODE = {
-    "quick": "pass",
-    "noisy": "import sys; print('x' * 3_000_000); sys.stderr.write('y' * 300_000)",
-    "error": "from mp4ds.errors import SourceError; raise SourceError('drive.bag', 'is damaged')",
-    "system": "open('/none/such')",
-    "memory": "bytearray(2**60)",
-    "crash": "import sys; sys.stderr.write('first\\nlast words\\n'); sys.exit(3)",
-    "quiet": "import sys; sys.exit()",
-    "odd": "raise ArithmeticError('odd')",
-    "killed": "import os, signal; os.kill(os.getpid(), signal.SIGKILL)",
-}
-SENTENCES = {
-    "error": "drive.bag: is damaged.",
-    "system": "/none/such: No such file or directory",
-    "memory": "out of memory; try fewer `jobs`",
-    "crash": "its process exited with code 3: last words",
-    "quiet": "its process exited with code 0",
-    "odd": "its process exited with code 1: ArithmeticError: odd",
-    "killed": "its process was killed by SIGKILL, perhaps for lack of memory",
-}
-
-
-@pytest.mark.parametrize("processes", [1, 3])
-def test_every_call_has_its_outcome(processes: int) -> None:
-    with ProcessExecutor(processes) as executor:
-        calls = {name: executor.submit(exec, code) for name, code in CODE.items()}
-        errors = {name: call.exception() for name, call in calls.items()}
-    assert {name: str(error) for name, error in errors.items() if error} == SENTENCES
-    assert {error.exit_code for error in errors.values() if isinstance(error, Mp4dsError)} == {1, 2}
-
-
-def test_no_more_than_so_many_run_at_a_time(tmp_path: Path) -> None:
-    code = (
-        "import os, pathlib, time\n"
-        f"here = pathlib.Path({str(tmp_path)!r}); mine = here / str(os.getpid()); mine.touch()\n"
-        "met = here.with_name('met')\n"
-        "while not met.exists() and len(list(here.iterdir())) < 2: time.sleep(0.01)\n"
-        "met.touch(); time.sleep(0.1); seen = len(list(here.iterdir())); mine.unlink()\n"
-        "if seen > 2: raise OSError(f'{seen} at a time')"
-    )
-    with ProcessExecutor(2) as executor:
-        for call in [executor.submit(exec, code, {}) for _ in range(8)]:
-            call.result()
-
 
 def test_a_call_whose_process_is_killed_is_made_once_more(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
@@ -186,27 +133,6 @@ def test_a_call_whose_process_is_killed_is_made_once_more(tmp_path: Path) -> Non
     with ProcessExecutor(1) as executor:  # nobody waits for it before all calls are to end
         call = executor.submit(exec, f"{once}os.kill(os.getpid(), 9)")
     assert call.exception() is None
-
-
-class Counter:
-    """Something that a process may keep from call to call; it is counted in the other process."""
-
-    def __init__(self) -> None:
-        self.calls = 0
-
-    def __call__(self) -> int:
-        self.calls += 1
-        return self.calls
-
-
-def test_what_is_called_stays_in_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that a recording need not be opened again."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
-    counter = Counter()
-    with ProcessExecutor(1) as executor:
-        calls = [executor.submit(counter) for _ in range(3)]
-        assert [call.result() for call in calls] == [1, 2, 3]
-    assert counter.calls == 0
 
 
 SLEEP = "import os, pathlib, time; pathlib.Path({!r}, str(os.getpid())).touch(); time.sleep(60)"
@@ -239,28 +165,6 @@ def test_a_process_ends_when_its_caller_is_killed(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- each of several items
-
-
-def squared(number: int) -> tuple[int, int]:
-    return number * number, os.getpid()
-
-
-def failing(number: int) -> int:
-    if number == 2:
-        raise OptionError("two")
-    return number
-
-
-@pytest.mark.parametrize("jobs", [1, 3])
-def test_items_in_their_order(jobs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By modules that are found where the caller finds them, not in the current folder."""
-    (tmp_path / "queue.py").write_text("raise SystemExit('from the current folder')")
-    monkeypatch.chdir(tmp_path)
-    found = list(each(squared, range(6), jobs))
-    assert [(item, made[0]) for item, made in found] == [(n, n * n) for n in range(6)]
-    assert (os.getpid() in {made[1] for _, made in found}) == (jobs == 1)
-    with pytest.raises(OptionError, match="two"):
-        list(each(failing, range(5), jobs))
 
 
 def held(place: Path, number: int) -> None:

@@ -11,26 +11,21 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from mcap.writer import Writer
 from numpy.typing import NDArray
 
 import mp4ds
-from coded_scenes import CODED
 from compare import compare
 from definitions import IMAGE
 from in_parts import InlineExecutor, leftovers, use
 from mp4ds import yamlio
-from mp4ds.bags.formats import open_reader
 from mp4ds.errors import ScoringError
 from mp4ds.format.quality import Quality
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.windows import CrfControl
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info
-from mp4ds.records import Excerpt, Message
 from mp4ds.video.scores import find_ffmpeg, scores_of
 from round_trips import unpacked
-from scenes import Record, instant, scene, together
+from scenes import Record, instant, together
 from sources import SOURCES
 
 TOPIC = "/cam/image_raw"
@@ -123,38 +118,6 @@ def check_psnr(dataset: Path, noises: list[float], target: float) -> Quality:
     return found
 
 
-# ---------------------------------------------------------------- which crf
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_the_course_of_the_crf_keeps_mean_and_windows(seed: int) -> None:
-    """Scenes of any difficulty: the mean is what is asked for, and no window far below it."""
-    rng = np.random.default_rng(seed)
-    control = CrfControl(20, 1, 63, 0.5, 0.4)
-    slope = rng.uniform(0.1, 1.2)
-    height = 45 + 15 * slope * np.cumsum(rng.normal(0, 0.3, 200)).clip(-1.2, 2)
-    means, crfs, encodings = [], [], 0
-    for level in height:
-        tried: dict[int, float] = {}
-        crf: int | None = control.crf
-        while crf is not None:
-            assert crf not in tried
-            tried[crf] = float(level - slope * (crf - 20))
-            crf = control.next(tried, 42.0, 60)
-        kept = control.accepted(tried, 42.0, 60)
-        assert kept is not None, "these scenes all have a crf"
-        control.keep(tried, kept, 42.0, 60)
-        means.append(tried[kept])
-        crfs.append(kept)
-        encodings += len(tried)
-        assert np.mean(means) >= 42 - 1e-6
-    assert min(means) >= 41.5 - 1e-6
-    assert np.mean(means) <= 42.3
-    assert encodings < 2 * len(height)
-    best = np.clip(np.floor(20 + (height - 42) / slope), 1, 63)
-    assert np.mean(best - crfs) < 1, "no more bits than need be"
-
-
 # ---------------------------------------------------------------- the promise
 
 
@@ -211,43 +174,6 @@ def test_in_parts_too_and_each_time_alike(tmp_path: Path, executor: InlineExecut
 # ---------------------------------------------------------------- out of reach
 
 
-def test_one_of_two_equal_channels_cannot_have_the_score(tmp_path: Path) -> None:
-    """The channel of the first image is not that of the images that cannot have it."""
-    (whole,) = recording(tmp_path, [0.0, 0.0, 30.0])
-    excerpt = Excerpt(topics=frozenset([TOPIC]), others=False)
-    images = [item for item in open_reader(whole).records(excerpt) if isinstance(item, Message)]
-    small = {"height": 2, "width": 2, "encoding": "nv12", "step": 2, "data": np.zeros(6, np.uint8)}
-    path = tmp_path / "equal.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2")
-        definition = images[0].channel.schema
-        schema = writer.register_schema(definition.name, definition.encoding, definition.data)
-        first, second = (writer.register_channel(TOPIC, "cdr", schema) for _ in range(2))
-        for time in range(images[0].log_time - 8, images[0].log_time):
-            writer.add_message(first, time, Record(TOPIC, IMAGE, time, small).payload("cdr"), time)
-        for image in images:
-            writer.add_message(second, image.log_time, image.data, image.publish_time)
-        writer.finish()
-    options = PackOptions(quality="psnr=55", **{**QUICK, "codec": "av1", "preset": "12"})
-    summary = mp4ds.pack(path, tmp_path / "dataset", options)
-    notes = [note for topic in summary.topics for note in topic.notes]
-    assert any("kept lossless: psnr=55 is out of reach" in note for note in notes)
-    assert compare([path], unpacked(tmp_path, "mcap"), ignore_pixels=[TOPIC]) == []
-
-
-def test_what_cannot_have_the_score_is_lossless(tmp_path: Path) -> None:
-    paths = recording(tmp_path, [20.0])
-    options = PackOptions(quality="psnr=59.9", **{**QUICK, "codec": "av1", "preset": "12"})
-    summary = mp4ds.pack(paths, tmp_path / "dataset", options)
-    (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
-    assert any("kept lossless: psnr=59.9 is out of reach" in note for note in topic.notes)
-    with mp4ds.open(tmp_path / "dataset") as dataset:
-        assert dataset.streams[0].sidecar.profile == "lossless"
-    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
-    assert compare(paths, unpacked(tmp_path, "mcap")) == []
-
-
 @pytest.mark.parametrize("window", [None, 2 * WINDOW])
 def test_what_cannot_have_it_later_on_is_lossless(
     window: int | None,
@@ -268,22 +194,6 @@ def test_what_cannot_have_it_later_on_is_lossless(
     with mp4ds.open(tmp_path / "dataset") as dataset:
         profiles = {stream.sidecar.profile: len(stream) for stream in dataset.streams}
     assert profiles == ({"lossless": 60} if window is None else {"psnr=55": 40, "lossless": 20})
-
-
-def test_small_images_are_lossless(tmp_path: Path) -> None:
-    paths = SOURCES["bag-none"](tmp_path / "source", scene("rgb8", width=12, height=12))
-    summary = mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="psnr=30", **QUICK))
-    (topic,) = (topic for topic in summary.topics if topic.topic == TOPIC)
-    assert any("less than 16 rows" in str(text) for text in (*topic.notes, *topic.verbatim))
-
-
-def test_jpeg_files_that_cannot_have_it_stay(tmp_path: Path) -> None:
-    paths = SOURCES["mcap-ros2-none"](tmp_path / "source", CODED["jpeg-rgb"]())
-    options = {"transcode": True, **QUICK}
-    mp4ds.pack(paths, tmp_path / "small", PackOptions(quality="ssim=0.9", **options))
-    assert quality_of(tmp_path / "small").mean >= 0.9
-    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(quality="psnr=59.9", **options))
-    assert compare(paths, unpacked(tmp_path, "mcap")) == []
 
 
 # ---------------------------------------------------------------- what is written is checked

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,10 +13,9 @@ import pytest
 from coded_scenes import CODED
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError
-from mp4ds.format.fields import DecodedColumns, everything
+from mp4ds.format.fields import DecodedColumns
 from mp4ds.plugins.playing.timeline import ReadAhead
 from mp4ds.records import Message, Record
-from mp4ds.video.mp4 import read_sample_table
 from round_trips import packed
 from scenes import TRAITS, Scene, odd_scene, scene
 
@@ -78,55 +76,6 @@ def test_from_every_kind_of_place(name: str, tmp_path: Path) -> None:
                 assert [item[2] for item in found] == [item[2] for item in wanted]
 
 
-def test_only_messages_from_a_time_on(tmp_path: Path) -> None:
-    folder = packed(tmp_path, scene("mono8"), "mcap-ros2-zstd")
-    with Dataset(folder) as dataset:
-        kinds = {type(record) for record in dataset.records(start=0)}
-        assert kinds == {Message} < {type(record) for record in dataset.records()}
-
-
-def without_packets(long: Path, folder: Path, first: int, end: int) -> Path:
-    """The dataset with zeros for some packets, which do not decode: in whole groups of pictures."""
-    shutil.copytree(long, folder)
-    for video in folder.glob("*.mp4"):
-        data = bytearray(video.read_bytes())
-        with video.open("rb") as file:
-            table = read_sample_table(file, len(data), "")
-        keys = [key for key in np.flatnonzero(table.sync).tolist() if first <= key <= end]
-        groups = slice(keys[0], keys[-1])
-        for place, size in zip(table.places[groups], table.sizes[groups], strict=True):
-            data[place : place + size] = bytes(size)
-        video.write_bytes(data)
-    return folder
-
-
-def test_nothing_before_the_key_frame_is_decoded(long: Path, tmp_path: Path) -> None:
-    with Dataset(without_packets(long, tmp_path / "cut", 0, 96)) as dataset:
-        start = int(dataset[TOPIC].log_times[101])
-        assert len(rows(dataset.records(start=start, topics=[TOPIC]))) == 99
-        with pytest.raises(FormatError):
-            rows(dataset.records(topics=[TOPIC]))
-
-
-def test_some_topics(long: Path) -> None:
-    with Dataset(long) as dataset:
-        whole = rows(dataset.records())
-        start = whole[300][2]
-        for topics in ([TOPIC], ["/imu", TOPIC], {"/cam/camera_info"}, ["/none"], []):
-            wanted = [item for item in whole if item[0] in topics]
-            assert rows(dataset.records(topics=topics)) == wanted
-            wanted = [item for item in wanted if item[2] >= start]
-            assert Counter(rows(dataset.records(topics=topics, start=start))) == Counter(wanted)
-
-
-def test_one_video_alone(long: Path) -> None:
-    sidecar = next(path for path in long.glob("*.yaml") if path.with_suffix(".mp4").exists())
-    with Dataset(sidecar) as pair:
-        whole = rows(pair.records())
-        start = whole[100][2]
-        assert rows(pair.records(start=start)) == [item for item in whole if item[2] >= start]
-
-
 # ---------------------------------------------------------------- chosen ones
 
 
@@ -161,39 +110,6 @@ def test_chosen_messages_keep_their_places(trait: str, start: int | None, tmp_pa
             assert [item[2] for item in found] == sorted(item[2] for item in wanted)
 
 
-def test_a_choice_is_asked_when_the_message_before_was_made(long: Path) -> None:
-    """So that frames can be left out for which it is too late by then."""
-    events: list[tuple[str, int]] = []
-
-    def choose(columns: DecodedColumns) -> Iterator[int]:
-        index = 0
-        while index < len(columns.log_time):
-            events.append(("asked", index))
-            yield index
-            index += 1 if index < 10 else 40
-
-    with Dataset(long) as dataset:
-        stream = dataset[TOPIC]
-        times = {int(time): index for index, time in enumerate(stream.log_times)}
-        for record in dataset.records(choose=choose, topics=[TOPIC]):
-            if isinstance(record, Message):
-                events.append(("made", times[record.log_time]))
-    numbers = [*range(10), *range(10, 200, 40)]
-    assert events == [(what, number) for number in numbers for what in ("asked", "made")]
-
-
-@pytest.mark.parametrize("name", ["video-h264", "jpeg-rgb"])
-def test_chosen_packets(name: str, tmp_path: Path) -> None:
-    with Dataset(packed(tmp_path, CODED[name](frames=30))) as dataset:
-        (stream,) = dataset.streams
-        payloads = dict(stream.payloads())
-        chosen = dict(stream.payloads(every(7)))
-        refers = not name.startswith("jpeg")
-        assert chosen.keys() >= set(every(7)(stream.columns))
-        assert (len(chosen) > 5) == refers
-        assert all(payloads[index] == payload for index, payload in chosen.items())
-
-
 # ---------------------------------------------------------------- of a decoder
 
 
@@ -219,25 +135,6 @@ def test_pictures_of_any_frames(codec: str, tmp_path: Path) -> None:
                 assert all(np.array_equal(picture, whole[i]) for i, picture in both)
 
 
-@pytest.mark.parametrize(
-    ("chosen", "harmless"), [(range(20, 60), (0, 16)), ([3, 9, 60, 62, 199], (64, 192))]
-)
-def test_far_key_frames_are_sought(
-    chosen: Sequence[int],
-    harmless: tuple[int, int],
-    long: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """What is far from any chosen frame is not decoded."""
-    monkeypatch.setattr("os.cpu_count", lambda: 4)
-    with (
-        Dataset(without_packets(long, tmp_path / "cut", *harmless)) as dataset,
-        dataset.streams[0].open_video(sequential=True) as decoder,
-    ):
-        assert len(list(decoder.pictures_at(chosen))) == len(chosen)
-
-
 # ---------------------------------------------------------------- what is checked
 
 
@@ -251,30 +148,6 @@ def test_digests_are_compared_from_a_time_on(long: Path, tmp_path: Path) -> None
         with pytest.raises(FormatError) as caught:
             rows(dataset.records(start=int(times[149]), topics=[TOPIC]))
         assert caught.value.code == "digest-mismatch"
-
-
-def test_the_whole_video_is_hashed_for_everything_alone(tmp_path: Path) -> None:
-    folder = packed(tmp_path, scene("rgb8"), quality="visual")
-    video = next(folder.glob("*.mp4"))
-    video.write_bytes(video.read_bytes().replace(b"VideoHandler", b"videoHandler"))
-    with Dataset(folder) as dataset:
-        frames = len(dataset[TOPIC])
-        assert len(rows(dataset.records(start=0, topics=[TOPIC]))) == frames
-        assert len(rows(dataset.records(choose=every(2), topics=[TOPIC]))) == frames / 2
-        with pytest.raises(FormatError) as caught:
-            rows(dataset.records(topics=[TOPIC]))
-        assert caught.value.code == "hash-mismatch"
-
-
-@pytest.mark.parametrize("choose", [everything, every(2)])
-def test_messages_that_are_in_no_file(choose: Any, long: Path) -> None:
-    with Dataset(long) as dataset:
-        ordinal = dataset.streams[0].columns.ordinal
-        ordinal[100:] += 1
-        with pytest.raises(FormatError, match=rf"message 100 of topic {TOPIC}") as caught:
-            rows(dataset.records(choose=choose))
-        assert caught.value.code == "messages-missing"
-        assert rows(dataset.records(start=0))
 
 
 # ---------------------------------------------------------------- ahead

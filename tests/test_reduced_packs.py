@@ -17,7 +17,6 @@ from coded_scenes import CODED
 from commands import call
 from definitions import COMPRESSED, IMAGE, INFO
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
-from mp4ds.errors import TargetExistsError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import PackOptions
@@ -27,7 +26,7 @@ from mp4ds.records import Message
 from mp4ds.unpacking.pictures import at_most
 from republished import psnr
 from scenes import Scene, scene
-from sources import SOURCES, write_bag, write_mcap
+from sources import SOURCES, write_bag
 
 RAW = (
     "mono8",
@@ -204,14 +203,6 @@ def test_a_maximum_rate_goes_by_stamps(stamp: int | None, tmp_path: Path) -> Non
 # ---------------------------------------------------------------- what it is read from
 
 
-def test_a_recording_without_an_index(tmp_path: Path) -> None:
-    for name, indexed in (("with", True), ("without", False)):
-        path = tmp_path / f"{name}.mcap"
-        write_mcap(path, scene("mono8"), indexed=indexed)
-        mp4ds.pack(path, tmp_path / name, PackOptions(resize=(32, 24), every=2))
-    assert rows(tmp_path / "with") == rows(tmp_path / "without")
-
-
 @pytest.mark.parametrize("name", ["raw-bgr8", "jpeg-rgb"])
 def test_foxglove_in_protobuf_becomes_ros(name: str, tmp_path: Path) -> None:
     sources = FOXGLOVE_SOURCES["mcap-protobuf"](tmp_path, FOXGLOVE[name]())
@@ -225,18 +216,6 @@ def test_foxglove_in_protobuf_becomes_ros(name: str, tmp_path: Path) -> None:
     types = {row[0]: row[2] for row in rows(tmp_path / "small")}
     assert types[topic] == IMAGE
     assert types["/camera/calibration"] == INFO
-
-
-def test_labels_are_not_mixed(tmp_path: Path) -> None:
-    sources = SOURCES["bag-lz4"](tmp_path, scene("mono8"))
-    mp4ds.pack(sources, tmp_path / "whole")
-    mp4ds.pack(sources, tmp_path / "small", PackOptions(resize=0.5, nearest=["/cam/*"]))
-    whole = mp4ds.open(tmp_path / "whole", layer="exact")
-    small = mp4ds.open(tmp_path / "small", layer="exact")
-    with whole, small:
-        numbers = range(len(whole[TOPIC]))
-        before, after = whole[TOPIC].read(numbers), small[TOPIC].read(numbers)
-        assert (after == before[:, 1::2, 1::2]).all()
 
 
 # ---------------------------------------------------------------- what is told
@@ -264,33 +243,6 @@ def test_what_was_done_is_told(tmp_path: Path) -> None:
     )
     (calibrations,) = (one for one in alone.topics if one.topic == INFO_TOPIC)
     assert calibrations.notes == []  # no images were resized
-
-
-def test_calibrations_of_unknown_images_are_told(tmp_path: Path) -> None:
-    made = scene("mono8")
-    moved = [
-        replace(one, topic="/lens", values={**one.values, "header": {"stamp": 1, "frame_id": ""}})
-        if one.msgtype == INFO
-        else one
-        for one in made.messages
-    ]
-    write_bag(tmp_path / "drive.bag", replace(made, messages=moved))
-    summary = mp4ds.pack(tmp_path / "drive.bag", tmp_path / "small", PackOptions(resize=0.5))
-    (lens,) = (one for one in summary.topics if one.topic == "/lens")
-    assert lens.notes == [
-        "as recorded, not adapted: no images are known to be its own (`camera_info`)"
-    ]
-
-
-def test_each_of_several(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_bag(tmp_path / f"{name}.bag", scene("mono8", frames=3))
-    bags = [tmp_path / "a.bag", tmp_path / "b.bag"]
-    assert len(mp4ds.pack_each(bags, tmp_path / "all", PackOptions(resize=0.5))) == 2
-    assert mp4ds.pack_each(bags, tmp_path / "all", PackOptions(resize=0.5)) == []
-    for options in (PackOptions(), PackOptions(resize=0.25)):
-        with pytest.raises(TargetExistsError):
-            mp4ds.pack_each(bags, tmp_path / "all", options)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -19,15 +18,13 @@ import mp4ds
 from coded_scenes import CODED, MakeScene
 from commands import call
 from definitions import COMPRESSED, IMAGE, INFO
-from mp4ds.errors import FormatError, OptionError
+from mp4ds.errors import FormatError
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.packing.options import PackOptions
-from mp4ds.unpacking.pictures import ReductionOptions, at_most
 from mp4ds.unpacking.unpack import UnpackOptions
-from pictures import picture
 from republished import CAMERAS, Read, file_picture, image_of, psnr, read
-from scenes import Record, Scene, odd_scene, scene
-from test_republish import Packed, still
+from scenes import Scene, scene
+from test_republish import Packed
 
 TOPIC = "/cam/image_raw"
 RAW = [
@@ -158,19 +155,6 @@ def test_smaller_images_of_another_kind(
             assert np.array_equal(image, data)
 
 
-def test_a_mosaic_in_a_png_file_becomes_colours(tmp_path: Path) -> None:
-    """A file that shows one says so in its format alone."""
-    made = Packed(tmp_path, still("bayer_rggb8", "bayer_rggb8; png compressed "), "bag-none")
-    summary, messages = made.unpack("bag", None, resize=0.5)
-    found = [message for message in messages if message.type_name == COMPRESSED]
-    assert summary.as_recorded == {}
-    assert {message.value.format for message in found} == {"rgb8; png compressed bgr8"}
-    colour = picture("rgb8", frame=0, width=64, height=48, rng=None)
-    small = cv2.resize(colour, (32, 24), interpolation=cv2.INTER_AREA)
-    for message in found:
-        assert psnr(file_picture(message.value.data.tobytes()), small) > 25
-
-
 @pytest.mark.parametrize("name", ["raw-mono8", "jpeg-rgb", "video-h264"])
 @pytest.mark.parametrize("to", TARGETS)
 def test_calibrations_are_made_to_match(packed: Callable[..., Packed], name: str, to: str) -> None:
@@ -191,20 +175,6 @@ def test_calibrations_are_made_to_match(packed: Callable[..., Packed], name: str
         assert np.isclose(k[2], 64 / 2 * 40 / 64 - 0.5)
         assert np.isclose(k[4], 0.9 * 64 * 30 / 48)
         assert (value.binning_x, value.binning_y, value.roi.width) == (0, 0, 0)
-
-
-def test_what_no_video_holds_is_told(tmp_path: Path) -> None:
-    made = Packed(tmp_path, odd_scene("data-empty"), "mcap-ros2-zstd")
-    summary, messages = made.unpack("mcap", None, resize=0.5, every=2)
-    with mp4ds.open(made.folder / "dataset") as dataset:
-        assert dataset.manifest is not None
-        verbatim = {entry.reason: entry.messages for entry in dataset.manifest.verbatim}
-    expected = {f"stored verbatim: {reason}": count for reason, count in verbatim.items()}
-    assert summary.as_recorded == {"/odd/image": expected}
-    (count,) = expected.values()
-    sizes = Counter(m.value.width for m in messages if m.type_name == IMAGE)
-    assert sizes == {32: count, 16: (8 - count + 1) // 2}
-    assert summary.thinned == {"/odd/image": (8 - count) // 2}
 
 
 # ---------------------------------------------------------------- fewer
@@ -257,39 +227,6 @@ def test_packets_that_refer_to_others_stay(packed: Callable[..., Packed], name: 
         assert np.array_equal(image_of(message), frame.data)
 
 
-def test_packets_that_are_all_key_frames(tmp_path: Path) -> None:
-    one = CODED["video-h264"](frames=1)
-    (key,) = (record for record in one.messages if record.topic == "/cam/video")
-    period = 33_000_000
-    records = [
-        Record(
-            key.topic,
-            key.msgtype,
-            key.log_time + n * period,
-            {**key.values, "timestamp": key.values["timestamp"] + n * period},
-        )
-        for n in range(6)
-    ]
-    made = Packed(tmp_path, Scene(records), "mcap-ros2-zstd")
-    plain = made.unpack("mcap", None)[1]
-    assert rows(made.unpack("mcap", None, every=2)[1]) == rows(plain[::2])
-
-
-def test_calibrations_whose_stamps_no_image_has(tmp_path: Path) -> None:
-    made = scene("mono8", frames=9)
-    records = []
-    for record in made.messages:
-        records.append(record)
-        if record.msgtype == INFO:
-            values = dict(record.values)
-            values["header"] = {**values["header"], "stamp": values["header"]["stamp"] + 5}
-            records.append(Record(record.topic, INFO, record.log_time + 7, values))
-    packed_ = Packed(tmp_path, Scene(records), "mcap-ros2-zstd")
-    summary, messages = packed_.unpack("mcap", None, every=3)
-    assert [m.type_name for m in messages].count(INFO) == 9 + 3
-    assert summary.thinned == {TOPIC: 6, "/cam/camera_info": 6}
-
-
 @pytest.mark.parametrize("how", [{"every": 2}, {"resize": 0.5}, {"every": 2, "resize": 0.5}])
 def test_damage_is_found(how: dict[str, Any], tmp_path: Path) -> None:
     """The whole video is compared with its hash where messages have no digests; all are counted."""
@@ -313,9 +250,6 @@ def test_damage_is_found(how: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(FormatError) as caught:
         made.unpack("mcap", None, **how)
     assert caught.value.code == "message-count"
-
-
-# ---------------------------------------------------------------- from a place on
 
 
 # ---------------------------------------------------------------- image files
@@ -355,52 +289,7 @@ def camera(rate: float, frames: int = 600, jitter: int = 0, seed: int = 0) -> ND
     return times + rng.integers(-jitter, jitter + 1, frames)
 
 
-@pytest.mark.parametrize("jitter", [0, 1_000, 1_000_000, 7_000_000])
-@pytest.mark.parametrize("rate", [10.0, 15.0, 29.97, 30.0, 60.0])
-def test_a_camera_of_the_rate_loses_nothing(rate: float, jitter: int) -> None:
-    for seed in range(20):
-        times = camera(rate, jitter=round(min(jitter, 0.2e9 / rate)), seed=seed)
-        assert at_most(rate, times).all()
-        assert at_most(2 * rate, times).all()
-
-
-@pytest.mark.parametrize("jitter", [0, 3_000_000])
-@pytest.mark.parametrize("rate", [1.0, 7.0, 12.5, 20.0, 24.0, 29.0])
-def test_any_rate_holds_on_the_average(rate: float, jitter: int) -> None:
-    times = camera(30.0, jitter=jitter)
-    count = int(at_most(rate, times).sum())
-    assert count == pytest.approx(rate * 20, abs=2)
-
-
-def test_gaps_and_clocks_that_are_set_back() -> None:
-    first = camera(30.0, 30)
-    later = camera(30.0, 30) + 3_600 * 10**9 + 12_345_678
-    for times in (np.concatenate([first, later]), np.concatenate([later, first])):
-        kept = np.flatnonzero(at_most(10.0, times))
-        assert kept.tolist() == list(range(0, 60, 3))
-    assert at_most(10.0, np.array([5, 5, 5, 5])).tolist() == [True, False, False, False]
-    assert at_most(10.0, np.array([5])).tolist() == [True]
-
-
 # ---------------------------------------------------------------- options
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        *({"resize": value} for value in (0, -1.0, float("nan"), float("inf"), True, 1e9)),
-        *(
-            {"resize": value}
-            for value in ((0, 1), (1,), (1, 2, 3), (1.5, 2), (True, 2), (10**6, 1))
-        ),
-        *({"every": value} for value in (0, -1, 1.5, True, "2", None)),
-        *({"max_rate": value} for value in (0, -1.0, float("nan"), float("inf"), True, "3")),
-    ],
-    ids=repr,
-)
-def test_not_a_reduction(options: dict[str, Any]) -> None:
-    with pytest.raises(OptionError, match=r"`(resize|every|max_rate)` .* use "):
-        ReductionOptions(**options)
 
 
 def test_the_command_line(packed: Callable[..., Packed], tmp_path: Path) -> None:

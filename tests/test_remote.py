@@ -21,14 +21,13 @@ from in_parts import InlineExecutor, leftovers, use
 from mp4ds.bags.formats import open_sources
 from mp4ds.errors import OptionError, PartsFailedError, RemoteError, SourceError
 from mp4ds.files.ranges import BLOCK, KEPT_BYTES, Blocks, RemoteFile
-from mp4ds.files.urls import RemotePath, location
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.packer import Packer
 from mp4ds.plugins.info import info, intrinsics
 from mp4ds.records import Message
 from remote_servers import Request, Server, web_server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores, web
-from round_trips import own_target, packed, unpacked
+from round_trips import own_target, unpacked
 from sources import SOURCES, Scene, scene, write_bag, write_mcap
 
 __all__ = ["folder_url", "put", "s3", "s3_running", "stores", "web"]
@@ -53,40 +52,6 @@ def covered(ranges: Sequence[tuple[int, int]]) -> int:
 
 
 # ---------------------------------------------------------------- names
-
-
-@pytest.mark.parametrize(
-    ("url", "shown", "name", "parent", "child"),
-    [
-        ("s3://b/k/drive.mcap", "s3://b/k/drive.mcap", "drive.mcap", "s3://b/k", "s3://b/k/a b"),
-        ("S3://b/k/drive/", "s3://b/k/drive", "drive", "s3://b/k", "s3://b/k/a b"),
-        ("s3://b", "s3://b", "b", "s3://b", "s3://b/a b"),
-        ("s3://b/50%?.bag", "s3://b/50%?.bag", "50%?.bag", "s3://b", "s3://b/a b"),
-        ("https://h/a%20b.bag", "https://h/a%20b.bag", "a b.bag", "https://h", "https://h/a%20b"),
-        (
-            f"https://me:pw@h:8/k/x.bag?{SECRET}#part",
-            "https://h:8/k/x.bag",
-            "x.bag",
-            f"https://me:pw@h:8/k?{SECRET}",
-            f"https://me:pw@h:8/k/a%20b?{SECRET}",
-        ),
-    ],
-)
-def test_names(url: str, shown: str, name: str, parent: str, child: str) -> None:
-    path = RemotePath(url)
-    assert (str(path), path.name, path.parent.url) == (shown, name, parent)
-    assert path.with_name("a b").url == child
-    assert (path.suffix, path.stem) == (Path(name).suffix, Path(name).stem)
-    assert path == RemotePath(path.url)
-    assert "4711" not in repr(path)
-    assert "pw" not in repr(path)
-
-
-def test_local_paths_stay_paths(tmp_path: Path) -> None:
-    assert location("drive.bag") == Path("drive.bag")
-    assert location(tmp_path) is tmp_path
-    assert location("a:b/c.bag") == Path("a:b/c.bag")
-    assert location("file:///data/a%20b.bag") == Path("/data/a b.bag")
 
 
 def test_nothing_of_it_is_imported_for_local_paths(packed_bag: Path) -> None:
@@ -142,38 +107,6 @@ def test_reads_are_exact_whatever_was_announced(size: int, passes: Any) -> None:
                 assert stream.read(length) == origin.data[place:end]
                 assert stream.tell() == max(place, size if end is None else min(end, size))
     assert len(origin.fetched) <= sum(len(a) + 2 * len(r) for a, r in passes) + 8
-
-
-def test_reading_in_order_fetches_everything_once_and_ahead() -> None:
-    origin = Origin(20_000_000)
-    with origin.open() as stream:
-        while block := stream.read(10_000):
-            assert len(block) == 10_000
-    assert covered(origin.fetched) == 20_000_000
-    assert len(origin.fetched) < 12
-
-
-def test_what_comes_after_the_reader_fetches_nothing() -> None:
-    """The source is hashed behind the reader."""
-    origin = Origin(KEPT_BYTES * 2)
-    with origin.open() as first:
-        while first.read(2**20):
-            with origin.open() as second:
-                second.seek(max(0, first.tell() - 2**22))
-                second.read(2**20)
-    assert covered(origin.fetched) == KEPT_BYTES * 2
-
-
-def test_announced_ranges_alone_are_fetched() -> None:
-    origin = Origin(20_000_000)
-    ranges = [(start, start + 1000) for start in range(0, 20_000_000, 100_000)]
-    with origin.open() as stream:
-        stream.expect(ranges)
-        for start, end in ranges:
-            stream.seek(start)
-            assert stream.read(end - start) == origin.data[start:end]
-    assert all(start % BLOCK == 0 for start, _ in origin.fetched)
-    assert covered(origin.fetched) <= len(ranges) * 2 * BLOCK
 
 
 def kept(blocks: Blocks) -> int:
@@ -302,13 +235,6 @@ def test_a_database_comes_with_what_is_beside_it(tmp_path: Path, put: Put) -> No
             info(where)
 
 
-def test_a_database_without_room(tmp_path: Path, put: Put, monkeypatch: pytest.MonkeyPatch) -> None:
-    (path,) = SOURCES["rosbag2-sqlite3-v9"](tmp_path, scene("mono8"))
-    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 10}))
-    with pytest.raises(SourceError, match=r"not enough space\. Set TMPDIR to another folder"):
-        info(put(path))
-
-
 # ---------------------------------------------------------------- datasets
 
 
@@ -344,26 +270,6 @@ def test_a_dataset_is_used_there_as_here(
     mp4ds.unpack(url, "bag", tmp_path / "again.bag")
     mp4ds.unpack(here, "bag", tmp_path / "local.bag")
     assert compare([tmp_path / "again.bag"], tmp_path / "local.bag") == []
-
-
-def test_what_makes_frames_exact_is_looked_for_once(tmp_path: Path) -> None:
-    dataset = packed(tmp_path, scene("rgb8"))
-    with web_server(tmp_path) as web:
-        for layer, due in (("view", 0), ("exact", 1), (None, 1)):
-            web.forget()
-            with mp4ds.open(f"{web.url}/{dataset.name}", layer=layer) as there:
-                assert len(there[TOPIC].read([0, 5])) == 2
-            looks = [method for method, path, _ in web.requests if path.endswith(".exact.mp4")]
-            assert looks.count("HEAD") == due
-            assert bool(looks) == bool(due)
-
-
-def test_an_unpack_without_a_name_comes_here(
-    packed_bag: Path, put: Put, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    mp4ds.unpack(put(packed_bag), "mcap")
-    assert [path.name for path in tmp_path.iterdir()] == ["dataset_unpacked.mcap"]
 
 
 def test_problems_of_a_dataset_are_found_there(
@@ -457,25 +363,6 @@ def test_a_network_that_fails_while_a_video_is_read(
             with pytest.raises(RemoteError, match=r"could not be read"):
                 mp4ds.validate(url, deep=True)
     assert capfd.readouterr().err == ""
-
-
-def test_a_recording_that_changes(
-    tmp_path: Path, put: Put, stores: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_bag(tmp_path / "drive.bag", scene("mono8", frames=9))
-    url = put(tmp_path / "drive.bag")
-    use(monkeypatch, InlineExecutor(lambda task: task == "00001"))
-    with pytest.raises(PartsFailedError):
-        mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
-    going_on = use(monkeypatch, InlineExecutor())
-    write_bag(tmp_path / "other.bag", scene("mono8", frames=9, seed=1))
-    stores.put(str(tmp_path / "other.bag"), url)
-    with pytest.raises(SourceError, match=r"has changed since packing began"):
-        mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
-    put(tmp_path / "drive.bag")
-    mp4ds.pack(url, tmp_path / "dataset", PackOptions(window=3))
-    assert "00000" not in going_on.ran
-    assert "00001" in going_on.ran
 
 
 def test_a_recording_that_changes_while_it_is_packed(

@@ -14,7 +14,7 @@ import pytest
 import mp4ds
 from coded_scenes import CODED
 from compare import compare
-from mp4ds.errors import OptionError, SourceError
+from mp4ds.errors import SourceError
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import PackOptions
@@ -86,13 +86,6 @@ def test_coded_images(kind: str, tmp_path: Path) -> None:
     assert compare(before.sources, unpacked(tmp_path, "mcap")) == []
 
 
-def test_in_parts(recording: Path, tmp_path: Path) -> None:
-    mp4ds.pack(recording, tmp_path / "whole")
-    mp4ds.pack(tmp_path / "whole", tmp_path / "dataset", PackOptions(window=4))
-    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
-    assert compare([recording], unpacked(tmp_path, "bag")) == []
-
-
 def test_log_times_that_do_not_tell_the_order(tmp_path: Path) -> None:
     """Messages of equal times in different files: such a dataset is read as a whole."""
     made = odd_scene("encoding-change")
@@ -142,26 +135,6 @@ def test_views_are_not_taken_for_what_was_recorded(recording: Path, tmp_path: Pa
     assert mp4ds.validate(tmp_path / "anew", deep=True) == []
     mp4ds.pack(tmp_path / "exact", tmp_path / "rest", PackOptions(exclude=["/cam/*"]))
     assert manifest(tmp_path / "rest").profile == "lossless"
-
-
-def test_a_quality_that_says_nothing_of_another_codec(recording: Path, tmp_path: Path) -> None:
-    mp4ds.pack(recording, tmp_path / "small", PackOptions(quality="crf=30", codec="h264"))
-    mp4ds.pack(tmp_path / "small", tmp_path / "copy")
-    assert manifest(tmp_path / "copy").streams == manifest(tmp_path / "small").streams
-    with pytest.raises(OptionError, match=r"packed as crf=30\. Give one"):
-        mp4ds.pack(tmp_path / "small", tmp_path / "again", PackOptions(codec="av1"))
-    with pytest.raises(OptionError, match="packed as crf=30, lossless"):
-        mp4ds.pack([tmp_path / "small", recording], tmp_path / "again")
-    assert not (tmp_path / "again").exists()
-
-
-def test_jpeg_files_that_were_encoded_anew_are_again(tmp_path: Path) -> None:
-    options = PackOptions(quality="visual", transcode=True)
-    (source,) = SOURCES["mcap-ros2-zstd"](tmp_path, CODED["jpeg-rgb"](frames=6))
-    mp4ds.pack(source, tmp_path / "eye", options)
-    mp4ds.pack(tmp_path / "eye", tmp_path / "again")
-    with mp4ds.open(tmp_path / "again") as opened:
-        assert [stream.sidecar.body for stream in opened.streams] == ["jpeg"]
 
 
 def edit_sidecar(dataset: Path) -> Path:
@@ -238,28 +211,6 @@ def test_a_changed_sidecar_is_not_unpacked(
     with pytest.raises(mp4ds.FormatError, match=f"{changed}.*manifest"):
         mp4ds.export(tmp_path / "changed", "euroc", tmp_path / "again")
     assert not (tmp_path / "again").exists()
-
-
-def test_topics_that_were_left_out(recording: Path, tmp_path: Path) -> None:
-    mp4ds.pack(recording, tmp_path / "less", PackOptions(exclude=["/imu"]))
-    mp4ds.pack(tmp_path / "less", tmp_path / "again", PackOptions(exclude=["/tf*"]))
-    told = manifest(tmp_path / "again").topics_left_out
-    assert told[0] == "/imu"
-    assert len(told) > 1
-
-
-def test_what_was_lost_stays_told(recording: Path, tmp_path: Path) -> None:
-    damaged = tmp_path / "damaged.bag"
-    damaged.write_bytes(recording.read_bytes()[:-4000])
-    mp4ds.pack(damaged, tmp_path / "saved", PackOptions(salvage=True))
-    mp4ds.pack(tmp_path / "saved", tmp_path / "again")
-    assert manifest(tmp_path / "again").losses == manifest(tmp_path / "saved").losses != []
-
-
-def test_no_dataset_is_salvaged(recording: Path, tmp_path: Path) -> None:
-    mp4ds.pack(recording, tmp_path / "whole")
-    with pytest.raises(OptionError, match="`salvage` works with recordings"):
-        mp4ds.pack(tmp_path / "whole", tmp_path / "again", PackOptions(salvage=True))
 
 
 def test_who_made_it(recording: Path, tmp_path: Path) -> None:

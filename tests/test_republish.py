@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import product
@@ -27,7 +26,7 @@ from definitions import CODED_VIDEO, COMPRESSED, IMAGE, PACKET
 from edits import agreed
 from encoders import cv, nal_units
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES, foxglove_scene
-from mp4ds.errors import ConversionError, FormatError, OptionError
+from mp4ds.errors import ConversionError, FormatError
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.pictures import KINDS
 from mp4ds.unpacking.republish import Republished, republished_topic
@@ -443,61 +442,6 @@ def test_files_of_every_encoding(encoding: str, kind: str, target: str, tmp_path
             assert psnr(file_picture(data), original) > 33
 
 
-@pytest.mark.one_in(2)
-@pytest.mark.parametrize(
-    ("encoding", "kind", "ros1", "ros2"),
-    [
-        ("rgb8", "jpeg", "rgb8; jpeg compressed bgr8", None),
-        ("bgr8", "png", "bgr8; png compressed bgr8", None),
-        ("bgra8", "jpeg", "bgra8; jpeg compressed bgr8", None),
-        ("rgb16", "png", "rgb16; png compressed bgr16", None),
-        ("mono8", "jpeg", "mono8; jpeg compressed ", "mono8; jpeg compressed mono8"),
-        ("mono8", "png", "mono8; png compressed ", None),
-        ("16UC1", "png", "16UC1; png compressed ", None),
-        ("bayer_rggb8", "png", "bayer_rggb8; png compressed ", None),
-        ("bayer_rggb8", "jpeg", "rgb8; jpeg compressed bgr8", None),
-        ("yuv422", "jpeg", "rgb8; jpeg compressed bgr8", None),
-        ("8UC3", "jpeg", "8UC3; jpeg compressed ", None),
-    ],
-)
-def test_formats_are_those_of_the_transport(
-    encoding: str, kind: str, ros1: str, ros2: str | None, tmp_path: Path
-) -> None:
-    made = Packed(tmp_path, scene(encoding, noisy=False, frames=2), "bag-none")
-    for to, told in (("bag", ros1), ("rosbag2", ros2 or ros1)):
-        found = [m for m in made.unpack(to, kind)[1] if m.type_name == COMPRESSED]
-        assert {message.value.format for message in found} == {told}
-
-
-def test_quantised_depths_without_their_parameters(packed: Pack, tmp_path: Path) -> None:
-    made = packed("depth-32FC1-png", "mcap-ros2-zstd")
-    folder = tmp_path / "dataset"
-    shutil.copytree(made.folder / "dataset", folder)
-    (sidecar,) = (path for path in folder.glob("*.yaml") if path.name != "dataset.yaml")
-    lines = sidecar.read_text("utf-8").splitlines()
-    kept = [line for line in lines if "prefix:" not in line and not line.startswith("checksum")]
-    sidecar.write_text("\n".join(kept) + "\n", "utf-8")
-    with mp4ds.open(sidecar) as dataset:
-        stream = dataset[made.topic]
-        assert stream.read([0], format="native").dtype == np.uint16
-        with pytest.raises(mp4ds.OptionError, match="quantised depths without their parameters"):
-            stream.read([0], format="depth_m")
-
-
-@pytest.mark.parametrize("quality", [5, 60, 95])
-@pytest.mark.parametrize("name", ["raw-bgr8", "raw-mono8"])
-def test_jpeg_quality(packed: Pack, name: str, quality: int) -> None:
-    """Files are as good as libjpeg's of that quality, with full chroma."""
-    made = packed(name, "mcap-ros2-zstd")
-    found = made.unpack("mcap", "jpeg", jpeg_quality=quality)[1]
-    pictures = shown([message for message in found if message.type_name == COMPRESSED])
-    for image, original in zip(pictures, truth(made.cameras), strict=True):
-        source = original if original.ndim == 2 else original[..., ::-1]
-        sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
-        reference = cv(source, ".jpg", cv2.IMWRITE_JPEG_QUALITY, quality, *sampling)
-        assert abs(psnr(image, original) - psnr(file_picture(reference), original)) < 0.2
-
-
 @pytest.mark.parametrize("extension", [".png", ".jpg"])
 def test_the_encoding_in_a_format_tells_a_mosaic(extension: str, tmp_path: Path) -> None:
     """As in compressed_image_transport, whose files of a mosaic are grey."""
@@ -702,20 +646,6 @@ def test_verbatim_messages_stay_and_are_counted(packed: Pack) -> None:
     assert order == [record.values["header"]["stamp"] for record in made.cameras]
 
 
-def test_a_recorded_topic_is_taken(tmp_path: Path) -> None:
-    made = both(scene("rgb8"), on("/cam/image_raw/compressed", CODED["jpeg-rgb"](frames=8)))
-    both_ = Packed(tmp_path, made, "bag-none")
-    for kind, old, new, taken in (
-        ("raw", "/cam/image_raw/compressed", "/cam/image_raw_raw", "/cam/image_raw"),
-        ("jpeg", "/cam/image_raw", "/cam/image_raw/compressed_jpeg", "/cam/image_raw/compressed"),
-    ):
-        summary, messages = both_.unpack("bag", kind)
-        type_name = TYPES[kind].replace("/msg/", "/")
-        assert summary.republished == {old: Republished(new, type_name, taken)}
-        assert len([message for message in messages if message.topic == new]) == 8
-        assert len([message for message in messages if message.topic == taken]) == 8
-
-
 def test_packets_that_do_not_decode_stay(packed: Pack) -> None:
     """Those that refer to a lost one."""
     made = packed("video-h265-lost", "mcap-ros2-zstd")
@@ -733,40 +663,6 @@ def test_packets_that_do_not_decode_stay(packed: Pack) -> None:
     assert summary.messages == {
         topic: len([m for m in messages if m.topic == topic]) for topic in summary.messages
     }
-
-
-def test_only_16_bits_are_depths(tmp_path: Path) -> None:
-    """Whatever a sidecar says of the format."""
-    made = Packed(tmp_path, still("bgr8", "jpeg", ".jpg"), "bag-none")
-    sidecar = tmp_path / "dataset" / "cam_image_raw_compressed.yaml"
-    text = sidecar.read_text("utf-8").replace("format: jpeg", "format: 16UC1; compressedDepth")
-    assert "compressedDepth" in text
-    sidecar.write_text(text.partition("checksum:")[0], "utf-8")
-    output = tmp_path / "out.mcap"
-    mp4ds.unpack(sidecar, "mcap", output, UnpackOptions(images="raw"))
-    found = read(output)
-    assert {(m.topic, m.value.encoding) for m in found} == {("/cam/image_raw", "rgb8")}
-    assert len(found) == len(made.cameras)
-
-
-def test_depths_of_unknown_unit_stay(tmp_path: Path) -> None:
-    def depth(n: int) -> bytes:
-        return bytes(12) + cv(picture("16UC1", frame=0, width=64, height=48, rng=None), ".png")
-
-    records = [
-        Record(
-            "/depth/compressedDepth",
-            COMPRESSED,
-            10**18 + n * 10**8,
-            {"header": {"stamp": 10**18}, "format": "compressedDepth", "data": depth(n)},
-        )
-        for n in range(4)
-    ]
-    made = Packed(tmp_path, Scene(records), "mcap-ros2-none")
-    for kind in ("raw", "png"):
-        summary, _ = made.unpack("mcap", kind)
-        reason = "its format 'compressedDepth' does not give the unit of its depths"
-        assert summary.as_recorded == {made.topic: {reason: 4}}
 
 
 def test_a_camera_that_changes(packed: Pack, tmp_path: Path) -> None:
@@ -855,30 +751,6 @@ def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> No
             assert [message.value.header.seq for message in found] == expected
 
 
-def latched(encoding: str) -> Scene:
-    made = scene(encoding, frames=3)
-    return Scene(
-        [
-            Record(r.topic, r.msgtype, r.log_time, r.values, publisher=int(r.msgtype == IMAGE))
-            for r in made.messages
-            if r.msgtype == IMAGE
-        ]
-    )
-
-
-def test_latching_is_kept_as_qos(tmp_path: Path) -> None:
-    made = Packed(tmp_path / "a", latched("mono8"), "bag-none")
-    messages = made.unpack("bag", "png")[1]
-    assert {message.metadata["latching"] for message in messages} == {1}
-    made.unpack("rosbag2", "png")
-    mp4ds.pack(made.folder / "again", tmp_path / "second", mp4ds.PackOptions(codec="h264"))
-    mp4ds.unpack(tmp_path / "second", "bag", tmp_path / "back.bag", UnpackOptions(images="raw"))
-    back = [m for m in read(tmp_path / "back.bag") if m.topic == "/cam/image_raw"]
-    assert {(m.metadata["latching"], m.metadata["callerid"]) for m in back} == {(1, "/second")}
-    assert {m.metadata["digest"] for m in back} == {MD5SUMS["raw"]}
-    assert all(map(np.array_equal, shown(back), truth(made.cameras)))
-
-
 def test_two_publishers_of_a_topic(tmp_path: Path) -> None:
     one = scene("mono8", frames=4)
     two = [
@@ -895,20 +767,6 @@ def test_two_publishers_of_a_topic(tmp_path: Path) -> None:
     assert {m.topic for m in found} == {"/cam/image_raw/compressed"}
 
 
-def test_stamps_beyond_32_bits_have_no_place_in_ros(tmp_path: Path) -> None:
-    made = FOXGLOVE["raw-mono8"](frames=2)
-    late = [
-        Record(r.topic, r.msgtype, r.log_time, {**r.values, "timestamp": 2**33 * 10**9})
-        for r in made.messages
-        if r.topic == "/camera/image"
-    ]
-    packed_ = Packed(tmp_path, Scene(late), "mcap-protobuf")
-    for kind in ("raw", "compressed-video"):
-        with pytest.raises(ConversionError, match=r"/camera/image: message 0: .* bits for"):
-            packed_.unpack("mcap", kind)
-    assert not (tmp_path / "again.mcap").exists()
-
-
 # ---------------------------------------------------------------- topics
 
 
@@ -917,20 +775,13 @@ def test_stamps_beyond_32_bits_have_no_place_in_ros(tmp_path: Path) -> None:
     [
         ("/cam/image_raw", "sensor_msgs/Image", "jpeg", "/cam/image_raw/compressed"),
         ("/cam", "foxglove.RawImage", "compressed-video", "/cam/compressed_video"),
-        ("/cam", "foxglove.RawImage", "raw", "/cam"),
         ("/cam/compressed", "sensor_msgs/Image", "jpeg", "/cam/compressed/compressed"),
         ("/cam/compressed", "sensor_msgs/CompressedImage", "raw", "/cam"),
-        ("/cam/compressed", "sensor_msgs/CompressedImage", "png", "/cam/compressed"),
         ("/cam/compressedDepth", "sensor_msgs/CompressedImage", "png", "/cam/compressed"),
         ("/cam/jpg", "sensor_msgs/CompressedImage", "raw", "/cam/jpg/raw"),
-        ("/cam/jpg", "foxglove.CompressedImage", "jpeg", "/cam/jpg"),
-        ("/cam/jpg", "foxglove.CompressedImage", "compressed-video", "/cam/jpg/compressed_video"),
         ("/cam/ffmpeg", "x/msg/FFMPEGPacket", "compressed-video", "/cam/compressed_video"),
-        ("/cam/foxglove", "foxglove_msgs/CompressedVideo", "raw", "/cam"),
-        ("/cam/compressed_video", "foxglove.CompressedVideo", "png", "/cam/compressed"),
         ("/video", "foxglove.CompressedVideo", "compressed-video", "/video"),
         ("/compressed", "sensor_msgs/CompressedImage", "raw", "/compressed/raw"),
-        ("compressed", "sensor_msgs/CompressedImage", "raw", "compressed/raw"),
         ("", "sensor_msgs/Image", "jpeg", "/compressed"),
     ],
 )
@@ -941,23 +792,6 @@ def test_topics_are_those_of_image_transport(
 
 
 # ---------------------------------------------------------------- options, errors, command line
-
-
-@pytest.mark.parametrize(
-    ("to", "options", "problem"),
-    [
-        ("mcap", {"images": "bmp"}, "`images` 'bmp' is not known. Use raw, jpeg, png, compressed"),
-        ("mcap", {"jpeg_quality": 0}, "`jpeg_quality` 0 is below 1"),
-        ("images", {"images": "raw"}, "`images` is for recordings"),
-    ],
-)
-def test_options_that_contradict(
-    packed: Pack, tmp_path: Path, to: str, options: dict[str, Any], problem: str
-) -> None:
-    made = packed("raw-mono8", "mcap-ros2-zstd")
-    with pytest.raises(OptionError, match=problem):
-        mp4ds.unpack(made.folder / "dataset", to, tmp_path / "out", UnpackOptions(**options))
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.one_in(2)
@@ -1005,23 +839,6 @@ def without_sum(sidecar: Path) -> None:
     lines = sidecar.read_text("utf-8").splitlines(keepends=True)
     kept_ = [line for line in lines if not line.startswith(("  sha256:", "  size:", "checksum:"))]
     sidecar.write_text("".join(kept_), "utf-8")
-
-
-@pytest.mark.parametrize("frames", [5, 9])
-@pytest.mark.parametrize("kind", ["compressed-video", "jpeg"])
-def test_a_video_of_other_frames_is_refused(
-    packed: Pack, kind: str, frames: int, tmp_path: Path
-) -> None:
-    made = packed("raw-mono8", "mcap-ros2-zstd")
-    other = Packed(tmp_path / "other", scene("mono8", frames=frames), "mcap-ros2-zstd")
-    for folder, pattern in ((made.folder, "*.yaml"), (other.folder, "*.mp4")):
-        for path in folder.glob(f"dataset/cam_image_raw{pattern}"):
-            shutil.copy(path, tmp_path)
-    without_sum(tmp_path / "cam_image_raw.yaml")
-    output, options = tmp_path / "out.mcap", UnpackOptions(images=kind)
-    with pytest.raises(FormatError, match=r"frame-count|digest-mismatch"):
-        mp4ds.unpack(tmp_path / "cam_image_raw.yaml", "mcap", output, options)
-    assert not output.exists()
 
 
 def test_the_command_line(packed: Pack, tmp_path: Path) -> None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -65,26 +63,6 @@ def test_it_goes_on_from_the_last_finished_part(
     assert compare([pack.source], unpacked(tmp_path, "bag")) == []
 
 
-class SlowToShow(InlineExecutor):
-    """Whose last result is seen a while after its call is done, as on a shared file system."""
-
-    def __init__(self, part: Path) -> None:
-        super().__init__()
-        self._part = part
-
-    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
-        future = super().submit(fn, *args, **kwargs)
-        if self._part.exists():
-            hidden = self._part.rename(self._part.with_name(f".{self._part.name}"))
-            threading.Timer(1.0, hidden.rename, (self._part,)).start()
-        return future
-
-
-def test_a_result_that_is_seen_late_is_waited_for(pack: Pack) -> None:
-    pack.run(SlowToShow(pack.target.with_name(WORK) / PARTS[3]))
-    assert facts(pack.target) == pack.expected
-
-
 def test_keep_going_runs_all_others_and_names_what_failed(pack: Pack) -> None:
     executor = InlineExecutor(lambda name: name in (PARTS[0], PARTS[2]))
     error = pack.refused(f"{pack.target}: 2 of 4 parts could not be", executor, keep_going=True)
@@ -132,39 +110,10 @@ def test_a_changed_source_is_refused(
     assert isinstance(error, SourceError)
 
 
-def test_another_recording_under_the_same_name_is_refused(
-    pack: Pack, stopped: Callable[[int], Path]
-) -> None:
-    stopped(1)
-    pack.source = Path(shutil.copy(pack.source, pack.source.with_name("other.bag")))
-    error = pack.refused(r"holds an unfinished pack of .*`restart`")
-    assert isinstance(error, OptionError)
-
-
 def test_restart_begins_anew(pack: Pack, stopped: Callable[[int], Path]) -> None:
     stopped(3)
     assert pack.run(restart=True) == PARTS
     assert facts(pack.target) == pack.expected
-
-
-def test_parts_without_a_plan_are_made_again(pack: Pack, stopped: Callable[[int], Path]) -> None:
-    (stopped(2) / "plan.json").unlink()
-    assert pack.run(codec="ffv1") == PARTS
-    assert len(mp4ds.Dataset(pack.target).streams) == 1
-
-
-def test_parts_that_are_being_discarded_keep_their_plan(
-    pack: Pack, stopped: Callable[[int], Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    stopped(2)
-    with monkeypatch.context() as patch:
-        patch.setattr(shutil, "rmtree", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            pack.run(codec="ffv1", restart=True)
-    pack.refused("different `codec`", codec="ffv1")
 
 
 @pytest.mark.parametrize(
@@ -267,19 +216,6 @@ def test_many_recordings_are_one_job(tmp_path: Path, monkeypatch: pytest.MonkeyP
     paths[1].replace(paths[0])
     with pytest.raises(TargetExistsError):
         pack_each(paths[:1], tmp_path / "datasets", IN_PARTS)
-
-
-def test_summaries_are_in_the_order_of_the_sources(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whichever was done first."""
-    paths = []
-    for name in ("b", "a", "c"):
-        (path,) = SOURCES["bag-none"](tmp_path, scene("mono8", frames=9))
-        paths.append(path.rename(tmp_path / f"{name}.bag"))
-    use(monkeypatch, InlineExecutor())  # all calls are done at once, so any may be the first
-    done = pack_each(paths, tmp_path / "datasets", IN_PARTS)
-    assert [summary.dataset.name for summary in done] == ["b", "a", "c"]
 
 
 # ---------------------------------------------------------------- killed, in earnest

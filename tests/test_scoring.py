@@ -19,15 +19,11 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import ScoringError
 from mp4ds.video.scores import (
-    MAX_PSNR,
-    METRICS,
     VMAF_MODEL,
     Ffmpeg,
     YuvFrame,
     find_ffmpeg,
-    psnr,
     scores_of,
-    ssim,
 )
 from waiting import WATCHDOG_S, until
 
@@ -146,25 +142,6 @@ def test_psnr_and_ssim_are_those_of_ffmpeg(
 # ---------------------------------------------------------------- what is scored
 
 
-def test_identical_frames_have_the_highest_scores() -> None:
-    for bits in (8, 10):
-        frames = clip((64, 48), bits=bits, noise=0.05)
-        scores = scores_of(frames, frames)
-        assert {name: len(values) for name, values in scores.items()} == dict.fromkeys(
-            METRICS[1:], FRAMES
-        )
-        for name in METRICS[1:4]:
-            assert (scores[name] == MAX_PSNR[bits]).all()
-        assert np.allclose(scores["ssim"], 1.0)
-
-
-def test_differences_of_either_sign_do_not_wrap_around() -> None:
-    low, high = np.zeros((16, 16), np.uint8), np.full((16, 16), 255, np.uint8)
-    assert psnr(low, high) == psnr(high, low) == pytest.approx(0)
-    assert ssim(low, high) == pytest.approx(ssim(high, low))
-    assert ssim(low, high) < 0.01
-
-
 @needs_vmaf
 def test_memory_is_that_of_a_few_frames() -> None:
     size, frames = (320, 240), 60
@@ -187,26 +164,6 @@ def test_memory_is_that_of_a_few_frames() -> None:
 
 
 # ---------------------------------------------------------------- what goes wrong
-
-
-@pytest.mark.parametrize(
-    ("original", "made", "said"),
-    [
-        ([], [], "no frames"),
-        (clip((64, 48)), clip((64, 48))[:-1], "more originals than the 7"),
-        (clip((64, 48))[:-1], clip((64, 48)), "more decoded frames than the 7"),
-        (clip((64, 48)), clip((64, 46)), "Decoded frame 0 differs"),
-        (clip((64, 48)), clip((64, 48), bits=10), "Decoded frame 0 differs"),
-        (clip((64, 48)) + clip((66, 48)), clip((64, 48), frames=16), "Original 8 differs"),
-        (clip((63, 48)), clip((63, 48)), "63x48"),
-        (clip((14, 48)), clip((14, 48)), "14x48"),
-    ],
-)  # fmt: skip
-def test_frames_that_do_not_match(
-    original: list[YuvFrame], made: list[YuvFrame], said: str
-) -> None:
-    with pytest.raises(ScoringError, match=said):
-        scores_of(original, made)
 
 
 def program(folder: Path, script: str) -> str:
@@ -247,35 +204,6 @@ def test_an_ffmpeg_without_libvmaf_is_not_taken(
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ScoringError, match=r"pip install 'mp4ds\[vmaf\]'"):
         find_ffmpeg()
-
-
-def test_an_ffmpeg_on_the_path_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    script = "print('   model             <string>     ..FV....... Set the model')"
-    path = program(tmp_path, script)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert find_ffmpeg().path == path
-
-
-@needs_vmaf
-def test_an_error_of_the_caller_leaves_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    started = []
-    plain = subprocess.Popen
-
-    def recorded(*args: object, **kwargs: object) -> object:
-        started.append(plain(*args, **kwargs))  # type: ignore[call-overload]
-        return started[-1]
-
-    def broken() -> Iterator[YuvFrame]:
-        yield from clip((64, 48))
-        raise KeyboardInterrupt
-
-    ffmpeg = find_ffmpeg()
-    monkeypatch.setattr(subprocess, "Popen", recorded)
-    with pytest.raises(KeyboardInterrupt):
-        scores_of(clip((64, 48), frames=20), broken(), ffmpeg=ffmpeg)
-    assert len(started) == 1
-    assert started[0].poll() is not None
 
 
 _ENDLESS = """

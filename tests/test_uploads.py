@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from collections.abc import Callable
@@ -10,9 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 
 import mp4ds
 from commands import call
@@ -20,15 +17,11 @@ from compare import compare
 from in_parts import InlineExecutor, facts, use
 from mp4ds.errors import (
     PartsFailedError,
-    RemoteError,
-    SourceError,
     TargetError,
     TargetExistsError,
 )
-from mp4ds.files.uploads import local_path
-from mp4ds.files.urls import RemotePath
 from mp4ds.packing.options import PackOptions, PackProgress
-from mp4ds.packing.pack import pack_each, pack_share
+from mp4ds.packing.pack import pack_each
 from mp4ds.unpacking.unpack import UnpackOptions
 from remote_servers import Request, Server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores
@@ -136,14 +129,6 @@ def test_a_pack_is_uploaded_the_manifest_last(
     assert replace(summary, dataset=here.dataset) == here
 
 
-def test_large_files_go_in_parts(store: Store, tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(os.urandom(40_000_000))
-    target = RemotePath(f"{store.folder}/file")
-    target.upload(tmp_path / "file")
-    assert store.server.put().count("file") == 3
-    assert store.files.cat(target.url) == (tmp_path / "file").read_bytes()
-
-
 @pytest.mark.parametrize("force", [False, True])
 def test_what_is_there_is_kept(force: bool, source: Path, store: Store) -> None:
     store.files.pipe_file(f"{store.url}/thesis.tex", b"years of work")
@@ -208,21 +193,6 @@ def test_a_failed_upload_keeps_what_was_made(
     assert compare([source], store.unpacked()) == []
 
 
-def test_what_is_uploaded_is_counted(
-    source: Path, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import s3fs
-
-    async def short(self: Any, local: str, key: str, **_: Any) -> None:
-        await self._pipe_file(key, Path(local).read_bytes()[:-1])
-
-    monkeypatch.setattr("s3fs.S3FileSystem._put_file", short)
-    s3fs.S3FileSystem.clear_instance_cache()  # their methods are bound when they are made
-    with pytest.raises(RemoteError, match=r"could not be uploaded: only \d+ of \d+ bytes arrived"):
-        mp4ds.pack(source, store.url, FAST)
-    s3fs.S3FileSystem.clear_instance_cache()
-
-
 def test_a_store_that_refuses_is_told_before_the_work(source: Path, store: Store) -> None:
     store.server.fails = lambda heard: 403 if heard.method == "PUT" else None
     with pytest.raises(TargetError, match=r"cannot be uploaded: access denied"):
@@ -235,15 +205,6 @@ def test_a_store_that_refuses_is_told_before_the_work(source: Path, store: Store
     ):
         with pytest.raises(TargetError, match=words):
             mp4ds.pack(source, url, FAST)
-    assert store.kept() == []
-
-
-def test_a_source_that_cannot_be_read_leaves_nothing(tmp_path: Path, store: Store) -> None:
-    (tmp_path / "broken.bag").write_bytes(b"#ROSBAG V2.0\n broken")
-    for name in ("broken.bag", "none.bag"):
-        with pytest.raises(SourceError):
-            mp4ds.pack(tmp_path / name, store.url, FAST)
-    assert store.names(store.folder) == set()
     assert store.kept() == []
 
 
@@ -263,17 +224,6 @@ def test_a_divided_pack_goes_on(
     assert compare([source], store.unpacked()) == []
 
 
-def test_shares_meet_in_the_temporary_folder(
-    source: Path, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = replace(FAST, window=3)
-    use(monkeypatch, InlineExecutor())
-    for number in (1, 2):
-        pack_share(source, store.url, (number, 2), options)
-    mp4ds.pack(source, store.url, replace(options, join=True))
-    assert compare([source], store.unpacked()) == []
-
-
 def test_one_dataset_each(source: Path, store: Store, put: Put, tmp_path: Path) -> None:
     write_bag(tmp_path / "other.bag", scene("mono8", frames=3))
     urls, folder = [put(source), put(tmp_path / "other.bag")], f"{store.folder}/all"
@@ -284,14 +234,6 @@ def test_one_dataset_each(source: Path, store: Store, put: Put, tmp_path: Path) 
     with pytest.raises(TargetExistsError):
         pack_each(urls, f"{folder}/", FAST)
     assert mp4ds.validate(folder) == []
-
-
-def test_two_at_a_time(source: Path, store: Store) -> None:
-    folder = local_path(RemotePath(store.url)).parent
-    with (folder / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(TargetError, match=r"another mp4ds is already making it here"):
-            mp4ds.pack(source, store.url, FAST)
 
 
 def test_the_temporary_folder_is_ones_own(source: Path, store: Store, tmp_path: Path) -> None:
@@ -321,17 +263,6 @@ def test_an_unpack_is_uploaded(target: str, packed_bag: Path, store: Store, tmp_
         mp4ds.unpack(packed_bag, to, url, options)
     mp4ds.unpack(packed_bag, to, url, replace(options, force=True))
     assert not any(name.endswith(".mp4ds-upload") for name in store.names(store.folder))
-
-
-def test_a_file_stays_where_its_replacement_fails(packed_bag: Path, store: Store) -> None:
-    url = f"{store.folder}/again.bag"
-    mp4ds.unpack(packed_bag, "bag", url)
-    before = store.files.cat(url)
-    store.server.fails = refusing("again.bag")
-    with pytest.raises(TargetError, match=r"The output is kept in"):
-        mp4ds.unpack(packed_bag, "bag", url, UnpackOptions(force=True, exclude=["/imu"]))
-    assert store.names(store.folder) == {"again.bag"}
-    assert store.files.cat(url) == before
 
 
 def test_images_are_uploaded(packed_bag: Path, store: Store, tmp_path: Path) -> None:
@@ -374,20 +305,3 @@ def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -
     again = f"{folder_url}/again.bag"
     assert run("unpack", dataset, "--to", "bag", "-o", again)["output"] == again
     assert run("info", again)["topics"] == run("info", recording)["topics"]
-
-
-# ---------------------------------------------------------------- folders of images
-
-
-def test_a_folder_of_images_is_packed_to_a_url(folder_url: str, tmp_path: Path) -> None:
-    (tmp_path / "images").mkdir()
-    slope = np.add.outer(np.arange(24), np.arange(32)).astype(np.uint8)
-    for number in range(3):
-        Image.fromarray(slope + number).save(tmp_path / "images" / f"{number}.png")
-    options = PackOptions(codec="ffv1", images=mp4ds.ImportOptions(rate="2"))
-    mp4ds.pack(tmp_path / "images", f"{folder_url}/ds", options)
-    with mp4ds.open(f"{folder_url}/ds") as dataset:
-        for number, frame in enumerate(dataset["/camera/image_raw"]):
-            assert np.array_equal(frame.data, slope + number)
-    with pytest.raises(SourceError, match="Download it first"):
-        mp4ds.pack(f"{folder_url}/ds", tmp_path / "ds", options)

@@ -206,30 +206,6 @@ def test_all_frames_are_there_in_their_place(tmp_path: Path) -> None:
         assert TOPIC in dataset
 
 
-def test_a_topic_without_a_video(tmp_path: Path) -> None:
-    made = mixed(odd=tuple(range(FRAMES)))
-    dataset = mp4ds.open(packed(tmp_path, made))  # without a video, nothing is left open
-    assert dataset.topics == []
-    assert TOPIC in dataset
-    assert np.array_equal(dataset[TOPIC][3].data, pictures(made)[3])
-    assert "/cam/camera_info" not in dataset
-    summary = mp4ds.unpack(dataset.path, "images", tmp_path / "images")
-    assert summary.messages == {TOPIC: FRAMES}
-
-
-def test_messages_with_the_same_log_time(tmp_path: Path) -> None:
-    made = mixed(odd=(4, 5, 6))
-    images = [n for n, item in enumerate(made.messages) if item.topic == TOPIC]
-    time = made.messages[images[4]].log_time
-    for number in (5, 6):
-        place = images[number]
-        made.messages[place] = replace(made.messages[place], log_time=time)
-    with mp4ds.open(packed(tmp_path, made)) as dataset:
-        found = dataset[TOPIC]
-        for number, pixels in enumerate(pictures(made)):
-            assert np.array_equal(found[number].data, pixels), number
-
-
 def test_verbatim_images_of_a_damaged_dataset(tmp_path: Path) -> None:
     """Those that can be read."""
     folder = packed(tmp_path, mixed())

@@ -172,21 +172,3 @@ def test_it_is_played(options: dict[str, Any], views: Path, seen: dict[str, Any]
     if "publish_as" not in options:
         for sent, pixels in zip(node.sent, seen[LEFT], strict=True):
             assert sent.payload.endswith(pixels.tobytes())
-
-
-def test_lerobot_gets_videos_of_the_views(views: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow")
-    done = call("export", "lerobot", views, "-o", tmp_path / "out", "--codec", "h264")
-    assert done.code == 0, done.err
-    assert done.out.count("its pixels are those of its view") == 2
-    assert len([*(tmp_path / "out").rglob("*.mp4")]) == 2
-
-
-def test_encoder_settings_are_compared_on_the_views(views: Path, tmp_path: Path) -> None:
-    words = ("--frames", "2", "--codecs", "h264", "--presets", "ultrafast", "--crf", "30")
-    done = call("evaluate", views, "-o", tmp_path / "out", *words)
-    assert done.code == 0, done.err
-    assert "already lossy (a dataset of visual)" in done.out
-
-
-# ---------------------------------------------------------------- one of them, and both again

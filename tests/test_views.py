@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from mp4ds.errors import FormatError, Mp4dsError, OptionError, SourceError
 from mp4ds.format.models import StreamSidecar
 from mp4ds.packing.options import PackOptions
 from mp4ds.unpacking.unpack import UnpackOptions
-from player_scenes import RecordingPublisher, run
 from round_trips import journey, unpacked
 from sources import SOURCES, scene
 
@@ -184,24 +182,6 @@ def test_pixels_have_a_view_if_asked(case: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (
-            {"view": "av1", "quality": "visual"},
-            "`view` is for lossless packing: with `qual",
-        ),
-        ({"view": "h264", "quality": "psnr=40"}, "`quality` psnr=40, the videos are what a view"),
-        ({"view": "av1", "purpose": "speed"}, "`purpose` speed encodes nothing twice"),
-        ({"view": "vp9"}, "`view` 'vp9' is not known. Use av1, h264, none"),
-    ],
-)
-def test_where_there_are_no_views(options: dict[str, Any], words: str, tmp_path: Path) -> None:
-    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-rgb"](frames=2))
-    with unchanged(tmp_path), pytest.raises(OptionError, match=words):
-        mp4ds.pack(source, tmp_path / "dataset", PackOptions(**options))
-
-
-@pytest.mark.parametrize(
     ("words", "view"),
     [
         ((), None),
@@ -325,32 +305,6 @@ def test_views_alone_are_unpacked(
             assert {header.format for header in sidecar.headers} == {"av1;yuv420p;bgr8;rgb8"}
 
 
-@pytest.mark.filterwarnings("ignore:.*exact layer not here")
-def test_views_alone_are_played(alone: tuple[Path, str]) -> None:
-    dataset, kind = alone
-    publisher, _ = run(dataset, RecordingPublisher(world="ros2"), rate=50.0, jpeg_quality=90)
-    with mp4ds.open(dataset) as opened:
-        (topic,) = opened.topics
-        channel = opened.streams[0].channel
-    found = [sent for sent in publisher.sent if sent.topic == topic]
-    assert len(found) == FRAMES
-    assert {sent.channel and sent.channel.type_name for sent in found} == {channel.type_name}
-    if ALONE[kind] == "packet":
-        assert all(b"av1" in sent.payload for sent in found)
-
-
-def test_training_on_views(alone: tuple[Path, str]) -> None:
-    pytest.importorskip("torch")
-    training = import_module("mp4ds.torch")
-    dataset, _ = alone
-    with mp4ds.open(dataset) as opened:
-        (topic,) = opened.topics
-        shown = opened[topic].read([3])[0]
-    frames = training.FrameDataset(dataset, channels_first=False)
-    assert len(frames) == FRAMES
-    assert np.array_equal(np.asarray(frames[3][topic]), shown)
-
-
 @pytest.mark.parametrize("options", [{"quality": "crf=40"}, {"quality": "psnr=20"}])
 def test_views_alone_are_encoded_again(
     alone: tuple[Path, str], options: dict[str, Any], tmp_path: Path
@@ -367,14 +321,6 @@ def test_views_alone_are_encoded_again(
     mp4ds.pack(copy, again, PackOptions(**options))
     assert {one.profile for one in sidecars(again)} == {options["quality"]}
     assert mp4ds.validate(again, deep=True) == []
-
-
-def test_it_is_told_what_views_add(tmp_path: Path) -> None:
-    (source,) = SOURCES[ROS2](tmp_path / "source", CODED["jpeg-420"](width=320, height=240))
-    summary = mp4ds.pack(source, tmp_path / "dataset", PackOptions(view="av1"))
-    (path,) = (tmp_path / "dataset").glob("*compressed.mp4")
-    size = f"{path.stat().st_size / 1000:.1f} kB"
-    assert summary.larger == f"views of JPEG files and video packets take {size}"
 
 
 @pytest.mark.parametrize("view", [False, True])
@@ -471,18 +417,6 @@ def test_views_alone_are_copied_and_sliced(alone: tuple[Path, str], tmp_path: Pa
         assert mp4ds.pack(dataset, made, options).is_copy
         assert [(one.profile, one.body) for one in sidecars(made)] == [("visual", ALONE[kind])]
         assert mp4ds.validate(made, deep=True) == []
-
-
-def test_slices_out_of_order_keep_views(tmp_path: Path) -> None:
-    recorded = CODED["jpeg-rgb"]()
-    own = [record for record in recorded.messages if record.topic == f"{RAW}/compressed"]
-    early = replace(own[5], log_time=own[4].log_time - 1)
-    places = [early if record is own[5] else record for record in recorded.messages]
-    sources = SOURCES[ROS2](tmp_path / "source", replace(recorded, messages=places))
-    mp4ds.pack(sources, tmp_path / "first", PackOptions(view="h264"))
-    options = PackOptions(start="0.05")
-    summary = mp4ds.pack(tmp_path / "first", tmp_path / "dataset", options)
-    assert codecs(tmp_path / "dataset") == ["h264"], summary.not_copied
 
 
 @pytest.mark.parametrize("kind", ["jpeg-rgb", "video-h265"])
