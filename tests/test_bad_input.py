@@ -21,7 +21,6 @@ from typing import Any
 import pytest
 
 import mp4ds
-from coded_scenes import CODED
 from commands import (
     Result,
     call,
@@ -33,7 +32,6 @@ from commands import (
     without_progress,
 )
 from compare import compare
-from mp4ds.plugins import demo as demo_of
 from scenes import ENCODINGS, IMAGE, START, Record, Scene, image_cdr, image_ros1, picture
 from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
 from test_faults import disk_of
@@ -176,13 +174,6 @@ def test_a_source_that_cannot_be_read(command: str, name: str, tmp_path: Path) -
     options = ("-o", tmp_path / "dataset") if command == "pack" else ()
     with unchanged(tmp_path):
         refused(call(command, path, *options), 2, word)
-
-
-def test_one_bad_part_of_several(small_bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "second").mkdir()
-    second = cut("bag")(tmp_path / "second")
-    with unchanged(tmp_path):
-        refused(call("pack", small_bag, second, "-o", tmp_path / "dataset"), 2, str(second))
 
 
 def test_a_source_that_is_given_twice(small_bag: Path, tmp_path: Path) -> None:
@@ -379,13 +370,6 @@ def test_a_folder_without_permission(small_bag: Path, small_dataset: Path, tmp_p
     refused(call("pack", small_bag, "-o", tmp_path / "x"), 2, "Permission denied")
 
 
-def test_a_name_that_is_too_long(small_bag: Path, tmp_path: Path) -> None:
-    with unchanged(tmp_path):
-        result = call("pack", small_bag, "-o", tmp_path / ("x" * 300))
-        assert result.code in (1, 2)
-        refused(result, result.code, "File name too long")
-
-
 def test_what_is_replaced_stays_until_the_new_one_is_whole(
     small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -411,12 +395,6 @@ def test_packing_onto_the_source(name: str, tmp_path: Path) -> None:
             refused(call("pack", source, "-o", source, *force), 2, str(source))
 
 
-def test_packing_a_part_of_a_dataset_onto_it(small_dataset: Path, tmp_path: Path) -> None:
-    source = small_dataset / "messages.mcap"
-    with unchanged(tmp_path):
-        refused(call("pack", source, "-o", small_dataset, "--force"), 2, str(small_dataset))
-
-
 @pytest.mark.parametrize("name", ["messages.mcap", "cam_image_raw.mp4", "dataset.yaml", "new.mcap"])
 @pytest.mark.parametrize("to", ["bag", "mcap"])
 def test_unpacking_into_the_dataset(
@@ -426,14 +404,6 @@ def test_unpacking_into_the_dataset(
     with unchanged(tmp_path):
         result = call("unpack", small_dataset, "--to", to, "-o", target, "--force")
         refused(result, 2, str(small_dataset))
-
-
-@pytest.mark.parametrize("name", ["cam_image_raw.mp4", "cam_image_raw.yaml"])
-def test_unpacking_a_pair_onto_itself(name: str, small_dataset: Path, tmp_path: Path) -> None:
-    sidecar = small_dataset / "cam_image_raw.yaml"
-    with unchanged(tmp_path):
-        result = call("unpack", sidecar, "--to", "mcap", "-o", small_dataset / name, "--force")
-        refused(result, 2, name)
 
 
 # ---------------------------------------------------------------- a disk that is full
@@ -465,27 +435,6 @@ def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> N
         else:
             *options, name = UNPACK_TARGETS[job]
             result = call("unpack", demo / "drive", *options, disk / name)
-        refused(result, 1, str(disk / "x"), "No space left")
-        assert tree(disk) == {}
-
-
-CODED_KINDS = ["jpeg-444", "png-16-bit-cv2", "depth-32FC1-rvl", "video-h264", "video-vp9"]
-
-
-@pytest.mark.one_in(6)
-@pytest.mark.parametrize("to", ["dataset", "mcap"])
-@pytest.mark.parametrize("kind", CODED_KINDS)
-def test_a_disk_that_is_full_of_coded_pictures(kind: str, to: str, tmp_path: Path) -> None:
-    recorded = CODED[kind](frames=24, width=320, height=240)
-    (source,) = SOURCES["bag-none"](tmp_path, recorded)
-    dataset = tmp_path / "dataset"
-    if to == "mcap":
-        assert call("pack", source, "-o", dataset).code == 0
-    with disk_of(tmp_path / "disk", "size=96k") as disk, unchanged(source.parent):
-        if to == "dataset":
-            result = call("pack", source, "-o", disk / "x")
-        else:
-            result = call("unpack", dataset, "--to", "mcap", "-o", disk / "x")
         refused(result, 1, str(disk / "x"), "No space left")
         assert tree(disk) == {}
 
@@ -632,20 +581,6 @@ def test_an_option_that_is_wrong(
         refused(call(*(paths.get(argument, argument) for argument in arguments)), 2, word)
 
 
-@pytest.mark.parametrize("quality", [0, 101])
-def test_a_jpeg_quality_that_is_wrong(quality: int, small_dataset: Path, tmp_path: Path) -> None:
-    options = ("--to", "mcap", "-o", tmp_path / "x", "--jpeg-quality", quality)
-    with unchanged(tmp_path):
-        result = call("unpack", small_dataset, *options)
-        assert result.code == 2
-        assert "--jpeg-quality" in result.err
-    with (
-        unchanged(tmp_path),
-        pytest.raises(mp4ds.OptionError, match=f"{quality} is (below|above) 1"),
-    ):
-        mp4ds.unpack(small_dataset, "mcap", None, mp4ds.UnpackOptions(jpeg_quality=quality))
-
-
 @pytest.mark.parametrize("codec", ["h264", "av1"])
 def test_a_preset_that_is_wrong(codec: str, small_bag: Path, tmp_path: Path) -> None:
     # as a process: encoders write to stderr on their own
@@ -677,16 +612,6 @@ def test_a_command_line_that_cannot_be_understood(
         assert re.search(r"^Error: |^mp4ds: \S+ .* (below|from) ", result.err, re.MULTILINE)
 
 
-@pytest.mark.parametrize("seconds", ["0", "3601", "nan", "inf"])
-def test_a_demo_of_no_length(seconds: str, tmp_path: Path) -> None:
-    with unchanged(tmp_path):
-        result = call("demo", tmp_path / "out.bag", "--seconds", seconds)
-        assert result.code == 2
-        assert "seconds" in result.err
-    with unchanged(tmp_path), pytest.raises(mp4ds.OptionError, match="seconds, not"):
-        demo_of.demo(tmp_path / "out.bag", seconds=float(seconds))
-
-
 # ---------------------------------------------------------------- datasets that are none
 
 NO_DATASETS: dict[str, Callable[[Path], Path]] = {
@@ -709,15 +634,6 @@ def test_not_a_dataset(name: str, command: str, tmp_path: Path) -> None:
         refused(call(command, path, *options), 2, str(path))
 
 
-def test_other_yaml_is_a_problem_of_a_sidecar(tmp_path: Path) -> None:
-    path = written("notes.yaml", b"shopping: [milk]\n")(tmp_path)
-    with unchanged(tmp_path):
-        refused(call("unpack", path, "--to", "mcap", "-o", tmp_path / "out"), 1, str(path))
-        result = call("validate", path)
-    assert (result.code, result.err) == (1, "")
-    assert "version-unsupported" in result.out
-
-
 @pytest.mark.parametrize("to", ["bag", "rosbag2"])
 def test_messages_that_a_target_cannot_hold(to: str, tmp_path: Path) -> None:
     source = SOURCES["mcap-none-profile"](tmp_path, scene("mono8"))[0]
@@ -737,32 +653,6 @@ def parsed(result: Result) -> Any:
         raise ValueError(f"{word} is no JSON")
 
     return json.loads(result.out, parse_constant=refuse)
-
-
-@pytest.mark.parametrize("command", ["pack", "unpack", "images", "validate", "info", "demo"])
-def test_json_of_success(
-    command: str, small_bag: Path, small_dataset: Path, tmp_path: Path
-) -> None:
-    arguments: dict[str, tuple[object, ...]] = {
-        "pack": ("pack", small_bag, "-o", tmp_path / "x"),
-        "unpack": ("unpack", small_dataset, "--to", "bag", "-o", tmp_path / "x.bag"),
-        "images": ("unpack", small_dataset, "--to", "images", "-o", tmp_path / "x"),
-        "validate": ("validate", small_dataset, "--deep"),
-        "info": ("info", small_bag),
-        "demo": ("demo", tmp_path / "x.bag", "--seconds", 0.1),
-    }
-    result = call(*arguments[command], "--json")
-    assert result.code == 0
-    assert result.err == ""
-    keys = {
-        "pack": "topics",
-        "unpack": "messages",
-        "images": "messages",
-        "validate": "problems",
-        "info": "topics",
-        "demo": "messages",
-    }
-    assert keys[command] in parsed(result)
 
 
 @pytest.mark.parametrize(

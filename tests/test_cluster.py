@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, as_completed
@@ -121,15 +119,6 @@ def test_an_error_of_the_caller_drops_what_waits_and_leaves_the_cluster(
     assert all(worker.poll() is None for worker in cluster.workers)
 
 
-# ---------------------------------------------------------------- memory
-
-
-def test_a_call_leaves_no_memory_behind(cluster: RealCluster, tmp_path: Path) -> None:
-    executor = cluster_executor(cluster.address, 4)
-    assert not errors(executor, clusters.leave_large, tmp_path, *numbered(4))
-    assert len(list(tmp_path.glob("*.freed"))) == 4
-
-
 # ---------------------------------------------------------------- deaths
 
 
@@ -209,18 +198,6 @@ def test_a_cluster_without_workers_is_given_up(
         assert "has had no worker for 1 s. Start some, or find out" in str(found["a"])
 
 
-def test_workers_may_come_late(tmp_path: Path) -> None:
-    with (
-        RealCluster(tmp_path / "dask", workers=0) as cluster,
-        cluster_executor(cluster.address, 1) as executor,
-    ):
-        call = executor.submit(os.getpid)
-        timer = threading.Timer(1, cluster.add_worker)
-        timer.start()
-        call.result()
-        timer.join()
-
-
 # ---------------------------------------------------------------- ways to a cluster
 
 
@@ -265,37 +242,6 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_nobody_at_the_address(address: str, tmp_path: Path) -> None:
     with pytest.raises(RemoteError, match="no Dask scheduler can be reached"):
         errors(cluster_executor(address, 1), clusters.write, tmp_path, "a")
-
-
-@pytest.mark.usefixtures("impatient")
-@pytest.mark.parametrize(
-    ("says", "problem"),
-    [
-        (b"", "no Dask scheduler can be reached"),
-        (b"SSH-2.0-OpenSSH_9.2p1 Debian-2\r\n", "is not a Dask scheduler"),
-        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "is not a Dask scheduler"),
-        (b"\xff" * 1000, "is not a Dask scheduler"),
-        (bytes(1000), "is not a Dask scheduler"),
-        ((2**31).to_bytes(8, "little"), "no Dask scheduler can be reached"),
-    ],
-)
-def test_another_server_at_the_address(says: bytes, problem: str, tmp_path: Path) -> None:
-    kept: list[socket.socket] = []
-
-    def serve(server: socket.socket) -> None:
-        connection, _ = server.accept()
-        kept.append(connection)
-        connection.sendall(says)
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        thread = threading.Thread(target=serve, args=(server,))
-        thread.start()
-        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(RemoteError, match=problem):
-            errors(cluster_executor(address, 1), clusters.write, tmp_path, "a")
-        thread.join()
-    for connection in kept:
-        connection.close()
 
 
 def test_tls_needs_certificates(tmp_path: Path) -> None:
@@ -394,12 +340,6 @@ def test_a_batch_system_that_is_not_there(system: str, tmp_path: Path) -> None:
     }
     named = {f"jobqueue.{system}.{name}": value for name, value in settings.items()}
     with dask.config.set(named), pytest.raises(RemoteError, match="could not be submitted"):
-        errors(cluster_executor(system, 1), clusters.write, tmp_path, "a")
-
-
-@pytest.mark.parametrize("system", access.BATCH_SYSTEMS)
-def test_a_batch_system_that_is_not_set_up(system: str, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=rf"`cluster` {system}: .*jobqueue.yaml"):
         errors(cluster_executor(system, 1), clusters.write, tmp_path, "a")
 
 

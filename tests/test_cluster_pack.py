@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import subprocess
 import sys
@@ -86,17 +85,6 @@ def test_it_is_the_same_dataset(
 
 
 @pytest.mark.slow
-def test_the_command_line_says_nothing_of_dask(
-    cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path
-) -> None:
-    with command(source, tmp_path, cluster) as process:
-        _, stderr = process.communicate(timeout=WATCHDOG_S)
-    assert process.returncode == 0, stderr
-    assert not re.search("distributed|dask|Traceback|Warning", stderr)
-    assert facts(tmp_path / "dataset") == expected
-
-
-@pytest.mark.slow
 def test_a_killed_worker_does_not_matter(
     source: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -110,31 +98,6 @@ def test_a_killed_worker_does_not_matter(
         _, stderr = process.communicate(timeout=WATCHDOG_S)
     assert process.returncode == 0, stderr
     assert facts(tmp_path / "dataset") == expected
-
-
-@pytest.mark.slow
-def test_a_lost_scheduler_is_told_and_another_goes_on(
-    cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path
-) -> None:
-    with (
-        RealCluster(tmp_path / "dask") as lost,
-        command(source, tmp_path, lost) as process,
-    ):
-        until(lambda: len(finished(tmp_path)) >= 2)
-        lost.scheduler.kill()
-        _, stderr = process.communicate(timeout=WATCHDOG_S)
-    assert process.returncode == 1
-    assert "Traceback" not in stderr
-    said = " ".join(stderr.split())  # as it is folded to the terminal's width
-    assert f"{lost.address}: the connection to the Dask scheduler was lost" in said
-    assert "run the same command again to resume" in said
-    assert not (tmp_path / "dataset").exists()
-    kept = finished(tmp_path)
-    assert 2 <= len(kept) < PARTS
-    mp4ds.pack(source, tmp_path / "dataset", on(cluster), progress=(seen := []).append)
-    assert max(progress.tasks_before for progress in seen) == len(kept)
-    assert facts(tmp_path / "dataset") == expected
-    assert leftovers(tmp_path) == []
 
 
 @pytest.mark.slow

@@ -24,11 +24,10 @@ import pytest
 from PIL import Image
 
 import mp4ds
-from chromium import chromium
 from coded_scenes import CODED
-from commands import call, refused, typed
+from commands import call, typed
 from mp4ds.cli.report import print_evaluation
-from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, TargetError
+from mp4ds.errors import OptionError, Refused, ScoringError, SourceError
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.packing.options import PackOptions
@@ -37,15 +36,12 @@ from mp4ds.plugins.evaluating.clips import chosen, make_clip, open_cameras
 from mp4ds.plugins.evaluating.evaluate import (
     EvaluateOptions,
     evaluate,
-    settings_of,
 )
-from mp4ds.plugins.evaluating.page import page, table
+from mp4ds.plugins.evaluating.page import page
 from mp4ds.plugins.evaluating.trials import (
     Cell,
     Evaluation,
     Setting,
-    mean_size,
-    reachable_score,
     recommend,
 )
 from mp4ds.video.codecs import QualityTarget
@@ -78,51 +74,6 @@ def recording(folder: Path, encoding: str = "rgb8", source: str = "bag-none", **
 
 
 @pytest.mark.parametrize(
-    ("texts", "values"),
-    [
-        ("18", (18,)),
-        (["16:25"], tuple(range(16, 26))),
-        (["16:25:3"], (16, 19, 22, 25)),
-        ("30,20:22,21", (20, 21, 22, 30)),
-        ([63], (63,)),
-    ],
-)
-def test_crfs(texts: str | list[str | int], values: tuple[int, ...]) -> None:
-    assert EvaluateOptions(crf=texts).crf == values
-
-
-@pytest.mark.parametrize("metric", ["vmaf", "psnr", "ssim"])
-def test_targets(metric: str) -> None:
-    assert EvaluateOptions(target=f"{metric}=0.5").target == QualityTarget(metric, 0.5)
-
-
-CRFS = ("", "a", "16:", "25:16", "0", "64", "16:25:0", "-3", "16-25")
-TARGETS = (
-    *("", "99", "vmaf", "vmaf=", "=3", "psnr_y=40", "crf=20", "vmaf=0", "vmaf=101", "vmaf=nan"),
-)
-
-
-@pytest.mark.parametrize(
-    ("name", "text"), [*(("crf", text) for text in CRFS), *(("target", text) for text in TARGETS)]
-)
-def test_values_that_are_wrong(name: str, text: str) -> None:
-    with pytest.raises(OptionError, match=f"`{name}`"):
-        EvaluateOptions(**{name: text})
-
-
-def test_codecs_get_the_presets_and_crfs_that_they_have() -> None:
-    options = EvaluateOptions(codecs=["av1", "h264", "h265"], presets=["8", "fast"], crf=["50:60"])
-    settings = settings_of(options)
-    assert {(item.codec, item.preset) for item in settings} == {
-        ("av1", "8"), ("h264", "fast"), ("h265", "fast"),
-    }  # fmt: skip
-    assert max(item.crf for item in settings if item.codec == "av1") == 60
-    assert max(item.crf for item in settings if item.codec == "h264") == 51
-    without = settings_of(EvaluateOptions(crf=["20"]))
-    assert {item.codec for item in without} == {"av1", "h264", "h265"}
-
-
-@pytest.mark.parametrize(
     ("changed", "said"),
     [
         ({"codecs": ["vp9"]}, "`codecs` 'vp9'"),
@@ -138,24 +89,6 @@ def test_options_that_are_wrong(changed: dict[str, Any], said: str, tmp_path: Pa
     with pytest.raises(OptionError, match=said):
         evaluate(tmp_path, replace(QUICK, **changed), output=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-# ---------------------------------------------------------------- which frames
-
-
-def at_hertz(hertz: float, count: int) -> np.ndarray[Any, np.dtype[np.int64]]:
-    return 5_000_000_000 + (np.arange(count) * 1e9 / hertz).astype(np.int64)
-
-
-def test_clips_are_from_the_middle_or_a_given_time() -> None:
-    times, origin = at_hertz(10, 100), 4_500_000_000
-    assert chosen(times, origin, 10) == list(range(45, 55))
-    assert chosen(times[:6], origin, 10) == list(range(6))
-    assert chosen(times, origin, 3, start=1.5) == [10, 11, 12]
-    assert chosen(times, origin, 3, start=0.0) == [0, 1, 2]
-    assert chosen(times, origin, 3, start=10.35) == [99]
-    with pytest.raises(Refused, match="no images in the requested time"):
-        chosen(times, origin, 3, start=11.0)
 
 
 # ---------------------------------------------------------------- recommendation
@@ -185,23 +118,9 @@ def test_the_smallest_and_the_fastest_that_reach_the_target_are_recommended() ->
     assert {item.setting for item in both} == {cells[0].setting}
 
 
-def test_the_target_keeps_from_the_ceiling() -> None:
-    for ceiling, due in ((99.9, 99.5), (99.65, 99.45)):
-        scores = {"vmaf": ScoreSummary(ceiling, ceiling, ceiling, ceiling)}
-        assert reachable_score(QualityTarget("vmaf", 99.5), scores) == pytest.approx(due)
-    assert reachable_score(QualityTarget("psnr", 42), {}) == 42
-
-
 def packet_bytes(path: Path) -> int:
     with av.open(str(path)) as container:
         return sum(packet.size for packet in container.demux(video=0))
-
-
-def test_a_frame_of_a_long_video_is_estimated_without_the_key_frames_of_a_clip() -> None:
-    clip = [1000, 100, 100, 1200, 100], [1, 0, 0, 1, 0]
-    assert mean_size(*clip, gop=60) == pytest.approx((1100 + 59 * 100) / 60)
-    assert mean_size(*clip, gop=1) == 1100
-    assert mean_size([500], [1], gop=60) == 500
 
 
 # ---------------------------------------------------------------- every kind of source
@@ -255,15 +174,6 @@ def test_the_videos_are_those_of_a_pack(
     mp4ds.pack(path, tmp_path / "drive", packing)
     (video,) = (tmp_path / "drive").glob("*.mp4")
     assert packet_bytes(video) == camera.cells[0].size
-
-
-def test_a_setting_that_cannot_be_tried_is_told(tmp_path: Path) -> None:
-    options = replace(QUICK, codecs=["h264", "h265"])
-    (camera,) = evaluate(
-        recording(tmp_path, "rgb8", width=48), options, output=tmp_path / "out"
-    ).cameras
-    assert [item.setting.codec for item in camera.cells] == ["h264"]
-    assert any("h265 ultrafast crf 24" in note and "48x64" in note for note in camera.notes)
 
 
 @pytest.mark.parametrize(
@@ -395,15 +305,6 @@ def test_the_data_set_is_reckoned(whole: Evaluation) -> None:
     assert ours.cpu_days == pytest.approx(shown.encode_cpu_seconds / 12 * frames / 86_400)
 
 
-def test_names_in_the_table_are_no_formulas(whole: Evaluation) -> None:
-    (camera,) = whole.cameras
-    cell = camera.cells[0]
-    setting = replace(cell.setting, preset="@SUM(A1)")
-    odd = replace(camera, topic='=HYPERLINK("x")', cells=[replace(cell, setting=setting)])
-    (line,) = csv.DictReader(table(replace(whole, cameras=[odd])).splitlines())
-    assert (line["topic"], line["preset"]) == ('\'=HYPERLINK("x")', "'@SUM(A1)")
-
-
 def test_files(whole: Evaluation) -> None:
     folder, (camera,) = whole.output, whole.cameras
     lines = list(csv.DictReader((folder / "evaluation.csv").read_text().splitlines()))
@@ -510,16 +411,6 @@ def command_lines() -> list[str]:
 # ---------------------------------------------------------------- what goes wrong
 
 
-def test_a_folder_of_others_is_not_written_to(tmp_path: Path) -> None:
-    path = recording(tmp_path)
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("mine")
-    for output in (tmp_path / "mine", path, tmp_path / "none" / "out"):
-        with pytest.raises(TargetError):
-            evaluate(path, QUICK, output=output)
-    assert [item.name for item in (tmp_path / "mine").iterdir()] == ["notes.txt"]
-
-
 def no_ffmpeg() -> None:
     raise ScoringError("VMAF needs an ffmpeg with libvmaf.")
 
@@ -540,13 +431,6 @@ def test_without_libvmaf(
     for text in (page(found), capsys.readouterr().out):
         assert "PSNR Y" in text
         assert not re.search(r"\bVMAF\b|harmonic|5 %|>least<", text)
-
-
-def test_where_nothing_reaches_the_target(tmp_path: Path) -> None:
-    options = replace(QUICK, target="psnr=59")
-    (camera,) = evaluate(recording(tmp_path), options, output=tmp_path / "out").cameras
-    assert camera.recommended == []
-    assert any("no setting reaches psnr 59.00" in note for note in camera.notes)
 
 
 # ---------------------------------------------------------------- command line, documents
@@ -570,21 +454,6 @@ def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         assert done.err.startswith(f"mp4ds: {wrong[0]}")
 
 
-@pytest.mark.browser
-@pytest.mark.parametrize("width", [1400, 390])
-def test_the_page_fits_the_window(width: int, whole: Evaluation, tmp_path: Path) -> None:
-    with chromium(tmp_path, width=1400, height=900) as tab:
-        size = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-        tab.command("Emulation.setDeviceMetricsOverride", **size)
-        tab.open((whole.output / "index.html").as_uri(), ready="document.readyState === 'complete'")
-        assert tab.evaluate("innerWidth") == width
-        assert tab.evaluate("document.documentElement.scrollWidth") <= width
-        cut = (
-            "[...document.querySelectorAll('p, svg, img')].filter(e => e.scrollWidth > innerWidth)"
-        )
-        assert tab.evaluate(f"{cut}.length") == 0
-
-
 @pytest.mark.slow
 @needs_vmaf
 def test_the_commands_of_the_page(tmp_path: Path) -> None:
@@ -598,11 +467,3 @@ def test_the_commands_of_the_page(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     out = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, text=True)
     assert out.count("av1 12 crf 24") == 2
-
-
-@needs_vmaf
-def test_the_commands_of_the_paper_are_understood(tmp_path: Path) -> None:
-    lines = re.findall(r"^mp4ds .*", (ROOT / "docs" / "paper.md").read_text(), re.MULTILINE)
-    assert len(lines) == 3
-    for line in lines:
-        refused(typed(line, tmp_path), 2, "no such file or folder")

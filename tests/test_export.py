@@ -37,9 +37,7 @@ from export_scenes import (
     pose_at,
     stamps_of,
 )
-from mp4ds.options import seconds_text
 from mp4ds.plugins.exporting.folders import interpolated
-from mp4ds.plugins.exporting.job import ExportJob
 from scenes import PERIOD, Record, Scene, scene
 
 MADE = drive()
@@ -118,21 +116,6 @@ def test_euroc(dataset: Path, tmp_path: Path) -> None:
     assert any(DEPTH in note and "T_BS" in note for note in summary.notes)
 
 
-def test_euroc_imu_and_poses(dataset: Path, tmp_path: Path) -> None:
-    summary = export(dataset, "euroc", tmp_path / "out", poses=ODOMETRY, topics=[IMU])
-    sent = sorted((m.values["header"]["stamp"], m.values) for m in MADE.messages if m.topic == IMU)
-    _, *rows = rows_of(tmp_path / "out/mav0/imu0/data.csv")
-    assert [int(row[0]) for row in rows] == [stamp for stamp, _ in sent]
-    for row, (_, values) in zip(rows, sent, strict=True):
-        turn, pull = values["angular_velocity"], values["linear_acceleration"]
-        expected = [*(turn.get(axis, 0.0) for axis in "xyz"), 0.0, 0.0, pull["z"]]
-        assert [float(value) for value in row[1:]] == expected
-    _, *poses = rows_of(tmp_path / "out/mav0/pose0/data.csv")
-    assert [int(row[0]) for row in poses] == [pose_at(n)[0] for n in range(FRAMES + 1)]
-    assert [float(value) for value in poses[3][1:]] == [pose_at(3)[1], 0, 0, 1, 0, 0, 0]
-    assert summary.left_out[COLOUR] == {"not selected": FRAMES}
-
-
 # ---------------------------------------------------------------- TUM
 
 
@@ -154,19 +137,6 @@ def test_tum(dataset: Path, tmp_path: Path) -> None:
     acceleration = np.loadtxt(tmp_path / "out/accelerometer.txt")
     assert (np.diff(acceleration[:, 0]) >= 0).all()
     assert acceleration[:, 3] == pytest.approx([9.81] * 4 * FRAMES)
-
-
-@pytest.mark.parametrize(
-    ("time", "text"),
-    [
-        (1_700_000_000_000_000_007, "1700000000.000000007"),
-        (0, "0.000000000"),
-        (-1, "-0.000000001"),
-        (-2_500_000_000, "-2.500000000"),
-    ],
-)
-def test_seconds_keep_every_digit(time: int, text: str) -> None:
-    assert seconds_text(time) == text
 
 
 def test_frames_that_belong_together(dataset: Path, tmp_path: Path) -> None:
@@ -251,27 +221,6 @@ def test_pycolmap_distorts_as_opencv(model: str, tmp_path: Path) -> None:
         point = np.array([x, y, 1.0])
         expected = projected(point, LENSES[model][0], fisheye=model == "equidistant")
         assert camera.img_from_cam(point) == pytest.approx(expected, abs=1e-3)
-
-
-@pytest.mark.parametrize("to", ["colmap", "euroc", "tum"])
-def test_an_unsuitable_topic_of_poses_is_refused_first(
-    to: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def decode(*_: object) -> None:
-        pytest.fail("frames are written before the topic is looked at")
-
-    monkeypatch.setattr(ExportJob, "write_png_files", decode)
-    with pytest.raises(mp4ds.OptionError, match=f"`poses` {IMU}"):
-        export(dataset, to, tmp_path / "out", poses=IMU)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_colmap_without_poses(dataset: Path, tmp_path: Path) -> None:
-    summary = export(dataset, "colmap", tmp_path / "out", topics=["/front/*"])
-    assert any("images.txt is empty" in note for note in summary.notes)
-    for name in ("images.txt", "points3D.txt"):  # COLMAP refuses a model without them
-        lines = (tmp_path / "out/sparse/0" / name).read_text().splitlines()
-        assert all(line.startswith("#") for line in lines)
 
 
 # ---------------------------------------------------------------- and imported again
@@ -368,15 +317,6 @@ def test_poses_between_two() -> None:
     assert middle[:3, 3].tolist() == [1.5, 0, 0]
     angle = np.pi / 4  # half of the quarter, the shorter way round
     assert middle[0, :2] == pytest.approx([np.cos(angle), -np.sin(angle)])
-
-
-def test_a_quaternion_of_zeros_is_no_pose() -> None:
-    rows = [(time, (float(time), 0.0, 0.0, 0.0, 0.0, 0.0, float(time != 2))) for time in (1, 2, 3)]
-    count, pose_at = interpolated(rows)
-    middle = pose_at(2)
-    assert count == 2
-    assert middle is not None
-    assert middle[:3, 3].tolist() == [2, 0, 0]
 
 
 # ---------------------------------------------------------------- which frames, and how
@@ -681,15 +621,12 @@ def test_the_command(dataset: Path, tmp_path: Path) -> None:
     [
         ("nuscenes", {}, "format 'nuscenes' is not known"),
         ("lerobot", {"poses": ODOMETRY}, "`poses` works with"),
-        ("euroc", {"fps": 30}, "`fps` works with lerobot"),
         ("euroc", {"poses": IMU}, "`poses` /imu is of type sensor_msgs/Imu"),
         ("euroc", {"poses": "/none"}, "not a ROS topic"),
         ("euroc", {"topics": ["/nothing*"]}, "matches no topic"),
         ("tum", {"topics": ["/chatter"]}, "TUM cannot hold any topic"),
-        ("euroc", {"crf": 20}, "`crf` works with lerobot"),
         ("lerobot", {"codec": "ffv1"}, "`codec` 'ffv1' is not known"),
         ("lerobot", {"codec": "h264", "crf": 60}, "not from 0 to 51"),
-        ("lerobot", {"native": True}, "`native` works with euroc, tum, colmap"),
         ("euroc", {"tolerance_ns": -1}, "`tolerance_ns` -1 is below 0"),
         ("euroc", {"every": 0}, "`every` 0"),
     ],

@@ -36,29 +36,6 @@ def test_options_stand_by_what_they_are_about(command: str) -> None:
     assert not re.search(r"<[a-z]+( range)?>|x<=|x>=|\{|\]\]", done.stdout)
 
 
-@pytest.mark.parametrize(
-    ("command", "usage", "needed"),
-    [
-        ("play", "DATASET...", True),
-        ("record", "[TOPIC...]", False),
-        ("demo", "[OUTPUT]", False),
-        ("import images", "FOLDER", True),
-    ],
-)
-def test_usage_tells_what_may_be_left_out(command: str, usage: str, needed: bool) -> None:
-    done = CliRunner(env={"COLUMNS": "80"}).invoke(commands, [*command.split(), "--help"])
-    assert done.stdout.splitlines()[0].endswith(f" {command} [OPTIONS] {usage}")
-    if needed:
-        done = CliRunner().invoke(commands, command.split())
-        assert (done.exit_code, f"Missing argument '{usage}'" in done.stderr) == (2, True)
-
-
-def test_sentences_are_whole(tmp_path: Path) -> None:
-    text = " ".join(run("--help", folder=tmp_path).out.split())
-    assert all(does in text for _, does in COMMANDS.values())
-    assert "..." not in text.replace("[ARGS]...", "")
-
-
 def test_nothing_is_printed_but_errors(
     packed_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -71,11 +48,6 @@ def test_nothing_is_printed_but_errors(
         assert (tmp_path / f"again{place}.bag").exists()
     refused(call("-q", "info", "nothing"), 2, "no such file")
     assert call("-q", "info", packed_bag, "--json").out.startswith("{")
-
-
-def test_where_errors_come_from(tmp_path: Path) -> None:
-    assert "Traceback" not in run("info", "nothing", folder=tmp_path).err
-    assert "Traceback" in run("-v", "info", "nothing", folder=tmp_path).err
 
 
 @pytest.mark.parametrize(

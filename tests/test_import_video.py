@@ -228,23 +228,6 @@ def write_twice(path: Path, video: Path) -> None:
     path.write_bytes(data)
 
 
-def test_what_messages_lack_is_counted(tmp_path: Path) -> None:
-    video = write_video(tmp_path / "a.mp4", "libx264", bf="0")
-    data = bytearray(video.read_bytes())
-    lasts = data.index(b"elst") + 12
-    struct.pack_into(">I", data, lasts, 350)  # milliseconds
-    video.write_bytes(data)
-    deep = write_video(tmp_path / "deep.mkv", "ffv1", pix_fmt="gray16le")
-    clear = write_video(tmp_path / "clear.mkv", "ffv1", pix_fmt="yuva420p")
-    for path, options, left_out in (
-        (video, (), {"frames that its edit list hides": 3}),
-        (deep, ("--decode",), {"low bits of each sample, which 8 bits do not hold": 8}),
-        (clear, ("--decode",), {"alpha channels": 1}),
-    ):
-        said = call("import", "video", path, "-o", tmp_path / "ds", "-f", "--json", *options)
-        assert json.loads(said.out)["skipped"] == left_out
-
-
 @pytest.mark.parametrize(
     ("name", "left_out"),
     [

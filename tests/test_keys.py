@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from mp4ds.cli.nodes import Keyboard, keys_in
+from mp4ds.cli.nodes import Keyboard
 from mp4ds.cli.play import player_keys
 from ros2_sides import Controls
 from waiting import until
@@ -75,23 +75,6 @@ def test_each_key(name: str, terminal: Terminal) -> None:
         terminal.type(typed)
         until(lambda: bool(controls.asked))
     assert controls.asked == [asked]
-
-
-def test_a_key_that_comes_byte_by_byte(terminal: Terminal) -> None:
-    typed, asked = KEYS["right"]
-    controls = Controls()
-    with Keyboard(player_keys(controls), fd=terminal.fd):
-        for n in range(len(typed)):
-            assert not controls.asked
-            terminal.type(typed[n : n + 1])
-            time.sleep(0.03)
-        until(lambda: bool(controls.asked))
-    assert controls.asked == [asked]
-
-
-def test_keys_of_one_piece() -> None:
-    typed = b" " + ESC + b"[C" + ESC + b"[1;2A" + ESC + b"s" + ESC + ESC + b"OB" + b"\xc3\xa9b"
-    assert [*keys_in(typed)] == [" ", "right", "s", "down", "b"]
 
 
 # ---------------------------------------------------------------- the terminal is given back

@@ -74,26 +74,6 @@ def test_samples_are_those_of_the_export(drives: list[Path], exported: Path) -> 
     assert number == len(own) == own.num_frames
 
 
-def test_what_is_told_of_them(drives: list[Path], exported: Path) -> None:
-    own = dataset(drives)
-    info = json.loads((exported / "meta/info.json").read_text())
-    assert (own.meta.fps, own.meta.total_episodes) == (info["fps"], info["total_episodes"])
-    for key, feature in info["features"].items():
-        for name in ("video.codec", "video.pix_fmt"):
-            feature.get("info", {}).pop(name, None)
-        assert own.meta.features[key] == {**feature, "shape": tuple(feature["shape"])}
-    table = pq.read_table(exported / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
-    assert own.meta.episodes.items() <= table.items()
-    statistics = json.loads((exported / "meta/stats.json").read_text())
-    assert own.meta.stats.keys() == statistics.keys()
-    for key, found in statistics.items():
-        for name, values in found.items():
-            assert own.meta.stats[key][name].tolist() == values
-    assert own.meta.camera_keys == [FRONT, SIDE]
-    assert own.meta.shapes[FRONT] == (48, 64, 3)
-    assert own.meta.names["observation.state"] == ["shoulder", "elbow", "finger"]
-
-
 def test_delta_timestamps_and_episodes(drives: list[Path]) -> None:
     deltas = {FRONT: [-0.05, 0], SIDE: [0], "observation.state": [0], "action": [0, 0.05, 0.1]}
     own = pickle.loads(pickle.dumps(dataset(drives, delta_timestamps=deltas, return_uint8=True)))

@@ -60,10 +60,6 @@ def test_of_tf_static_the_newest_of_each_child_frame_is_kept() -> None:
     assert late(static_channel(1), *many) == many
 
 
-def test_a_message_of_tf_static_that_does_not_parse_is_kept() -> None:
-    assert late(static_channel(1), b"\0\1\0\0", static_transform("imu"))[0] == b"\0\1\0\0"
-
-
 @pytest.mark.parametrize(
     ("channel", "depth"),
     [

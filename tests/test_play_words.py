@@ -91,11 +91,6 @@ def test_ros_tells_names(typed: str, names: NodeNames) -> None:
     assert node_arguments(["drive", *typed.split()]) == (["drive"], names)
 
 
-def test_ros1_tells_parameters_of_any_text() -> None:
-    words = ["drive", "__log:=/home/a b/x.log", "_frame:=", "_name:=two words", "__master:=x"]
-    assert node_arguments(words) == (["drive"], PLAIN)
-
-
 @pytest.mark.parametrize(
     ("text", "node", "expected"),
     [
@@ -122,13 +117,6 @@ def test_ros1_tells_a_namespace_by_the_environment(monkeypatch: pytest.MonkeyPat
     assert PLAIN.in_world("ros1").resolved("imu") == "/robot/imu"
     assert PLAIN.in_world("ros2").resolved("imu") == "/imu"
     assert NodeNames(namespace="/own").in_world("ros1").resolved("imu") == "/own/imu"
-
-
-def test_rules_go_by_full_names() -> None:
-    names = NodeNames("player", "/robot", (("scan", "/a"), ("~/b", "c"), ("/clock", "/sim")))
-    assert [
-        names.renamed(one) for one in ("/robot/scan", "/robot/player/b", "/clock", "/scan")
-    ] == [*("/a", "/robot/c", "/sim", "/scan")]
 
 
 # ---------------------------------------------------------------- the table of docs/playing.md

@@ -21,7 +21,6 @@ import images
 import mp4ds
 from chromium import Tab, played, video_player
 from coded_scenes import CODED
-from commands import ffprobe
 from definitions import PICTURES
 from mp4ds.packing.options import PackOptions
 from pictures import CAREFUL, blocks
@@ -231,27 +230,6 @@ def expected_ticks(dataset: Path) -> list[int]:
 # ---------------------------------------------------------------- ffmpeg
 
 
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("name", CASES)
-def test_ffprobe_knows_all(name: str, datasets: Datasets) -> None:
-    case, path = case_of(name, datasets[name]), video_of(datasets[name])
-    found = ffprobe(path, "-count_frames", "-show_streams", "-show_format")
-    (stream,) = found["streams"]
-    assert stream["codec_name"] == case.codec
-    assert stream["pix_fmt"] in case.pixel_formats
-    assert (stream["width"], stream["height"]) == (WIDTH, case.height)
-    assert int(stream["nb_read_frames"]) == int(stream["nb_frames"]) == case.frames
-    assert stream["has_b_frames"] == 0
-    assert stream["time_base"] == "1/1000000"
-    assert float(stream["start_time"]) == 0
-    span = expected_ticks(datasets[name])[-1] / 1e6
-    for duration in (stream["duration"], found["format"]["duration"]):
-        assert span < float(duration) < span + 0.2
-    tags = [stream.get(f"color_{tag}") for tag in ("range", "space", "transfer", "primaries")]
-    others = [None] * 2 if case.is_packets and not case.options else ["bt709"] * 2
-    assert tags == [case.range, case.matrix, *others]
-
-
 def ffmpeg(path: Path, pixel_format: str, *filters: str) -> bytes:
     """All frames, as ffmpeg converts them."""
     if not shutil.which("ffmpeg"):
@@ -281,26 +259,6 @@ def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: Datasets
             planes = [frame.reshape(case.height, WIDTH)]
             frame = images.pixels(side["image"], side["video"], planes)
         assert np.array_equal(np.ravel(frame).view(np.uint8), np.ravel(data).view(np.uint8))
-
-
-DECODERS = {"h265": "hevc", "ffmpeg": "h264", "av1": "libdav1d"}
-
-
-@pytest.mark.parametrize(
-    "name", [name for name, case in CASES.items() if case.is_packets and not case.options]
-)
-def test_ffmpeg_decodes_packets_as_if_they_had_just_been_recorded(
-    name: str, datasets: Datasets
-) -> None:
-    case, path = CASES[name], video_of(datasets[name])
-    codec = name.split()[1] if name.startswith("packets") else "mjpeg"
-    context: Any = av.CodecContext.create(DECODERS.get(codec, codec), "r")
-    recorded = [bytes(image.values["data"]) for image in case.images()][-case.frames :]
-    frames = [frame for data in recorded for frame in context.decode(av.Packet(data))]
-    frames += context.decode(None)
-    assert len(frames) == case.frames
-    expected = b"".join(frame.to_ndarray().tobytes() for frame in frames)
-    assert ffmpeg(path, frames[0].format.name) == expected
 
 
 SHOWN = [name for name, case in CASES.items() if case.codec != "ffv1" and not case.raw]

@@ -15,18 +15,14 @@ from typing import Any
 from unittest import mock
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from commands import Result, program
-from mp4ds.cli.output import Log, duration_text
+from mp4ds.cli.output import Log
 from mp4ds.cli.pack import pack_progress, rows_of, share_of
 from mp4ds.packing.options import PackOptions, PackProgress
 from mp4ds.packing.pack import pack_each
 from mp4ds.plugins.demo import demo
 from test_terminal import Screen
 
-HOUR = 3600.0
 HOSTILE = "/cam\x1b[31m\n\r\t\u202e\x00\x9b2J"
 
 
@@ -86,82 +82,6 @@ def logged(reports: Iterable[Report], outcome: str = "done") -> list[str]:
     return stream.getvalue().splitlines()
 
 
-# ---------------------------------------------------------------- where it stands
-
-
-def share_told(*states: PackProgress) -> Any:
-    return share_of({state.dataset: state for state in states})
-
-
-def test_parts_tell_where_the_work_does_not() -> None:
-    assert share_told(told(None, tasks_done=119)) == pytest.approx(119 / 240)
-
-
-def test_datasets_count_by_their_size() -> None:
-    joining = told(1.0, dataset="a", gigabytes=10, phase="joining")
-    assert share_told(joining, told(0.5, dataset="b", gigabytes=30)) == pytest.approx(25 / 40)
-
-
-@pytest.mark.parametrize("before", [0.0, 0.8])
-def test_the_time_left_is_by_what_this_run_did(before: float) -> None:
-    lines = logged((n, [told(before + n * (1 - before) / 1000)]) for n in range(401))
-    assert lines[-2].endswith(" | 10 min left")
-
-
-@pytest.mark.parametrize("share", [None, 0.0, 0.5])
-def test_no_time_left_is_told_that_is_not_known(share: float | None) -> None:
-    assert "left" not in " ".join(logged((n, [told(share, parts=0)]) for n in range(19)))
-
-
-# ---------------------------------------------------------------- anything at all
-
-
-@st.composite
-def jobs(draw: st.DrawFn) -> list[tuple[float, PackProgress]]:
-    """Reports in any order, true or not."""
-    now, found = 0.0, []
-    for _ in range(draw(st.integers(1, 8))):
-        now += draw(st.floats(0, 2000))
-        share = draw(st.none() | st.floats(0, 1))
-        state = told(
-            share,
-            dataset=draw(st.sampled_from(["a", "b", HOSTILE])),
-            phase=draw(st.sampled_from(["planning", "packing", "packing", "joining"])),
-            parts=draw(st.integers(0, 300)),
-            before=draw(st.integers(0, 300)),
-            gigabytes=draw(st.sampled_from([0.0, 1e-9, 1.0, 1e6])),
-            cameras=draw(st.integers(0, 60)),
-            failed=draw(st.integers(0, 300)),
-            note=draw(st.text(max_size=30)),
-        )
-        names = draw(st.lists(st.text(max_size=80), max_size=3))
-        topics = {**state.topics, **{name: (draw(st.integers(0, 9)), None) for name in names}}
-        found.append((now, dataclasses.replace(state, topics=topics)))
-    return found
-
-
-@settings(max_examples=3, deadline=None)
-@given(jobs(), st.integers(20, 200), st.integers(1, 60))
-def test_contradictory_progress_is_shown_sensibly(
-    reports: list[tuple[float, PackProgress]], width: int, height: int
-) -> None:
-    clock, lines = Clock(0.0), io.StringIO()
-    log = Log(lines, clock=clock, now=clock.now)
-    states: dict[Path, PackProgress] = {}
-    size = {"COLUMNS": str(width), "LINES": str(height), "TERM": "xterm"}
-    with mock.patch.dict(os.environ, size), shown_on(Screen()) as screen, pack_progress() as take:
-        for now, state in reports:
-            clock.seconds = now
-            take(state)
-            states[state.dataset] = state
-            log.show(rows_of(states))
-    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue())
-    assert all(letter.isprintable() or letter in "\n\r" for letter in text)
-    log.end("done")
-    for line in lines.getvalue().splitlines():
-        assert re.fullmatch(r"\d\d:\d\d:\d\d packing [ -~]+", line)
-
-
 # ---------------------------------------------------------------- log files
 
 
@@ -191,13 +111,6 @@ def test_the_log_of_a_pack() -> None:
     )
 
 
-def test_the_log_of_several_datasets() -> None:
-    a = told(1.0, dataset="a", phase="joining", note="cam0.mp4")
-    line, _ = logged((n, [a, told(n / 100, dataset="b", failed=1)]) for n in range(1, 12))
-    assert re.search(r"packing 2 datasets: 55 % \| parts 264/480  1 failed  ", line)
-    assert "a joining cam0.mp4  parts 240/240  50.0 GB -> 5.0 GB, b parts 24/240" in line
-
-
 def test_hostile_names_reach_no_log() -> None:
     topics = {HOSTILE + "\udcff" + str(n) + "x" * n: (n, None) for n in range(1000)}
     state = told(0.1, dataset=HOSTILE, topics=topics, note=HOSTILE)
@@ -215,24 +128,6 @@ def test_a_pack_does_not_fail_for_want_of_a_log(mode: str) -> None:
         log = Log(stream, clock=Clock())
         log.show(rows_of({Path("/data/drive"): told(0.5)}))
         log.end("done")
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0.0, "0 s"),
-        (99.4, "99 s"),
-        (100, "2 min"),
-        (3569, "59 min"),
-        (3571, "1 h 0 min"),
-        (4320, "1 h 12 min"),
-        (47 * HOUR, "47 h 0 min"),
-        (51 * HOUR, "2 d 3 h"),
-        (1e9, "11574 d 2 h"),
-    ],
-)
-def test_durations(seconds: float, text: str) -> None:
-    assert duration_text(seconds) == text
 
 
 # ---------------------------------------------------------------- while a command runs
@@ -267,15 +162,6 @@ def test_a_short_pack_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> 
         take(told(0.0))
         take(told(1.0))
     assert capsys.readouterr() == ("", "")
-
-
-def test_a_short_pack_does_not_import_rich() -> None:
-    code = (
-        "import sys, mp4ds.cli.pack as p\n"
-        "with p.pack_progress(): pass\n"
-        "print([name for name in sys.modules if name.split('.')[0] == 'rich'])"
-    )
-    assert program("-c", code) == Result(0, "[]\n", "")
 
 
 # ---------------------------------------------------------------- terminals

@@ -16,7 +16,6 @@ from commands import program
 from mp4ds import errors
 from mp4ds.plugins.demo import demo
 
-ROOT = Path(__file__).parents[1]
 NAMES = [
     "Box", "ConversionError", "Dataset", "EncoderRefusedError", "EvaluateOptions",
     "Evaluation", "ExportOptions", "ExportSummary", "FormatError", "Frame",
@@ -42,12 +41,6 @@ def test_these_are_the_names() -> None:
         assert getattr(mp4ds, name) is not None
 
 
-def test_other_names_are_attribute_errors() -> None:
-    with pytest.raises(AttributeError, match="'opne'"):
-        mp4ds.opne  # noqa: B018
-    assert not hasattr(mp4ds, "__wrapped__")
-
-
 TREE = re.findall(r"(\w+Error)(?: \((\w+)\))?(?: +(?:exit code )?(\d))?", str(errors.__doc__))
 """Each error as it is drawn: its name, the builtin one that it is too, and its exit code."""
 
@@ -67,25 +60,6 @@ def test_every_error_is_public_and_drawn() -> None:
     }
     assert found == {name for name, _, _ in TREE}
     assert found == {name for name in NAMES if name.endswith("Error")}
-
-
-def test_the_errors_sentences() -> None:
-    path = Path("drive")
-    for error, sentence in [
-        (mp4ds.SourceError(path, "is odd", "Fix it."), "drive: is odd. Fix it."),
-        (mp4ds.SourceError(path, "is odd"), "drive: is odd."),
-        (mp4ds.SourceNotFoundError("drive"), "drive: no such file or folder. Check the path."),
-        (mp4ds.FormatError("some-code", path, "is odd"), "drive: is odd [some-code]."),
-        (mp4ds.ConversionError("/t", "is odd"), "topic /t: is odd."),
-    ]:
-        assert str(error) == sentence
-    for error in (
-        mp4ds.TargetExistsError(path),
-        mp4ds.VersionError(path, "2.0", "1.0"),
-        mp4ds.WriteError(path, OSError(28, "No space left on device")),
-    ):
-        assert str(error).startswith("drive: ")
-        assert str(error).endswith(".")
 
 
 # ---------------------------------------------------------------- documentation
@@ -129,22 +103,6 @@ def test_importing_is_cheap() -> None:
     assert [name for name in HEAVY if name in loaded] == []
 
 
-@pytest.mark.parametrize(
-    ("code", "absent"),
-    [
-        ("mp4ds.FormatError", ["numpy", "av", "pydantic"]),
-        ("mp4ds.__version__", ["numpy", "av", "pydantic"]),
-        ("import mp4ds.cli", ["numpy", "av", "pydantic", "rosbags", "mcap"]),
-        ("mp4ds.open", ["click", "rich", "jsonschema"]),
-        ("mp4ds.pack", ["click", "rich", "jsonschema"]),
-        ("mp4ds.evaluate", ["click", "rich", "jsonschema", "distributed", "dask"]),
-    ],
-)
-def test_what_is_used_is_imported(code: str, absent: list[str]) -> None:
-    loaded = program("-c", f"import mp4ds, sys; {code}; print(*sys.modules)").out.split()
-    assert [name for name in absent if name in loaded] == []
-
-
 def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
     """A short pack is mostly imports: those of other formats, codecs and folders wait."""
     source, dataset = tmp_path / "short.bag", tmp_path / "dataset"
@@ -159,30 +117,3 @@ def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
         *("mp4ds.plugins.importing.layouts", "mp4ds.plugins.importing.ros_mp4"),
     ]
     assert [name for name in others if name in loaded] == []
-
-
-def test_importing_changes_nothing() -> None:
-    """No logging set up, no signals, no warnings filters, no environment."""
-    code = (
-        "import os, signal, warnings, logging, locale\n"
-        "def state():\n"
-        "    return (dict(os.environ), signal.getsignal(signal.SIGINT), list(warnings.filters),\n"
-        "            logging.root.handlers[:], locale.setlocale(locale.LC_ALL))\n"
-        "before = state()\n"
-        "import mp4ds\n"
-        "print(before == state())"
-    )
-    assert program("-c", code).out == "True\n"
-
-
-def test_the_version_is_that_of_the_build() -> None:
-    text = (ROOT / "src" / "mp4ds" / "_version.py").read_text()
-    assert f'"{mp4ds.__version__}"' in text
-    assert re.fullmatch(r"\d+\.\d+\.\d+(\.\w+|[a-z]+\d+)?", mp4ds.__version__)
-
-
-# ---------------------------------------------------------------- types
-
-
-def test_the_package_says_that_it_is_typed() -> None:
-    assert Path(mp4ds.__file__).with_name("py.typed").is_file()

@@ -9,13 +9,8 @@ import json
 import re
 import shutil
 import signal
-import socket
-import struct
 import sys
-import threading
-import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -24,18 +19,16 @@ import av
 import cv2
 import numpy as np
 import pytest
-from rosbags.highlevel import AnyReader
 
 import mp4ds
 from coded_scenes import CODED
 from commands import call, start
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.format.models import Calibration
-from mp4ds.plugins.reporting.cameras import axis_of, overlay_of, pack_column
-from mp4ds.plugins.reporting.report import ReportOptions, as_script, report
+from mp4ds.plugins.reporting.cameras import overlay_of
+from mp4ds.plugins.reporting.report import ReportOptions, report
 from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.plugins.reporting.stills import Look
-from mp4ds.times import lost_frames
 from report_scenes import (
     COLOUR,
     DEPTH,
@@ -47,7 +40,7 @@ from report_scenes import (
     serving,
     two_cameras,
 )
-from sources import COMMON, ENCODINGS, Scene, scene
+from sources import COMMON, ENCODINGS, scene
 from waiting import WATCHDOG_S
 
 
@@ -93,49 +86,6 @@ def digests(folder: Path) -> dict[str, str]:
     return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.glob("*.*")}
 
 
-CASES = Path(__file__).parents[1] / "conformance/cases/datasets"
-
-
-@pytest.mark.parametrize("name", ["bag", "layouts-deep", "packets", "views", "views-alone"])
-def test_of_the_conformance_suite(name: str, tmp_path: Path) -> None:
-    made = report(shutil.copytree(CASES / name, tmp_path / name))
-    due = json.loads((CASES / name / "expected.json").read_text())["streams"]
-    assert made.problems == []
-    assert {camera.topic for camera in made.cameras} == {stream["topic"] for stream in due}
-    assert all(path.stat().st_size for path in made.files.values())
-
-
-# ---------------------------------------------------------------- columns and figures
-
-
-def test_two_hours_at_60_hz_are_small() -> None:
-    rng = np.random.default_rng(3)
-    stamps = 1_700_000_000 * 10**9 + np.arange(432_000) * 16_666_667
-    stamps = stamps + rng.integers(-200_000, 200_000, len(stamps))
-    logs = stamps + rng.integers(2_000_000, 9_000_000, len(stamps))
-    packed = [pack_column(column) for column in (stamps, logs, (stamps - stamps[0]) // 1000)]
-    assert [column["size"] for column in packed] == [4, 4, 2]
-    assert sum(len(column["values"]) for column in packed) < 6_000_000
-
-
-def test_lost_frames_by_the_rule() -> None:
-    steps = np.array([10, 10, 10, 15, 15.1, 24.9, 25, 10, 100, 10, 0, -30, 10], float)
-    assert lost_frames(steps).tolist() == [0, 0, 0, 0, 1, 1, 2, 0, 9, 0, 0, 0, 0]
-    assert not len(lost_frames(np.empty(0)))
-
-
-def test_the_axis_is_that_of_the_stamps_where_they_are_of_one_clock() -> None:
-    times = np.arange(100) * 10**8 + 10**18
-    sound = {"stamp": times, "log_time": times + 5}
-    assert axis_of([sound, sound]) == "stamp"
-    assert axis_of([]) == "stamp"
-    assert axis_of([sound, {"stamp": times * 0, "log_time": times}]) == "log_time"
-    assert axis_of([sound, {"stamp": times - 10**17, "log_time": times}]) == "log_time"
-    outlier = times.copy()
-    outlier[50] = 0
-    assert axis_of([{"stamp": outlier, "log_time": times}]) == "log_time"
-
-
 # ---------------------------------------------------------------- calibrations
 
 
@@ -173,37 +123,6 @@ def test_the_grid_is_straight_without_distortion(name: str) -> None:
             undistorted = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # before 5
             found = undistorted(points, k, d, R=None, P=None, criteria=criteria)
         assert found.reshape(-1, 2).std(axis=0).min() < 2e-4
-
-
-def test_the_grid_of_rectified_images_is_that_of_p() -> None:
-    overlay = overlay_of(LENSES["barrel"], (640, 480), "/cam/image_rect_color")
-    assert overlay["center"] == pytest.approx([310.5 / 640, 240.5 / 480], abs=1e-4)
-    assert all(len(set(line[0::2])) == 1 or len(set(line[1::2])) == 1 for line in overlay["lines"])
-
-
-@pytest.mark.parametrize(
-    ("lens", "size", "problem"),
-    [
-        (calibration("plumb_bob", [], k=[0.0] * 9), (640, 480), "not calibrated"),
-        (calibration("plumb_bob", [0.1]), (320, 240), "640x480, these are 320x240"),
-        (calibration("my lens", [0.1]), (640, 480), "'my lens'"),
-        (calibration("plumb_bob", [0.0] * 12 + [0.1]), (640, 480), "tilted"),
-    ],
-)
-def test_there_is_no_grid_without_a_reason(
-    lens: Calibration, size: tuple[int, int], problem: str
-) -> None:
-    overlay = overlay_of(lens, size, "/cam/image_raw")
-    assert problem in overlay["problem"]
-    assert not overlay["lines"]
-
-
-@pytest.mark.parametrize("value", [1e-300, 1e300, 1e18])
-def test_a_grid_of_impossible_numbers_is_bounded(value: float) -> None:
-    lens = calibration("plumb_bob", [value, -value], k=[value, 0, value, 0, value, value, 0, 0, 1])
-    overlay = overlay_of(lens, (640, 480), "/cam/image_raw")
-    assert sum(map(len, overlay["lines"])) < 100_000
-    json.loads(as_script(overlay["lines"]))
 
 
 # ---------------------------------------------------------------- the page's files
@@ -307,24 +226,6 @@ def test_lossless_cameras_play_their_views(with_views: Path, tmp_path: Path) -> 
     assert all(re.fullmatch(r"av1 visual, \w+ lossless", one) for one in both)
     assert views == ["av1 visual"] * 2
     assert "exact layer not here" in "".join(data["notes"])
-
-
-def test_an_old_mosaic_has_stills_and_is_told_of_views(packed_bag: Path, tmp_path: Path) -> None:
-    """Its video shows four planes: nobody wants to see them. What it is told to do helps."""
-    (camera,) = report(packed_bag, ReportOptions(output=tmp_path / "page")).cameras
-    assert camera.plays == "stills"
-    assert "does not look like the image; `mp4ds pack DATASET -o NEW --view`" in camera.note
-    (facts,) = data_of(tmp_path / "page")["cameras"]
-    assert facts["calibrations"][0]["overlay"]["lines"]
-    assert facts["shown"] == [1, 1]
-    assert call("pack", packed_bag, "-o", tmp_path / "new", "--view").code == 0
-    assert [camera.plays for camera in report(tmp_path / "new").cameras] == ["video"]
-    old, new = (
-        mp4ds.unpack(path, "bag", tmp_path / f"{path.name}.bag").output
-        for path in (packed_bag, tmp_path / "new")
-    )
-    with AnyReader([old]) as first, AnyReader([new]) as second:
-        assert [raw for *_, raw in first.messages()] == [raw for *_, raw in second.messages()]
 
 
 def test_a_remote_dataset_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -433,32 +334,6 @@ def test_every_kind_of_image_is_seen(
             assert np.abs(blocks(shown) - blocks(expected)).mean() < 8
 
 
-# ---------------------------------------------------------------- scores
-
-
-def test_scores_of_a_pack_are_plotted(tmp_path: Path) -> None:
-    made = two_cameras(second="mono8")
-    dataset = pack_cameras(tmp_path, made, quality="psnr=40", topics=[COLOUR])
-    report(dataset)
-    found = np.frombuffer(base64.b64decode(columns_of(dataset, 0)["scores"]["psnr"]), "<f4")
-    with mp4ds.open(dataset) as opened:
-        quality = opened.streams[0].sidecar.video.quality
-        assert quality is not None
-        np.testing.assert_allclose(found, quality.decode(FRAMES), rtol=1e-6)
-
-
-# ---------------------------------------------------------------- options
-
-
-def test_a_topic_of_two_sizes_has_two_cameras(tmp_path: Path) -> None:
-    later = scene("mono8", frames=4, width=80)
-    shifted = [replace(m, log_time=m.log_time + 10**9) for m in later.messages]
-    made = Scene([*scene("mono8", frames=4).messages, *shifted])
-    dataset = pack_cameras(tmp_path, made)
-    names = [camera.topic for camera in report(dataset).cameras]
-    assert names == ["/cam/image_raw (cam_image_raw)", "/cam/image_raw (cam_image_raw-2)"]
-
-
 # ---------------------------------------------------------------- the server
 
 
@@ -542,29 +417,6 @@ def test_other_sites_and_users_get_nothing(server: ReportServer) -> None:
         answer = connection.getresponse()
         assert (answer.status, answer.read()) == (404, b"")
     connection.close()
-
-
-def test_odd_requests_print_nothing(
-    server: ReportServer, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """What scanners and browsers that were closed send; the next one is answered all the same."""
-    path = urlsplit(server.root).path.encode()
-    host = b" HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n" % server.server_port
-    asked = (b"GET http://[" + host, b"GET //[" + host, b"GET " + path + b"/d/a%20b.mp4" + host)
-    for request in (*(line + b"\r\n" for line in asked), asked[2], b"GET /", b"\x16\x03\x01\r\n"):
-        for is_reset in (False, True):
-            with socket.create_connection(("127.0.0.1", server.server_port), 20) as connection:
-                connection.sendall(request)
-                if is_reset:
-                    linger = struct.pack("ii", 1, 0)
-                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
-                elif request.startswith(asked[:2]):
-                    assert connection.recv(100).startswith(b"HTTP/1.1 404")
-    for _ in range(3):
-        assert ask(server, "/index.html")[0] == 200
-    while any("process_request" in thread.name for thread in threading.enumerate()):
-        time.sleep(0.01)  # each ends: it reads the end of what was sent, or a reset
-    assert capfd.readouterr() == ("", "")
 
 
 # ---------------------------------------------------------------- the command

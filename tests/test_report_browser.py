@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import time
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 import mp4ds
 from chromium import Tab, chromium
-from mp4ds.plugins.reporting.cameras import pack_column
 from mp4ds.plugins.reporting.report import report
 from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.plugins.reporting.stills import Look
@@ -26,8 +24,6 @@ from report_scenes import (
     DEPTH,
     FRAMES,
     HEIGHT,
-    LATE,
-    REPEATED,
     WIDTH,
     blocks,
     pack_cameras,
@@ -41,7 +37,6 @@ pytestmark = pytest.mark.browser
 READY = "typeof mp4dsReport === 'object' && mp4dsReport.ready.then(() => true)"
 SETTLED = "mp4dsReport.settled()"
 CAMERAS = (DEPTH, COLOUR)  # in the order of the page
-INT64 = np.iinfo(np.int64)
 
 
 @pytest.fixture(scope="module")
@@ -165,35 +160,6 @@ def test_every_frame_is_found_by_its_number(page: Tab, recorded: Recorded) -> No
             assert_shows(page, recorded, 0, recorded.frame_at(0, time))
 
 
-def test_steps_by_keys_follow_one_camera(page: Tab, recorded: Recorded) -> None:
-    page.evaluate("document.querySelectorAll('.camera header')[1].click()")
-    for _ in range(3):
-        page.press("ArrowRight")
-    assert_shows(page, recorded, 1, 3)
-    assert_shows(page, recorded, 0, recorded.frame_at(0, recorded.stamps[1][3] - recorded.base))
-    page.press("ArrowLeft")
-    assert_shows(page, recorded, 1, 2)
-    page.press("End")
-    assert_shows(page, recorded, 0, FRAMES - 2)
-    page.press("Home")
-    assert_shows(page, recorded, 1, 0)
-    page.press("ArrowLeft")
-    assert_shows(page, recorded, 1, 0)
-
-
-def test_a_repeated_stamp_is_a_step_of_its_own(page: Tab, recorded: Recorded) -> None:
-    first = REPEATED - 2
-    assert recorded.stamps[0][first] == recorded.stamps[0][first + 1]
-    page.evaluate(f"mp4dsReport.player.go(mp4dsReport.player.cameras[0].position[{first - 1}])")
-    for number in (first, first + 1, first + 2):
-        page.press("ArrowRight")
-        assert_shows(page, recorded, 0, number)
-    page.press("ArrowLeft")
-    assert_shows(page, recorded, 0, first + 1)
-    page.press("ArrowLeft")
-    assert_shows(page, recorded, 0, first)
-
-
 @pytest.mark.parametrize("kind", ["seconds", "decimal", "nanoseconds"])
 def test_going_to_a_time_that_is_typed(kind: str, page: Tab, recorded: Recorded) -> None:
     stamp = int(recorded.stamps[1][17])
@@ -257,69 +223,6 @@ def test_plots_have_the_numbers_of_the_columns(page: Tab, recorded: Recorded) ->
     np.testing.assert_allclose(series(page, "offset"), offsets, rtol=1e-12)
 
 
-def test_the_figures_of_the_table(page: Tab, recorded: Recorded) -> None:
-    rows = page.evaluate(
-        "[...document.querySelectorAll('#timing tbody tr')]"
-        ".map(row => [...row.cells].map(cell => cell.textContent))"
-    )
-    for row, stamps, logs in zip(rows, recorded.stamps, recorded.logs, strict=True):
-        steps, delays = intervals(stamps) / 1e6, (logs - stamps) / 1e6
-        usual = np.median(steps[steps > 0])
-        lost = lost_frames(steps)
-        assert row[1:10] == [
-            str(len(stamps)),
-            f"{1000 / usual:.2f}",
-            f"{usual:.3f}",
-            f"{steps.std():.3f}",
-            f"{np.percentile(abs(steps - usual), 99):.3f}",
-            f"{steps.max():.1f}",
-            f"{lost.sum()} in {(lost > 0).sum()} gaps" if lost.any() else "0",
-            str((steps == 0).sum()),
-            "0",
-        ]
-        found = [float(number) for number in re.findall(r"[-\d.]+", row[11])]
-        assert found == pytest.approx([np.median(delays), delays.min(), delays.max()], rel=0.01)
-    assert rows[0][12] == "reference"
-    assert float(rows[1][12].split()[0]) == pytest.approx(-LATE / 1e6, abs=0.3)
-
-
-@pytest.mark.parametrize(
-    ("steps", "figures"),
-    [
-        (
-            [20, 21, 19, 20, 61, 20, 0, 20, -5, 20],
-            {"median": 20, "rate": 50, "missing": 2, "gaps": 1, "repeated": 1, "backward": 1},
-        ),
-        ([1000], {"median": 1000, "rate": 1, "longest": 1000, "missing": 0}),
-        ([], {"median": None, "rate": None, "jitter": None, "longest": None, "missing": 0}),
-        ([0, 0], {"median": None, "rate": None, "within": None, "repeated": 2, "missing": 0}),
-        ([-1, -1], {"median": None, "rate": None, "backward": 2, "missing": 0}),
-    ],
-)
-def test_figures_where_times_are_odd(
-    steps: list[int], figures: dict[str, float | None], page: Tab
-) -> None:
-    found = page.evaluate(f"mp4dsColumns.timing(Float64Array.from([NaN, ...{steps}]))")
-    assert {name: found[name] for name in figures} == figures
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        [INT64.min, INT64.max, 0, INT64.max, INT64.min, -1, 1],
-        [10**18 + n * 16_666_667 + (n * n % 1000) for n in range(100)],
-        [5, 4, 3, 10**18, -(10**18), 0],
-        [n * 33_333_333 + n % 3 for n in range(9)],
-        [0, 0, 0],
-        [3],
-    ],
-)
-def test_columns_come_back_in_the_page(values: list[int], page: Tab) -> None:
-    packed = json.dumps(pack_column(np.array(values, np.int64)))
-    found = page.evaluate(f"Array.from(mp4dsColumns.decode({packed}, {len(values)}), String)")
-    assert [int(value) for value in found] == values
-
-
 def test_the_calibration_grid_is_drawn(page: Tab) -> None:
     canvas = "document.querySelectorAll('.camera canvas')[1]"
     painted = (
@@ -331,26 +234,6 @@ def test_the_calibration_grid_is_drawn(page: Tab) -> None:
     assert page.evaluate(painted) > 500
     page.press("g")
     assert page.evaluate(painted) == 0
-
-
-def test_the_clock_waits_on_a_busy_machine(page: Tab) -> None:
-    """What is on the screen, and the clock, at each step of playing on a slow processor."""
-    page.evaluate(
-        "window.steps = []; mp4dsReport.player.listeners.push(() => { const p = mp4dsReport.player;"
-        " if (p.isPlaying) steps.push([p.time, ...p.cameras.map(c => c.shown)]); }); 0"
-    )
-    page.command("Emulation.setCPUThrottlingRate", rate=20)
-    try:
-        page.evaluate("mp4dsReport.player.play()")
-        until(lambda: not page.evaluate("mp4dsReport.player.isPlaying"))
-        assert page.evaluate("mp4dsReport.player.time === mp4dsReport.player.end")
-    finally:
-        page.command("Emulation.setCPUThrottlingRate", rate=1)
-    steps = np.array(page.evaluate("steps"))
-    for camera in (0, 1):
-        positions = page.evaluate(f"[...mp4dsReport.player.cameras[{camera}].position]")
-        ends = np.array([*positions[1:], np.inf])[steps[:, camera + 1].astype(int)]
-        assert (steps[:, 0] - ends).max() <= 0.2e9 + 1
 
 
 # ---------------------------------------------------------------- sizes, names and troubles
@@ -366,20 +249,6 @@ def test_the_page_fits_the_window(width: int, browser: Tab, drive: Path) -> None
             "(v => v.clientWidth / v.clientHeight)(document.querySelector('video'))"
         )
         assert ratio == pytest.approx(WIDTH / HEIGHT, rel=0.02)
-
-
-def test_depth_is_seen_in_stills_of_the_nearest_frames(browser: Tab, tmp_path: Path) -> None:
-    drive = pack_cameras(tmp_path, two_cameras())
-    report(drive)
-    page, made = show(browser, (drive / "index.html").as_uri()), Recorded(drive)
-    for number in (FRAMES - 2, 0, 5):
-        page.evaluate(f"mp4dsReport.player.go({float(made.stamps[0][number] - made.base)})")
-        assert_shows(page, made, 0, number)
-        badge = page.evaluate("document.querySelector('.camera .badge').textContent")
-        assert badge == f"still: frame {number}"
-    captions = "[...document.querySelectorAll('.camera .caption')].map(c => c.textContent)"
-    assert re.fullmatch(r"Shown in false colour: \d.*", page.evaluate(captions)[0])
-    assert page.evaluate(captions)[1] == "Stills: no browser plays ffv1"
 
 
 def test_a_lossless_mosaic_plays_in_colour(browser: Tab, with_views: Path, tmp_path: Path) -> None:
@@ -398,15 +267,6 @@ def test_a_lossless_mosaic_plays_in_colour(browser: Tab, with_views: Path, tmp_p
         return bool(np.abs(blocks(seen) - blocks(expected)).mean() < 6)
 
     until(is_shown)
-
-
-def test_videos_of_10_bits_are_shown_as_they_are(browser: Tab, tmp_path: Path) -> None:
-    drive = pack_cameras(tmp_path, two_cameras(), codec="av1-10bit")
-    report(drive)
-    page, made = show(browser, (drive / "index.html").as_uri()), Recorded(drive)
-    for number in (FRAMES - 1, 0, 5):
-        page.evaluate(f"mp4dsReport.player.go({float(made.stamps[1][number] - made.base)})")
-        assert_shows(page, made, 1, number)
 
 
 def test_a_server_shows_lossless_rgb_to_the_bit(browser: Tab, tmp_path: Path) -> None:

@@ -14,8 +14,7 @@ import pytest
 import mp4ds
 from commands import call, refused, unchanged
 from mp4ds.cli.output import print_table
-from scenes import START, Record, Scene
-from sources import SOURCES, scene, write_bag, write_mcap, write_rosbag2
+from sources import SOURCES, scene, write_bag, write_rosbag2
 from test_terminal import Screen
 
 VIDEO, SIDECAR, MANIFEST = "cam_image_raw.mp4", "cam_image_raw.yaml", "dataset.yaml"
@@ -31,17 +30,6 @@ def dataset(packed_bag: Path, tmp_path: Path) -> Path:
 # ---------------------------------------------------------------- results
 
 
-def test_what_has_no_bytes_has_no_ratio(tmp_path: Path) -> None:
-    """A slice that holds nothing but messages without fields."""
-    words = Record("/chatter", "std_msgs/msg/String", START, {"data": "x"})
-    empty = Record("/start", "std_msgs/msg/Empty", START + 10**9, ros1=b"")
-    write_bag(tmp_path / "drive.bag", Scene([words, empty]))
-    done = call("pack", tmp_path / "drive.bag", "-o", tmp_path / "drive", "--start", "0.5")
-    assert (done.code, done.err) == (0, "")
-    assert "drive: 0 B -> " in done.out
-    assert "times" not in done.out
-
-
 def test_what_was_checked_of_a_dataset(dataset: Path) -> None:
     done = call("validate", "--deep", dataset)
     assert done.out.endswith(
@@ -54,26 +42,6 @@ def test_what_was_checked_of_a_dataset(dataset: Path) -> None:
         f"{dataset / VIDEO}: is listed in the manifest but missing [file-missing]",
         f"{dataset}: 1 problem",
     ]
-
-
-def test_only_what_was_packed_is_compared(tmp_path: Path) -> None:
-    """Without its camera, a dataset is not a thousand times smaller."""
-    write_bag(tmp_path / "drive.bag", scene("rgb8", width=640, height=480))
-    summary = mp4ds.pack(
-        tmp_path / "drive.bag", tmp_path / "drive", mp4ds.PackOptions(exclude=["/cam/image_raw"])
-    )
-    assert summary.source_bytes == sum(topic.raw_bytes for topic in summary.topics)
-    assert summary.source_bytes < 100_000
-
-
-def test_one_of_a_kind_is_singular(tmp_path: Path) -> None:
-    one = Record("/chatter", "std_msgs/msg/String", START, {"data": "x"})
-    write_mcap(tmp_path / "drive.mcap", Scene([one]), "ros2", metadata=False)
-    assert "s, 1 message\n" in call("info", tmp_path / "drive.mcap").out
-    call("pack", tmp_path / "drive.mcap", "-o", tmp_path / "drive")
-    done = call("unpack", tmp_path / "drive", "--to", "bag", "-o", tmp_path / "drive.bag")
-    assert "drive.bag: 1 message of 1 topic\n" in done.out
-    assert "not supported by this format: attachments (2)\n" in done.out
 
 
 def test_paths_are_as_users_write_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,20 +138,6 @@ def test_a_table_fits_a_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) 
     assert lines[-1].endswith(" ...")
 
 
-def test_a_table_of_few_rows_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert len(printed(monkeypatch, 80, ROWS[:20])) == 21
-
-
-def test_wide_letters_stay_in_their_columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = [["/\u8eca" * 30, "a/B", "1", "", "", "x"], ["/b", "a/B", "2", "", "", "x"]]
-    for columns in (80, 40):
-        _, wide, plain = printed(monkeypatch, columns, rows)
-        start = plain.index("2")
-        assert len(wide[: wide.index("1")].encode("utf-16-le")) // 2 < start
-        taken = sum(2 if letter == "\u8eca" else 1 for letter in wide[: wide.index("1")])
-        assert taken == start
-
-
 # ---------------------------------------------------------------- what is wrong
 
 
@@ -234,13 +188,6 @@ def test_a_video_alone_that_was_cut_short(dataset: Path, tmp_path: Path) -> None
         mp4ds.open(tmp_path / "alone.mp4")
 
 
-def test_a_video_without_its_sidecar(dataset: Path, tmp_path: Path) -> None:
-    (tmp_path / "alone.mp4").write_bytes((dataset / VIDEO).read_bytes())
-    refused = call("info", tmp_path / "alone.mp4")
-    assert refused.code == 1
-    assert "alone.mp4: is a video without its sidecar, alone.yaml [file-missing]." in refused.err
-
-
 def test_a_folder_of_datasets_is_not_one(dataset: Path) -> None:
     with pytest.raises(mp4ds.SourceError) as caught:
         mp4ds.open(dataset.parent)
@@ -260,28 +207,3 @@ def test_a_recording_is_not_a_dataset(tmp_path: Path) -> None:
             f"{source}: is a recording, not a dataset. Make a dataset of it first: "
             f"mp4ds pack {source}"
         )
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("pack IN -o OUT --gop 0", "mp4ds: --gop 0 is below 1."),
-        ("pack IN -o OUT --gop 200000", "mp4ds: --gop 200000 is above 100000."),
-        ("pack IN -o OUT --gop ten", "Invalid value for '--gop': 'ten' is not a valid integer"),
-        ("demo OUT --seconds ten", "Invalid value for '--seconds': 'ten' is not a valid float"),
-        ("validate IN --jobs 0", "0 is not in the range 1<=x<=1024"),
-        ("pack IN -o OUT --codec bogus", "--codec 'bogus' is not one that mp4ds can encode. Use "),
-        ("pack IN -o OUT --codec av1", "--codec 'av1' does not support lossless packing. Use "),
-        ("pack IN -o OUT --duration +1e9", "--duration '+1e9' is not a number of seconds"),
-        ("demo /proc/no.bag", "no.bag: "),
-        ("record --ros1 -e [ -o OUT", "mp4ds: '[' is not a valid regular expression: "),
-    ],
-)
-def test_what_an_option_may_be(words: str, said: str, tmp_path: Path) -> None:
-    write_bag(tmp_path / "drive.bag", scene("mono8", frames=2))
-    places = {"IN": tmp_path / "drive.bag", "OUT": tmp_path / "out"}
-    done = call(*(places.get(word, word) for word in words.split()))
-    assert done.code in (1, 2)
-    assert said in done.err
-    assert not re.search("Input should|source is untouched", done.err)
-    assert not (tmp_path / "out").exists()

@@ -19,7 +19,6 @@ from mp4ds.plugins.reporting.stills import (
     StillOptions,
     frames,
     number_at,
-    spread,
 )
 from report_scenes import COLOUR, DEPTH, FRAMES, HEIGHT, WIDTH, blocks, pack_cameras, two_cameras
 from sources import COMMON, ENCODINGS, odd_scene, scene
@@ -138,27 +137,7 @@ def test_every_encoding_can_be_looked_at(encoding: str, tmp_path: Path) -> None:
     assert png.max() > 150  # dark ones of 16 bits, too, whose exact values look black
 
 
-def test_exact_floats_have_no_image(tmp_path: Path) -> None:
-    dataset = pack_cameras(tmp_path, scene("32FC1", frames=4), quality="lossless")
-    with pytest.raises(OptionError, match="cannot hold 32FC1"):
-        frames(dataset, tmp_path / "out.png", StillOptions(at="#3", exact=True))
-    assert not (tmp_path / "out.png").exists()
-
-
 # ---------------------------------------------------------------- sheets
-
-
-@pytest.mark.parametrize(
-    ("count", "wanted", "numbers"),
-    [
-        (3, 20, [0, 1, 2]),
-        (20, 20, list(range(20))),
-        (30, 3, [5, 15, 25]),
-        (432_000, 2, [108_000, 324_000]),
-    ],
-)
-def test_frames_of_a_sheet_are_spread(count: int, wanted: int, numbers: list[int]) -> None:
-    assert spread(count, wanted) == numbers
 
 
 def test_a_sheet_shows_its_frames(drive: Path, tmp_path: Path) -> None:
@@ -180,11 +159,6 @@ def test_a_sheet_shows_its_frames(drive: Path, tmp_path: Path) -> None:
             found.append((y, x))
     assert found == sorted(found)
     assert len({y for y, _ in found}) == 2
-
-
-def test_a_sheet_that_is_too_large(drive: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="exceeds"):
-        frames(drive, tmp_path / "a.png", StillOptions(topic=COLOUR, sheet=(80, 1), resize=16.0))
 
 
 # ---------------------------------------------------------------- options and the command

@@ -12,7 +12,6 @@ import re
 import shutil
 import signal
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -148,14 +147,6 @@ def test_a_sample_is_the_frame_of_its_number(drives: list[Path]) -> None:
             dataset[number]
 
 
-def test_channels_first_is_a_view(drives: list[Path]) -> None:
-    image = FrameDataset(drives[0], topics=[LEFT])[3][LEFT]
-    assert image.shape == (3, 48, 64)
-    assert image.permute(1, 2, 0).is_contiguous()
-    last = FrameDataset(drives[0], topics=[LEFT], channels_first=False)[3][LEFT]
-    assert torch.equal(last, image.permute(1, 2, 0))
-
-
 def test_floats_are_fractions(drives: list[Path], grey: Path) -> None:
     bytes_ = FrameDataset(drives[0], topics=[LEFT])[5][LEFT]
     floats = FrameDataset(drives[0], topics=[LEFT], dtype="float32")[5][LEFT]
@@ -203,13 +194,6 @@ def test_many_samples_of_several_datasets(drives: list[Path]) -> None:
         assert torch.equal(sample[LEFT], first(frames_of(drives[recording], LEFT)[row]))
     samples[2][LEFT].zero_()
     assert torch.equal(samples[3][LEFT], first(frames_of(drives[0], LEFT)[3]))
-
-
-def test_one_camera_is_opened_lazily(drives: list[Path], tmp_path: Path) -> None:
-    shutil.copytree(drives[0], tmp_path / "drive")
-    (tmp_path / "drive" / "left_image_raw.mp4").unlink()
-    assert len(FrameDataset(tmp_path / "drive", topics=[LEFT])) == FRAMES
-    assert FrameStream(tmp_path / "drive", topics=[LEFT]).samples == FRAMES
 
 
 def open_videos() -> int:
@@ -265,15 +249,6 @@ def test_offsets_in_seconds(drives: list[Path]) -> None:
         assert sample[f"{RIGHT}_is_pad"].tolist() == missing.tolist()
     assert dataset[LOST + 2][f"{RIGHT}_is_pad"].tolist() == [True, False, False]
     assert dataset[LOST - 1][f"{RIGHT}_is_pad"].tolist() == [False, False, True]
-
-
-@pytest.mark.parametrize(("tolerance", "padded"), [(0, True), (10**9, False)])
-def test_a_tolerance_decides_what_is_padding(
-    drives: list[Path], tolerance: int, padded: bool
-) -> None:
-    offsets: dict[str, Any] = {"offsets": (0.03, 0), "offsets_in": "seconds"}
-    dataset = FrameDataset(drives[0], topics=[LEFT], **offsets, tolerance_ns=tolerance)
-    assert dataset[5][f"{LEFT}_is_pad"].tolist() == [padded, False]
 
 
 # ---------------------------------------------------------------- several cameras
@@ -341,27 +316,6 @@ def test_wrong_options(drives: list[Path], options: dict[str, Any], sentence: st
     assert sentence in str(caught.value)
 
 
-def test_names_of_other_libraries(drives: list[Path]) -> None:
-    with pytest.raises(TypeError, match=r"here it is offsets=.* offsets_in="):
-        FrameDataset(drives[0], delta_timestamps={LEFT: [-0.1, 0]})  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="FrameDataset has no 'batch_size'"):
-        FrameDataset(drives[0], batch_size=4)  # type: ignore[arg-type]
-    dataset = FrameDataset(drives[0], topics=[LEFT])
-    for index in ([0, 1], slice(0, 2), 0.5):
-        with pytest.raises(TypeError, match=r"Subset\(dataset, \[0, 5\]\)"):
-            _ = dataset[index]  # type: ignore[index]
-
-
-def test_not_a_path(drives: list[Path]) -> None:
-    with mp4ds.open(drives[0]) as dataset:
-        for wrong in (None, 7, [drives[0]]):
-            with pytest.raises(TypeError, match="is no path: give a str"):
-                mp4ds.open(wrong)  # type: ignore[arg-type]
-        for several in (dataset, [dataset]):
-            with pytest.raises(TypeError, match=r"is no path: give a str"):
-                FrameDataset(several)  # type: ignore[arg-type]
-
-
 # ---------------------------------------------------------------- layers
 
 
@@ -391,20 +345,6 @@ def test_exact_frames_that_are_not_here_are_told_at_once(with_views: Path, tmp_p
     FrameDataset(drive, topics=["/right/image_raw"], layer="exact")[0]
     with pytest.raises(mp4ds.OptionError, match=r"/left/image_raw has no exact frames here"):
         FrameDataset(drive, topics=["/left/image_raw"], layer="exact")
-
-
-def test_wrong_options_of_streams(drives: list[Path]) -> None:
-    for options, sentence in [
-        ({"window": 0}, "window is 0"),
-        ({"world_size": 0}, "world_size is 0"),
-        ({"rank": 2, "world_size": 2}, "rank is 2, but must be less"),
-        ({"buffer": -1}, "buffer is -1"),
-        ({"cache_files": 1}, "cache_files is 1, but must be at least 2"),
-    ]:
-        with pytest.raises(mp4ds.OptionError, match=sentence):
-            FrameStream(drives[0], **options)
-    with pytest.raises(mp4ds.OptionError, match="epoch is -1"):
-        FrameStream(drives[0]).set_epoch(-1)
 
 
 def test_without_torch() -> None:
@@ -483,19 +423,6 @@ def test_an_epoch(drives: list[Path], workers: int, method: str | None) -> None:
     assert sorted(seen) == list(range(len(dataset)))
     assert batch["stamp_ns"].dtype == torch.int64
     assert torch.equal(dataset[3][LEFT], expected[3][LEFT]), "and in the parent afterwards"
-
-
-def test_threads_that_share_a_dataset(drives: list[Path]) -> None:
-    """Also where each closes the video that another one reads."""
-    dataset = FrameDataset(drives[0], cache_files=1)
-    expected = [dataset[number] for number in range(8)]
-
-    def alike(seed: int) -> bool:
-        numbers = np.random.default_rng(seed).permutation(len(expected)).tolist()
-        return all(torch.equal(dataset[n][RIGHT], expected[n][RIGHT]) for n in numbers)
-
-    with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(alike, range(8))) == [True] * 8
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
@@ -739,14 +666,6 @@ def test_workers_that_stay_learn_of_the_epoch(drives: list[Path]) -> None:
     assert orders[0] == orders[2] != orders[1]
 
 
-def test_a_kept_sample_does_not_keep_others(drives: list[Path]) -> None:
-    """So the memory of a buffer is that of its samples."""
-    for sample in FrameStream(drives[0], topics=[LEFT], buffer=4):
-        image = sample[LEFT]
-        assert image.untyped_storage().nbytes() == image.numel()
-        assert image.permute(1, 2, 0).is_contiguous()
-
-
 # ---------------------------------------------------------------- torchcodec
 
 
@@ -799,23 +718,6 @@ def test_torchcodec_refuses_what_it_would_show_wrongly(tmp_path: Path) -> None:
     drive = packed(tmp_path / "a", camera(LEFT, "bayer_rggb8", 0), quality="lossless")
     with pytest.raises(mp4ds.OptionError, match=r"bayer_rggb8 images .* layout mosaic8"):
         FrameDataset(drive, backend="torchcodec")[0]
-
-
-@pytest.mark.usefixtures("torchcodec")
-def test_torchcodec_takes_our_index(drives: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    options: dict[str, Any] = {"topics": [LEFT], "backend": "torchcodec"}
-    scanned = [FrameDataset(drives[0], **options)[n][LEFT] for n in range(FRAMES)]
-    monkeypatch.setattr("mp4ds.torch.cameras._SCANNED", 0)
-    indexed = FrameDataset(drives[0], **options)
-    for number in reversed(range(FRAMES)):
-        assert torch.equal(indexed[number][LEFT], scanned[number])
-    with (
-        mp4ds.open(drives[0]) as dataset,
-        av.open(str(dataset[LEFT].streams[0].video_path)) as container,
-    ):
-        frames = json.loads(dataset[LEFT].streams[0].frame_mappings())["frames"]
-        packets = sorted((p.pts, p.is_keyframe) for p in container.demux(video=0) if p.size)
-    assert [(frame["pts"], bool(frame["key_frame"])) for frame in frames] == packets
 
 
 @pytest.mark.usefixtures("torchcodec")

@@ -179,16 +179,3 @@ def test_shared_memory_of_others_is_not_used(
     (tmp_path / f"mp4ds-{os.getuid()}").chmod(0o777)
     with pytest.raises(ValueError, match="belongs to somebody else; give a folder"):
         FrameDataset(drive, cache="ram")
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"cache_bytes": 0}, "cache_bytes is 0, but must be at least 1"),
-        ({"cache": __file__}, "test_torch_cache.py cannot be used: File exists"),
-        ({"backend": "torchcodec"}, "cache needs backend='mp4ds'"),
-    ],
-)
-def test_wrong_options(drive: Path, tmp_path: Path, options: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ValueError, match=sentence):
-        FrameDataset(drive, topics=[LEFT], **{"cache": tmp_path, **options})

@@ -10,7 +10,6 @@ import tarfile
 import zipfile
 from collections.abc import Iterator
 from email.message import Message
-from importlib.metadata import requires
 from pathlib import Path
 from typing import Any
 
@@ -235,33 +234,3 @@ def test_the_lock_meets_all_requirements(python: str, system: str) -> None:
             versions = lock.get(canonicalize_name(one.name), [])
             is_met = len(versions) == 1 and versions[0] in one.specifier
             assert is_met, f"{text}: lock/ has {versions}; bash tools/lock.sh renews it"
-
-
-@pytest.mark.parametrize("name", ["Dockerfile", "Dockerfile.ros2"])
-def test_container_images_have_all_they_build_from(name: str) -> None:
-    lines = (ROOT / ".dockerignore").read_text().splitlines()
-    sent = [line[1:] for line in lines if line.startswith("!")]
-    assert all((ROOT / path).exists() for path in sent)
-    pyproject = (ROOT / "pyproject.toml").read_text()
-    included = re.findall(r'^"([\w./-]+)" = ', pyproject, re.MULTILINE)
-    for path in ("src", "hatch_build.py", "LICENSE", "README.md", *included):
-        assert path.split("/")[0] in sent, path
-    extras = re.findall(r"\[([a-z,]+)\]", (ROOT / name).read_text())
-    known = {
-        re.split(r"\W", one.rpartition("extra == ")[2][1:])[0] for one in requires("mp4ds") or []
-    }
-    assert extras
-    assert {extra for found in extras for extra in found.split(",")} <= known
-
-
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / ".github" / "workflows").glob("*.yml")), ids=lambda path: path.name
-)
-def test_workflows_run_what_is_there(path: Path) -> None:
-    workflow = yaml.safe_load(path.read_text())
-    for job in workflow["jobs"].values():
-        assert job["timeout-minutes"]
-        for step in job["steps"]:
-            command = step.get("run", "")
-            for file in re.findall(r"[\w./-]+\.(?:sh|py|cff|md)\b|\.ci/\w+", command):
-                assert (ROOT / file).exists() or f"> {file}" in command, f"{path.name}: {file}"
