@@ -276,6 +276,7 @@ def test_nothing_to_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         ({"max_duration": float("nan")}, "max_duration"),
         ({"codec": "av1"}, "lossless"),
         ({"custom_data": ["operator"]}, "'operator' is not of the form KEY=VALUE"),
+        ({"prefix": "run"}, "`prefix` is for a dataset that is not named"),
     ],
 )
 def test_options_that_make_no_sense(options: dict[str, Any], said: str, tmp_path: Path) -> None:

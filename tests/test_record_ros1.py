@@ -92,6 +92,32 @@ def test_topics_that_are_named(roscore: Core, tmp_path: Path) -> None:
             assert found == topics, name
 
 
+def test_some_messages_of_what_a_node_hears(roscore: Core, tmp_path: Path) -> None:
+    """The first ones of what `rosbag record --node` gets, which takes no --limit with it."""
+    bag = make_drive(tmp_path / "drive.bag")
+    topics = ["/camera/image_raw", "/tf"]
+    prefix = ["--limit=5", "--output-prefix", str(tmp_path / "live"), "__name:=record"]
+    theirs = ["-O", str(tmp_path / "theirs.bag"), "__name:=record_theirs"]
+    listener = roscore.start(RECORD, "-O", str(tmp_path / "heard"), *topics, "__name:=listener")
+    until(lambda: "/listener" in roscore.nodes(), listener)
+    other = roscore.start(RECORD, "--node=/listener", *theirs)
+    ours = roscore.start(*python("mp4ds", "record", "--ros1", "--node=listener", *prefix))
+    try:
+        until(lambda: {"/record", "/record_theirs"} <= {*roscore.nodes()}, other)
+        roscore.play([PLAY, "--quiet", "--queue", "100000", str(bag)], topics, 3)
+        assert ours.wait(WATCHDOG_S) == 0  # by itself
+    finally:
+        for process in (other, listener, ours):
+            process.send_signal(signal.SIGINT)
+            process.wait(WATCHDOG_S)
+    (made,) = tmp_path.glob("live_*")
+    assert re.fullmatch(r"live(_\d+){3}-\d\d_\d\d_\d\d", made.name)
+    mp4ds.unpack(made, None, tmp_path / "again.bag")
+    found, due = contents(tmp_path / "again.bag"), contents(tmp_path / "theirs.bag")
+    assert found == {key: messages[:5] for key, messages in due.items()}
+    assert {topic for topic, *_ in found} == {*topics}
+
+
 def spooled(folder: Path) -> int:
     """Bytes of a recording that are not packed yet."""
     return sum(path.stat().st_size for path in folder.glob("*.mcap"))

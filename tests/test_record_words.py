@@ -101,6 +101,11 @@ ALL = {"all": True}
             },
         ),
         ("--ros2 -a --storage-preset-profile fastwrite", ALL),
+        (
+            "--ros1 --node /slam -l 5 -L 2G --output-prefix run",
+            {"of_node": "/slam", "limit": 5, "min_space": 2**31, "prefix": "run"},
+        ),
+        ("--ros2 -a -f cdr", ALL),
         ("--ros2 -a --snapshot-mode", {"keep_last": 60} | ALL),
         ("-a --keep-last 90s --and-then 2m", {"keep_last": 90, "and_then": 120} | ALL),
         ("-a --keep-last 5 --trigger /go", {"keep_last": 5, "trigger": ("/go",)} | ALL),

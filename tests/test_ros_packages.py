@@ -313,8 +313,10 @@ def noted(folder: Path) -> int:
 
 def test_roslaunch(roscore: Core, workspace: Workspace, drive: Path, tmp_path: Path) -> None:
     """One launch file records what another one plays, until Ctrl-C; paths are of the shell."""
+    made = tmp_path / "a live one_0"
     start = workspace.command(tmp_path, "roslaunch", "mp4ds", "record.launch")
-    recorder = roscore.start(*start, "output:=a live one", "topics:=/camera/* /tf", "name:=bag")
+    start += ["output:=a live one", "topics:=/camera/* /tf", "options:=--max-size 4G"]
+    recorder = roscore.start(*start, "name:=bag")
     try:
         until(lambda: "/bag" in roscore.nodes())
         start = workspace.command(tmp_path, "roslaunch", "mp4ds", "play.launch")
@@ -323,7 +325,7 @@ def test_roslaunch(roscore: Core, workspace: Workspace, drive: Path, tmp_path: P
         assert code == 0, errors
         assert "has died" not in output + errors
         assert roscore.run("rosparam", "get", "/use_sim_time")[1].strip() == "true"
-        until(lambda: noted(tmp_path / "a live one") == 20)
+        until(lambda: noted(made) == 20)
     finally:
         recorder.send_signal(signal.SIGINT)
         code = recorder.wait(WATCHDOG_S)
@@ -333,8 +335,8 @@ def test_roslaunch(roscore: Core, workspace: Workspace, drive: Path, tmp_path: P
     assert "has died" not in log
     assert "escalating" not in log
     assert not [*tmp_path.glob(f"*{UNFINISHED}")]
-    assert mp4ds.validate(tmp_path / "a live one", deep=True) == []
-    mp4ds.unpack(tmp_path / "a live one", None, tmp_path / "again.bag")
+    assert mp4ds.validate(made, deep=True) == []
+    mp4ds.unpack(made, None, tmp_path / "again.bag")
     found, due = payloads(tmp_path / "again.bag"), payloads(tmp_path / "a drive.bag")
     assert {*found} == {IMAGES, "/tf"}
     assert found[IMAGES] == due[IMAGES]

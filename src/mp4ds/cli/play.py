@@ -39,8 +39,8 @@ def _check_order(_: click.Context, __: click.Parameter, value: str | None) -> No
 def _refuse(_: click.Context, parameter: click.Parameter, value: object) -> None:
     if value:
         raise click.UsageError(
-            f"{parameter.opts[0]} is not supported: services are not called; recorded service "
-            "events are played as topics."
+            f"{parameter.opts[0]} is not supported: services are not called. Unpack the events of "
+            "services (--topics '*/_service_event') for `ros2 bag play`, which calls them."
         )
 
 

@@ -61,6 +61,20 @@ class RecordOptions(NodeOptions):
     exclude_regex: Parsed[re.Pattern[str] | None] = pattern(
         "Leave out topics whose name matches a regular expression.", "--exclude-regex", "-x"
     )
+    of_node: str | None = option(
+        "Record the topics that this node subscribes to (ROS 1).",
+        None,
+        "--node",
+        panel=WHAT,
+        only=("ros1",),
+    )
+    limit: int | None = option(
+        "Record so many messages of each topic, and stop when all have them.",
+        None,
+        "-l",
+        panel=WHAT,
+        least=1,
+    )
     duration: Parsed[float | None] = option(
         "Stop after so many seconds; also 5m, 2h.",
         None,
@@ -97,6 +111,8 @@ class RecordOptions(NodeOptions):
     )
     min_space: Parsed[int | None] = option(
         "Stop when the file system has less free space than this, such as 1G.",
+        None,
+        "-L",
         metavar="SIZE",
         parse=parse_size,
     )
@@ -159,12 +175,17 @@ class RecordOptions(NodeOptions):
         panel=WHAT,
     )
     ignore_leaf: bool = option(
-        "Leave out topics without a subscriber (ROS 2).", False, "--ignore-leaf-topics", panel=WHAT
+        "Leave out topics without a subscriber.", False, "--ignore-leaf-topics", panel=WHAT
     )
     custom_data: Sequence[str] = option(
         "Entry for custom_data of the rosbag2 metadata (ROS 2); repeatable.",
         (),
         metavar="KEY=VALUE",
+    )
+    prefix: str = option(
+        "What comes before the time in the name of a dataset that is not named.",
+        "mp4ds",
+        "--output-prefix",
     )
     about: str | None = about()
     force: bool = force()
@@ -178,6 +199,9 @@ class Wanted:
             the node's remappings give it, and recorded under the name given here.
         options: The others.
 
+    Attributes:
+        by_node: Topics that the node of the option of this name subscribes to.
+
     Raises:
         OptionError: Nothing is chosen, a pattern is not valid, or two topics are remapped to the
             same one.
@@ -185,9 +209,10 @@ class Wanted:
 
     def __init__(self, topics: Sequence[str], options: RecordOptions) -> None:
         is_all = options.all or options.all_topics or options.all_services
-        if not (topics or is_all or options.regex or options.topic_types):
+        if not (topics or is_all or options.regex or options.topic_types or options.of_node):
             raise OptionError("Name topics, or give `all`, `regex` or `topic_types`.")
         names = options.names
+        self.by_node: frozenset[str] = frozenset()
         self._recorded: dict[str, str] = {}
         for topic in topics:
             asked = names.resolved(topic.strip())
@@ -212,7 +237,8 @@ class Wanted:
             return True
         is_named = self._named is not None and self._named(topic)
         is_found = options.regex is not None and options.regex.search(topic) is not None
-        return is_named or is_found or type_name in options.topic_types
+        is_of_node = topic in self.by_node
+        return is_named or is_found or is_of_node or type_name in options.topic_types
 
     def recorded_as(self, topic: str) -> str:
         """The name under which a topic is recorded."""

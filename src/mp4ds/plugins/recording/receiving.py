@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from mp4ds.errors import Mp4dsError, Refused
@@ -135,7 +135,10 @@ class Source:
     def _look(self) -> None:
         """Subscribe to new topics."""
         is_ros2, options = self._node.world == "ros2", self._options
-        heard = self._node.subscribed_topics() if is_ros2 and options.ignore_leaf else None
+        heard = self._node.subscribed_topics() if options.ignore_leaf else None
+        if options.of_node:
+            node = options.names.resolved(options.of_node)
+            self._wanted.by_node = self._node.subscribed_topics(node)
 
         def is_new(topic: str, kind: str) -> bool:
             if topic in self._subscribed or (heard is not None and topic not in heard):
@@ -186,6 +189,7 @@ class MessageBuffer:
     Args:
         most_bytes: Limit of buffered payloads; beyond, the oldest messages are dropped and counted.
         last_ns: The latest log or publish time that the recording can hold; the first one is 0.
+        limit: Messages of each topic to take; later ones are left out.
 
     Attributes:
         topics: What came of each topic.
@@ -194,10 +198,11 @@ class MessageBuffer:
         gone: Messages taken out, or dropped, so far.
     """
 
-    def __init__(self, most_bytes: int, last_ns: int = INT64_MAX) -> None:
+    def __init__(self, most_bytes: int, last_ns: int = INT64_MAX, limit: int | None = None) -> None:
         self.topics: dict[str, TopicProgress] = {}
         self._most = most_bytes
         self._last_ns = last_ns
+        self._limit = limit
         self.bytes = self.put_in = self.gone = 0
         self._messages: deque[Message] = deque()
         self._changed = threading.Condition()
@@ -209,6 +214,8 @@ class MessageBuffer:
             if self._is_closed:
                 return
             topic = self.topics.setdefault(message.channel.topic, TopicProgress())
+            if topic.messages == self._limit:
+                return
             topic.messages += 1
             topic.bytes += len(message.data)
             times = message.log_time, message.publish_time
@@ -242,6 +249,11 @@ class MessageBuffer:
         self.gone += 1
         self.bytes -= len(message.data)
         return message
+
+    def has_all(self, topics: Iterable[str]) -> bool:
+        """Whether there are topics, and each has all the messages that are taken of it."""
+        found = [self.topics.get(topic, TopicProgress()).messages for topic in topics]
+        return set(found) == {self._limit}
 
     def close(self) -> None:
         """Take no more messages; buffered ones are still given out."""

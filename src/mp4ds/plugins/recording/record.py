@@ -162,7 +162,9 @@ def open_recorder(
     wanted = Wanted(topics, chosen)
     _check(chosen)
     others = _bag_info(chosen.custom_data) if world == "ros2" else []
-    default = "mp4ds" if chosen.keep_last else f"{datetime.now():mp4ds_{_TIME}}"
+    if dataset is not None and chosen.prefix != RecordOptions.prefix:
+        raise OptionError("`prefix` is for a dataset that is not named.")
+    default = chosen.prefix if chosen.keep_last else f"{chosen.prefix}_{datetime.now():{_TIME}}"
     made = dataset if dataset is not None else default
     if node is None:
         node = open_node(world, chosen, chosen.node or _NODES[world])
@@ -253,7 +255,7 @@ class Recorder:
         self._node = node
         self._others = others
         self._progress = progress
-        self._buffer = MessageBuffer(options.buffer * 10**6, _LAST_NS[node.world])
+        self._buffer = MessageBuffer(options.buffer * 10**6, _LAST_NS[node.world], options.limit)
         self._source = Source(node, options, wanted, self._take)
         self._changed = threading.Event()
         self._is_stopped = False
@@ -379,6 +381,8 @@ class Recorder:
                 if clock:
                     begun = time.monotonic()
                 if self._options.duration and time.monotonic() - begun >= self._options.duration:
+                    self._is_stopped = True
+                if self._options.limit and self._buffer.has_all(list(self._source.topics)):
                     self._is_stopped = True
                 usual = "looking back" if self._look_back else "recording"
                 state = f"waiting for {clock}" if clock else usual

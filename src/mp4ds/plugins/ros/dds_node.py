@@ -415,16 +415,16 @@ class DdsNode(Ros2Node):
                 ready[topic] = wanted
         return ready
 
-    def subscribed_topics(self) -> set[str]:
+    def subscribed_topics(self, node: str = "") -> frozenset[str]:
         """Topics with subscribers in other processes."""
         own = self._participant.guid
-        return {
+        return frozenset(
             f"/{one.topic_name.removeprefix(_PREFIX)}"
             for one in self._subscriptions.read(_MOST_ENDPOINTS)
             if one.sample_info.valid_data
             and one.sample_info.instance_state == InstanceState.Alive
             and one.participant_key != own
-        }
+        )
 
     def _is_defined(self, found: _Found, kind: str) -> bool:
         """Whether the definition of a topic's type has been looked for; starts to."""

@@ -404,9 +404,9 @@ class Node(ABC):
             RemoteError: Nobody who knows the topics responds.
         """
 
-    def subscribed_topics(self) -> set[str]:
-        """Topics that other nodes subscribe to (ROS 2)."""
-        raise NotImplementedError
+    @abstractmethod
+    def subscribed_topics(self, node: str = "") -> frozenset[str]:
+        """Topics that other nodes subscribe to, or only this one (ROS 1)."""
 
     @abstractmethod
     def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> Channel | None:

@@ -163,10 +163,10 @@ class RclpyNode(Ros2Node):
             and (self._options.unpublished or self._node.get_publishers_info_by_topic(topic))
         }
 
-    def subscribed_topics(self) -> set[str]:
+    def subscribed_topics(self, node: str = "") -> frozenset[str]:
         """Topics with subscribers."""
         found = self._node.get_topic_names_and_types()
-        return {topic for topic, _ in found if self._node.count_subscribers(topic)}
+        return frozenset(topic for topic, _ in found if self._node.count_subscribers(topic))
 
     def _announced(self, topic: str, kind: str) -> tuple[list[Qos], str, str]:
         publishers = self._node.get_publishers_info_by_topic(topic)

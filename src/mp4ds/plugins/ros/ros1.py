@@ -534,6 +534,14 @@ class Ros1Node(Node):
         found = self._of_master(rospy.get_published_topics)
         return {topic: [kind] for topic, kind in found if is_wanted(topic, kind)}
 
+    def subscribed_topics(self, node: str = "") -> frozenset[str]:
+        """Topics with subscribers that the master knows."""
+        own = rospy.get_name()
+        _, subscribed, _ = self._of_master(rosgraph.Master(own).getSystemState)
+        return frozenset(
+            topic for topic, nodes in subscribed if (node in nodes if node else {*nodes} - {own})
+        )
+
     def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> None:
         """Subscribe; each connection tells its own channel."""
 
