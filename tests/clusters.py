@@ -7,7 +7,6 @@ all, as those of a pack are.
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import json
 import os
@@ -20,7 +19,6 @@ from types import TracebackType
 
 from distributed import Client
 
-from mp4ds.errors import SourceError
 from waiting import WATCHDOG_S, until
 
 HERE = Path(__file__).parent
@@ -139,43 +137,3 @@ def die(folder: str, name: str) -> None:
     if name == "deadly":
         os.kill(os.getpid(), signal.SIGKILL)
     write(folder, name)
-
-
-class Large:
-    """Something in a cycle of references, which tells when its memory is given back."""
-
-    def __init__(self, folder: str, name: str) -> None:
-        self.mark = Path(folder, f"{name}.freed")
-        self.cycle = self
-
-    def __del__(self) -> None:
-        self.mark.touch()
-
-
-def leave_large(folder: str, name: str) -> None:
-    """Leave something large to the collector, which does not run by itself."""
-    gc.disable()
-    Large(folder, name)
-
-
-class OddError(Exception):
-    """An error that does not survive pickling."""
-
-    def __init__(self, first: str, second: object) -> None:
-        super().__init__(first)
-        self.second = second
-
-
-def fail(folder: str, name: str) -> None:
-    """Fail as the name says."""
-    with Path(folder, name).open("a") as attempts:
-        attempts.write("once\n")
-    errors = {
-        "source": SourceError("drive.bag", "is damaged", "Copy it again."),
-        "disk": OSError(28, "No space left on device"),
-        "odd": OddError("strange", lambda: None),
-        "silent": RuntimeError(),
-        "memory": MemoryError(),
-    }
-    if name in errors:
-        raise errors[name]

@@ -133,7 +133,7 @@ def test_workers_of_another_version_are_refused(source: Path, tmp_path: Path) ->
     (tmp_path / "sitecustomize.py").write_text(OTHER_VERSION)
     with (
         RealCluster(tmp_path / "dask", path=tmp_path) as cluster,
-        pytest.raises(PartsFailedError, match=r"on worker tcp:.* other versions than mp4ds"),
+        pytest.raises(PartsFailedError, match=r"has other versions than mp4ds"),
     ):
         mp4ds.pack(source, tmp_path / "dataset", on(cluster))
     assert not (tmp_path / "dataset").exists()

@@ -75,8 +75,6 @@ HOMES = {
     "torch": ("torch",),
     "click": ("cli",),
     "rich": ("cli",),
-    "dask": ("plugins/cluster.py",),
-    "dask_jobqueue": ("plugins/cluster.py",),
     "distributed": ("plugins/cluster.py",),
     "rospy": ("plugins/ros",),
     "rclpy": ("plugins/ros",),

@@ -403,9 +403,11 @@ def pack_parts(
             ready = []
             for call in wait(calls, _POLL_SECONDS, FIRST_COMPLETED).done:
                 pack, ended = calls.pop(call)
+                if options.cluster and call.cancelled():
+                    problem = "the connection to the Dask scheduler was lost"
+                    remedy = f"Check whether it is still running; {_KEPT}."
+                    raise RemoteError(options.cluster, problem, remedy)
                 error = call.exception()
-                if options.cluster and isinstance(error, RemoteError):  # it was lost
-                    raise error
                 if ended is not None:
                     pack.ended(ended, error)
                 elif error is not None:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from operator import index
 from pathlib import Path
 from typing import Any
@@ -229,7 +230,7 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
         "Parallel processes; default: one per core. Each holds the encoders of all cameras."
     )
     cluster: str | None = option(
-        "Dask scheduler at tcp://HOST:PORT, or slurm; default: this machine.",
+        "Dask scheduler at tcp://HOST:PORT; default: this machine.",
         panel=LONG,
         metavar="ADDRESS",
     )
@@ -415,3 +416,28 @@ class PackSummary:
     not_copied: str = ""
     latched: dict[str, int] = field(default_factory=dict)
     latched_left_out: list[str] = field(default_factory=list)
+
+
+# ---------------------------------------------------------------- plugins
+
+_EXTRAS = {"distributed": "cluster", "pyarrow": "lerobot"}
+"""Packages that a plugin may lack -> the extra that has them."""
+
+
+def plugin(name: str) -> Any:
+    """Something of a plugin, such as ``reducing:ReducedReader``: the only way from the core there.
+
+    Raises:
+        OptionError: A package that it needs is not installed.
+    """
+    module, _, found = name.partition(":")
+    try:
+        return getattr(import_module(f"mp4ds.plugins.{module}"), found)
+    except ImportError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in _EXTRAS:
+            raise
+        raise OptionError(
+            f"This needs {package}, which is not installed ({error}). Install it: pip install "
+            f"'mp4ds[{_EXTRAS[package]}]'"
+        ) from None

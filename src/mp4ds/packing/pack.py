@@ -53,14 +53,13 @@ from mp4ds.packing.manifest import (
     summarize,
     write_manifest,
 )
-from mp4ds.packing.options import NO_VIEW, PackOptions, PackProgress, PackSummary
+from mp4ds.packing.options import NO_VIEW, PackOptions, PackProgress, PackSummary, plugin
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.parts import PartsFolder, PlanNote, digest_source
 from mp4ds.packing.planning import (
     Plan,
     divide,
     open_recording,
-    plugin,
     surveyed,
 )
 from mp4ds.packing.spool import recover
@@ -654,8 +653,9 @@ def _executor(
 ) -> AbstractContextManager[Executor]:
     """What packs the pieces."""
     if options.cluster:
-        pieces = sum(len(pack.plan.pieces) for pack in packs)
-        executor: AbstractContextManager[Executor] = plugin("cluster")(options.cluster, pieces)
+        executor: AbstractContextManager[Executor] = plugin("cluster:cluster_executor")(
+            options.cluster
+        )
         return executor
     return ProcessExecutor(min(_processes_for(pack.plan) for pack in packs))
 

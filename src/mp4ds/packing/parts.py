@@ -27,6 +27,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from platform import node
 from typing import Any
 
 from mp4ds.bags.protocols import BagReader
@@ -54,6 +55,7 @@ from mp4ds.options import CONTENT, ENCODING
 from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools, write_manifest
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.planning import PIECE_NAME, Piece, Plan
+from mp4ds.processes import release_memory
 
 _SUFFIX = ".mp4ds-part"
 _PLAN_NAME = "plan.json"
@@ -425,9 +427,11 @@ class PartPacker:
         plan, place = self._plan, self._folder / piece.name
         if tools() != plan.tools:
             theirs = ", ".join(f"{name} {version}" for name, version in plan.tools.items())
-            raise Mp4dsError(f"here are other versions than {theirs}; install the same everywhere.")
+            raise Mp4dsError(
+                f"{node()} has other versions than {theirs}; install the same everywhere."
+            )
         if not self._folder.is_dir():
-            raise Mp4dsError(f"{self._folder} is not there; {SHARED}.")
+            raise Mp4dsError(f"{self._folder} is not there on {node()}; {SHARED}.")
         if part_facts(place) is not None:
             return
         try:
@@ -436,6 +440,8 @@ class PartPacker:
         except BaseException:
             self.close()  # it may be damaged in what was read ahead
             raise
+        finally:
+            release_memory()  # a worker of a cluster that uses much gets no more calls
 
     def _pack(self, piece: Piece, into: Path, exact: Exact) -> None:
         for path in into.iterdir():

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from importlib import import_module
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,7 @@ from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.calibrations import find_pairs
 from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey, depends_on_others
 from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools
-from mp4ds.packing.options import NO_VIEW, ImportOptions, PackOptions
+from mp4ds.packing.options import NO_VIEW, ImportOptions, PackOptions, plugin
 from mp4ds.packing.tracks import TrackPlan
 from mp4ds.packing.windows import WindowCoder
 from mp4ds.processes import available_cores
@@ -504,8 +503,10 @@ def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagR
     try:
         if options.slice:
             take_slice(reader, options.slice, options.selected)
-        for name, is_asked in {"redact": options.redact, "reduce": options.derives}.items():
-            reader = plugin(name)(reader, options) if is_asked else reader
+        if options.redact:
+            reader = plugin("redacting:RedactedReader")(reader, options)
+        if options.derives:
+            reader = plugin("reducing:ReducedReader")(reader, options)
     except BaseException:
         reader.close()
         raise
@@ -522,7 +523,7 @@ def _open_whole(paths: Sequence[Path], images: ImportOptions | None, *, salvage:
         raise OptionError(
             f"Only one folder or video can be imported at a time, but {len(paths)} were given."
         )
-    reader: BagReader = plugin("images")(paths[0], images)
+    reader: BagReader = plugin("importing.layouts:open_images")(paths[0], images)
     return reader
 
 
@@ -681,20 +682,3 @@ def _samples(
         if len(samples) == enough:
             break
     return samples
-
-
-# ---------------------------------------------------------------- plugins
-
-_PLUGINS = {
-    "images": "importing.layouts:open_images",
-    "cluster": "cluster:cluster_executor",
-    "reduce": "reducing:ReducedReader",
-    "redact": "redacting:RedactedReader",
-}
-"""What the core asks for -> module of `mp4ds.plugins`, and its name there."""
-
-
-def plugin(name: str) -> Any:
-    """What a plugin offers to the core, by one of the names above."""
-    module, _, found = _PLUGINS[name].partition(":")
-    return getattr(import_module(f"mp4ds.plugins.{module}"), found)

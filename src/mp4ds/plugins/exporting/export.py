@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 
 from mp4ds._version import __version__
@@ -19,6 +18,7 @@ from mp4ds.errors import OptionError, advising
 from mp4ds.files.outputs import listed_names, staged
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import document_of
+from mp4ds.packing.options import plugin
 from mp4ds.plugins.exporting.folders import write_colmap, write_euroc, write_tum
 from mp4ds.plugins.exporting.job import ExportJob, ExportOptions, ExportSummary
 
@@ -27,13 +27,7 @@ NOTE_NAME = "mp4ds_export.json"
 
 
 def _write_lerobot(*jobs: ExportJob) -> None:
-    try:
-        write = import_module("mp4ds.plugins.exporting.lerobot").write
-    except ImportError as error:
-        raise OptionError(
-            f"LeRobot needs pyarrow ({error}). Install it: pip install 'mp4ds[lerobot]'"
-        ) from None
-    write(*jobs)
+    plugin("exporting.lerobot:write")(*jobs)
 
 
 _FORMATS: dict[str, tuple[str, Callable[..., None]]] = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from mp4ds.files.urls import remote
 from mp4ds.format.models import EXACT_SUFFIX
 from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.messages.wire import CalibrationFields
-from mp4ds.packing.options import ImportOptions
+from mp4ds.packing.options import ImportOptions, plugin
 from mp4ds.plugins.importing.calibrations import (
     euroc_calibration,
     euroc_pose,
@@ -58,7 +57,7 @@ def open_images(folder: Path, options: ImportOptions) -> ImagesReader:
         raise SourceNotFoundError(folder)
     if options.episode is not None or (folder / _LEROBOT).is_file():
         with reading(folder):
-            reader: ImagesReader = _lerobot().open_episode(folder, options)
+            reader: ImagesReader = plugin("importing.lerobot:open_episode")(folder, options)
         return reader
     if options.topic is not None and not options.topic.strip("/"):
         raise OptionError(f"`topic` {options.topic!r} is not a topic name.")
@@ -82,15 +81,6 @@ def open_images(folder: Path, options: ImportOptions) -> ImagesReader:
     return reader
 
 
-def _lerobot() -> Any:
-    try:
-        return import_module("mp4ds.plugins.importing.lerobot")
-    except ImportError as error:
-        raise OptionError(
-            f"LeRobot needs pyarrow ({error}). Install it: pip install 'mp4ds[lerobot]'"
-        ) from None
-
-
 def episodes_in(folder: Path) -> list[int]:
     """The numbers of the episodes of a LeRobotDataset v3.
 
@@ -101,7 +91,7 @@ def episodes_in(folder: Path) -> list[int]:
     if not (folder / _LEROBOT).is_file():
         raise SourceError(folder, f"is not a LeRobotDataset v3: it has no {_LEROBOT}")
     with reading(folder):
-        found: list[int] = _lerobot().episodes_in(folder)
+        found: list[int] = plugin("importing.lerobot:episodes_in")(folder)
     return found
 
 
