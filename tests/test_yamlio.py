@@ -170,7 +170,7 @@ def test_plain_scalars(text: str, value: Any) -> None:
         ("? [a]\n: b\n", "not a string"),
         ("- a\n", "not a map"),
         ("a: 1\n---\nb: 1\n", "several"),
-        ("", "no document"),
+        ("", "is empty"),
         ("a: 1e999\n", "finite"),
         ("a: " + "9" * 5000 + "\n", "integer"),
         ("a: [1\n", "subset, perhaps cut short: line 2: did not find expected"),

@@ -259,7 +259,7 @@ def _build(events: Iterable[Any], scalar: Callable[[Any], Any], *, is_subset: bo
         if len(open_nodes) + height > MAX_DEPTH + 1:  # the first encloses the document
             raise ValueError(f"line {line}: is nested deeper than {MAX_DEPTH} levels")
     if len(root) != 1:
-        raise ValueError("holds no document, or several")
+        raise ValueError("has several documents" if root else "is empty")
     return root[0]
 
 

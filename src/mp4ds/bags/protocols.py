@@ -72,7 +72,7 @@ class BagReader(ABC):
         slice: What is given of it; all, unless it was set.
         pairs: Calibration channels and those of their images, by id; None: yet to be found.
         reduction: What is done to its images, as manifests have it; empty for nothing.
-        redaction: What the last `records` made unrecognisable, as manifests have it.
+        redaction: What the last `records` redacted, as manifests have it.
     """
 
     format: Format

@@ -126,9 +126,12 @@ class RedactedTopic(Model):
 
 
 class RedactionEntry(Model):
-    """How parts of images were made unrecognisable before they were packed."""
+    """How images were redacted before they were packed."""
 
     rules_sha256: Sha256 | None = Field(None, description="Of the file of rules.")
+    rules_text: str | None = Field(
+        None, description="The file itself, with its boxes; absent: it does not say `keep_rules`."
+    )
     function: str | None = Field(
         None, description="Module and name of the function that found what to change."
     )
@@ -366,7 +369,7 @@ class Manifest(Model):
     )
     redactions: list[RedactionEntry] = Field(
         default_factory=list,
-        description="What was made unrecognisable before they were packed, the oldest first.",
+        description="What was redacted before they were packed, the oldest first.",
     )
     messages: Size = Field(description="Messages of the recording that were packed.")
     losses: Annotated[list[LossEntry], Field(max_length=MAX_LOSSES)] = Field(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +12,7 @@ from mp4ds.errors import OptionError
 from mp4ds.format.sidecars import model_problems
 from mp4ds.options import Time, parse_time
 
+_OF_BOX = ("x", "y", "width", "height")
 LEAST_SQUARE = 8
 """Pixels of a side of the squares that are blurred."""
 PROVEN_TOGETHER = 300
@@ -60,13 +60,14 @@ class Rules(BaseModel):
 
     rules: Annotated[list[Rule], Field(min_length=1)]
     proof: Annotated[int, Field(ge=0)] = PROVEN_TOGETHER
+    keep_rules: bool = False
 
 
-def load_rules(path: Path) -> tuple[Rules, str]:
+def load_rules(path: Path) -> tuple[Rules, bytes]:
     """Read a file of rules.
 
     Returns:
-        The rules, and the SHA-256 of the file.
+        The rules, and the file.
 
     Raises:
         OptionError: It cannot be read, or is not valid; says where.
@@ -87,12 +88,14 @@ def load_rules(path: Path) -> tuple[Rules, str]:
         names = key.split(".")
         if names[0] == "rules" and names[1:]:
             names[:2] = [f"rule {int(names[1]) + 1}"]
+        if names[1:2] == ["box"] and names[2:]:
+            names[1:] = ["box " + _OF_BOX[int(names[2])]]
         raise OptionError(f"{path}: {', '.join(names)}: {problem}.") from None
     except OptionError:
         raise
     except ValueError as error:
         raise OptionError(f"{path} is not valid YAML: {error}.") from None
-    return found, hashlib.sha256(data).hexdigest()
+    return found, data
 
 
 def _scalar(event: Any) -> str | None:

@@ -65,7 +65,7 @@ class PartRecord:
         skipped: What the source holds and no dataset can: a phrase -> how many.
         transforms: Static transforms, the latest of each child frame.
         losses: What could not be read of a damaged recording.
-        redactions: What was made unrecognisable, of each part.
+        redactions: What was redacted, of each part.
     """
 
     folder: Path

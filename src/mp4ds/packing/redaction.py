@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
@@ -54,6 +55,7 @@ class Redaction:
     Attributes:
         name: Of the file, or of the function.
         sha256: Of the file; None of a function.
+        text: The file, if manifests are to have it.
         rules: Of the file.
         find: The function.
         proof: Changed images of which untouched blocks are proven together; 0 for no proof.
@@ -61,6 +63,7 @@ class Redaction:
 
     name: str
     sha256: str | None = None
+    text: str | None = None
     rules: Sequence[Rule] = ()
     find: Find | None = None
     proof: int = PROVEN_TOGETHER
@@ -90,8 +93,14 @@ def parse_redaction(value: Redaction | Find | Path | str) -> Redaction:
         kind = value if hasattr(value, "__qualname__") else type(value)
         return Redaction(f"{kind.__module__}:{kind.__qualname__}", find=value)
     place = location(value)
-    found, digest = load_rules(place)
-    return Redaction(str(place), digest, tuple(found.rules), proof=found.proof)
+    found, data = load_rules(place)
+    return Redaction(
+        str(place),
+        hashlib.sha256(data).hexdigest(),
+        data.decode() if found.keep_rules else None,
+        tuple(found.rules),
+        proof=found.proof,
+    )
 
 
 # ---------------------------------------------------------------- pixels
@@ -137,8 +146,8 @@ def placed(
         raise OptionError(f"box {list(numbers)} is not inside the {size[0]}x{size[1]} image")
     if made != numbers:
         raise OptionError(
-            f"box {list(numbers)} divides pixels that share their colours: {encoding.name} images "
-            f"need {list(made)}"
+            f"box {list(numbers)} cuts through pixels that share their chroma: in {encoding.name} "
+            f"images, use {list(made)}"
         )
     return made
 
@@ -235,7 +244,8 @@ def _values(
         (wanted >= low) & (wanted <= high) & (encoding.is_float | (wanted == np.rint(wanted)))
     )
     if not (is_special | is_value).all():
-        raise OptionError(f"fill {fill} is no value of {name} images: {low} to {high}")
+        shown = f"{fill:g}" if isinstance(fill, float) else fill
+        raise OptionError(f"fill {shown} is out of range for {name} images ({low} to {high})")
     made: Any = colour
     if is_yuv:
         matrix = [[65.481, 128.553, 24.966], [-37.797, -74.203, 112.0], [112.0, -93.786, -18.214]]

@@ -294,7 +294,8 @@ class RedactedReader(ChangedReader):
             if values := tally.blocks.values if tally.blocks else "":
                 told["untouched"] = {"values": values}
             topics.append(told)
-        return {**self._redaction.told, "rules": list(self._counts), "topics": topics}
+        told = {**self._redaction.told, "rules": list(self._counts), "topics": topics}
+        return {**told, "rules_text": self._redaction.text}
 
     # ------------------------------------------------------------ messages
 
