@@ -153,9 +153,14 @@ def test_for_training_there_are_as_many_key_frames_as_cost_little(name: str) -> 
     assert (training.gop < 10) == (name == "moving")
 
 
-@pytest.mark.parametrize(("asked", "gop"), [({}, "3"), ({"gop": 20}, "20")])
-def test_key_frames_of_differences(asked: dict[str, Any], gop: str, tmp_path: Path) -> None:
-    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("bayer_rggb8", frames=7))
+@pytest.mark.parametrize(
+    ("encoding", "asked", "gop"),
+    [("bayer_rggb8", {}, "3"), ("mono8", {}, "3"), ("mono8", {"gop": 20}, "20")],
+)
+def test_key_frames_of_differences(
+    encoding: str, asked: dict[str, Any], gop: str, tmp_path: Path
+) -> None:
+    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene(encoding, frames=7))
     mp4ds.pack(paths, tmp_path / "dataset", PackOptions(codec="h264", view="av1", **asked))
     with mp4ds.open(tmp_path / "dataset") as dataset:
         (sidecar,) = (stream.sidecar for stream in dataset.streams)

@@ -41,8 +41,8 @@ from mp4ds.video.codecs import (
     AV1,
     BESIDE_PRESET,
     DEFAULT_LOSSY,
+    DIFFERENCES_GOP,
     LOSSY_GOP,
-    MOSAIC_DIFFERENCES_GOP,
     PURPOSE_PRESET,
     TRAINING,
     TRAINING_CRF,
@@ -73,9 +73,8 @@ _PLAYED = ("yuv420p", "yuvj420p")
 """Pixel formats that any player of a codec shows."""
 _MANY = 6  # files, after which any number may follow
 _STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
-_LARGER, _AS_SMALL = 1.05, 1.04
-"""How much larger than without a view images may become by having one, at all and with PNG files,
-which decode fastest."""
+_LARGER = 1.05
+"""How much larger than without a view images may become by having one."""
 _NEGLIGIBLE = 1 / 50
 """Share of the raw size below which a video is kept even if zstd would be smaller."""
 
@@ -276,15 +275,15 @@ def _lossless_plans(
     view = _view_coding(pixels, encoding, options)
     if view is not None:
         source = [best.layout] if best.layout.is_source else []
-        is_usual = encoding.mosaic and options.gop is None and options.purpose is None
+        is_usual = not source and options.gop is None and options.purpose is None
         with suppress(OptionError, EncoderRefusedError):
             both, beside = choose_predicted(
                 pixels,
                 source or difference_layouts(view.layout),
                 view,
-                _AS_SMALL * least,
+                least,  # which the first images make 1 to 3 % too large
                 gop=options.group_frames,
-                h264_gop=MOSAIC_DIFFERENCES_GOP if is_usual else None,
+                h264_gop=DIFFERENCES_GOP if is_usual else None,
                 threads=threads,
                 codec=codec,
                 preset=options.preset if asked else None,

@@ -96,7 +96,7 @@ def packet_codec(message_format: str) -> str:
 # ---------------------------------------------------------------- encoders
 
 # maximum distance of key frames, chosen by cost (spec/notes.md)
-LOSSLESS_GOP, LOSSY_GOP, MOSAIC_DIFFERENCES_GOP = 10, 30, 3
+LOSSLESS_GOP, LOSSY_GOP, DIFFERENCES_GOP = 10, 30, 3
 ARCHIVE_GOP, LOSSY_TRAINING_GOP, VIEW_TRAINING_GOP = 120, 2, 15
 PURPOSE_PRESET = "4"
 """Preset of SVT-AV1 when the purpose of a dataset is known."""
@@ -160,8 +160,8 @@ _YUV = ("yuv420p", "yuv422p", "yuv444p")
 
 # as small as x264's default preset without loss, at half its time (spec/notes.md)
 _TUNING = "ref=3:mixed-refs=1:subme=5:me=dia:weightp=0:scenecut=0"
-# of differences to a view: within 0.5 % of that, at 0.6 of its time
-_OF_NOISE = {"preset": "ultrafast", "x264-params": "cabac=1"}
+# of differences to a view: within 0.5 % of that, at 0.6 of its time; intra blocks of 8x8 are free
+_OF_NOISE = {"preset": "ultrafast", "x264-params": "cabac=1:8x8dct=1:partitions=i8x8"}
 
 
 def _x264_lossless(pixel_format: str) -> _Coding:
