@@ -542,7 +542,7 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         "raw, jpeg, png, compressed-video",
     ),
     **{
-        f"resize {value}": (("unpack", "DATASET", "--to", "mcap", "--resize", value), "--resize")
+        f"resize {value}": (("pack", "BAG", "-o", "OUT", "--resize", value), "--resize")
         for value in ("", "0", "-1", "640x", "640x480x3", "nan", "1e9", "big", "99999x9")
     },
     **{

@@ -395,23 +395,14 @@ def test_pictures_that_cannot_be_decoded_are_published_as_recorded(tmp_path: Pat
     assert len(recorded) == reasons["its picture cannot be decoded"] > 0
 
 
-@pytest.mark.parametrize(
-    ("options", "frames"), [({"every": 3}, 7), ({"max_rate": 10.0}, 10), ({"resize": 0.5}, 20)]
-)
-def test_lower_quality_on_purpose(
+@pytest.mark.parametrize(("options", "frames"), [({"every": 3}, 7), ({"max_rate": 10.0}, 10)])
+def test_fewer_frames_on_purpose(
     drive: tuple[Path, list[Recorded]], options: dict[str, Any], frames: int
 ) -> None:
     publisher, summary = run(drive[0], immediate=True, **options)
     images = [sent for sent in publisher.sent if sent.topic == CAMERA]
     assert len(images) == frames
-    assert summary.thinned == ({CAMERA: 20 - frames} if frames < 20 else {})
+    assert summary.thinned == {CAMERA: 20 - frames}
     others = [item for item in drive[1] if item[0] != CAMERA]
     assert [item for item in published(publisher) if item[0] != CAMERA] == others
-    if "resize" not in options:
-        assert set(published(publisher)) <= set(drive[1])
-    else:
-        with mp4ds.open(drive[0]) as dataset:
-            small = dataset[CAMERA].get(range(20), resize=0.5)
-        assert [sent.payload[-80 * 60 :] for sent in images] == [
-            frame.data.tobytes() for frame in small
-        ]
+    assert set(published(publisher)) <= set(drive[1])

@@ -243,8 +243,8 @@ _NS = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reduction(Options):
-    """How to reduce images."""
+class Thinning(Options):
+    """How to leave out images."""
 
     every: int = option(
         "Keep only every Nth frame, starting with the first.",
@@ -256,17 +256,9 @@ class Reduction(Options):
     max_rate: float | None = option(
         "Maximum frames per second.", panel=WHAT, metavar="HZ", changes=ENCODING
     )
-    resize: Parsed[float | tuple[int, int] | None] = option(
-        "Scale images down, and the calibrations with them.",
-        metavar="0.5|WxH",
-        parse=parse_resize,
-        changes=ENCODING,
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.resize is not None:
-            _check_size(self.resize)
         if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
             raise OptionError(f"`every` {self.every!r} is not a number of frames: use 1 or more.")
         rate = self.max_rate
@@ -282,6 +274,23 @@ class Reduction(Options):
     def leaves_out(self) -> bool:
         """Whether there may be fewer images."""
         return self.every > 1 or self.max_rate is not None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reduction(Thinning):
+    """How to leave out images, and make them smaller."""
+
+    resize: Parsed[float | tuple[int, int] | None] = option(
+        "Scale images down, and the calibrations with them.",
+        metavar="0.5|WxH",
+        parse=parse_resize,
+        changes=ENCODING,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.resize is not None:
+            _check_size(self.resize)
 
     @property
     def reduces(self) -> bool:

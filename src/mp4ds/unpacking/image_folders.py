@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from mp4ds.dataset.images import Images, VerbatimImages
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.views import View
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import csv_cell
 from mp4ds.format.fields import DecodedColumns, marked
-from mp4ds.unpacking.pictures import ReductionOptions, files_of, resized_view
+from mp4ds.unpacking.pictures import FrameOptions, files_of
 from mp4ds.video.images import ImageFile
 
 _STAMPS_NAME = "stamps.csv"
@@ -37,7 +36,6 @@ class _Files:
         numbers: Their numbers in the topic, shape (frames,).
         is_kept: Which are written, shape (frames,).
         kind: ``png`` or ``jpeg``.
-        view: How their pixels are resized.
         file: Encodes them; None if their files are written as recorded.
     """
 
@@ -45,7 +43,6 @@ class _Files:
     numbers: NDArray[np.int64]
     is_kept: NDArray[np.bool_]
     kind: str
-    view: View
     file: ImageFile | None
 
     def all(self) -> Iterator[tuple[int, bytes | memoryview | None]]:
@@ -57,29 +54,23 @@ class _Files:
                 yield from files_of(part, marked(self.is_kept))
                 return
             is_strict = not part.sidecar.keeps_packets
-            choice, scale = marked(self.is_kept), self.view.scale
-            for index, picture in part.pictures(choice, scale, is_strict=is_strict):
+            for index, picture in part.pictures(marked(self.is_kept), is_strict=is_strict):
                 made = None
                 if picture is not None:
-                    made = file.encode(part.pixels(picture, self.view, index))
+                    made = file.encode(part.recorded_pixels(picture))
                 yield index, made
         elif isinstance(part, VerbatimImages):
             for index, shown in part.all_shown():
-                if not self.is_kept[index]:
-                    continue
-                pixels = (shown.pixels,)
-                yield (
-                    index,
-                    file.encode(part.pixels(pixels, self.view, index)) if file else shown.file,
-                )
+                if self.is_kept[index]:
+                    yield index, file.encode(shown.pixels) if file else shown.file
 
 
 class TopicImages:
     """The images of a topic, in videos and verbatim, about to be written.
 
     Args:
-        frames: The topic, whose frames are reduced together.
-        options: How to reduce them.
+        frames: The topic.
+        options: Which of its frames are left out, counted in the topic.
         image_format: ``png`` or ``jpeg``; None: JPEG files as recorded, others as png.
         jpeg_quality: Of new JPEG files, 1 to 100.
 
@@ -89,12 +80,11 @@ class TopicImages:
         refused: How many cannot be written, by reason.
 
     Raises:
-        OptionError: The size is too large.
         FormatError: The dataset is damaged.
     """
 
     def __init__(
-        self, frames: Topic, options: ReductionOptions, image_format: str | None, jpeg_quality: int
+        self, frames: Topic, options: FrameOptions, image_format: str | None, jpeg_quality: int
     ) -> None:
         self.topic = frames.topic
         self.thinned, self.refused = 0, Counter[str]()
@@ -105,15 +95,13 @@ class TopicImages:
             numbers = frames.numbers_of(place)
             kept = is_kept[numbers]
             self.thinned += part.count(~kept)
-            size = options.size_of(part.topic, part.image_size)
-            keeps_files = size is None and part.are_jpeg_files and image_format != "png"
+            keeps_files = part.are_jpeg_files and image_format != "png"
             kind = "jpeg" if keeps_files else image_format or "png"
-            view = resized_view(part, size)
             try:
                 file = None
                 if not keeps_files:
-                    file = ImageFile(view.encoding.name, kind, quality=jpeg_quality)
-                self._files.append(_Files(part, numbers, kept, kind, view, file))
+                    file = ImageFile(part.encoding, kind, quality=jpeg_quality)
+                self._files.append(_Files(part, numbers, kept, kind, file))
             except OptionError as error:
                 self.refused[str(error).rstrip(".")] += part.count(kept)
 

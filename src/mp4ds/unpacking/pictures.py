@@ -1,4 +1,4 @@
-"""The images of a stream in another form, frame by frame: its kind, size and number."""
+"""The images of a stream in another form, frame by frame: its kind and number."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.dataset.images import Images
 from mp4ds.dataset.rebuild import form_for
 from mp4ds.dataset.stream import Layer, Stream
-from mp4ds.dataset.views import Reduction, View
+from mp4ds.dataset.views import Thinning, View
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.fields import Choice, DecodedColumns, everything, unbroken
 from mp4ds.format.models import Header, StreamSidecar
@@ -122,12 +121,12 @@ def packet_format(form: ImageForm, sidecar: StreamSidecar, pixel_format: str) ->
     return ";".join((codec, pixel_format, before, shown))
 
 
-# ---------------------------------------------------------------- fewer, and smaller
+# ---------------------------------------------------------------- fewer
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReductionOptions(Reduction, TopicOptions):
-    """Which topics, and how to reduce their images: each stream separately."""
+class FrameOptions(Thinning, TopicOptions):
+    """Which topics, and which of their images: of each stream separately."""
 
     quality: str | None = option(
         "visual: the images of the views of lossless cameras; default: as recorded.",
@@ -219,7 +218,6 @@ class ImageForm:
         kind: One of `KINDS`.
         world: ``ros1`` or ``ros2``: what the messages are for.
         jpeg_quality: Of new JPEG files, 1 to 100.
-        size: Width and height in pixels; None for as recorded.
         in_place: Whether the messages are of that kind already, and stay on their channel. Files
             then keep their format field if they hold the same.
     """
@@ -227,7 +225,6 @@ class ImageForm:
     kind: str
     world: str
     jpeg_quality: int
-    size: tuple[int, int] | None
     in_place: bool
 
 
@@ -246,36 +243,20 @@ def _maker(stream: Stream, header: Header, form: ImageForm) -> tuple[View, Make]
     if is_inverse and len(header.prefix) != 2 * HEADER_BYTES:
         raise Refused("the parameters of its quantised depths are missing")
     recorded = encoding_of(sidecar, header)
-    view = resized_view(stream, form.size, sidecar.image.encoding if is_inverse else recorded)
-    encoding = recorded if is_inverse else view.encoding.name
+    view = stream.view(encoding=sidecar.image.encoding if is_inverse else recorded)
+    view = replace(view, scale=None)
     if form.kind == "raw":
         prefix = bytes.fromhex(header.prefix)
         as_metres = partial(metres_of, header=prefix) if is_inverse else None
-        return view, partial(raw_image, encoding=encoding, convert=as_metres)
+        return view, partial(raw_image, encoding=recorded, convert=as_metres)
     try:
-        file = ImageFile(encoding, form.kind, quality=form.jpeg_quality)
+        file = ImageFile(recorded, form.kind, quality=form.jpeg_quality)
     except OptionError:
-        raise Refused(f"{form.kind.upper()} files cannot hold {encoding} images") from None
-    told = format_of(encoding, form, has_mosaic=form.kind == "png")
-    if form.in_place and encoding == recorded:
+        raise Refused(f"{form.kind.upper()} files cannot hold {recorded} images") from None
+    told = format_of(recorded, form, has_mosaic=form.kind == "png")
+    if form.in_place:
         told = header.format or ""
     return view, lambda pixels: Given(CodedFields(told), file.encode(pixels))
-
-
-def resized_view(images: Images, size: tuple[int, int] | None, encoding: str | None = None) -> View:
-    """The view of images for another size.
-
-    Bayer mosaics and camera YUV cannot be resized as they are, and become RGB.
-
-    Args:
-        images: The images.
-        size: Width and height to make; None to keep them.
-        encoding: See `Images.view`.
-    """
-    if size is None:
-        return replace(images.view(encoding=encoding), scale=None)
-    is_plain = ENCODINGS[encoding or images.encoding].is_plain
-    return images.view("native" if is_plain else "rgb", size, encoding=encoding)
 
 
 def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
@@ -369,14 +350,14 @@ class Conversion:
             self._shown = shown_by_packets(stream)
             _check_video(self._shown, form)
             self._frames = self._packets
-        elif form.size is None and holds_files(stream, form.kind):
+        elif holds_files(stream, form.kind):
             encodings = [encoding_of(stream.sidecar, header) for header in headers]
             self._formats = [format_of(one, form, has_mosaic=True) for one in encodings]
             self._frames = self._files
         else:
             self._makers = [_maker(stream, header, form) for header in headers]
-            is_plain = stream.sidecar.body == "pixels" and self._makers[0][0].scale is None
-            self._frames = self._from_pixels if is_plain else self._from_pictures
+            is_raw = stream.sidecar.body == "pixels"
+            self._frames = self._from_pixels if is_raw else self._from_pictures
 
     def frames(self, choice: Choice, *, verify: bool) -> Frames:
         """The wanted frames, in order; packets come with those they refer to, from a key frame on.
@@ -410,30 +391,26 @@ class Conversion:
 
     def _from_pixels(self, choice: Choice, verify: bool) -> Frames:
         """From raw images, checked against their digests."""
-        form, image, (view, make) = self.form, self.stream.sidecar.image, self._makers[0]
+        form, image, (_, make) = self.form, self.stream.sidecar.image, self._makers[0]
         size = {"width": image.width, "height": image.height, "step": image.step}
         fields = ImageFields(image.encoding, is_bigendian=image.is_bigendian, **size)
         for index, body in _bodies(self.stream, choice, verify):
-            if form.kind == "raw" and form.size is None:
+            if form.kind == "raw":
                 yield index, Given(fields, body)
                 continue
             is_bigendian = bool(image.is_bigendian)
             pixels = pixel_view(body, ENCODINGS[image.encoding], **size, is_bigendian=is_bigendian)
-            if form.size is not None:
-                seen: Pixels = np.empty(view.shape, view.dtype)
-                view.give(np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("=")), seen)
-                pixels = seen
             yield index, make(pixels)
 
     def _from_pictures(self, choice: Choice, verify: bool) -> Frames:
         """From the decoded pictures of files and packets."""
-        stream, scale = self.stream, self._makers[0][0].scale
+        stream = self.stream
         if verify:
             stream.verify_pictures()
         with ExitStack() as files:
             packets = None
             is_strict = not stream.sidecar.keeps_packets
-            for index, picture in stream.pictures(choice, scale, is_strict=is_strict):
+            for index, picture in stream.pictures(choice, is_strict=is_strict):
                 if picture is not None:
                     view, make = self._makers[stream.columns.variant[index]]
                     yield index, make(stream.pixels(picture, view, index))

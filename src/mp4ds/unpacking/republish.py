@@ -14,9 +14,8 @@ from mp4ds.bags.convert import ENCODINGS, Converter
 from mp4ds.bags.types import SCHEMA_ENCODINGS, make_store, standard_of, types_of
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import ChannelGroup, MessageSource, Part
-from mp4ds.dataset.rebuild import CalibrationMessages, message_at
+from mp4ds.dataset.rebuild import message_at
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import adapted
 from mp4ds.errors import ConversionError, FormatError, OptionError, Refused
 from mp4ds.format.fields import Choice, everything, marked
 from mp4ds.messages.serializations import TRANSPORTS, is_camera, plain_message
@@ -26,12 +25,11 @@ from mp4ds.unpacking.pictures import (
     FAMILIES,
     KINDS,
     Conversion,
+    FrameOptions,
     Given,
     ImageForm,
     Kind,
-    ReductionOptions,
     holds_files,
-    is_inverse_depth,
 )
 
 
@@ -61,29 +59,6 @@ def free_topic(topic: str, kind: str, taken: Collection[str]) -> str:
     while topic in taken:
         topic += "_" + kind.replace("-", "_")
     return topic
-
-
-# ---------------------------------------------------------------- calibrations
-
-
-def _resized(
-    infos: CalibrationMessages, stream: Stream, size: tuple[int, int]
-) -> CalibrationMessages:
-    """The calibration messages of a stream for another width and height of its images.
-
-    Raises:
-        Refused: They cannot be adapted; says why.
-    """
-    whole = (0, 0, *stream.image_size)
-    made = [adapted(calibration, whole, size) for calibration in infos.info.calibrations]
-    found = CalibrationMessages(
-        infos.info.model_copy(update={"calibrations": made}), str(stream.path)
-    )
-    try:
-        _ = found.templates
-    except FormatError:
-        raise Refused("calibrations of this type cannot be adapted to another size") from None
-    return found
 
 
 # ---------------------------------------------------------------- republisher
@@ -142,10 +117,8 @@ class _Plan:
 class Republisher:
     """Converts the messages of a dataset: planned on creation, done while reading.
 
-    Messages that are only resized stay on their channel: raw images, JPEG and PNG files of
-    ROS keep their kind, and video packets become raw images, unless a kind is given.
-    Messages of which only some are left out stay as recorded, byte for byte. Calibrations are
-    adapted to the size, and left out with the images whose stamps they have.
+    Messages of which some are left out stay as recorded, byte for byte. Calibrations are left out
+    with the images whose stamps they have.
 
     Args:
         dataset: The dataset.
@@ -154,7 +127,7 @@ class Republisher:
         converts_all: Whether other channels are converted to it, too.
         kind: What to convert images to, one of `KINDS`; None for as recorded.
         jpeg_quality: Of new JPEG files, 1 to 100.
-        options: How to reduce images.
+        options: Which images to leave out.
         renamed: The name that a topic goes out by.
 
     Attributes:
@@ -167,7 +140,7 @@ class Republisher:
         thinned: Topics with messages left out -> how many.
 
     Raises:
-        OptionError: Images of that kind cannot be reduced.
+        OptionError: None of that kind can be left out.
     """
 
     def __init__(
@@ -179,11 +152,11 @@ class Republisher:
         converts_all: bool,
         kind: str | None = None,
         jpeg_quality: int = 95,
-        options: ReductionOptions | None = None,
+        options: FrameOptions | None = None,
         renamed: Callable[[str], str] = lambda topic: topic,
     ) -> None:
-        self._reduction = options or ReductionOptions()
-        check_kind(kind, self._reduction)
+        self._options = options or FrameOptions()
+        check_kind(kind, self._options)
         self._kind = kind
         self._world = world
         self._jpeg_quality = jpeg_quality
@@ -210,9 +183,9 @@ class Republisher:
         self._declare(dataset, planned, {channel.topic for channel in staying})
         for _, plans in planned:
             for plan in plans:
-                self._give_calibrations(plan, selected)
+                self._thin_calibrations(plan, selected)
         self.thinned = +self.thinned  # without those of which all are kept
-        if kind or self._reduction.reduces:
+        if kind or self._options.leaves_out:
             self._count_verbatim(dataset, selected)
 
     @property
@@ -264,20 +237,19 @@ class Republisher:
         return [plan for plan in plans if plan.conversion or plan.is_kept is not None]
 
     def _plan(self, stream: Stream) -> _Plan:
-        size = self._reduction.size_of(stream.topic, stream.image_size)
         is_replaced = stream.sidecar.replaces_packets
-        kind = self._kind or (_kind_of(stream, self._reduction) if size or is_replaced else "")
+        kind = self._kind or (_kind_of(stream, self._options) if is_replaced else "")
         is_kept = None
-        if self._reduction.leaves_out:
-            is_kept = self._reduction.kept(stream.columns)
+        if self._options.leaves_out:
+            is_kept = self._options.kept(stream.columns)
         if kind:
             is_done = self._is_done(stream, kind)
             try:
-                if not is_done or size or is_replaced:
+                if not is_done or is_replaced:
                     world = self._world
                     if is_done and stream.channel.message_encoding != ENCODINGS[world]:
                         world = "ros2" if world == "ros1" else "ros1"
-                    form = ImageForm(kind, world, self._jpeg_quality, size, in_place=is_done)
+                    form = ImageForm(kind, world, self._jpeg_quality, in_place=is_done)
                     return _Plan(stream, Conversion(stream, form), is_kept)
                 if is_kept is None:
                     raise Refused(f"they are already {KINDS[kind].noun}")
@@ -340,31 +312,20 @@ class Republisher:
                     source = partial(self._messages, plan, conversion, channel)
                     self.sources[plan.stream] = source
 
-    def _give_calibrations(self, plan: _Plan, selected: Callable[[str], bool]) -> None:
-        """Adapt the calibrations of a stream whose images are reduced.
+    def _thin_calibrations(self, plan: _Plan, selected: Callable[[str], bool]) -> None:
+        """Leave out the calibrations that only have the stamps of images that are left out.
 
-        If images are left out, so are the calibrations that only have their stamps. Those whose
-        stamps no image has are kept.
+        Those whose stamps no image has are kept.
         """
         stream, infos = plan.stream, plan.stream.infos
-        size = plan.conversion.form.size if plan.conversion else None
-        is_reduced = size is not None or plan.is_kept is not None
-        if infos is None or not is_reduced or not selected(infos.channel.topic):
+        if infos is None or plan.is_kept is None or not selected(infos.channel.topic):
             return
-        given = infos
-        is_wanted: NDArray[np.bool_] = np.ones(len(infos), np.bool_)
-        if size is not None:
-            try:
-                given = _resized(infos, stream, size)
-            except Refused as reason:
-                self.as_recorded[infos.channel.topic][str(reason)] += len(infos)
-        if plan.is_kept is not None:
-            stamps, frames = infos.columns.stamp, stream.stamps
-            is_wanted = ~np.isin(stamps, frames) | np.isin(stamps, frames[plan.is_kept])
-            self.thinned[infos.channel.topic] += int((~is_wanted).sum())
+        stamps, frames = infos.columns.stamp, stream.stamps
+        is_wanted = ~np.isin(stamps, frames) | np.isin(stamps, frames[plan.is_kept])
+        self.thinned[infos.channel.topic] += int((~is_wanted).sum())
 
         def messages(channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
-            return given.messages(channel, marked(is_wanted, choice))
+            return infos.messages(channel, marked(is_wanted, choice))
 
         self.sources[infos] = messages
 
@@ -411,31 +372,25 @@ class Republisher:
             raise FormatError("frame-count", stream.video_path, problem)
 
 
-def check_kind(kind: str | None, options: ReductionOptions) -> None:
-    """Refuse to reduce copied video.
+def check_kind(kind: str | None, options: FrameOptions) -> None:
+    """Refuse to leave out frames of copied video.
 
     Raises:
         OptionError: Says what to do.
     """
-    if kind and KINDS[kind].family == "video" and options.reduces:
+    if kind and KINDS[kind].family == "video" and options.leaves_out:
         raise OptionError(
-            f"`resize`, `every` and `max_rate` cannot be combined with `images` {kind}, which "
-            "copies the video. Use raw, jpeg or png."
+            f"`every` and `max_rate` cannot be combined with `images` {kind}, which copies the "
+            "video. Use raw, jpeg or png."
         )
 
 
-def _kind_of(stream: Stream, reduction: ReductionOptions) -> str:
-    """The kind of a stream's images, or what they become if that kind cannot be reduced."""
-    sidecar = stream.sidecar
-    if sidecar.body == "jpeg" or stream.are_jpeg_files:
-        return "jpeg"
-    if sidecar.body in ("png", "rvl"):
-        is_metres = any(is_inverse_depth(sidecar, header) for header in sidecar.headers)
-        return "raw" if is_metres else "png"
-    if sidecar.replaces_packets and not reduction.reduces:
-        name = stream.channel.type_name.replace(".", "/").rpartition("/")[2]
-        return next(kind for kind, own in KINDS.items() if own.type_name.endswith(f"/{name}"))
-    return "raw"
+def _kind_of(stream: Stream, options: FrameOptions) -> str:
+    """The kind of packets that a view replaces; raw images if some are left out."""
+    if options.leaves_out:
+        return "raw"
+    name = stream.channel.type_name.replace(".", "/").rpartition("/")[2]
+    return next(kind for kind, own in KINDS.items() if own.type_name.endswith(f"/{name}"))
 
 
 def _refers(stream: Stream) -> bool:

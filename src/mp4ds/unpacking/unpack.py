@@ -41,7 +41,7 @@ from mp4ds.records import (
     bounded,
 )
 from mp4ds.unpacking.image_folders import TopicImages, image_names
-from mp4ds.unpacking.pictures import KINDS, ReductionOptions, shown_by_packets
+from mp4ds.unpacking.pictures import KINDS, FrameOptions, shown_by_packets
 from mp4ds.unpacking.republish import Republished, Republisher, check_kind
 
 SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
@@ -52,7 +52,7 @@ _OURS = "mp4ds:"  # metadata records in which a dataset keeps the contents of a 
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnpackOptions(SliceOptions, ReductionOptions):
+class UnpackOptions(SliceOptions, FrameOptions):
     """How to unpack."""
 
     latched: bool = latched()
@@ -197,7 +197,7 @@ def _unpack_here(
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
             part = slice_of(whole, chosen.slice, chosen.selected)
-            if to == "images" or chosen.images or chosen.reduces or _has_replaced(whole, chosen):
+            if to == "images" or chosen.images or chosen.leaves_out or _has_replaced(whole, chosen):
                 # whose frames are counted from the slice's first one
                 with sliced(whole, part, path.parent, chosen.selected) as opened:
                     if to == "images":

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.views import View, adapted
+from mp4ds.dataset.views import Reduction, View, adapted
 from mp4ds.errors import OptionError
 from mp4ds.format.fields import marked
 from mp4ds.format.models import Calibration
@@ -23,7 +23,7 @@ from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import WHAT, Parsed, SliceOptions, force, option
 from mp4ds.times import intervals, sound_times, synchronize, usual_interval
-from mp4ds.unpacking.pictures import ReductionOptions, is_inverse_depth
+from mp4ds.unpacking.pictures import FrameOptions, is_inverse_depth
 from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
 
@@ -42,7 +42,7 @@ def _nanoseconds(value: str | int) -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions(SliceOptions, ReductionOptions):
+class ExportOptions(SliceOptions, Reduction, FrameOptions):
     """How to export."""
 
     native: bool = option(

@@ -21,7 +21,7 @@ from mp4ds.options import (
     seconds,
 )
 from mp4ds.plugins.ros.node import CLOCK, NodeOptions
-from mp4ds.unpacking.pictures import ReductionOptions
+from mp4ds.unpacking.pictures import FrameOptions
 
 KINDS = {"raw": "raw", "compressed": "jpeg", "ffmpeg": "ffmpeg"}
 """Transport that cameras are published as -> kind of image in `mp4ds.unpacking`."""
@@ -42,7 +42,7 @@ def rooted(topic: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayOptions(ReductionOptions, NodeOptions):
+class PlayOptions(FrameOptions, NodeOptions):
     """How to play datasets back."""
 
     exclude: Sequence[str] = option(
