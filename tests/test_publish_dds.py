@@ -120,6 +120,43 @@ def test_many_messages_of_which_all_are_kept(side: Side) -> None:
     assert got == [padded(payload) for payload in sent]
 
 
+IMAGE = "sensor_msgs/msg/Image"
+
+
+def large(kind: str, number: int) -> bytes:
+    """More than a socket holds, a few of them."""
+    if kind == STRING:
+        return message(kind, number) + bytes(20_000)
+    image = STORE.deserialize_cdr(message(kind, number), kind)
+    image.data = np.zeros(200_000, np.uint8)
+    return bytes(STORE.serialize_cdr(image, kind))
+
+
+@pytest.mark.parametrize(("kind", "count"), [(STRING, 900), (IMAGE, 30)])
+def test_a_subscriber_that_hangs_for_a_while_gets_all(side: Side, kind: str, count: int) -> None:
+    recorded = channel("/a", kind)
+    sent = [large(kind, number) for number in range(count)]
+    with side.open() as publisher:
+        with side.stopped(publisher, recorded):
+            for payload in sent:
+                publisher.publish(recorded, payload, 0)
+        assert side.peer.received("/a", count) == [padded(payload) for payload in sent]
+
+
+def test_a_subscriber_that_hangs_for_long_takes_no_more_memory(side: Side) -> None:
+    """What is kept for it is what is newest."""
+    recorded = channel("/a", IMAGE)
+    sent = [padded(large(IMAGE, number)) for number in range(100)]
+    with side.open() as publisher:
+        with side.stopped(publisher, recorded):
+            for payload in sent:
+                publisher.publish(recorded, payload, 0)
+        until(lambda: sent[-1] in side.peer.received("/a", 1))
+        got = side.peer.received("/a", 1)
+    assert got[-32:] == sent[-32:]
+    assert len(got) < 50
+
+
 def test_its_own_clock_is_none_of_others(side: Side) -> None:
     heard: list[int] = []
     with side.open() as publisher, side.open() as other:

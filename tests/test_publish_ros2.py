@@ -233,10 +233,11 @@ def test_subscribers_have_as_long_as_they_are_given(side: Side, milliseconds: in
     assert len(side.peer.received("/robot/topic", 1)) == 1
 
 
-def test_subscribers_that_do_not_acknowledge(side: Side) -> None:
+@pytest.mark.parametrize("milliseconds", [500, None])
+def test_subscribers_that_do_not_acknowledge(side: Side, milliseconds: int | None) -> None:
     """The topics are named, others are not."""
     heard, plain = channel("/robot/topic", STRING), channel("/robot/other", STRING)
-    publisher = side.open(wait_for_all_acked=500)
+    publisher = side.open(wait_for_all_acked=milliseconds)
     with side.stopped(publisher, heard):
         publisher.advertise(plain)
         publisher.publish(heard, message(STRING, 1), 0)

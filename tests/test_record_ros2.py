@@ -29,7 +29,7 @@ from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
 from ros2_sides import SIDES, STORE, Controls, Side, channel, message, padded
 from ros2_sides import side as side
 from scenes import scene
-from waiting import until
+from waiting import WATCHDOG_S, until
 
 pytest.importorskip("cyclonedds")
 
@@ -294,6 +294,30 @@ def test_a_message_that_cannot_be_taken(side: Side) -> None:
         source.close()
     assert source.lost == {"/robot/name": 1}
     assert [*source.warnings] == ["/robot/name: a message could not be recorded: ValueError('no')"]
+
+
+def test_a_recorder_that_hangs_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What comes over DDS meanwhile waits, and is not overwritten."""
+    recorded, taken, goes_on = channel("/robot/name", STRING), [], threading.Event()
+    sent = [padded(message(STRING, number)) for number in range(1000)]
+
+    def take(message: Message) -> None:
+        goes_on.wait(WATCHDOG_S)
+        taken.append(bytes(message.data))
+
+    with SIDES["dds"](monkeypatch) as side, side.open() as publisher:
+        publisher.advertise(recorded)
+        source = receiving(take)
+        source.start()
+        until(lambda: publisher.subscribers(recorded) == 1)
+        for payload in sent:
+            publisher.publish(recorded, payload, 0)
+        assert publisher._channels[id(recorded)][1].wait(WATCHDOG_S)  # it is in its queue
+        goes_on.set()
+        until(lambda: len(taken) == len(sent))
+        source.close()
+    assert taken == sent
+    assert not source.lost
 
 
 EVENT = "std_srvs/srv/Trigger_Event"

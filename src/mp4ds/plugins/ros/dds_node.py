@@ -117,17 +117,23 @@ _FOREVER = 2**63 - 1
 _HASH = re.compile(rb"(?:^|;)typehash=(RIHS\d\d_[0-9a-f]{64});")
 
 
-def _dds_qos(qos: Qos, user_data: str, *, is_reader: bool = False) -> Any:
+def _dds_qos(qos: Qos, user_data: str, *, is_reader: bool = False, unacknowledged: int = 0) -> Any:
     """A QoS profile for Cyclone DDS, mapped as by rmw_cyclonedds.
+
+    The depth is that for late subscribers. What is not taken or acknowledged yet may be more:
+    nobody is told when it is overwritten, and publishers and subscribers match whatever they keep.
 
     Args:
         qos: The ROS profile.
         user_data: User data to announce, such as the type hash.
-        is_reader: It is for a reader, which ignores what this participant writes.
+        is_reader: It is for a reader, which ignores what this participant writes. It keeps all: a
+            thread takes out what comes.
+        unacknowledged: How many messages a writer keeps at least that subscribers do not have yet.
     """
-    kept = Policy.History.KeepAll
-    if qos.history == "keep_last":
-        kept = Policy.History.KeepLast(qos.depth)
+    kept = late = Policy.History.KeepAll
+    if qos.history == "keep_last" and not is_reader:
+        late = Policy.History.KeepLast(qos.depth)
+        kept = Policy.History.KeepLast(max(qos.depth, unacknowledged))
     lease = _FOREVER if qos.liveliness_lease_duration is None else qos.liveliness_lease_duration
     liveliness = {
         "automatic": Policy.Liveliness.Automatic,
@@ -147,7 +153,7 @@ def _dds_qos(qos: Qos, user_data: str, *, is_reader: bool = False) -> Any:
         unlimited = (-1, -1, -1)
         policies += [
             Policy.Durability.TransientLocal,
-            Policy.DurabilityService(0, kept, *unlimited),
+            Policy.DurabilityService(0, late, *unlimited),
         ]
     if qos.deadline is not None:
         policies.append(Policy.Deadline(qos.deadline))
@@ -212,7 +218,9 @@ class _DdsWriter:
         self._seen: dict[int, float] = {}
         try:
             dds = Topic(participant, name, kind.writes)
-            self._writer = DataWriter(participant, dds, qos=_dds_qos(qos, _told(kind.type_hash)))
+            told = _told(kind.type_hash)
+            kept = _dds_qos(qos, told, unacknowledged=kind.unacknowledged)
+            self._writer = DataWriter(participant, dds, qos=kept)
         except DDSException as error:
             problem = f"DDS refuses it or its QoS: {error.msg}"
             raise ConversionError(topic, problem, "Leave it out, or override its QoS.") from None

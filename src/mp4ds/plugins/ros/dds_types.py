@@ -32,6 +32,10 @@ _DDS_NAME = re.compile(r"(?:\w+(?:::|\.))+dds_(?:::|\.)\w+_")
 _MAX_NESTING = 50
 _MAX_SIZE = 2**28  # bytes of fixed-size parts: the library counts them in 32 bits
 _TYPE_PATIENCE = 2_000_000_000  # ns to wait for another participant to describe a type
+_FEW, _MANY = 32, 1000
+"""Messages kept for slow subscribers: a second of a camera, and of types without blobs."""
+
+_BLOBS = ("byte", "char", "int8", "octet", "uint8")
 _BASES = {
     "bool": "bool",
     "octet": "byte",
@@ -53,12 +57,14 @@ class DdsType:
         type_hash: ``RIHS01_...``; empty if the definition is unknown.
         is_real: Whether it announces the real type.
         is_empty: Whether it has no fields: messages have one byte, which some recordings lack.
+        unacknowledged: How many messages to keep for subscribers that do not have them yet.
     """
 
     writes: Any
     type_hash: str
     is_real: bool
     is_empty: bool
+    unacknowledged: int
 
 
 # ---------------------------------------------------------------- names
@@ -140,8 +146,11 @@ def message_type(channel: Channel) -> DdsType:
         type_hash = type_hash or hash_of(found, name)
         real = as_is(make_struct(found, name))
     except Refused:
-        return DdsType(_opaque_type(dds_name(name)), type_hash, False, False)
-    return DdsType(real, type_hash, True, is_empty=found[name][1][0][0] == FILLER)
+        return DdsType(_opaque_type(dds_name(name)), type_hash, False, False, _FEW)
+    is_empty = found[name][1][0][0] == FILLER
+    shapes = (field_shape(desc) for _, fields in found.values() for _, desc in fields)
+    is_large = any(one.bound == 0 and one.base in _BLOBS for one in shapes)
+    return DdsType(real, type_hash, True, is_empty, _FEW if is_large else _MANY)
 
 
 def publisher_type(participant: Any, endpoint: Any) -> Any:

@@ -248,9 +248,9 @@ class NodeOptions(Options):
 
     @property
     def parting_s(self) -> float | None:
-        """How long to wait at the end for acknowledgements (ROS 2), may be infinite.
+        """How long to wait at the end for acknowledgements (ROS 2), may be infinite; None: 3 s.
 
-        Topics that are not acknowledged by then are named in a warning. None: 3 s, without one.
+        Topics that are not acknowledged by then are named in a warning.
         """
         return None
 

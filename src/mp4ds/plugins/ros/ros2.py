@@ -161,7 +161,7 @@ class Ros2Node(Node):
         for channel, writer in self._channels.values():
             if channel.topic not in late and not writer.wait(max(0.0, end - time.monotonic())):
                 late.add(channel.topic)
-        if late and patience is not None:
+        if late:
             topics = ", ".join(sorted(late))
             warnings.warn(
                 f"{topics}: subscribers have not acknowledged every message in time",
