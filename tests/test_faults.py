@@ -119,8 +119,9 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     remove = shutil.rmtree
 
     def spy(folder: Path, *args: Any, **options: Any) -> None:
-        if folder.name.startswith(".") and folder.is_dir():
-            kind = "joined" if folder.name.startswith(".dataset.") else folder.name[1:6]
+        name = folder.parent.name if folder.name == "new" else folder.name
+        if name.startswith(".") and folder.is_dir():
+            kind = "joined" if name.startswith(".dataset.") else name[1:6]
             states.add(f"{kind} {_state(folder)}")
         remove(folder, *args, **options)
 

@@ -303,7 +303,7 @@ def staged(
     except OSError as error:
         raise as_write_error(error, target) from error
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        _discard(folder)
         held.close()
 
 
@@ -326,7 +326,7 @@ def work_folder(parent: Path, prefix: str) -> Iterator[Path]:
     try:
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        _discard(folder)
         held.close()
 
 
@@ -369,7 +369,15 @@ def _remove_abandoned(folder: Path, before: Callable[[], None] = lambda: None) -
     with suppress(OSError), (folder / _LOCK).open("r+") as file:
         if is_mine(folder.lstat(), folder.parent) and lock(file):
             before()
-            shutil.rmtree(folder, ignore_errors=True)
+            _discard(folder)
+
+
+def _discard(folder: Path) -> None:
+    """Remove a run's folder, the lock last: what is left without it is nobody's."""
+    with suppress(OSError):
+        for path in folder.iterdir():
+            shutil.rmtree(path, ignore_errors=True)  # no file
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _prefix(target: Path) -> str:
@@ -392,6 +400,9 @@ def _clear_leftovers(target: Path) -> None:
             if {part.name for part in parts} <= {_LOCK, _NEW, _OLD} and (
                 {*inner} <= {target.name} and not any(part.is_symlink() for part in parts)
             ):
+                # the lock was there before the others, and may be gone or not yet on the disk
+                if parts and is_mine(folder.lstat(), folder.parent):
+                    (folder / _LOCK).touch()
                 _remove_abandoned(folder, restore)
 
 
