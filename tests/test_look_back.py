@@ -17,8 +17,10 @@ from mp4ds.bags.formats import open_sources
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.errors import Mp4dsError, WriteError
 from mp4ds.packing.options import PackOptions
+from mp4ds.plugins.recording.lookback import LookBack
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.record import Recorder, RecordSummary
+from mp4ds.plugins.recording.spool import Piece
 from mp4ds.records import Message
 from player_scenes import make_drive
 from record_scenes import PlayedNode, played
@@ -135,9 +137,22 @@ def test_nothing_is_left_without_a_trigger(drive: Path, tmp_path: Path) -> None:
     assert 0 < max(seen) < drive.stat().st_size
 
 
-def test_a_disk_that_is_full(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was on disk by then is recovered: what was looked back at, and what was being saved."""
-    sent, write = messages(drive), McapWriter.write
+@pytest.mark.parametrize("is_removed", [True, False])
+def test_a_disk_that_is_full(
+    is_removed: bool, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was on disk by then is recovered: what was looked back at, and what was being saved.
+
+    Also if a power cut brings back the piece whose latched messages piece 0 has.
+    """
+    sent, write, forget = messages(drive), McapWriter.write, LookBack._forget
+    removed: list[tuple[Path, bytes]] = []
+
+    def note(self: LookBack, piece: Piece) -> None:
+        removed.append((piece.writer.path, piece.writer.path.read_bytes()))
+        forget(self, piece)
+
+    monkeypatch.setattr(LookBack, "_forget", note)
     _, full, _ = sent[3 * len(sent) // 4]
 
     def refuse(self: McapWriter, message: Message) -> None:
@@ -151,11 +166,16 @@ def test_a_disk_that_is_full(drive: Path, tmp_path: Path, monkeypatch: pytest.Mo
         looked_back([drive], tmp_path / "live", acts, and_then=60)
     folders = [*tmp_path.glob("live*.recording")]
     assert len(folders) == 2
+    if not is_removed:
+        removed[0][0].write_bytes(removed[0][1])
     for folder in folders:
         summary = mp4ds.pack(folder, folder.with_suffix(""), PackOptions(salvage=True))
-        assert {one.problem for one in summary.losses} == {"the file ends before its footer"}
         found = again(folder.with_suffix(""))
         assert {topic for topic, *_ in found} == {topic for topic, *_ in sent}
+        assert len(found) == len({*found})
+        if not is_removed and folder == removed[0][0].parent:
+            continue  # it has the very first piece, too
+        assert {one.problem for one in summary.losses} == {"the file ends before its footer"}
         begun = next(number for number, one in enumerate(found) if one[0] != STATIC)
         place = sent.index(found[begun])
         assert found[begun:] == sent[place : 3 * len(sent) // 4]

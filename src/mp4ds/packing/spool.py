@@ -9,25 +9,35 @@ from __future__ import annotations
 
 import re
 import stat
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, Literal
 
+from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.mcap_records import copy_verified
 from mp4ds.bags.protocols import Format
+from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.concat import concat
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, Refused, SourceError
-from mp4ds.files.outputs import check_target, is_mine, lock, staged, work_folder
+from mp4ds.files.outputs import (
+    check_target,
+    is_mine,
+    lock,
+    staged,
+    sync,
+    sync_folder,
+    work_folder,
+)
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.format.fields import Gop, Model, Profile
 from mp4ds.format.manifest import About, LossEntry, Source
 from mp4ds.packing.manifest import PartRecord, dataset_files, summarize
 from mp4ds.packing.options import PackOptions, PackSummary
-from mp4ds.records import Loss, bounded
+from mp4ds.records import Loss, Message, MetadataRecord, Record, bounded
 from mp4ds.video.codecs import SPEED
 
 _NAME = re.compile(r"([0-9]{6})(\.mcap)?")
@@ -76,7 +86,7 @@ class SpoolFolder:
         self._settings_path = path / RECORDING_NAME
 
     def begin(self, settings: SpoolSettings) -> IO[bytes]:
-        """Make the folder, which must not exist.
+        """Make the folder, which must not exist; it is on the disk before anything is in it.
 
         Returns:
             What locks it: nobody takes it for one that was left while this is open. The lock is
@@ -91,6 +101,8 @@ class SpoolFolder:
         lock(file, shared=True)
         file.write(settings.model_dump_json(indent=1).encode() + b"\n")
         file.flush()
+        sync(self.path)
+        sync_folder(self.path.parent)
         return file
 
     def locked(self, *, shared: bool = False) -> IO[bytes]:
@@ -233,15 +245,20 @@ def recover(
     _check_owner(path, path.absolute().parent)
     folder = SpoolFolder(path)
     found = _found(path)
+    if not found:
+        raise SourceError(path, "holds no messages")
     with folder.locked(), work_folder(target.parent, f".{target.name}.") as place:
         settings = folder.settings()
-        old = range(1, min({*found} - {0}, default=1)) if settings.looks_back else ()
+        oldest = min({*found} - {0}, default=0)
+        old = range(1, oldest or 1) if settings.looks_back else ()
         parts, losses = [], _gaps([*sorted({*found, *old})])
         for number, is_packed in found.items():
             piece, part = folder.piece(number), folder.part(number)
             if not is_packed:
                 part, copy = place / part.name, place / piece.name
                 losses += copy_verified(piece, copy)
+                if settings.looks_back and oldest and number == 0:
+                    _leave_out_repeated(copy, folder.piece(oldest), settings.profile)
                 try:
                     pack(copy, part, settings.options(salvage=True))
                 except SourceError as error:  # not a record of it is left
@@ -262,6 +279,32 @@ def recover(
             raise SourceError(path, problem, remedy) from None
 
 
+def _leave_out_repeated(path: Path, oldest: Path, profile: str) -> None:
+    """Write the latched messages again, without those of a piece that was about to be removed."""
+    known = {_key(record) for record in _records(path)}
+    if repeated := known.intersection(map(_key, _records(oldest))) - {None}:
+        whole = path.rename(path.with_suffix(".whole"))
+        writer = McapWriter(path, profile=profile, compression="none")
+        for record in _records(whole):
+            if isinstance(record, MetadataRecord):
+                writer.add_metadata(record)
+            elif isinstance(record, Message) and _key(record) not in repeated:
+                writer.add_channel(record.channel)
+                writer.write(record)
+        writer.finish()
+
+
+def _records(piece: Path) -> Iterator[Record]:
+    with suppress(SourceError), McapSalvage(piece) as reader:
+        yield from reader.records()
+
+
+def _key(record: Record) -> tuple[object, ...] | None:
+    if isinstance(record, Message):
+        return record.channel.identity, record.log_time, bytes(record.data)
+    return None
+
+
 def _gaps(found: Sequence[int]) -> list[Loss]:
     """What is missing between pieces that are there, which no recorder leaves."""
     losses = []
@@ -274,7 +317,7 @@ def _gaps(found: Sequence[int]) -> list[Loss]:
     return losses
 
 
-def _found(path: Path) -> Mapping[int, bool]:
+def _found(path: Path) -> dict[int, bool]:
     """The numbers of pieces and parts in a folder, and whether a piece is packed.
 
     Raises:

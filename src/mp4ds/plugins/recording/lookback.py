@@ -18,7 +18,7 @@ from mp4ds.bags.latched import has_late, latched_before
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import with_own_payload
 from mp4ds.errors import TargetError
-from mp4ds.files.outputs import sync
+from mp4ds.files.outputs import sync, sync_folder
 from mp4ds.format.manifest import Excerpt as SourceExcerpt
 from mp4ds.format.manifest import Source
 from mp4ds.plugins.recording.spool import FAILURES, WINDOW_NS, Piece, Split
@@ -71,7 +71,9 @@ class Saved(Split):
             first.writer.add_channel(channel)
         for message in latched:
             self._write(first, message.of_channel(channels[message.channel.identity]))
-        self._complete(first)
+        self._close_piece(first)
+        sync(first.writer.path)
+        self._jobs.submit(self._pack, first)
         for piece in pieces:
             self.link(piece)
             self.take(piece)
@@ -81,6 +83,7 @@ class Saved(Split):
         number = self._numbers[piece.number] = self._count
         self._count += 1
         self.folder.piece(number).hardlink_to(piece.writer.path)
+        sync_folder(self.folder.path)  # before the other name is removed
 
     def take(self, piece: Piece) -> None:
         """Have a piece packed that is linked and complete, without what is before the start."""
@@ -132,7 +135,7 @@ class LookBack(Split):
         self._keeper = ThreadPoolExecutor(1, "look-back")
         super().__init__(new_path(), *spool)
         self._window_ns = min(WINDOW_NS, keep_ns // _PIECES)
-        self._open.pop().writer.finish()
+        self._close_piece(self._open.pop())
         self._check_links()
         self._begin(0)
 
@@ -208,7 +211,7 @@ class LookBack(Split):
         return piece
 
     def _complete(self, piece: Piece) -> None:
-        piece.writer.finish()
+        self._close_piece(piece)
         self._kept.append(piece)
         for saved in [one for one in self._saving if piece.number in one.awaited]:
             saved.awaited.remove(piece.number)
@@ -281,7 +284,9 @@ class LookBack(Split):
                 writer.write(message)
             writer.finish()
             sync(new)
+            sync_folder(new.parent)  # or the piece before this might be there again
             new.replace(before)
+            sync_folder(new.parent)
         piece.writer.path.unlink()
 
     def _remove(self) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from mp4ds.bags.latched import MOST_BYTES, LatchedMessages, has_late
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
 from mp4ds.errors import OptionError, TargetError
-from mp4ds.files.outputs import sync
+from mp4ds.files.outputs import sync, sync_folder
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.messages.serializations import is_camera
@@ -450,6 +450,7 @@ class Recorder:
                 self._error = error
                 self._splits[-1].abandon()
                 self.stop()
+            disk.submit(_sync, self._written())
 
     def _write_all(self, disk: ThreadPoolExecutor) -> None:
         syncing: Future[None] | None = None
@@ -481,8 +482,11 @@ class Recorder:
                     self.stop()
                 is_behind = self._buffer.bytes > self._options.buffer * 10**6 * _BEHIND
                 if not is_behind and (syncing is None or syncing.done()):
-                    syncing = disk.submit(_sync, self._splits[-1].paths)
+                    syncing = disk.submit(_sync, self._written())
                 next_flush = time.monotonic() + _FLUSH_S
+
+    def _written(self) -> list[Path]:
+        return [path for split in self._splits for path in split.written()]
 
     def _close_split(self) -> None:
         self._splits[-1].close(self._announced())
@@ -572,6 +576,8 @@ def _sync(paths: Sequence[Path]) -> None:
     for path in paths:
         with suppress(OSError):  # what the disk refuses, its writer is told, too
             sync(path)
+    for folder in {path.parent for path in paths}:
+        sync_folder(folder)
 
 
 def recorder_services(recorder: Recorder) -> Sequence[Service]:

@@ -122,6 +122,7 @@ class Split:
         self._depends: dict[int, bool] = {}
         self._window_ns = WINDOW_NS
         self._open: list[Piece] = []  # all but the newest take what is late
+        self._closed: list[Path] = []  # since `written` told of them
         self._count = 0  # of pieces
         check_target(target, force=options.force, owned=dataset_files)
         settings = SpoolSettings(
@@ -167,10 +168,10 @@ class Split:
             return True
         return self._options.max_size is not None and self.size >= self._options.max_size
 
-    @property
-    def paths(self) -> Sequence[Path]:
-        """The files that are being written."""
-        return [piece.writer.path for piece in self._open]
+    def written(self) -> list[Path]:
+        """The files that are being written, and those closed since the last call."""
+        closed, self._closed = self._closed, []
+        return closed + [piece.writer.path for piece in self._open]
 
     # ------------------------------------------------------------ writing
 
@@ -243,8 +244,12 @@ class Split:
         for piece in self._open:
             piece.writer.flush()
 
-    def _complete(self, piece: Piece) -> None:
+    def _close_piece(self, piece: Piece) -> None:
         piece.writer.finish()
+        self._closed.append(piece.writer.path)
+
+    def _complete(self, piece: Piece) -> None:
+        self._close_piece(piece)
         self._jobs.submit(self._pack, piece)
 
     def close(self, announced: Iterable[Channel]) -> None:
@@ -267,7 +272,9 @@ class Split:
         with suppress(OSError):
             self.flush()
         while self._open:
-            self._open.pop().writer.abandon()
+            piece = self._open.pop()
+            piece.writer.abandon()
+            self._closed.append(piece.writer.path)
 
     # ------------------------------------------------------------ packing
 
