@@ -106,16 +106,6 @@ def test_any_requests(
         assert access.seeking is None
 
 
-class Counting(FrameReader):
-    """Counts the packets that are read."""
-
-    reads = 0
-
-    def _packet(self, sample: int) -> bytes:
-        self.reads += 1
-        return super()._packet(sample)
-
-
 def test_a_file_that_was_cut_short_meanwhile(tmp_path: Path) -> None:
     recipe = RECIPES["svt-8"]
     path = written(tmp_path, recipe)

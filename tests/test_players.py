@@ -73,10 +73,6 @@ class Case:
         """The camera's messages."""
         return [m for m in self.scene().messages if m.msgtype in PICTURES]
 
-    @property
-    def is_packets(self) -> bool:
-        return self.kind in CODED and "png" not in self.kind and "depth" not in self.kind
-
 
 YUV = ("yuv420p", "yuvj420p")
 GREY_H264 = ("gray", "yuvj420p", "yuv420p")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -232,13 +234,28 @@ ALONE = {
 """Kind -> what the bodies of its messages are where only the view is left."""
 
 
+@pytest.fixture(scope="module")
+def viewed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Folders of a recording of a kind and its dataset with a view; not to be changed."""
+
+    @cache
+    def make(kind: str) -> Path:
+        folder = tmp_path_factory.mktemp(kind)
+        sources = SOURCES[ROS2](folder / "source", CODED[kind]())
+        mp4ds.pack(sources, folder / "whole", PackOptions(view="av1"))
+        return folder
+
+    return make
+
+
 @pytest.fixture(params=ALONE)
-def alone(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
+def alone(
+    request: pytest.FixtureRequest, viewed: Callable[[str], Path], tmp_path: Path
+) -> tuple[Path, str]:
     """A dataset of views alone, and its kind."""
-    (source,) = SOURCES[ROS2](tmp_path / "source", CODED[request.param]())
-    mp4ds.pack(source, tmp_path / "dataset", PackOptions(view="av1"))
-    assert remove_exact(tmp_path / "dataset") == 1
-    return tmp_path / "dataset", request.param
+    dataset = Path(shutil.copytree(viewed(request.param) / "whole", tmp_path / "dataset"))
+    assert remove_exact(dataset) == 1
+    return dataset, request.param
 
 
 def test_views_alone_are_a_dataset(alone: tuple[Path, str], tmp_path: Path) -> None:
@@ -258,11 +275,12 @@ def test_views_alone_are_a_dataset(alone: tuple[Path, str], tmp_path: Path) -> N
         refused(call(*command), 2, "has views only (exact layer not here: 1 file", "--quality vis")
 
 
-def test_another_reader(alone: tuple[Path, str], tmp_path: Path) -> None:
+def test_another_reader(alone: tuple[Path, str], viewed: Callable[[str], Path]) -> None:
     dataset, kind = alone
-    (source,) = (tmp_path / "source").iterdir()
-    mp4ds.pack(source, tmp_path / "whole", PackOptions(view="av1"))
-    (left,), (whole,) = (reader.dataset(path)["streams"] for path in (dataset, tmp_path / "whole"))
+    (source,) = (viewed(kind) / "source").iterdir()
+    (left,), (whole,) = (
+        reader.dataset(path)["streams"] for path in (dataset, viewed(kind) / "whole")
+    )
     assert (left["profile"], left["body"], left["payloads"]) == ("visual", ALONE[kind], None)
     assert left["packets"] == whole["view"]["packets"]
     made = [message for _, message in messages(source, whole["topic"])]
