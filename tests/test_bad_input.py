@@ -351,7 +351,7 @@ def test_a_folder_that_is_read_only(demo: Path, tmp_path: Path) -> None:
         for arguments in (
             ("pack", demo / "drive.bag", "-o", disk / "x"),
             ("unpack", demo / "drive", "--to", "mcap", "-o", disk / "x.mcap"),
-            *(("demo", disk / f"x{suffix}") for suffix in DEMOS),
+            ("demo", disk / "x.mcap"),
         ):
             refused(call(*arguments), 2, str(disk / "x"), "Read-only file system")
 
@@ -417,16 +417,11 @@ UNPACK_TARGETS = {
 }
 
 
-DEMOS = ("", ".bag", ".mcap")
-
-
-@pytest.mark.parametrize(
-    "job", ["pack", "pack-lossy", *(f"demo{suffix}" for suffix in DEMOS), *UNPACK_TARGETS]
-)
+@pytest.mark.parametrize("job", ["pack", "pack-lossy", "demo", *UNPACK_TARGETS])
 def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> None:
     with disk_of(tmp_path / "disk", "size=512k") as disk, unchanged(demo):
-        if job.startswith("demo"):
-            result = call("demo", disk / job.replace("demo", "x"), "--seconds", 1)
+        if job == "demo":
+            result = call("demo", disk / "x.mcap", "--seconds", 1)
         elif job == "pack":
             result = call("pack", demo / "drive.bag", "-o", disk / "x")
         elif job == "pack-lossy":
@@ -471,6 +466,7 @@ def test_interrupting_a_pack(long_demo: Path, tmp_path: Path) -> None:
         refused(result, 130, "interrupted")
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("numbers", "is_ignored", "code"),
     [

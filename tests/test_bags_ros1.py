@@ -396,6 +396,7 @@ def test_what_a_bag_cannot_hold_is_counted(tmp_path: Path) -> None:
         assert rows(reader) == [(0, START, b"a"), (0, START, b"b"), (0, START, b"c")]
 
 
+@pytest.mark.slow
 def test_memory_for_the_index_is_bounded(tmp_path: Path) -> None:
     """60,000 times and places are 10 MB of objects; of full chunks, counts alone are kept."""
     count, data = 60_000, bytes(1000)

@@ -69,7 +69,7 @@ EVEN |= {("full", "32FC1")}
 """Where the two are of about one size, so that either may be taken."""
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize(("content", "encoding", "source", "shape"), share(RAW, 6))
 def test_raw_images(content: str, encoding: str, source: str, shape: str, tmp_path: Path) -> None:
     recorded = scene(encoding, frames=FRAMES, content=content, **SHAPES[shape])
@@ -300,7 +300,7 @@ LEAST = {
 """dB, of a lossy video and a JPEG file of quality 95; 33 for others, whose colours are halved."""
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("name", "quality"),
     share([(name, quality) for name in TRANSCODED for quality in QUALITIES], len(QUALITIES)),
@@ -386,6 +386,7 @@ def test_what_grows_is_explained(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- all of it at once
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("source", ["bag-bz2", "rosbag2-mcap-v9", "mcap-ros2-zstd"])
 def test_a_robot_with_many_cameras(source: str, tmp_path: Path) -> None:
     """Several topics and kinds in one recording, in several threads."""

@@ -86,6 +86,7 @@ def test_an_error_of_the_caller_drops_what_waits_and_leaves_the_cluster(
 # ---------------------------------------------------------------- deaths
 
 
+@pytest.mark.slow
 def test_calls_of_a_killed_worker_are_made_on_another(tmp_path: Path) -> None:
     names = numbered(8)
     with (

@@ -70,6 +70,7 @@ def finished(folder: Path) -> dict[str, int]:
     return {part.name: part.stat().st_mtime_ns for part in parts}
 
 
+@pytest.mark.slow
 def test_it_is_the_same_dataset(
     cluster: RealCluster, source: Path, expected: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -340,6 +340,7 @@ def bag_of(path: Path, packed: bytes, size: int) -> None:
     make_bag(path, [plain()], chunks, compression="bz2", size=size, packed=packed)
 
 
+@pytest.mark.slow
 def test_a_bag_that_unpacks_to_much(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     size = 150 * 2**20

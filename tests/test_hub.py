@@ -61,6 +61,7 @@ with mp4ds.open("{HOME}/first") as dataset:
     assert {name for name, _ in hub.sent if name.endswith(".mp4")} == {view}
 
 
+@pytest.mark.slow
 def test_commands_take_it(hub: Hub, drives: Path, tmp_path: Path) -> None:
     commands = [
         ["info", HOME, "--json"],

@@ -413,6 +413,7 @@ print(peak() - before)
 """
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("packets", "size", "copies", "bound"),
     [(16, 1 << 20, 16, 16 << 20), (15_000, 2_000, 4, 32 << 20)],

@@ -73,6 +73,7 @@ def sliced(way: str, source: Path, folder: Path, **options: Any) -> tuple[Any, P
     return summary, output
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("kind", TOPICS)
 def test_it_begins_with_them(way: str, kind: str, tmp_path: Path) -> None:

@@ -42,6 +42,7 @@ with mp4ds.open(dataset) as opened:
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("way", READING)
 def test_reading_without_unix(way: str, tmp_path: Path) -> None:
     assert program("-c", NO_UNIX + READING[way], DATASET, tmp_path / "out").err == ""

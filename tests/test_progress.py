@@ -224,6 +224,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [folder / "day.bag", folder / "night.bag"]
 
 
+@pytest.mark.slow
 def test_a_job_reports_all_its_datasets(drives: list[Path], tmp_path: Path) -> None:
     seen: list[PackProgress] = []
     options = PackOptions(quality="crf=40", codec="h264", preset="ultrafast", gop=4, window=4)

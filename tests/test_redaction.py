@@ -74,6 +74,7 @@ def messages(path: Path) -> list[tuple[Any, ...]]:
 # ---------------------------------------------------------------- recordings of others
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("name", "told", "changed"),
     [
@@ -107,7 +108,7 @@ KINDS: dict[str, Callable[..., Scene]] = {
 }
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(10)
 @pytest.mark.parametrize("change", ["fill", "blur"])
 @pytest.mark.parametrize("name", KINDS)
 def test_boxes_alone_change(name: str, change: str, tmp_path: Path) -> None:
@@ -363,6 +364,7 @@ def bright(topic: str, time: int, found: np.ndarray[Any, Any]) -> list[Any]:
     return [(-3.5, 40.2, 10, 20), Box(50, 40, 30, 30, fill=255), (70, 0, 5, 5)]
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["bgr8", "mono8", "bayer_rggb8", "nv12"])
 def test_a_function_finds_boxes(name: str, tmp_path: Path) -> None:
     source = recorded(tmp_path, scene(name, frames=12))

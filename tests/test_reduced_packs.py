@@ -76,7 +76,7 @@ def others(dataset: Path, *left_out: str) -> list[tuple[Any, ...]]:
     return [row for row in rows(dataset) if row[0] not in left_out and "Info" not in row[2]]
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", SCENES)
 def test_what_becomes_of_images(name: str, tmp_path: Path) -> None:
     sources = SOURCES["mcap-ros2-zstd"](tmp_path, SCENES[name]())

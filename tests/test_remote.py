@@ -215,6 +215,7 @@ def test_a_slice_fetches_what_is_in_it(name: str, large: Path, tmp_path: Path) -
     assert compare(source, tmp_path / ("again" + source.suffix), start=start, end=end) == []
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
 def test_a_pass_fetches_the_file_once(name: str, large: Path, tmp_path: Path) -> None:
     """It is hashed, too; some is read before, for planning."""
@@ -334,6 +335,7 @@ def test_a_server_without_ranges(name: str, tmp_path: Path) -> None:
         assert web.sent < 2**26  # what is under way when the connection is closed
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["drive.bag", "drive.mcap"])
 @pytest.mark.parametrize("after", [3, 8, 20])
 def test_a_network_that_fails_is_no_damage(

@@ -46,7 +46,7 @@ def images(dataset: Path) -> list[str]:
         return opened.topics
 
 
-@pytest.mark.one_in(4)
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("source", SOURCES)
 def test_what_was_exact_stays_so(source: str, tmp_path: Path) -> None:
     first = tmp_path / "first"
@@ -76,7 +76,7 @@ def test_odd_recordings(trait: str, tmp_path: Path) -> None:
     assert compare(before.sources, unpacked(tmp_path, "bag")) == []
 
 
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(10)
 @pytest.mark.parametrize("kind", CODED)
 def test_coded_images(kind: str, tmp_path: Path) -> None:
     first = tmp_path / "first"

@@ -794,7 +794,7 @@ def test_topics_are_those_of_image_transport(
 # ---------------------------------------------------------------- options, errors, command line
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

@@ -206,6 +206,7 @@ SEEN = [
 ]
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("decoder", ["libaom-av1", "libdav1d"])
 @pytest.mark.parametrize(("path", "view"), SEEN, ids=[view["video"] for _, view in SEEN])
 def test_other_decoders_of_views_give_the_same_samples(

@@ -612,6 +612,7 @@ def remembering(kind: str, whole: Document) -> Validator:
     return validator
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("kind", WHOLE)
 def test_the_model_takes_nothing_that_the_released_schema_refuses(kind: str) -> None:
     whole = WHOLE[kind]()

@@ -20,6 +20,7 @@ from mp4ds.cli import commands as command_line
 from remote_servers import Many, serving
 
 ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.slow  # to build it takes half a minute
 for _module in ("mkdocs", "material", "mkdocstrings_handlers.python"):
     pytest.importorskip(_module, reason="needs pip install 'mp4ds[docs]'")
 

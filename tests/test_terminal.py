@@ -118,6 +118,7 @@ STREAMS = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 @pytest.mark.parametrize("name", STREAMS)
 def test_a_standard_stream_that_takes_nothing(name: str, recording: Path, tmp_path: Path) -> None:

@@ -354,7 +354,7 @@ def test_without_torch() -> None:
 
 # ---------------------------------------------------------------- workers
 
-WORKERS = [(0, None), (2, "fork"), (2, "spawn")]
+WORKERS = [(0, None), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slow)]
 
 
 @pytest.mark.one_in(2)
@@ -730,6 +730,7 @@ def test_torchcodec_never_shows_differences(with_views: Path) -> None:
 # ---------------------------------------------------------------- the notebook
 
 
+@pytest.mark.slow
 def test_a_policy_learns_in_the_notebook(tmp_path: Path) -> None:
     notebook: Any = nbformat.read(ROOT / "examples/train.ipynb", 4)
     where = {"metadata": {"path": str(tmp_path)}}

@@ -93,7 +93,7 @@ def test_a_codec_that_was_asked_for(encoding: str) -> None:
             chosen(samples, encoding, codec=codec)
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("encoding", ["mono8", "rgb8", "uyvy", "bayer_rggb8", "nv12"])
 def test_large_images_are_tried_in_part(encoding: str) -> None:
     """The estimate is for the whole."""

@@ -245,6 +245,7 @@ def test_the_temporary_folder_is_ones_own(source: Path, store: Store, tmp_path: 
 # ---------------------------------------------------------------- unpacks
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("target", TARGETS)
 def test_an_unpack_is_uploaded(target: str, packed_bag: Path, store: Store, tmp_path: Path) -> None:
     to, storage = TARGETS[target]

@@ -87,6 +87,7 @@ def test_the_pure_wheel_has_what_the_package_needs_and_no_more(pure: zipfile.Zip
     assert metadata_of(pure, "WHEEL")["Tag"] == "py3-none-any"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 def test_a_compiled_wheel_is_for_its_platform(unpacked: Path, tmp_path: Path) -> None:
     source = shutil.copytree(unpacked, tmp_path / "source")
