@@ -22,7 +22,7 @@ from mp4ds.bags.formats import open_sources
 from mp4ds.errors import Mp4dsError
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.record import Recorder, RecordSummary, open_recorder
-from mp4ds.plugins.ros.node import Receive
+from mp4ds.plugins.ros.node import Follower, Receive
 from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message
 
@@ -57,6 +57,7 @@ class PlayedNode:
         self._before = before
         self._altered = altered
         self._receivers: dict[str, Receive] = {}
+        self._followers: dict[str, Receive] = {}
         self._thread = threading.Thread(target=self._play, daemon=True)
         with open_sources(self._paths) as reader:
             self.world = reader.profile
@@ -82,7 +83,8 @@ class PlayedNode:
         with open_sources(self._paths) as reader:
             for number, record in enumerate(reader.records()):
                 topic = record.channel.topic if isinstance(record, Message) else ""
-                if topic not in self._receivers:
+                taking = [by[topic] for by in (self._receivers, self._followers) if topic in by]
+                if not taking:
                     continue
                 self._before(number)
                 first = record.log_time if first is None else first
@@ -95,14 +97,16 @@ class PlayedNode:
                 self._tick(message.log_time)
                 self.time = message.log_time
                 data = bytes(message.data)
-                self._receivers[topic](message.channel, data, message.publish_time)
+                for receive in taking:
+                    receive(message.channel, data, message.publish_time)
         self.stop()
 
     def serve(self, services: object) -> None:
         pass
 
-    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        self._receivers[topic] = lambda channel, data, time: on_message(None)
+    def follow(self, topic: str, follower: Follower) -> None:
+        taking = {one.id: follower(one) for one in self._channels if one.topic == topic}
+        self._followers[topic] = lambda channel, data, _: taking[channel.id](data)
 
     def close(self) -> None:
         pass

@@ -9,21 +9,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from rosbags.convert.converter import default_message
 
 import mp4ds
 from coded_scenes import CODED
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.mcap import McapWriter
-from mp4ds.errors import Mp4dsError, WriteError
+from mp4ds.errors import Mp4dsError, Refused, WriteError
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.recording.lookback import LookBack
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.record import Recorder, RecordSummary
 from mp4ds.plugins.recording.spool import Piece
-from mp4ds.records import Message
-from player_scenes import make_drive
+from mp4ds.plugins.recording.triggers import Trigger
+from mp4ds.records import Channel, Message
+from player_scenes import START, make_drive, ros1_channel, ros2_channel
 from record_scenes import PlayedNode, played
+from scenes import typestore
 from sources import SOURCES
 
 S = 10**9
@@ -216,6 +220,8 @@ def test_a_clock_that_jumps_back(drive: Path, tmp_path: Path) -> None:
         ({"max_duration": 60}, "contradicts"),
         ({"max_splits": 2}, "contradicts"),  # it would delete what was saved
         ({"keep_last": 0}, "more than 0"),
+        ({"trigger": ["/battery:percentage=0.2"]}, "neither TOPIC nor TOPIC:FIELD>VALUE"),
+        ({"trigger": ["/battery:a..b>0"]}, "neither TOPIC nor TOPIC:FIELD>VALUE"),
         ({}, "cannot link files"),
     ],
 )
@@ -243,3 +249,102 @@ def test_messages_that_trigger(and_then: float | None, drive: Path, tmp_path: Pa
     )
     (made,) = summary.datasets  # one message follows the other in no time
     assert STATIC not in {topic.topic for topic in made.topics}
+
+
+def test_conditions_that_trigger(drive: Path, tmp_path: Path) -> None:
+    """Once, when they become true; those that cannot are told, and the others go on."""
+    second = START // S + 4
+    good = f"/tf:transforms[0].header.stamp.sec>={second}"
+    summary, _ = looked_back([drive], tmp_path / "live", {}, trigger=["/tf:speed > 1", good])
+    (made,) = summary.datasets
+    sent = messages(drive)
+    at = next(one[1] for one in sent if one[0] == "/tf" and one[1] >= second * S)
+    assert again(made.dataset) == due(sent, at, more=0)
+    (warning,) = summary.warnings
+    assert "--trigger '/tf:speed > 1' cannot trigger: there is no field 'speed'" in warning
+    assert "tf2_msgs/msg/TFMessage has transforms" in warning
+
+
+BATTERY, DIAGNOSTICS = "sensor_msgs/{}BatteryState", "diagnostic_msgs/{}DiagnosticArray"
+
+
+def typed(world: str, kind: str) -> Channel:
+    make = ros1_channel if world == "ros1" else ros2_channel
+    return make(0, "/x", kind.format("" if world == "ros1" else "msg/"), "")
+
+
+def sent_as(channel: Channel, **fields: Any) -> bytes:
+    """A message; a field of a part is named with two underscores."""
+    store, kind = typestore(channel.message_encoding), channel.type_name
+    kind = kind if "/msg/" in kind else kind.replace("/", "/msg/")
+    value = default_message(store, kind)
+    for name, field in fields.items():
+        *parts, last = name.split("__")
+        target = value
+        for part in parts:
+            target = getattr(target, part)
+        setattr(target, last, field)
+    is_ros1 = channel.message_encoding == "ros1"
+    write = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+    return bytes(write(value, kind))
+
+
+@pytest.mark.parametrize("world", ["ros1", "ros2"])
+@pytest.mark.parametrize(
+    ("condition", "field", "values", "expected"),
+    [
+        ("percentage<0.2", "percentage", [0.5, 0.1, 0.1, 0.5, 0.1], [1, 4]),
+        ("percentage<=0.2", "percentage", [0.2, 0.1, float("nan"), 0.2], [0, 3]),  # float32
+        ("header.stamp.sec != 7", "header__stamp__sec", [7, 8, 9, 7, 8], [1, 4]),
+        ("present == true", "present", [False, True, True, False, True], [1, 4]),
+        ("location=='dock 1'", "location", ["", "dock 1", "dock 2", "dock 1"], [1, 3]),
+        ("location==dock 1", "location", ["", "dock 1", "dock 2", "dock 1"], [1, 3]),
+        ("power_supply_status>=2", "power_supply_status", [1, 3, 2, 1, 2], [1, 4]),
+        ("cell_voltage[1]>4", "cell_voltage", [[], [5, 4], [4, 5], [5], [5, 5]], [2, 4]),
+    ],
+)
+def test_values_that_trigger(
+    world: str, condition: str, field: str, values: list[Any], expected: list[int]
+) -> None:
+    channel = typed(world, BATTERY)
+    is_triggered = Trigger(f"/x:{condition}").watch(channel)
+    if isinstance(values[0], list):
+        values = [np.array(one, np.float32) for one in values]
+    payloads = [sent_as(channel, **{field: one}) for one in values]
+    assert [number for number, one in enumerate(payloads) if is_triggered(one)] == expected
+    assert not is_triggered(b"damaged")
+    assert is_triggered(payloads[expected[0]])  # it has ended with what cannot be read
+
+
+@pytest.mark.parametrize("world", ["ros1", "ros2"])
+def test_levels_that_trigger(world: str) -> None:
+    """Which are bytes."""
+    channel = typed(world, DIAGNOSTICS)
+    is_triggered = Trigger("/x: status[0].level >= 2").watch(channel)
+    store = typestore(channel.message_encoding)
+    status = default_message(store, "diagnostic_msgs/msg/DiagnosticStatus")
+    found = []
+    for level in (0, 2, 1, 2):
+        status = replace(status, level=level)
+        found.append(is_triggered(sent_as(channel, status=[status])))
+    assert found == [False, True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("condition", "said"),
+    [
+        ("voltag>1", "there is no field 'voltag': a sensor_msgs/msg/BatteryState has header, "),
+        ("header.stamp.secs>1", "there is no field 'secs': .*Time has sec, nanosec"),
+        ("voltage.x>1", "there is no field 'x'"),
+        ("header>1", "header is a std_msgs/msg/Header: choose .*, header.stamp, header.frame_id"),
+        ("cell_voltage>1", r"cell_voltage is an array: choose an element, such as .*\[0\]"),
+        ("voltage[0]>1", "voltage is no array"),
+        ("voltage>low", "voltage is a float32, which 'low' is not"),
+        ("present>1", "present is a bool: compare it with == or !="),
+        ("present==1", "present is a bool, which '1' is not"),
+        ("location<x", "location is a string: compare it with == or !="),
+    ],
+)
+def test_conditions_that_cannot_be(condition: str, said: str) -> None:
+    with pytest.raises(Refused, match=said):
+        Trigger(f"/x:{condition}").watch(typed("ros2", BATTERY))

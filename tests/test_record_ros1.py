@@ -153,7 +153,7 @@ def test_a_clock_that_starts_late(roscore: Core, tmp_path: Path) -> None:
 def test_looking_back(roscore: Core, tmp_path: Path) -> None:
     """Saved by a service, a signal and a message, while nothing comes; with what is latched."""
     bag = make_drive(tmp_path / "drive.bag")
-    options = ("-a", "--exclude", "/rosout*", "--exclude", "/go", "--trigger", "/go")
+    options = ("-a", "--exclude", "/rosout*", "--exclude", "/go", "--trigger", "/go:data==true")
     command = ours(tmp_path / "live", *options, "--keep-last", "10m", "__name:=bag")
     log = roscore.folder / "python.log"
     begin = log.stat().st_size if log.exists() else 0
@@ -170,7 +170,7 @@ def test_looking_back(roscore: Core, tmp_path: Path) -> None:
         until(lambda: is_saved(1), recorder)
         recorder.send_signal(signal.SIGUSR1)
         until(lambda: is_saved(2), recorder)
-        done = roscore.run("rostopic", "pub", "-1", "/go", "std_msgs/Empty")
+        done = roscore.run("rostopic", "pub", "-1", "/go", "std_msgs/Bool", "true")
         until(lambda: is_saved(3), recorder)
         recorder.send_signal(signal.SIGINT)
         assert recorder.wait(WATCHDOG_S) == 0

@@ -196,7 +196,9 @@ def test_looking_back(side: Side, tmp_path: Path) -> None:
     """Saved by a service while nothing comes, and by a message; each with what is latched."""
     strings, trigger = channel("/robot/name", STRING), channel("/robot/go", STRING)
     latched = channel("/robot/map", STRING, qos=LATCHED)
-    options = RecordOptions(to="ros2", keep_last=600, all=True, trigger=["/robot/go"])
+    options = RecordOptions(
+        to="ros2", keep_last=600, all=True, trigger=["/robot/go:data==message 2"]
+    )
     saved: list[Path] = []
     replies: list[Any] = []
     with side.open() as publisher:

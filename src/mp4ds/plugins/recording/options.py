@@ -133,9 +133,10 @@ class RecordOptions(NodeOptions):
         parse=_parse_duration,
     )
     trigger: Sequence[str] = option(
-        "Trigger by each message on this topic, recorded or not; repeatable.",
+        "Save at each message on this topic, recorded or not; with a condition, such as "
+        "'/battery:percentage<0.2', whenever it becomes true. Repeatable.",
         (),
-        metavar="TOPIC",
+        metavar="TOPIC[:FIELD>VALUE]",
         panel=WHAT,
     )
     buffer: int = option(

@@ -12,12 +12,13 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
 
 from mp4ds.bags.latched import MOST_BYTES, LatchedMessages, has_late
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
-from mp4ds.errors import OptionError, TargetError
+from mp4ds.errors import OptionError, Refused, TargetError
 from mp4ds.files.outputs import sync, sync_folder
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
@@ -28,6 +29,7 @@ from mp4ds.plugins.recording.lookback import LookBack
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.receiving import MessageBuffer, Source, TopicProgress
 from mp4ds.plugins.recording.spool import Split
+from mp4ds.plugins.recording.triggers import Trigger
 from mp4ds.plugins.ros.node import (
     Node,
     Service,
@@ -186,6 +188,8 @@ def _check(options: RecordOptions) -> None:
         )
     if options.keep_last is None and (options.and_then is not None or options.trigger):
         raise OptionError("`and_then` and `trigger` need `keep_last`.")
+    for text in options.trigger:
+        Trigger(text)
     if options.keep_last is not None and (
         options.max_duration or options.max_size or options.max_splits
     ):
@@ -408,11 +412,21 @@ class Recorder:
         if self._node.world == "ros1":  # `rosbag record` has no services
             services = [one for one in services if one.name == "snapshot"]
         self._node.serve(services)
-        for topic in self._options.trigger:
-            resolved = self._options.names.resolved(topic)
-            self._node.listen(self._options.names.renamed(resolved), self._on_trigger)
+        for text in self._options.trigger:
+            trigger, names = Trigger(text), self._options.names
+            topic = names.renamed(names.resolved(trigger.topic))
+            self._node.follow(topic, partial(self._watch, trigger, text))
 
-    def _on_trigger(self, _: object) -> None:
+    def _watch(self, trigger: Trigger, text: str, channel: Channel) -> Callable[[bytes], None]:
+        """What is called with each message on a trigger's topic."""
+        try:
+            is_triggered = trigger.watch(channel)
+        except Refused as reason:
+            self._source.warn(f"--trigger {text!r} cannot trigger: {reason}")
+            return lambda data: None
+        return lambda data: self._on_trigger() if is_triggered(data) else None
+
+    def _on_trigger(self) -> None:
         """Save because of a message; those that come while what follows is saved belong to it."""
         now = time.monotonic()
         if now >= self._quiet_until and self.snapshot():

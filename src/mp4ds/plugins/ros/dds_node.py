@@ -295,9 +295,13 @@ class _Found:
 
     since: float
     publishers: dict[Any, Any] = field(default_factory=dict)
-    kind: Any = None  # class of its messages, once it is looked for
+    kind: Any = None  # class of its messages, once that and the definition are looked for
     definition: str = ""
     asking: threading.Thread | None = None
+
+    def is_of(self, kind: str) -> bool:
+        """Whether that is the class and definition of a type: a topic may have several."""
+        return self.kind is not None and ros_type(self.kind.__idl_typename__) == kind
 
 
 class DdsNode(Ros2Node):
@@ -350,7 +354,9 @@ class DdsNode(Ros2Node):
         name = _PREFIX + topic.lstrip("/")
         found = self._found.get(name, _Found(0.0))
         if publisher := _publisher_of(found, kind):
-            message_class = found.kind or publisher_type(self._participant, publisher)
+            message_class = found.kind
+            if not found.is_of(kind):
+                message_class = publisher_type(self._participant, publisher)
             type_hash = _user_data(publisher, _HASH)
         else:
             made = message_type(Channel(0, topic, "cdr", Schema(kind, "", b""), {}))
@@ -439,11 +445,12 @@ class DdsNode(Ros2Node):
         if found.kind is None:
             publisher = _publisher_of(found, kind)
             type_hash = _user_data(publisher, _HASH)
-            found.kind = publisher_type(self._participant, publisher)
+            made = publisher_type(self._participant, publisher)
             found.definition = standard_definition(kind, type_hash)
-            found.definition = found.definition or announced_definition(found.kind, type_hash)
+            found.definition = found.definition or announced_definition(made, type_hash)
             if type_hash and not found.definition:
                 found.asking = self._start(self._ask, found, publisher, kind, type_hash)
+            found.kind = made  # at last, as several threads look
         return found.asking is None or not found.asking.is_alive()
 
     def _ask(self, found: _Found, publisher: Any, kind: str, type_hash: str) -> None:
@@ -458,12 +465,14 @@ class DdsNode(Ros2Node):
     def _announced(self, topic: str, kind: str) -> tuple[list[Qos], str, str]:
         found = self._found[_PREFIX + topic.lstrip("/")]
         offered = [_offered_by(one.qos) for one in found.publishers.values()]
-        return offered, _user_data(_publisher_of(found, kind), _HASH), found.definition
+        definition = found.definition if found.is_of(kind) else ""
+        return offered, _user_data(_publisher_of(found, kind), _HASH), definition
 
     def _kinds_of(self, topic: str) -> Sequence[str]:
         self._discover()
         found = self._found.get(_PREFIX + topic.lstrip("/"), _Found(0.0))
-        return [ros_type(one.type_name) for one in found.publishers.values()]
+        kinds = [ros_type(one.type_name) for one in found.publishers.values()]
+        return kinds if kinds and self._is_defined(found, kinds[0]) else []
 
     def _count_lost(self) -> None:
         for topic, reader in self._received.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import struct
 import sys
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -271,6 +272,9 @@ Receive = Callable[[Channel, bytes, int], None]
 Each channel has an id of its own.
 """
 
+Follower = Callable[[Channel], Callable[[bytes], object]]
+"""Called with a channel once it is known; returns what is called with each of its messages."""
+
 
 @dataclass(frozen=True, slots=True)
 class Service:
@@ -377,14 +381,26 @@ class Node(ABC):
     def follow_clock(self, on_time: Callable[[int], None]) -> None:
         """Call back with each time, in nanoseconds, that another node publishes as /clock."""
 
-    @abstractmethod
     def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Call back for each message of any type on another node's topic.
+        """Call back with the header stamp of each message on another node's topic.
+
+        Args:
+            topic: As for `follow`.
+            on_message: Called with nanoseconds; with None if there is no header, or that is not
+                known.
+
+        Raises:
+            OptionError: There cannot be such a topic.
+        """
+        self.follow(topic, lambda channel: lambda data: on_message(_header_stamp(channel, data)))
+
+    @abstractmethod
+    def follow(self, topic: str, follower: Follower) -> None:
+        """Follow another node's topic, whatever its type.
 
         Args:
             topic: The topic, which may have no publisher yet.
-            on_message: Called with the header stamp of the message, in nanoseconds; with None if
-                it has no header, or that is not known.
+            follower: Called with each of its channels.
 
         Raises:
             OptionError: There cannot be such a topic.
@@ -445,6 +461,20 @@ class Node(ABC):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+_HEADER = re.compile(rb"(?:\s|#[^\n]*\n)*(?:std_msgs/)?Header\s")
+_STAMP = struct.Struct("<4xII")
+
+
+def _header_stamp(channel: Channel, data: bytes) -> int | None:
+    """The stamp of a ROS 1 message that begins with a header, nanoseconds."""
+    definition = channel.schema.data if channel.schema else b""
+    has_header = channel.message_encoding == "ros1" and _HEADER.match(definition)
+    if not has_header or len(data) < _STAMP.size:
+        return None
+    seconds, nanoseconds = _STAMP.unpack_from(data)
+    return int(seconds * 10**9 + nanoseconds)
 
 
 # ---------------------------------------------------------------- opening

@@ -6,7 +6,6 @@ Imported only if rospy is installed.
 from __future__ import annotations
 
 import os
-import re
 import socket
 import struct
 import tempfile
@@ -33,7 +32,15 @@ from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import is_ros1
 from mp4ds.bags.ros1 import make_channel
 from mp4ds.errors import ConversionError, OptionError, RemoteError
-from mp4ds.plugins.ros.node import CLOCK, Node, NodeNames, NodeOptions, Receive, Service
+from mp4ds.plugins.ros.node import (
+    CLOCK,
+    Follower,
+    Node,
+    NodeNames,
+    NodeOptions,
+    Receive,
+    Service,
+)
 from mp4ds.records import Channel
 
 MAX_BYTES = 128 << 20
@@ -523,11 +530,18 @@ class Ros1Node(Node):
 
         self._subscribe(self._clock_topic, on_message)
 
-    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Subscribe to a topic for its header stamps."""
+    def follow(self, topic: str, follower: Follower) -> None:
+        """Subscribe; a channel is known with its first message."""
         if not _is_name(topic):
             raise OptionError(f"{topic!r} is not a valid ROS 1 topic name, such as /reply.")
-        self._subscribe(topic, lambda message: on_message(_stamp_of(message)))
+        takers: dict[int, Callable[[bytes], object]] = {}
+
+        def receive(channel: Channel, data: bytes, _: int) -> None:
+            if channel.id not in takers:
+                takers[channel.id] = follower(channel)
+            takers[channel.id](data)
+
+        self.subscribe(topic, "", topic, receive)
 
     def topics(self, is_wanted: Callable[[str, str], bool]) -> Mapping[str, Sequence[str]]:
         """Topics that the master knows."""
@@ -620,15 +634,3 @@ class Ros1Node(Node):
 
     def _senders(self) -> list[Sender]:
         return [sender for topic in self._topics.values() for sender in topic.senders]
-
-
-_HEADER = re.compile(r"(?:\s|#[^\n]*\n)*(?:std_msgs/)?Header\s")
-
-
-def _stamp_of(message: Any) -> int | None:
-    """The stamp of a message that begins with a header, nanoseconds."""
-    definition = (message._connection_header or {}).get("message_definition", "")
-    if not _HEADER.match(definition) or len(message._buff) < 12:
-        return None
-    _, seconds, nanoseconds = struct.unpack_from("<III", message._buff)
-    return int(seconds * _NS + nanoseconds)

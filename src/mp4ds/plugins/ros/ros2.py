@@ -22,7 +22,14 @@ from mp4ds.bags.types import (
     types_of,
 )
 from mp4ds.errors import ConversionError, OptionError, Refused
-from mp4ds.plugins.ros.node import CLOCK, SERVICE_EVENTS, Node, NodeOptions, Receive
+from mp4ds.plugins.ros.node import (
+    CLOCK,
+    SERVICE_EVENTS,
+    Follower,
+    Node,
+    NodeOptions,
+    Receive,
+)
 from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, asked_qos, offered_qos, qos_text
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
@@ -102,7 +109,7 @@ class Ros2Node(Node):
 
     @abstractmethod
     def _kinds_of(self, topic: str) -> Sequence[str]:
-        """Types of a topic that other nodes publish."""
+        """Types of a topic that other nodes publish, with definitions as far as there are any."""
 
     def _complain(self, text: str) -> None:
         """Say that something does not work, where nodes say so."""
@@ -181,36 +188,44 @@ class Ros2Node(Node):
 
         self._read(self._clock_topic, CLOCK_TYPE, CLOCK_QOS, on_message)
 
-    def listen(self, topic: str, on_message: Callable[[int | None], None]) -> None:
-        """Subscribe to a topic as soon as it has a publisher, whatever its type."""
+    def follow(self, topic: str, follower: Follower) -> None:
+        """Subscribe as soon as the topic has a publisher."""
         if not is_topic(topic):
             raise OptionError(f"{topic!r} is not a valid ROS 2 topic name.")
-        self._start(self._seek, topic, on_message)
+        self._start(self._seek, topic, follower)
 
-    def _seek(self, topic: str, on_message: Callable[[int | None], None]) -> None:
+    def _seek(self, topic: str, follower: Follower) -> None:
         known: set[str] = set()
         while not self._ended.wait(_LOOK_S):
             for kind in {*self._kinds_of(topic)} - known:
                 known.add(kind)
-                asked = asked_qos(self._announced(topic, kind)[0])
-                qos = replace(asked, durability="volatile")  # no message of the past
+                channel, qos = self._channel(topic, kind, topic)
+                qos = replace(qos, durability="volatile")  # no message of the past
                 try:
-                    self._read(topic, kind, qos, lambda *_: on_message(None))
+                    self._read(topic, kind, qos, partial(_take, follower(channel)))
                 except (Refused, ConversionError) as error:  # perhaps because of another type
                     self._complain(f"{topic}: {error}")
 
     def subscribe(self, topic: str, kind: str, name: str, receive: Receive) -> Channel:
         """Subscribe with the QoS that the publishers offer, on a channel as rosbag2 records it."""
-        offered, type_hash, definition = self._announced(topic, kind)
-        schema = Schema(kind, _ENCODING if definition else "", definition.encode())
-        metadata = {QOS_KEY: qos_text(offered), **({HASH_KEY: type_hash} if type_hash else {})}
-        channel = Channel(len(self._received), name, "cdr", schema, metadata)
-        qos = self._overrides.get(topic) or asked_qos(offered)
+        channel, asked = self._channel(topic, kind, name)
+        qos = self._overrides.get(topic) or asked
         try:
             self._received[topic] = self._read(topic, kind, qos, partial(receive, channel))
         except ConversionError as error:
             raise Refused(error.problem) from None
         return channel
+
+    def _channel(self, topic: str, kind: str, name: str) -> tuple[Channel, Qos]:
+        """The channel of a topic that others publish, and the QoS that hears all of them."""
+        offered, type_hash, definition = self._announced(topic, kind)
+        schema = Schema(kind, _ENCODING if definition else "", definition.encode())
+        metadata = {QOS_KEY: qos_text(offered), **({HASH_KEY: type_hash} if type_hash else {})}
+        return Channel(len(self._received), name, "cdr", schema, metadata), asked_qos(offered)
+
+
+def _take(take: Callable[[bytes], object], data: bytes, _: int) -> None:
+    take(data)
 
 
 def is_topic(name: str) -> bool:
