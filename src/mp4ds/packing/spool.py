@@ -23,15 +23,7 @@ from mp4ds.dataset.checks import validate
 from mp4ds.dataset.concat import concat
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, Refused, SourceError
-from mp4ds.files.outputs import (
-    check_target,
-    is_mine,
-    lock,
-    staged,
-    sync,
-    sync_folder,
-    work_folder,
-)
+from mp4ds.files.outputs import check_target, is_mine, lock, staged, work_folder
 from mp4ds.files.sources import RECORDING_NAME
 from mp4ds.format.fields import Gop, Model, Profile
 from mp4ds.format.manifest import About, LossEntry, Source
@@ -86,7 +78,7 @@ class SpoolFolder:
         self._settings_path = path / RECORDING_NAME
 
     def begin(self, settings: SpoolSettings) -> IO[bytes]:
-        """Make the folder, which must not exist; it is on the disk before anything is in it.
+        """Make the folder, which must not exist; it is not synced yet.
 
         Returns:
             What locks it: nobody takes it for one that was left while this is open. The lock is
@@ -101,8 +93,6 @@ class SpoolFolder:
         lock(file, shared=True)
         file.write(settings.model_dump_json(indent=1).encode() + b"\n")
         file.flush()
-        sync(self.path)
-        sync_folder(self.path.parent)
         return file
 
     def locked(self, *, shared: bool = False) -> IO[bytes]:

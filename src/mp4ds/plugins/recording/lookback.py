@@ -21,7 +21,7 @@ from mp4ds.errors import TargetError
 from mp4ds.files.outputs import sync, sync_folder
 from mp4ds.format.manifest import Excerpt as SourceExcerpt
 from mp4ds.format.manifest import Source
-from mp4ds.plugins.recording.spool import FAILURES, WINDOW_NS, Piece, Split
+from mp4ds.plugins.recording.spool import FAILURES, WINDOW_NS, Piece, Split, sync_all
 from mp4ds.records import Channel, Excerpt, Message
 
 _PIECES = 10
@@ -72,7 +72,7 @@ class Saved(Split):
         for message in latched:
             self._write(first, message.of_channel(channels[message.channel.identity]))
         self._close_piece(first)
-        sync(first.writer.path)
+        sync_all(self.written())
         self._jobs.submit(self._pack, first)
         for piece in pieces:
             self.link(piece)

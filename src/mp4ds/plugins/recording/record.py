@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -19,7 +19,6 @@ from pathlib import Path
 from mp4ds.bags.latched import MOST_BYTES, LatchedMessages, has_late
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
 from mp4ds.errors import OptionError, Refused, TargetError
-from mp4ds.files.outputs import sync, sync_folder
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.messages.serializations import is_camera
@@ -28,7 +27,7 @@ from mp4ds.packing.spool import remove_dataset
 from mp4ds.plugins.recording.lookback import LookBack
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.receiving import MessageBuffer, Source, TopicProgress
-from mp4ds.plugins.recording.spool import Split
+from mp4ds.plugins.recording.spool import Split, sync_all
 from mp4ds.plugins.recording.triggers import Trigger
 from mp4ds.plugins.ros.node import (
     Node,
@@ -464,10 +463,10 @@ class Recorder:
                 self._error = error
                 self._splits[-1].abandon()
                 self.stop()
-            disk.submit(_sync, self._written())
+            disk.submit(sync_all, self._written())
 
     def _write_all(self, disk: ThreadPoolExecutor) -> None:
-        syncing: Future[None] | None = None
+        syncing = disk.submit(sync_all, self._written())
         next_flush = time.monotonic() + _FLUSH_S
         while True:
             split = self._splits[-1]
@@ -482,6 +481,7 @@ class Recorder:
                 if not self._look_back and (self._is_split_asked or split.is_full):
                     self._close_split()
                     self._begin_split()
+                    syncing = disk.submit(sync_all, self._written())
                     self._repeat_latched(message.log_time)
                 self._splits[-1].write(message)
                 if self._options.repeat_latched and has_late(message.channel):
@@ -495,8 +495,8 @@ class Recorder:
                     self._source.warn("stopped: the file system has less free space than asked for")
                     self.stop()
                 is_behind = self._buffer.bytes > self._options.buffer * 10**6 * _BEHIND
-                if not is_behind and (syncing is None or syncing.done()):
-                    syncing = disk.submit(_sync, self._written())
+                if not is_behind and syncing.done():
+                    syncing = disk.submit(sync_all, self._written())
                 next_flush = time.monotonic() + _FLUSH_S
 
     def _written(self) -> list[Path]:
@@ -584,14 +584,6 @@ class Recorder:
                     f"{folder}: unfinished recording; if no recorder is writing it any more, "
                     f"recover it: {salvage_command(folder)}"
                 )
-
-
-def _sync(paths: Sequence[Path]) -> None:
-    for path in paths:
-        with suppress(OSError):  # what the disk refuses, its writer is told, too
-            sync(path)
-    for folder in {path.parent for path in paths}:
-        sync_folder(folder)
 
 
 def recorder_services(recorder: Recorder) -> Sequence[Service]:

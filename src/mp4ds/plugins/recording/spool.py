@@ -18,8 +18,8 @@ from pathlib import Path
 
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.errors import Mp4dsError, TargetError, WriteError, path_text
-from mp4ds.files.outputs import check_target
-from mp4ds.files.sources import UNFINISHED, salvage_command
+from mp4ds.files.outputs import check_target, sync, sync_folder
+from mp4ds.files.sources import RECORDING_NAME, UNFINISHED, salvage_command
 from mp4ds.format.manifest import Source
 from mp4ds.format.sidecars import load_about
 from mp4ds.messages.serializations import is_camera
@@ -122,7 +122,7 @@ class Split:
         self._depends: dict[int, bool] = {}
         self._window_ns = WINDOW_NS
         self._open: list[Piece] = []  # all but the newest take what is late
-        self._closed: list[Path] = []  # since `written` told of them
+        self._closed = [self.folder.path / RECORDING_NAME]  # since `written` told of them
         self._count = 0  # of pieces
         check_target(target, force=options.force, owned=dataset_files)
         settings = SpoolSettings(
@@ -320,6 +320,15 @@ class Split:
         path, target = (shlex.quote(path_text(path)) for path in (self.folder.path, self.target))
         left = f"It holds what was recorded. Then run: mp4ds pack --salvage {path} -o {target}"
         return WriteError(self.folder.path, error, left)
+
+
+def sync_all(paths: Sequence[Path]) -> None:
+    """Sync files to disk, with their names and those of their folders."""
+    for path in paths:
+        with suppress(OSError):  # what the disk refuses, its writer is told, too
+            sync(path)
+    for folder in {above for path in paths for above in (path.parent, path.parent.parent)}:
+        sync_folder(folder)
 
 
 # ---------------------------------------------------------------- in the process
