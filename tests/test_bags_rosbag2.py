@@ -152,17 +152,6 @@ def test_a_database_without_metadata() -> None:
     check_index(reader, messages(records))
 
 
-def test_qos_comes_from_the_metadata_where_the_database_has_no_column(tmp_path: Path) -> None:
-    write(tmp_path / "a", "sqlite3", scene())
-    with closing(sqlite3.connect(tmp_path / "a" / "run_0.db3")) as connection, connection:
-        connection.execute("ALTER TABLE topics DROP COLUMN offered_qos_profiles")
-    (image, *_) = Rosbag2Reader(tmp_path / "a").channels
-    assert image.metadata["offered_qos_profiles"] == OLD_QOS
-    # An empty one is what the database tells.
-    (empty, *_) = Rosbag2Reader(real(f"{PY}sqlite3/convert_a")).channels
-    assert empty.metadata["offered_qos_profiles"] == ""
-
-
 # Round trips ------------------------------------------------------------------------------
 
 

@@ -371,28 +371,6 @@ def test_on_the_command_line(dataset: Path, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- other commands
 
 
-@pytest.mark.parametrize("damage", [*DAMAGES, "messages"])
-def test_what_an_export_or_a_player_does_not_need(
-    damage: str, dataset: Path, packed: tuple[Path, Path], tmp_path: Path
-) -> None:
-    options = {"topics": ["/right/*"]}
-    if damage == "messages":
-        flip(dataset / "messages.mcap", 0.4)
-    else:
-        DAMAGES[damage](dataset)
-    target, whole = tmp_path / "export", tmp_path / "whole"
-    summary = mp4ds.export(dataset, "tum", target, mp4ds.ExportOptions(**options))
-    expected = mp4ds.export(packed[1], "tum", whole, mp4ds.ExportOptions(**options))
-    assert summary.messages == expected.messages
-    publisher = RecordingPublisher(world="ros1")
-    play = mp4ds.PlayOptions(immediate=True, **options)
-    with open_player(dataset, play, node=publisher) as player:
-        player.run()
-    assert Counter(sent.topic for sent in publisher.sent) == Counter(
-        {"/right/image_raw": FRAMES, "/right/camera_info": FRAMES}
-    )
-
-
 def test_errors_of_other_commands_say_where_the_damage_is(dataset: Path, tmp_path: Path) -> None:
     flip(file_of(dataset, "left.mp4"), 0.3)
     words = (

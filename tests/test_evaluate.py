@@ -351,26 +351,6 @@ def test_the_same_again_tries_nothing(whole: Evaluation, bag: Path) -> None:
     assert again.cameras == whole.cameras
 
 
-@pytest.mark.slow
-def test_what_is_new_or_damaged_is_tried(tmp_path: Path) -> None:
-    path = recording(tmp_path)
-
-    def counts(**changed: Any) -> tuple[int, int]:
-        result = evaluate(path, replace(QUICK, **changed), output=tmp_path / "out")
-        sizes.append(result.cameras[0].cells[0].size)
-        return result.tried, result.known
-
-    sizes: list[int] = []
-    assert counts() == (1, 0)
-    (known,) = (tmp_path / "out" / "cells").iterdir()
-    assert counts(crf=["24", "30"]) == (1, 1)
-    for damaged in ("[1", json.dumps({**json.loads(known.read_text()), "size": "large"})):
-        known.write_text(damaged)
-        assert counts() == (1, 0)
-    assert len(set(sizes)) == 1
-    assert counts(frames=8) == (1, 0)
-
-
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
 @pytest.mark.parametrize(
     "number", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]

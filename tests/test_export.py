@@ -430,19 +430,6 @@ def test_lerobot_tables(lerobot_folder: Path) -> None:
         assert found.ravel() == pytest.approx(expected, abs=0.02)
 
 
-def test_lerobot_videos(lerobot_folder: Path) -> None:
-    import cv2
-
-    path = "videos/observation.images.front_image_raw/chunk-000/file-001.mp4"
-    capture = cv2.VideoCapture(str(lerobot_folder / path))
-    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(30, abs=0.01)
-    for frame, _ in lerobot_frames():
-        _, image = capture.read()
-        expected = pixels_of(COLOUR, frame).astype(float)
-        assert np.abs(image[..., ::-1] - expected).mean() < 8  # other frames: more than 20
-    assert not capture.read()[0]
-
-
 @pytest.mark.parametrize("decoder", ["mp4ds", pytest.param("torchcodec", marks=pytest.mark.slow)])
 def test_lerobot_videos_have_the_range_that_its_decoder_takes_them_for(
     decoder: str, tmp_path: Path

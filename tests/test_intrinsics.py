@@ -23,7 +23,7 @@ from mp4ds.dataset.views import effective
 from mp4ds.messages.transforms import Transform
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.plugins.info import CameraCalibrations, Intrinsics, intrinsics
-from scenes import INFO, PERIOD, START, TF, Record, Scene, calibration, scene
+from scenes import INFO, START, TF, Record, Scene, calibration, scene
 from sources import SOURCES, write_bag, write_mcap
 
 FOCUS = [100.0, 100.0, 100.0, 125.0, 125.0, 100.0, 150.0, 150.0]  # of one message after the other
@@ -129,21 +129,6 @@ def test_names_that_tell_nothing_are_paired_by_stamp(tmp_path: Path) -> None:
     check_focused(camera, made)
     mp4ds.pack(path, tmp_path / "dataset")
     assert camera_of(intrinsics(tmp_path / "dataset")) == camera
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_what_belongs_to_no_other_is_listed_too(packed: bool, tmp_path: Path) -> None:
-    left = named(
-        scene("mono8", with_info=False),
-        {"/cam/image_raw": "/left/image_raw"},
-    )
-    lens = {**calibration(64, 48), "width": 64, "height": 48, "header": {"frame_id": "lens"}}
-    alone = [Record("/lens", INFO, START + n * PERIOD, lens) for n in range(4)]
-    path = recorded(tmp_path, Scene([*left.messages, *alone]), packed=packed)
-    first, second = intrinsics(path).cameras
-    assert (first.topic, first.info_topic, first.calibrations) == ("/left/image_raw", "", [])
-    assert (second.topic, second.info_topic, second.sizes) == ("", "/lens", [])
-    assert [(item.message, item.frame_id) for item in second.calibrations] == [(0, "lens")]
 
 
 # ---------------------------------------------------------------- transforms

@@ -91,19 +91,6 @@ def test_the_terminal_is_as_it_was_after_the_end(terminal: Terminal) -> None:
     assert "keys" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
-    controls = Controls()
-    reading, writing = os.pipe()
-    os.write(writing, b"  ")
-    with Keyboard(player_keys(controls), fd=reading):
-        assert "keys" not in [thread.name for thread in threading.enumerate()]
-        time.sleep(0.05)
-    assert os.read(reading, 10) == b"  "
-    os.close(reading)
-    os.close(writing)
-    assert not controls.asked
-
-
 # ---------------------------------------------------------------- signals, in a session of its own
 
 

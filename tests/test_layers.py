@@ -153,23 +153,6 @@ def test_frames_of_another_dataset_are_not_read(
                 read(opened[TOPICS[0]])
 
 
-def test_what_may_be_depths_is_exact_wherever_that_is_here(tmp_path: Path) -> None:
-    dataset = Path(shutil.copytree(CASE.with_name("views-deep"), tmp_path / "dataset"))
-    topic, other = "/mono16_12/image_raw", "/rgb16_12/image_raw"
-    recorded, seen = unpacked(dataset), unpacked(dataset, VISUAL)
-    assert seen[topic] == recorded[topic]
-    assert seen[other] != recorded[other]
-    with mp4ds.open(dataset, layer="view") as opened:
-        depths = opened[topic].read([1], format="depth_m")
-        assert np.array_equal(np.rint(depths * 1000), opened[topic].read([1], format="native"))
-        with pytest.raises(OptionError, match="what a view shows of depths cannot be measured"):
-            opened[topic].read([1], format="depth_m", layer="view")
-    exact(dataset, "mono16_12_image_raw").unlink()
-    assert unpacked(dataset, VISUAL)[topic] != recorded[topic]
-    with mp4ds.open(dataset) as opened, pytest.raises(OptionError, match="no exact frames here"):
-        opened[topic].read([1], format="depth_m")
-
-
 @pytest.mark.parametrize("given", [view, exact])
 def test_a_pair_is_found_by_either_video(
     given: Callable[[Path, str], Path], dataset: Path, tmp_path: Path

@@ -14,7 +14,7 @@ import pytest
 
 import mp4ds
 from commands import program
-from scenes import Scene, scene
+from scenes import Scene
 from test_examples import ROOT
 from test_vectors import COMMAND, JOINTS, LEFT, RIGHT, TASK, packed, robot
 
@@ -199,25 +199,6 @@ def test_tasks_and_single_numbers(drives: list[Path]) -> None:
     assert seen == [(3, 48, 64)] * 2
     assert int(sample[FRONT].max()) < 128
     assert LeRobotDataset(drives[:1]).meta.fps == 30  # that of the camera
-
-
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_depths(encoding: str, tmp_path: Path) -> None:
-    made = scene(encoding, frames=4, with_info=False)
-    drive = packed(tmp_path, made)
-    own = LeRobotDataset(drive, return_uint8=encoding == "16UC1", cache=tmp_path / "cache")
-    key = "observation.images.cam_image_raw"
-    assert (own.meta.depth_keys, own.meta.shapes[key]) == ([key], (48, 64, 1))
-    with mp4ds.open(own.paths[0]) as recorded:
-        depths = recorded["/cam/image_raw"].read(range(4), format="native").astype(np.float32)
-    depths[~np.isfinite(depths)] = 0
-    with np.errstate(over="ignore"):  # some are absurd
-        expected = depths * np.float32({"16UC1": 1, "32FC1": 1000}[encoding])
-    for number in (0, 1, 2, 3, 1):  # the last from the cache
-        assert own[number][key].dtype == torch.float32
-        assert np.array_equal(own[number][key][0].numpy(), expected[number])
-    if encoding == "16UC1":
-        assert own.meta.stats[key]["max"].tolist() == [[[expected.max()]]]
 
 
 @pytest.mark.parametrize(

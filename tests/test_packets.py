@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from array import array
 from pathlib import Path
-from typing import Any
 
 import av
 import pytest
@@ -146,19 +145,6 @@ def test_parameters_that_were_sent_before(codec: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- refusals and faults
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265", "av1", "vp9"])
-def test_a_first_picture_that_cannot_be_used(codec: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    first, second = [packet.data for packet in encode(ENCODINGS[codec], frames=2, gop=9)]
-    writer = PacketWriter(path, codec, width=WIDTH + 2, height=HEIGHT)
-    assert "cannot be decoded" in refusal(lambda: writer.write(first, 0, keyframe=True))
-    if codec != "vp9":  # whose header tells no size
-        writer = PacketWriter(path, codec, width=WIDTH, height=HEIGHT)
-        assert "cannot be decoded" in refusal(lambda: writer.begin(second))
-    writer.close()
-    assert not path.exists()
-
-
 def test_packets_that_a_muxer_joins_are_missed(tmp_path: Path) -> None:
     """The muxer joins a VP9 frame that is not shown with the next; the parser refuses it."""
     frames = [packet.data for packet in encode(ENCODINGS["vp9"], frames=4, gop=9)]
@@ -194,23 +180,6 @@ def video(tmp_path: Path) -> Path:
     path = tmp_path / "a.mp4"
     write(path, "mjpeg", [jpeg(picture) for picture in scene(5)])
     return path
-
-
-@pytest.mark.parametrize(
-    ("code", "options"),
-    [
-        ("codec-mismatch", {"codec": "h264"}),
-        ("codec-mismatch", {"codec": "nothing"}),
-        ("frame-count", {"codec": "mjpeg", "frames": 4}),
-        ("frame-count", {"codec": "mjpeg", "frames": 6}),
-        ("geometry-mismatch", {"codec": "mjpeg", "coded_size": (WIDTH, HEIGHT + 1)}),
-    ],
-)
-def test_what_a_reader_expects(code: str, options: dict[str, Any], video: Path) -> None:
-    with pytest.raises(VideoError) as caught:
-        PacketReader(video, **options)
-    assert caught.value.code == code
-    assert str(video) in str(caught.value)
 
 
 # ---------------------------------------------------------------- standing alone

@@ -257,27 +257,6 @@ def test_ffmpeg_has_the_pixels_of_a_lossless_video(name: str, datasets: Datasets
         assert np.array_equal(np.ravel(frame).view(np.uint8), np.ravel(data).view(np.uint8))
 
 
-SHOWN = [name for name, case in CASES.items() if case.codec != "ffv1" and not case.raw]
-
-
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("name", SHOWN)
-def test_ffmpeg_shows_the_same_colours(name: str, datasets: Datasets) -> None:
-    """Nearly, where it is told in which way to interpolate: its weights are not to a 32nd.
-
-    It decodes JPEG in another way than libjpeg, and mp4ds as libjpeg does.
-    """
-    most, mean = (40, 3) if name.startswith("jpeg") else (8, 0.6)
-    place = "in_h_chr_pos=0:in_v_chr_pos=128:" if CASES[name].is_left else ""
-    scale = f"scale={place}flags=bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
-    raw = ffmpeg(video_of(datasets[name]), "rgb24", "-vf", scale)
-    frames = np.frombuffer(raw, np.uint8).reshape(-1, HEIGHT, WIDTH, 3)
-    for frame, picture in zip(frames, shown_pictures(datasets[name]), strict=True):
-        apart = np.abs(frame.astype(int) - picture)
-        assert apart.max() <= most
-        assert apart.mean() < mean
-
-
 # ---------------------------------------------------------------- PyAV
 
 

@@ -341,21 +341,6 @@ def test_camera_yuv_is_not_cut(encoding: str, tmp_path: Path) -> None:
         assert np.array_equal(part, stream.read([0])[0][3:10, 1:10])
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        *({"resize": value} for value in (0, -1.0, float("nan"), float("inf"), True, "2", 1e9,
-                                          (0, 4), (4, -1), (4,), (1, 2, 3), (2.5, 2), (99999, 1))),
-        *({"crop": value} for value in ((0, 0, 0, 1), (-1, 0, 5, 5), (0, 0, 65, 48), (1, 1, 1),
-                                        (60, 0, 5, 1), 3, "abcd", (0, 0, 2.5, 2), (0, 47, 1, 2))),
-    ],
-)  # fmt: skip
-def test_no_such_size_or_part(options: Any, colour: mp4ds.Topic) -> None:
-    for ask in (colour.get, colour.read):
-        with pytest.raises(mp4ds.OptionError, match=r"crop|resized"):
-            ask([0], **options)
-
-
 # ---------------------------------------------------------------- words
 
 MISTAKES: dict[str, tuple[type[Exception], str]] = {

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -14,12 +13,10 @@ from coded_scenes import CODED
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError
 from mp4ds.format.fields import DecodedColumns
-from mp4ds.plugins.playing.timeline import ReadAhead
 from mp4ds.records import Message, Record
 from round_trips import packed
 from scenes import TRAITS, Scene, odd_scene, scene
 
-T = TypeVar("T")
 Row = tuple[str, int, int, int, bytes]
 TOPIC = "/cam/image_raw"
 SCENES: dict[str, Callable[[], Scene]] = {
@@ -148,24 +145,3 @@ def test_digests_are_compared_from_a_time_on(long: Path, tmp_path: Path) -> None
         with pytest.raises(FormatError) as caught:
             rows(dataset.records(start=int(times[149]), topics=[TOPIC]))
         assert caught.value.code == "digest-mismatch"
-
-
-# ---------------------------------------------------------------- ahead
-
-
-@pytest.mark.parametrize("start", [None, 0])
-@pytest.mark.parametrize("trait", ["size-change", "plain"])
-def test_sources_are_read_by_threads(trait: str, start: int | None, tmp_path: Path) -> None:
-    with Dataset(packed(tmp_path, odd_scene(trait))) as dataset:
-        threads: list[ReadAhead[Any]] = []
-
-        def ahead(items: Iterator[T]) -> Iterator[T]:
-            threads.append(ReadAhead(items, 4))
-            return threads[-1]
-
-        wanted = rows(dataset.records(start=start))
-        assert rows(dataset.records(start=start, ahead=ahead)) == wanted
-        sources = [len(group.parts) + bool(group.recorded_ids) for group in dataset._groups]
-        assert len(threads) == 1 + sum(sources)
-        for thread in threads:
-            thread.close()

@@ -172,21 +172,6 @@ def test_too_much(structures: list[str], code: str, packed: Path, tmp_path: Path
     assert [problem.code for problem in mp4ds.validate(path)] == [code]
 
 
-@pytest.mark.parametrize(
-    ("changed", "problem"),
-    [
-        ({"codec": "h264"}, "a packet of codec h264 holds one frame"),
-        ({"codec": "ffv1"}, "a video of codec ffv1 has no references"),
-    ],
-)
-def test_references_of_another_codec(
-    changed: dict[str, Any], problem: str, packed: Path, tmp_path: Path
-) -> None:
-    path = edited(packed, tmp_path, lambda video: video.update(changed))
-    (found,) = mp4ds.validate(path)
-    assert (found.code, problem in found.message) == ("model-invalid", True)
-
-
 PLAIN = "k" + " 1" * 15
 MISFITS: dict[str, tuple[Change, str]] = {
     "too-few-groups": (setting(groups=[0, 0, 1]), "column of groups"),
@@ -212,19 +197,6 @@ def test_references_of_another_video(name: str, packed: Path, tmp_path: Path) ->
     ):
         stream.get([3])
     assert raised.value.code == "references-invalid"
-
-
-@pytest.mark.parametrize(
-    "change", [replacing("k 1", "k 2"), replacing("+1,2,", "+2,1,")], ids=["before", "order"]
-)
-def test_distances_that_contradict_themselves(change: Change, packed: Path, tmp_path: Path) -> None:
-    path = edited(packed, tmp_path, change)
-    assert [problem.code for problem in mp4ds.validate(path)] == ["references-invalid"]
-    with closing(Topic([Stream(path)])) as stream:
-        with pytest.raises(FormatError, match="does not match the references") as raised:
-            stream.get([3])
-        assert raised.value.code == "references-invalid"
-        assert stream.get([49])[0].index == 49  # of another group
 
 
 def with_a_frame_less(video: dict[str, Any]) -> None:

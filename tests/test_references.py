@@ -260,20 +260,6 @@ def test_frames_decode_from_what_they_refer_to(name: str) -> None:
     assert flat or not hierarchical or left_out > 0
 
 
-@pytest.mark.one_in(4)
-@pytest.mark.parametrize("name", RECIPES)
-def test_a_parser_may_begin_at_any_key_packet(name: str) -> None:
-    clip = encoded(RECIPES[name])
-    whole = parsed(clip)
-    for number, packet in enumerate(clip.packets):
-        if packet.is_key:
-            assert parsed(clip, number) == whole[number:]
-        else:
-            parser = parser_of(clip)
-            for key in (False, True):
-                assert refusal(parser.frames, packet.data, key=key)
-
-
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_reaches_across_key_packets_is_refused(name: str) -> None:
     clip = encoded(REFUSED[name])

@@ -154,39 +154,6 @@ def test_for_training_there_are_as_many_key_frames_as_cost_little(name: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("encoding", "asked", "gop"),
-    [("bayer_rggb8", {}, "3"), ("mono8", {}, "3"), ("mono8", {"gop": 20}, "20")],
-)
-def test_key_frames_of_differences(
-    encoding: str, asked: dict[str, Any], gop: str, tmp_path: Path
-) -> None:
-    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene(encoding, frames=7))
-    mp4ds.pack(paths, tmp_path / "dataset", PackOptions(codec="h264", view="av1", **asked))
-    with mp4ds.open(tmp_path / "dataset") as dataset:
-        (sidecar,) = (stream.sidecar for stream in dataset.streams)
-    assert sidecar.view
-    assert sidecar.predicted
-    assert sidecar.video.options["g"] == gop
-    assert compare(paths, unpacked(tmp_path, "mcap")) == []
-
-
-def test_lossy_videos_for_a_purpose(tmp_path: Path) -> None:
-    paths = SOURCES["mcap-ros2-none"](tmp_path, source_scene("rgb8", frames=3))
-    found = {}
-    for purpose in (None, "archive", "training", "speed"):
-        mp4ds.pack(paths, tmp_path / f"{purpose}", PackOptions(quality="visual", purpose=purpose))
-        with mp4ds.open(tmp_path / f"{purpose}") as dataset:
-            options = dataset.streams[0].sidecar.video.options
-            found[purpose] = options["crf"], options["preset"], options["g"]
-    assert found == {
-        None: ("18", "7", "30"),
-        "archive": ("18", "4", "120"),
-        "training": ("33", "6", "2"),
-        "speed": ("18", "11", "30"),
-    }
-
-
-@pytest.mark.parametrize(
     ("encoding", "codec"), [("bayer_rggb8", "h264"), ("rgb8", "h264"), ("16UC1", "ffv1")]
 )
 def test_packing_at_speed(encoding: str, codec: str, tmp_path: Path) -> None:

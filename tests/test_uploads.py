@@ -17,6 +17,7 @@ from compare import compare
 from in_parts import InlineExecutor, facts, use
 from mp4ds.errors import (
     PartsFailedError,
+    RemoteError,
     TargetError,
     TargetExistsError,
 )
@@ -191,6 +192,21 @@ def test_a_failed_upload_keeps_what_was_made(
     assert store.names() == FILES
     assert store.kept() == []
     assert compare([source], store.unpacked()) == []
+
+
+def test_what_is_uploaded_is_counted(
+    source: Path, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import s3fs
+
+    async def short(self: Any, local: str, key: str, **_: Any) -> None:
+        await self._pipe_file(key, Path(local).read_bytes()[:-1])
+
+    monkeypatch.setattr("s3fs.S3FileSystem._put_file", short)
+    s3fs.S3FileSystem.clear_instance_cache()  # their methods are bound when they are made
+    with pytest.raises(RemoteError, match=r"could not be uploaded: only \d+ of \d+ bytes arrived"):
+        mp4ds.pack(source, store.url, FAST)
+    s3fs.S3FileSystem.clear_instance_cache()
 
 
 def test_a_store_that_refuses_is_told_before_the_work(source: Path, store: Store) -> None:

@@ -18,7 +18,7 @@ from PIL import Image
 import mp4ds
 from coded_scenes import CODED
 from definitions import COMPRESSED, IMAGE
-from mp4ds import ConversionError, UnpackOptions
+from mp4ds import UnpackOptions
 from mp4ds.messages.depth import encode_rvl
 from scenes import Record, Scene
 from sources import SOURCES, scene
@@ -160,24 +160,6 @@ def test_what_has_no_picture_is_counted(name: str, tmp_path: Path) -> None:
         assert path.read_bytes() == first.values["data"]
     else:
         assert without
-
-
-def test_one_topic_that_files_cannot_hold(tmp_path: Path) -> None:
-    made = scene("mono8", frames=4)
-    flow = scene("8UC2", frames=4, with_info=False).messages
-    messages = [*made.messages, *(replace(m, topic="/flow") for m in flow if m.topic == TOPIC)]
-    messages.sort(key=lambda message: message.log_time)
-    dataset = packed(tmp_path, Scene(messages))
-    words = r"topic /flow: PNG cannot hold 8UC2 images.*`exclude` /flow, .*`skip_unconvertible`"
-    with pytest.raises(ConversionError, match=words):
-        mp4ds.unpack(dataset, "images", tmp_path / "images")
-    assert not (tmp_path / "images").exists()
-    options = UnpackOptions(skip_unconvertible=True)
-    summary = mp4ds.unpack(dataset, "images", tmp_path / "images", options)
-    assert summary.messages == {TOPIC: 4}
-    (counted,) = summary.unconvertible["/flow"].values()
-    assert counted == 4
-    assert [path.name for path in (tmp_path / "images").iterdir()] == ["cam_image_raw"]
 
 
 # ---------------------------------------------------------------- as frames

@@ -11,7 +11,6 @@ import zipfile
 from collections.abc import Iterator
 from email.message import Message
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -25,8 +24,6 @@ ROOT = Path(__file__).parents[1]
 for _module in ("hatchling", "hatch_fancy_pypi_readme"):
     pytest.importorskip(_module)
 VERSION = mp4ds.__version__
-OWN_NAMES = {"xxhash": "python-xxhash"}
-"""Packages that conda-forge calls otherwise."""
 
 
 def built(kind: str, source: Path, target: Path, **environment: str) -> Path:
@@ -180,23 +177,6 @@ def test_the_citation_is_of_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == VERSION
     assert citation["license"] == "Apache-2.0"
-
-
-def test_the_recipe_for_conda_needs_what_the_package_needs() -> None:
-    recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text())
-    assert recipe["context"]["version"] == VERSION
-    told = {
-        name: least
-        for name, _, least in (one.partition(" >=") for one in recipe["requirements"]["run"])
-    }
-    pyproject = (ROOT / "pyproject.toml").read_text()
-    listed = pyproject.partition("\ndependencies = [")[2].partition("\n]")[0]
-    needed: dict[str, Any] = {"python": "3.10"}
-    for name, least in re.findall(r'^  "([\w-]+)>=([\d.]+)', listed, re.MULTILINE):
-        needed[OWN_NAMES.get(name, name)] = least  # of several lines the last, for newer Pythons
-    assert told == needed
-    host = {one.split(" ")[0] for one in recipe["requirements"]["host"]}
-    assert {"hatchling", "hatch-fancy-pypi-readme"} <= host
 
 
 def pinned() -> Iterator[Requirement]:

@@ -19,7 +19,7 @@ from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from in_parts import InlineExecutor, facts, leftovers, use
 from mp4ds.packing.options import PackOptions
 from pictures import ENCODINGS, picture
-from round_trips import own_target, packed, unpacked
+from round_trips import own_target, unpacked
 from scenes import Scene
 from sources import SOURCES, TRAITS, odd_scene, scene
 
@@ -145,21 +145,3 @@ def test_channels_that_cannot_be_told_apart(tmp_path: Path, executor: InlineExec
     assert len(executor.ran) > 3
     assert facts(tmp_path / "dataset") == facts(tmp_path / "whole")
     assert compare([path], unpacked(tmp_path, "mcap")) == []
-
-
-@pytest.mark.parametrize(("view", "processes"), [(None, 3), ("none", 8)])
-def test_as_many_processes_as_memory_serves(
-    view: str | None, processes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The encoder of a view takes most of it, and the images that wait for it some."""
-    asked: list[int] = []
-
-    def executor(count: int) -> InlineExecutor:
-        asked.append(count)
-        return InlineExecutor()
-
-    monkeypatch.setattr("mp4ds.packing.pack.ProcessExecutor", executor)
-    monkeypatch.setattr("mp4ds.packing.pack.available_cores", lambda: 8)
-    monkeypatch.setattr("mp4ds.packing.pack.memory_bytes", lambda: 2 * 64 * 48 * 1400)
-    packed(tmp_path, scene("mono8", frames=9), codec="h264", window=3, view=view)
-    assert asked == [processes]
