@@ -139,7 +139,7 @@ def test_every_kind_of_source(kind: str, tmp_path: Path) -> None:
     if kind == "video":
         source = Path(shutil.copy(source / "cam_image_raw.mp4", tmp_path / "alone.mp4"))
     (camera,) = evaluate(source, QUICK, output=tmp_path / "out").cameras
-    if kind not in ("lossy dataset", "video"):  # which are no mosaics any more
+    if kind != "video":  # which is no mosaic
         assert (camera.topic, camera.clip.encoding) == (TOPIC, "bayer_grbg8")
         assert camera.storage[0].frame_bytes == 96 * 64
     assert camera.clip.image_size == (96, 64)

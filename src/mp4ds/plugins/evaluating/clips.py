@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import open_dataset
-from mp4ds.dataset.topic import Topic
+from mp4ds.dataset.recording import DatasetReader
 from mp4ds.errors import Refused
 from mp4ds.format.sidecars import names_dataset
 from mp4ds.messages.encodings import ENCODINGS, Pixels
@@ -24,7 +24,9 @@ from mp4ds.messages.layouts import LAYOUTS, Layout, layout_for
 from mp4ds.messages.serializations import is_camera, kind_of
 from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.inspection import MessageInspector, depends_on_others
+from mp4ds.packing.options import ImportOptions
 from mp4ds.plugins.evaluating.trials import FRAMES, TICKS, Clip
+from mp4ds.plugins.importing.layouts import open_images
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import TIMESCALE, PresentationClock
 from mp4ds.video.codecs import LOSSLESS
@@ -33,7 +35,6 @@ from mp4ds.video.scores import SMALLEST
 
 _JPEG = "JPEG files, which `mp4ds pack` re-encodes only with --transcode"
 
-_AT_ONCE = 8  # frames of a dataset in memory at once
 _SECOND = 1_000_000_000
 _DETAIL = (96, 128)  # rows and columns shown side by side
 
@@ -78,17 +79,26 @@ def open_cameras(place: Path) -> Iterator[tuple[list[Camera], dict[str, str]]]:
         SourceError: It is not a recording, a dataset or a video.
         FormatError: It is a dataset, and breaks a rule of the format.
     """
-    if names_dataset(place):
-        with open_dataset(place) as dataset, ExitStack() as topics:
-            # stream by stream: an encoder takes images of one size
-            opened = [topics.enter_context(closing(Topic([part]))) for part in dataset.parts]
-            yield list(map(_of_topic, opened)), {}
-    else:
-        with open_reader(place) as reader:
-            yield _of_recording(reader)
+    lossy = ""
+    with ExitStack() as stack:
+        if not names_dataset(place):
+            reader = stack.enter_context(open_reader(place))
+        elif (dataset := stack.enter_context(open_dataset(place))).channels:
+            reader = DatasetReader(dataset)
+            lossy = next(
+                (
+                    one.profile
+                    for one in (stream.sidecar for stream in dataset.streams)
+                    if one.profile != LOSSLESS
+                ),
+                "",
+            )
+        else:  # a video of any other program
+            reader = stack.enter_context(open_images(place, ImportOptions(decode=True)))
+        yield _of_recording(reader, lossy and f"a dataset of {lossy}")
 
 
-def _of_recording(reader: BagReader) -> tuple[list[Camera], dict[str, str]]:
+def _of_recording(reader: BagReader, lossy: str = "") -> tuple[list[Camera], dict[str, str]]:
     times = reader.times()
     cameras: list[Camera] = []
     left_out: dict[str, str] = {}
@@ -100,7 +110,8 @@ def _of_recording(reader: BagReader) -> tuple[list[Camera], dict[str, str]]:
         elif kind_of(channel) is CodedFields and depends_on_others(channel, first):
             left_out[channel.topic] = "has video packets, which `mp4ds pack` copies"
         else:
-            cameras.append(_of_channel(reader, channel, own, _JPEG if _is_jpeg(first) else ""))
+            known = lossy or (_JPEG if _is_jpeg(first) else "")
+            cameras.append(_of_channel(reader, channel, own, known))
     return cameras, left_out
 
 
@@ -131,27 +142,6 @@ def _of_channel(
             number += 1
 
     return Camera(channel.topic, times, read, lossy)
-
-
-def _of_topic(topic: Topic) -> Camera:
-    lossy, form = "", "native"
-    for stream in topic.streams:
-        if stream.sidecar.video.codec == "mjpeg":
-            lossy = _JPEG
-        if stream.sidecar.profile != LOSSLESS:
-            lossy = f"a dataset of {stream.sidecar.profile}"
-            # a lossy video has already been demosaiced; doing it again would not help
-            form = "rgb" if ENCODINGS[stream.encoding].mosaic else "native"
-    order = np.argsort(topic.log_times, kind="stable")
-
-    def read(indices: Sequence[int]) -> Iterator[Shot]:
-        for at in range(0, len(indices), _AT_ONCE):
-            numbers = [int(order[index]) for index in indices[at : at + _AT_ONCE]]
-            for frame in topic.get(numbers, format=form):
-                kind = (frame.encoding, *topic.image_size)
-                yield kind, frame.data, frame.stamp_ns, frame.log_time_ns
-
-    return Camera(topic.topic, topic.log_times[order], read, lossy)
 
 
 # ---------------------------------------------------------------- clips
