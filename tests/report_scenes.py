@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -15,7 +12,6 @@ from numpy.typing import NDArray
 
 import mp4ds
 from mp4ds.packing.options import PackOptions
-from mp4ds.plugins.reporting.server import ReportServer
 from scenes import Record, Scene
 from sources import SOURCES, scene
 
@@ -59,19 +55,6 @@ def pack_cameras(folder: Path, made: Scene, **options: Any) -> Path:
     paths = SOURCES["bag-none"](folder / "source", made)
     mp4ds.pack(paths, folder / "drive", PackOptions(**{"quality": "visual", **options}))
     return folder / "drive"
-
-
-@contextmanager
-def serving(*servers: ReportServer) -> Iterator[None]:
-    """Let servers answer in threads of their own, and end them."""
-    with ExitStack() as stack:
-        for server in servers:
-            stack.enter_context(server)
-            thread = Thread(target=server.serve_forever, args=(0.05,))
-            thread.start()
-            stack.callback(thread.join)
-            stack.callback(server.shutdown)
-        yield
 
 
 def blocks(picture: NDArray[Any]) -> NDArray[np.float64]:

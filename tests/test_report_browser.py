@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 import mp4ds
 from chromium import Tab, chromium
 from mp4ds.plugins.reporting.report import report
-from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.plugins.reporting.stills import Look
 from mp4ds.times import intervals, lost_frames
 from report_scenes import (
@@ -27,7 +26,6 @@ from report_scenes import (
     WIDTH,
     blocks,
     pack_cameras,
-    serving,
     two_cameras,
 )
 from waiting import WATCHDOG_S, until
@@ -269,31 +267,6 @@ def test_a_lossless_mosaic_plays_in_colour(browser: Tab, with_views: Path, tmp_p
     until(is_shown)
 
 
-def test_a_server_shows_lossless_rgb_to_the_bit(browser: Tab, tmp_path: Path) -> None:
-    drive = pack_cameras(tmp_path, two_cameras(), quality="lossless", codec="h264", view="none")
-    summary = report(drive)
-    assert [camera.plays for camera in summary.cameras] == ["stills", "video"]
-    server = ReportServer(summary.files, summary.start)
-    with serving(server):
-        page = show(browser, server.url)
-        with mp4ds.open(drive) as dataset:
-            for number in (0, FRAMES - 1, 11):
-                page.evaluate(
-                    f"mp4dsReport.player.go(mp4dsReport.player.cameras[1].position[{number}])"
-                )
-                assert page.evaluate(SETTLED)
-                seen = page.evaluate(
-                    "(v => { const c = new OffscreenCanvas(v.videoWidth, v.videoHeight)"
-                    ".getContext('2d'); c.drawImage(v, 0, 0); return Array.from("
-                    "c.getImageData(0, 0, v.videoWidth, v.videoHeight).data); })"
-                    "(mp4dsReport.player.cameras[1].video)"
-                )
-                picture = np.array(seen, np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3]
-                np.testing.assert_array_equal(picture, dataset[COLOUR][number].data)
-        assert page.problems == []
-        page.open("about:blank", ready="true")
-
-
 def test_hostile_names_run_nothing(browser: Tab, tmp_path: Path) -> None:
     names = (
         "/a</script><script>window.evil=1</script>",
@@ -308,38 +281,6 @@ def test_hostile_names_run_nothing(browser: Tab, tmp_path: Path) -> None:
     assert heads == list(names)
     assert browser.evaluate("window.evil === undefined && !document.querySelector('main img')")
     assert browser.problems == []
-
-
-INTRUDER = """<!doctype html><title>intruder</title><script>
-const root = "ROOT", got = [], tries = [];
-const include = (name, facts, ready) => tries.push(new Promise(done => {
-  const made = Object.assign(document.createElement(name), facts);
-  made[ready] = () => { got.push(name); done(); };
-  made.onerror = done;
-  document.head.append(made);
-}));
-mp4dsReport = {dataset: facts => got.push(facts)};
-include("script", {src: `${root}/report/data.js`}, "onload");
-include("link", {rel: "stylesheet", href: `${root}/report/report.css`}, "onload");
-include("video", {src: `${root}/front_image_raw.mp4`}, "onloadedmetadata");
-for (const mode of ["cors", "no-cors"])
-  tries.push(fetch(`${root}/report/data.js`, {mode}).then(() => got.push(mode), () => 0));
-all = Promise.all(tries).then(() => got);
-</script>"""
-
-
-def test_another_origin_can_include_nothing(browser: Tab, drive: Path, tmp_path: Path) -> None:
-    """Even one that has learned the token."""
-    summary = report(drive)
-    page = tmp_path / "intruder.html"
-    server = ReportServer(summary.files, summary.start)
-    page.write_text(INTRUDER.replace("ROOT", server.root))
-    other = ReportServer({"/intruder.html": page}, "/intruder.html")
-    with serving(server, other):
-        for url in (page.as_uri(), other.url, other.url.replace("127.0.0.1", "localhost")):
-            browser.open(url, ready="typeof all === 'object'")
-            assert browser.evaluate("all") == []
-        browser.open("about:blank", ready="true")
 
 
 def test_troubles_are_told(browser: Tab, drive: Path, tmp_path: Path) -> None:

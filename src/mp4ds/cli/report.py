@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
@@ -15,14 +14,12 @@ from mp4ds.cli.options import (
     command,
     datasets_argument,
     jobs_option,
-    option,
     output_option,
     takes,
 )
-from mp4ds.cli.output import is_json, print_table, printed, progress_of, say, show
+from mp4ds.cli.output import print_table, progress_of, say, show
 from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, counted, interrupted, path_text, size_text
-from mp4ds.options import WHERE
 from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
 from mp4ds.plugins.evaluating.page import findings_of
 from mp4ds.plugins.evaluating.trials import Evaluation
@@ -33,7 +30,6 @@ from mp4ds.plugins.reporting.report import (
     report,
     reports,
 )
-from mp4ds.plugins.reporting.server import ReportServer
 from mp4ds.plugins.reporting.stills import StillOptions, StillSummary, frames
 
 _PLAYS = {"video": "plays its video", "stills": "shows stills", "nothing": "shows nothing"}
@@ -41,29 +37,16 @@ _PLAYS = {"video": "plays its video", "stills": "shows stills", "nothing": "show
 
 @command()
 @datasets_argument
-@option("--serve", is_flag=True, panel=WHERE, help="Serve it to browsers on this machine.")
-@option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=0,
-    panel=WHERE,
-    metavar="N",
-    help="Port for --serve; 0 picks a free one.",
-)
 @jobs_option
 @takes(ReportOptions)
-def report_command(
-    datasets: Sequence[str], serve: bool, port: int, jobs: int | None, options: ReportOptions
-) -> None:
+def report_command(datasets: Sequence[str], jobs: int | None, options: ReportOptions) -> None:
     """Make an HTML report: synchronised cameras, timing, topics, calibrations.
 
-    Open its index.html in a browser, from disk or with --serve; it works offline. Several datasets,
-    or a folder of them, get an overview page with a picture of each and links to their reports.
+    Open its index.html in a browser, from disk; it works offline. Several datasets, or a folder of
+    them, get an overview page with a picture of each and links to their reports.
     """
     found = datasets_in(datasets)
     if len(found) > 1:
-        if serve:
-            raise OptionError("--serve works with one dataset only.")
         summaries = _reports(datasets, found, options, jobs)
         show(summaries, _print_reports)
         if summaries.problems:
@@ -71,17 +54,7 @@ def report_command(
         return
     with progress_of("reporting") as tell:
         summary = report(found[0], options, progress=tell)
-    if is_json():
-        names = ("index", "bytes", "cameras", "problems")
-        show({name: getattr(summary, name) for name in names}, say)
-    else:
-        _print_report(summary)
-    if serve:
-        with ReportServer(summary.files, summary.start, port=port) as server:
-            with printed():
-                stream = sys.stderr if is_json() else sys.stdout
-                print(f"{server.url} (Ctrl-C ends)", file=stream, flush=True)
-            server.serve_forever()
+    show(summary, _print_report)
     if summary.problems:
         raise click.exceptions.Exit(1)
 

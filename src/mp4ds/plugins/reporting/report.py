@@ -114,22 +114,15 @@ class ReportSummary:
 
     Attributes:
         index: The page.
-        files: The files it needs, by path from the common folder of dataset and page.
         cameras: In the order of the page.
         bytes: Total size of what was written.
         problems: What could not be shown of the dataset.
     """
 
     index: Path
-    files: dict[str, Path] = field(repr=False)
     cameras: list[CameraSummary]
     bytes: int
     problems: list[str]
-
-    @property
-    def start(self) -> str:
-        """Path of the page's URL when `files` are served."""
-        return quote(next(name for name, path in self.files.items() if path == self.index))
 
 
 def report(
@@ -263,21 +256,13 @@ def _give_pictures(
 
 
 def _summary(folder: Path, cameras: list[ReportedCamera], problems: list[str]) -> ReportSummary:
-    own = [folder / _INDEX, *(p for p in (folder / _FOLDER).rglob("*") if p.is_file())]
-    videos = [c.stream.video_path.resolve() for c in cameras if c.video]
-    base = Path(os.path.commonpath([folder.resolve(), *(video.parent for video in videos)]))
+    files = [folder / _INDEX, *(p for p in (folder / _FOLDER).rglob("*") if p.is_file())]
     return ReportSummary(
         index=folder / _INDEX,
-        files={_place(path, base): path for path in (*own, *videos)},
         cameras=[CameraSummary(c.name, c.plays, c.note) for c in cameras],
-        bytes=sum(path.stat().st_size for path in own),
+        bytes=sum(path.stat().st_size for path in files),
         problems=problems,
     )
-
-
-def _place(path: Path, base: Path) -> str:
-    resolved = path.parent.resolve() / path.name
-    return f"/{resolved.relative_to(base).as_posix()}"
 
 
 # ---------------------------------------------------------------- data of the page
