@@ -93,7 +93,7 @@ def test_the_table_of_all(drives: Path, tmp_path: Path, monkeypatch: pytest.Monk
     one = brief(drives / "a")
     assert [row["messages"] for row in rows] == [one.messages] * 3
     assert re.search(rf" {3 * one.messages} ", lines[-1])
-    assert call("info", "drives", "--speed").code == 2
+    assert call("info", "drives", "--checksums").code == 2
 
 
 def test_all_are_validated(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -121,14 +121,15 @@ def named(made: Scene, names: dict[str, str]) -> Scene:
     return Scene(messages, made.silent)
 
 
-def test_names_that_tell_nothing_are_paired_by_stamp(tmp_path: Path) -> None:
+def test_names_that_tell_nothing_are_paired_on_request(tmp_path: Path) -> None:
     made = named(focused(scene("mono8")), {"/cam/image_raw": "/eye", "/cam/camera_info": "/lens"})
     path = SOURCES["bag-none"](tmp_path, made)[0]
-    camera = camera_of(intrinsics(path))
+    told = {topic.topic: topic.notes for topic in mp4ds.pack(path, tmp_path / "alone").topics}
+    assert "no images are known to be its own" in told["/lens"][0]
+    mp4ds.pack(path, tmp_path / "dataset", mp4ds.PackOptions(camera_info=["/eye=/lens"]))
+    camera = camera_of(intrinsics(tmp_path / "dataset"))
     assert (camera.topic, camera.info_topic) == ("/eye", "/lens")
     check_focused(camera, made)
-    mp4ds.pack(path, tmp_path / "dataset")
-    assert camera_of(intrinsics(tmp_path / "dataset")) == camera
 
 
 # ---------------------------------------------------------------- transforms

@@ -47,13 +47,6 @@ _TEXTS = {
     help="Print the cameras' calibrations as Python code.",
 )
 @option(
-    "--speed",
-    "what",
-    flag_value="speed",
-    panel=HOW,
-    help="Read some frames of a dataset and show how long one takes.",
-)
-@option(
     "--checksums",
     "what",
     flag_value="checksums",
@@ -69,8 +62,6 @@ def info_command(paths: Sequence[str], what: str | None, options: SliceOptions) 
     with progress_of("reading") as tell:
         if what == "intrinsics":
             show(facts.intrinsics(paths[0]), _print_intrinsics)
-        elif what == "speed":
-            show(facts.reading_speeds(paths[0]), _print_speeds)
         elif what == "checksums":
             show(_checksums(found[0]), _print_checksums)
         elif len(found) == 1:
@@ -225,21 +216,6 @@ def _print_info(result: facts.Info) -> None:
         say("shortened to fit; in full: --json, or `| less -S`")
     for note in result.notes:
         say(note)
-
-
-def _print_speeds(speeds: Sequence[facts.ReadingSpeed]) -> None:
-    """Print how long reading frames takes."""
-    rows = [
-        {
-            "topic": item.topic,
-            "layer": item.layer,
-            "per frame": size_text(item.bytes_per_frame),
-            "ms, random access": number(item.random_ms, 1),
-            "ms, in order": number(item.in_order_ms, 1),
-        }
-        for item in speeds
-    ]
-    print_table(rows, _TEXTS)
 
 
 def _info_row(topic: facts.TopicInfo) -> dict[str, str]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from itertools import islice
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from mp4ds.bags.protocols import BagReader, with_own_payload
+from mp4ds.bags.protocols import with_own_payload
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.fields import MAX_CAMERA_INFOS
 from mp4ds.format.models import Calibration, CameraInfo, ChannelModel
@@ -19,33 +17,15 @@ from mp4ds.messages.serializations import (
     is_camera,
     kind_of,
 )
-from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Parts
-from mp4ds.packing.inspection import MessageInspector, MessageTable
+from mp4ds.messages.wire import CalibrationFields, CodedFields
+from mp4ds.packing.inspection import MessageTable
 from mp4ds.packing.options import TopicSummary
-from mp4ds.records import Channel, Excerpt, Message
+from mp4ds.records import Channel, Message
 
 Pairs = Mapping[int, int]
 """Id of a calibration channel -> id of the channel of its images."""
 
-INFO_WINDOW = 50
-"""Number of latest stamps of a calibration channel that are compared."""
-IMAGE_WINDOW = 1000
-"""Number of latest stamps of an image channel compared with them: images may come more often."""
-
-MAX_CHANNELS = 256
-"""Calibration channels, and image channels, whose stamps are compared."""
-
-_MIN_COMMON = 3
-_MIN_SHARE = 0.8
 _LISTED = 20
-
-# the topics of one camera, as sensor_msgs/CameraInfo.msg and image_proc name them
-_VIEWS = frozenset(
-    {
-        *("image", "image_raw", "image_mono", "image_color"),
-        *("image_rect", "image_rect_raw", "image_rect_mono", "image_rect_color"),
-    }
-)
 
 # ---------------------------------------------------------------- by the user's choice
 
@@ -159,20 +139,10 @@ def pair_camera_infos(
     return pairs
 
 
-def _preference(image: Channel, size: tuple[int, int] = (0, 0)) -> tuple[bool, int, bool, str, int]:
+def _preference(image: Channel) -> tuple[bool, bool, str, int]:
     """Orders the images of a camera: the raw image is what the calibration was made for."""
-    coded = _is_coded(image)
-    return (
-        coded,
-        -size[0] * size[1] if coded else 0,
-        _leaf(_base(image)) != "image_raw",
-        image.topic,
-        image.id,
-    )
-
-
-def _is_coded(image: Channel) -> bool:
-    return kind_of(image) is CodedFields
+    is_coded = kind_of(image) is CodedFields
+    return is_coded, _leaf(_base(image)) != "image_raw", image.topic, image.id
 
 
 def _leaf(topic: str) -> str:
@@ -201,194 +171,20 @@ def _namespaces(image: Channel) -> list[str]:
     return list(dict.fromkeys((_parent(_base(image)), _parent(image.topic))))
 
 
-def _camera(image: Channel) -> str:
-    """Equal for image topics that are views of one camera, judging by names."""
-    base = _base(image)
-    return f"{_parent(base)}/" if _leaf(base) in _VIEWS else base
-
-
-# ---------------------------------------------------------------- by stamp
-
-
-class _Track:
-    """What is known of one channel: its latest stamps, zero for none, and its latest message."""
-
-    frame_id: str
-    fields: Fields
-    size: tuple[int, int]
-
-    def __init__(self, channel: Channel, window: int) -> None:
-        self.channel = channel
-        self.stamps: deque[int] = deque(maxlen=window)
-        self.messages = 0
-
-
-class StampPairing:
-    """Pairs by stamps the calibrations that names leave unpaired.
-
-    `add` takes messages of calibration and image channels in recorded order. The latest
-    `INFO_WINDOW` and `IMAGE_WINDOW` stamps of each channel are kept, so that memory is bounded and
-    a channel that starts late is compared with what was recorded at the same time. A calibration
-    channel is paired if
-
-    - at least 3 of its stamps are an image channel's, and at least 80 % of those between that
-      channel's first and last stamp (stamps of zero count as not found),
-    - its frame_id, where both have one, and its size, by ROI and binning, are the images',
-    - and this is so for the images of one camera only, or for those of one camera with the same
-      frame_id, and for no other calibration channel of this camera, which has none yet.
-    """
-
-    def __init__(self) -> None:
-        self._infos: dict[int, _Track] = {}
-        self._images: dict[int, _Track] = {}
-        self._overflow = False
-        self._forms: dict[int, MessageSplitter] = {}
-        self._sizes: dict[int, tuple[int, int]] = {}  # of coded images, as of their first
-
-    def add(self, channel: Channel, parts: Parts, *, size: tuple[int, int] = (0, 0)) -> None:
-        """Take a message.
-
-        Args:
-            channel: Its channel, of calibrations or images.
-            parts: The message.
-            size: Width and height of a coded image, if not in its message.
-        """
-        is_info = isinstance(parts.fields, CalibrationFields)
-        tracks = self._infos if is_info else self._images
-        if channel.id not in tracks:
-            if len(tracks) == MAX_CHANNELS:
-                self._overflow = True
-                return
-            tracks[channel.id] = _Track(channel, INFO_WINDOW if is_info else IMAGE_WINDOW)
-        track = tracks[channel.id]
-        track.stamps.append(parts.stamp)
-        track.messages += 1
-        track.frame_id = parts.frame_id.lstrip("/")
-        track.fields = parts.fields
-        told = parts.fields.width, parts.fields.height
-        track.size = size if 0 in told else told
-
-    def take(self, message: Message) -> None:
-        """Take a message as recorded; one that cannot be parsed is left out."""
-        channel = message.channel
-        if channel.id not in self._forms:
-            self._forms[channel.id] = MessageSplitter(channel)
-        with suppress(Refused):
-            _, parts = self._forms[channel.id].split(message)
-            if isinstance(parts.fields, CodedFields) and channel.id not in self._sizes:
-                key = MessageInspector(channel).inspect(message).key
-                self._sizes[channel.id] = key.width, key.height
-            self.add(channel, parts, size=self._sizes.get(channel.id, (0, 0)))
-
-    def decide(self, paired: Pairs, *, final: bool = True) -> dict[int, int]:
-        """Pair what was added so far.
-
-        Args:
-            paired: Existing pairs. These calibrations are not paired again, and these images take
-                no other calibration, but still compete with the others.
-            final: Whether the recording has ended. Then all stamps must agree for channels with
-                fewer than 3 messages; before, these are not paired.
-
-        Returns:
-            Id of the calibration channel -> id of the image channel; the new ones only. Nothing
-            if there are more than `MAX_CHANNELS` of a kind.
-        """
-        if self._overflow:
-            return {}
-        images = [(image, set(image.stamps) - {0}) for image in self._images.values()]
-        taken = set(paired.values())
-        claims: dict[int, Channel] = {}
-        for info_id, info in sorted(self._infos.items()):
-            if info_id not in paired:
-                fitting = [image for image, found in images if _fits(info, image, found, final)]
-                claim = _only_camera(info, fitting, taken)
-                if claim is not None:
-                    claims[info_id] = claim
-        cameras = Counter(map(_camera, claims.values()))
-        return {
-            info_id: image.id for info_id, image in claims.items() if cameras[_camera(image)] == 1
-        }
-
-
-def _only_camera(info: _Track, fitting: list[_Track], taken: set[int]) -> Channel | None:
-    """The best image channel, if all that match are of one camera without a calibration."""
-    same_frame = [image for image in fitting if info.frame_id and info.frame_id == image.frame_id]
-    fitting = same_frame or fitting
-    if len({_camera(image.channel) for image in fitting}) != 1:
-        return None
-    if any(image.channel.id in taken for image in fitting):
-        return None
-    return min(fitting, key=lambda image: _preference(image.channel, image.size)).channel
-
-
-def _fits(info: _Track, image: _Track, found: set[int], final: bool) -> bool:
-    if info.frame_id and image.frame_id and info.frame_id != image.frame_id:
-        return False
-    if not isinstance(info.fields, CalibrationFields) or not _size_fits(info.fields, image.size):
-        return False
-    if not found:
-        return False
-    first, last = min(found), max(found)
-    due = [stamp for stamp in info.stamps if stamp == 0 or first <= stamp <= last]
-    common = [stamp for stamp in due if stamp in found]
-    needed = min(_MIN_COMMON, info.messages, image.messages) if final else _MIN_COMMON
-    return len(set(common)) >= needed and len(common) >= _MIN_SHARE * len(due)
-
-
-def _size_fits(calibration: CalibrationFields, size: tuple[int, int]) -> bool:
-    """Whether a calibration can apply to images of a size (REP 104), if both are known."""
-    if 0 in size or 0 in (calibration.width, calibration.height):
-        return True
-    return any(
-        abs(width - size[0]) < 1 and abs(height - size[1]) < 1
-        for width, height in _image_sizes(calibration)
-    )
-
-
-def _image_sizes(calibration: CalibrationFields) -> Iterator[tuple[float, float]]:
-    """Sizes that images of a calibration may have: whole or cut, binned or not."""
-    _, _, roi_height, roi_width = calibration.roi
-    for width, height in ((calibration.width, calibration.height), (roi_width, roi_height)):
-        if width and height:
-            yield width, height
-            yield width / max(1, calibration.binning_x), height / max(1, calibration.binning_y)
-
-
 # ---------------------------------------------------------------- all of them
 
-_PAIRING_MESSAGES = 5_000
-_DECIDED_EVERY = 100
 
-
-def find_pairs(reader: BagReader, chosen: Sequence[str], channels: Sequence[Channel]) -> Pairs:
+def find_pairs(chosen: Sequence[str], channels: Sequence[Channel]) -> Pairs:
     """Pair calibrations with images before anything is packed, so that all parts agree.
 
-    Only where names leave a calibration topic unpaired are the first messages read.
-
     Args:
-        reader: The recording.
         chosen: Pairs that the user names, ``IMAGE=INFO``.
-        channels: What is packed of it.
+        channels: What is packed of the recording.
 
     Raises:
         OptionError: A chosen pair is not possible.
     """
-    pairs = pair_camera_infos(channels, chosen=choose_pairs(chosen, channels))
-    infos = [channel for channel in channels if is_calibration(channel)]
-    if not any(map(is_camera, channels)) or all(channel.id in pairs for channel in infos):
-        return pairs
-    pairing = StampPairing()
-    ids = {channel.id for channel in channels if is_camera(channel) or is_calibration(channel)}
-    topics = frozenset(channel.topic for channel in channels if channel.id in ids)
-    records = reader.records(Excerpt(topics=topics, others=False))
-    for number, record in enumerate(islice(records, _PAIRING_MESSAGES)):
-        if isinstance(record, Message) and record.channel.id in ids:
-            pairing.take(record)
-        if number % _DECIDED_EVERY == 0:
-            pairs.update(pairing.decide(pairs, final=False))
-            if all(channel.id in pairs for channel in infos):
-                return pairs
-    return {**pairs, **pairing.decide(pairs)}
+    return pair_camera_infos(channels, chosen=choose_pairs(chosen, channels))
 
 
 _MAX_PENDING = 1000
@@ -483,6 +279,10 @@ class Calibrations:
         if channel.id not in self._channels:
             self._channels[channel.id] = channel
             self._pairs = pair_camera_infos(list(self._channels.values()), chosen=self._pairs)
+
+    def have_images(self, channel: Channel) -> bool:
+        """Whether it is known which images the calibrations of a channel are for."""
+        return channel.id in self._pairs
 
     def take(self, message: Message) -> None:
         """Add a calibration to its stream, or keep it if it belongs to none."""

@@ -172,7 +172,7 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
         changes=ENCODING,
     )
     camera_info: Sequence[str] = option(
-        "Pair a camera topic with its camera_info, if neither names nor stamps do.",
+        "Pair a camera topic with its camera_info, if their names do not.",
         (),
         panel=WHAT,
         metavar="IMAGE=INFO",

@@ -431,7 +431,7 @@ class _Camera:
 # ---------------------------------------------------------------- packer
 
 _Made = TypeVar("_Made")
-_NOT_ADAPTED = "as recorded, not adapted: no images are known to be its own (`camera_info`)"
+_UNPAIRED = "no images are known to be its own (`camera_info` names them)"
 
 
 def until_in_reach(make: Callable[[Exact], _Made]) -> _Made:
@@ -565,8 +565,9 @@ class Packer:
                 self._cameras[channel.identity] = _Camera(self, channel)
             return self._cameras[channel.identity].take
         if is_calibration(channel):
-            if self.reader.reduction.get("images") and channel.id not in self.plan.pairs:
-                self.part.topic(channel).notes.append(_NOT_ADAPTED)
+            if self.plan.frames and not self.calibrations.have_images(channel):
+                adapted = ", so it is not adapted" if self.reader.reduction.get("images") else ""
+                self.part.topic(channel).notes.append(_UNPAIRED + adapted)
             return self.calibrations.take
         if self._transforms.takes(channel):
             return self._take_transforms

@@ -558,7 +558,7 @@ def divide(
     packed = [channel for channel in channels if is_camera(channel)]
     pairs = reader.pairs
     if pairs is None:
-        pairs = find_pairs(reader, options.camera_info, channels)
+        pairs = find_pairs(options.camera_info, channels)
     pieces = _pieces(reader, channels, pairs, options) if reader.is_indexed else []
     cores = max(1, available_cores() // recordings)
     stats = reader.stats()

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import random
-import statistics
-import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +17,6 @@ from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import Matrix, effective
 from mp4ds.errors import Refused, SourceError, counted
 from mp4ds.files.urls import location
@@ -31,7 +26,7 @@ from mp4ds.messages.serializations import MessageSplitter, is_calibration, is_ca
 from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.messages.wire import CalibrationFields, CodedFields, ImageFields
 from mp4ds.options import WHOLE, Slice, iso_text
-from mp4ds.packing.calibrations import StampPairing, pair_camera_infos
+from mp4ds.packing.calibrations import pair_camera_infos
 from mp4ds.packing.inspection import MessageInspector
 from mp4ds.packing.planning import open_recording
 from mp4ds.records import Channel, Message, latched_text
@@ -116,66 +111,6 @@ def _open_any(path: Path | str) -> Dataset | BagReader:
     """Open a recording, a dataset, or a video with its sidecar: a context manager."""
     place = location(path)
     return Dataset(place) if names_dataset(place) else open_reader(place)
-
-
-@dataclass(frozen=True, slots=True)
-class ReadingSpeed:
-    """How long a topic's frames take to read on this machine.
-
-    Attributes:
-        topic: The topic.
-        layer: Which of its frames, if there is a view: ``exact`` or ``view``; else empty.
-        bytes_per_frame: Of the videos that are read.
-        random_ms: Median time of a random frame, milliseconds.
-        in_order_ms: Mean time of a frame when reading in order, milliseconds.
-    """
-
-    topic: str
-    layer: str
-    bytes_per_frame: float
-    random_ms: float
-    in_order_ms: float
-
-
-_READS = 12
-_IN_ORDER = 30
-
-
-def reading_speeds(path: Path | str) -> list[ReadingSpeed]:
-    """Read some frames of each topic, and measure.
-
-    Args:
-        path: A dataset, or a video with its sidecar; or its URL.
-
-    Raises:
-        SourceError: It is not a dataset, or cannot be read.
-        FormatError: The dataset breaks a rule of the format.
-    """
-    with Dataset(path) as dataset:
-        by_topic = [[one for one in dataset.streams if one.topic == it] for it in dataset.topics]
-        return [_reading_speed(layer) for own in by_topic for layer in max(own, key=len).layers]
-
-
-def _reading_speed(stream: Stream) -> ReadingSpeed:
-    frames = Topic([stream])
-    numbers = random.Random(0)
-    frames.read([0], format="native")
-    times = []
-    for _ in range(_READS):
-        number = numbers.randrange(len(stream))
-        begun = time.perf_counter()
-        frames.read([number], format="native")
-        times.append(time.perf_counter() - begun)
-    count = min(_IN_ORDER, len(stream))
-    begun = time.perf_counter()
-    for _ in islice(frames, count):
-        pass
-    in_order = (time.perf_counter() - begun) / count
-    frames.close()
-    size = sum(path.stat().st_size for path, _ in stream.videos) / len(stream)
-    median = 1e3 * statistics.median(times)
-    layer = stream.layer if stream.exact_path else ""
-    return ReadingSpeed(stream.topic, layer, size, median, 1e3 * in_order)
 
 
 def _recording_info(reader: BagReader) -> Info:
@@ -542,7 +477,6 @@ class _Cameras:
         self._infos: dict[int, CameraCalibrations] = {}
         self._last: dict[int, tuple[str, CalibrationFields]] = {}
         self._seen: dict[int, tuple[str, tuple[int, int]]] = {}
-        self._stamps = StampPairing()
         self.transforms = TransformCollector()
 
     def take(self, message: Message) -> None:
@@ -552,6 +486,8 @@ class _Cameras:
             return
         number = self._counts[channel.id]
         self._counts[channel.id] += 1
+        if channel.id in self._seen:
+            return
         if channel.id not in self._forms:
             self._forms[channel.id] = MessageSplitter(channel)
             if is_calibration(channel):
@@ -560,14 +496,10 @@ class _Cameras:
             _, parts = self._forms[channel.id].split(message)
         except Refused:
             return
-        size = 0, 0
         if isinstance(parts.fields, CalibrationFields):
             self._add(message, number, parts.frame_id, parts.fields)
         else:
-            if channel.id not in self._seen:
-                self._seen[channel.id] = parts.frame_id, _size(message, parts.fields)
-            size = self._seen[channel.id][1]
-        self._stamps.add(channel, parts, size=size)
+            self._seen[channel.id] = parts.frame_id, _size(message, parts.fields)
 
     def _add(self, message: Message, number: int, frame_id: str, fields: CalibrationFields) -> None:
         """Add a calibration if it differs from the one before it."""
@@ -587,7 +519,6 @@ class _Cameras:
             channels: All channels.
         """
         pairs = pair_camera_infos(channels)
-        pairs.update(self._stamps.decide(pairs))
         by_topic: dict[str, CameraCalibrations] = {}
         for channel in filter(is_camera, channels):
             camera = by_topic.setdefault(channel.topic, CameraCalibrations(channel.topic))

@@ -141,7 +141,7 @@ class ReducedReader(ChangedReader):
                 self._types[one.id] = types
                 self._given[one.id] = types.channel(one, one.id, one.topic)
         self.is_indexed = reader.is_indexed and options.max_rate is None and not self.videos
-        self.pairs = self._images = find_pairs(reader, options.camera_info, chosen)
+        self.pairs = self._images = find_pairs(options.camera_info, chosen)
         self._views: dict[tuple[str, _Kind], View] = {}
         self._originals: dict[int, _Kind] = {}
         images = []
