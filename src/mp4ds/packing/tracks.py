@@ -149,17 +149,29 @@ def open_track(
     Raises:
         Refused: The encoder does not support such pictures.
     """
-    if plan.coding is None and plan.view is None:
-        return _CopiedTrack(path, seen, rate, plan.note)
-    if plan.coding is None:
-        return _ViewedTrack(path, view_path, plan, seen, threads, rate)
     size = seen.key.width, seen.key.height
-    if plan.view is not None:
-        return _LayeredTrack(path, view_path, plan, seen, threads, rate)
-    if plan.target is None:
-        return _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
-    coder = WindowCoder(plan.coding, size, plan.target, threads, rate)
-    return _ScoredTrack(path, coder, plan.note)
+    if plan.coding is None:
+        own: Track = _CopiedTrack(path, seen, rate, plan.note)
+    elif plan.target is None:
+        own = _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
+    else:
+        own = _ScoredTrack(
+            path, WindowCoder(plan.coding, size, plan.target, threads, rate), plan.note
+        )
+    if plan.view is None:
+        return own
+    few = threads if plan.coding is None else min(threads, _VIEW_THREADS)
+    open_view = partial(_EncodedTrack, view_path, plan.view, size, few, rate, "")
+    try:
+        if plan.coding is None:
+            return _PacketsTrack(own, open_view, seen)
+        if plan.is_predicted and isinstance(own, _EncodedTrack):
+            return _DifferencesTrack(own, open_view, size)
+        return _ViewedTrack(own, open_view)
+    except BaseException:
+        own.abandon()
+        path.unlink(missing_ok=True)
+        raise
 
 
 # ---------------------------------------------------------------- copied
@@ -310,54 +322,64 @@ class _EncodedTrack(_PictureTrack):
         self._encoder.abandon()
 
 
-class _LayeredTrack(Track):
-    """A view, and the images or their differences to those of the view.
+class _ViewedTrack(Track):
+    """A track, and a view beside it.
 
-    For differences, images wait for their view: an encoder may look ahead with as many, and holds
-    them too.
+    Args:
+        own: The track.
+        open_view: Opens the view.
     """
 
     view: _EncodedTrack
 
+    def __init__(self, own: Track, open_view: Callable[..., _EncodedTrack]) -> None:
+        self._own, self.note = own, own.note
+        self.view = open_view()
+
+    def prove(self, seen: CameraMessage) -> CameraMessage:
+        self.view.prove(seen)
+        return self._own.prove(seen)
+
+    def write(self, seen: CameraMessage, tick: int) -> None:
+        self._own.write(seen, tick)
+        if seen.pixels is not None:
+            self.view.encode(seen.pixels, tick)
+
+    def close(self) -> None:
+        self.view.close()
+        self._own.close()
+
+    def abandon(self) -> None:
+        self.view.abandon()
+        self._own.abandon()
+
+    def describe(self) -> dict[str, Any]:
+        return self._own.describe()
+
+
+class _DifferencesTrack(_ViewedTrack):
+    """A view, and the differences of the images to those that it shows.
+
+    Images wait for their view: an encoder may look ahead with as many, and holds them too.
+    """
+
+    _own: _EncodedTrack
+
     def __init__(
-        self,
-        path: Path,
-        view_path: Path,
-        plan: TrackPlan,
-        seen: CameraMessage,
-        threads: int,
-        rate: float | None,
+        self, own: _EncodedTrack, open_view: Callable[..., _EncodedTrack], size: tuple[int, int]
     ) -> None:
-        if plan.coding is None or plan.view is None:
-            raise ValueError("a plan without a view")
-        size = seen.key.width, seen.key.height
-        self._bits = plan.view.layout.used_bits
-        self._is_predicted = plan.is_predicted
-        self._own = _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
-        coded = self._follow if plan.is_predicted else None
-        few = min(threads, _VIEW_THREADS)
-        try:
-            self.view = _EncodedTrack(view_path, plan.view, size, few, rate, "", coded=coded)
-        except BaseException:
-            self._own.abandon()
-            path.unlink(missing_ok=True)
-            raise
-        self.note = self._own.note
-        self._predictor = Predictor(plan.view, size, self.view.configuration)
+        super().__init__(own, partial(open_view, coded=self._follow))
+        self._bits = self.view.coding.layout.used_bits
+        self._predictor = Predictor(self.view.coding, size, self.view.configuration)
         self._waiting: deque[tuple[Pixels, int]] = deque()
 
     def prove(self, seen: CameraMessage) -> CameraMessage:
         self.view.prove(seen)
         # others can hold every difference
-        is_asked = self._own.coding.layout.is_source or not self._is_predicted
-        return self._own.prove(seen) if is_asked else seen
+        return self._own.prove(seen) if self._own.coding.layout.is_source else seen
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         if seen.pixels is None:
-            return
-        if not self._is_predicted:
-            self._own.write(seen, tick)
-            self.view.encode(seen.pixels, tick)
             return
         pixels = native(seen.pixels)
         # the message may be gone when its turn comes
@@ -372,8 +394,7 @@ class _LayeredTrack(Track):
     def close(self) -> None:
         try:
             self.view.close()
-            if self._is_predicted:
-                self._follow(None)
+            self._follow(None)
         except BaseException:
             self._own.abandon()
             raise
@@ -381,41 +402,23 @@ class _LayeredTrack(Track):
         if self._waiting:
             raise RuntimeError(f"{len(self._waiting)} frames of {self.view} were not decoded")
 
-    def abandon(self) -> None:
-        self.view.abandon()
-        self._own.abandon()
-
     def describe(self) -> dict[str, Any]:
-        made = self._own.describe()
-        return {**made, "color": None} if self._is_predicted else made
+        return {**self._own.describe(), "color": None}
 
 
-class _ViewedTrack(Track):
+class _PacketsTrack(_ViewedTrack):
     """Packets as they came, and a view of what they show.
 
     Each has a frame there. One that cannot be decoded is shown as the picture before it, or grey.
     """
 
-    view: _EncodedTrack
-
     def __init__(
-        self,
-        path: Path,
-        view_path: Path,
-        plan: TrackPlan,
-        seen: CameraMessage,
-        threads: int,
-        rate: float | None,
+        self, own: Track, open_view: Callable[..., _EncodedTrack], seen: CameraMessage
     ) -> None:
-        if plan.view is None:
-            raise ValueError("a plan without a view")
-        key, layout = seen.key, plan.view.layout
-        size = key.width, key.height
-        self.view = _EncodedTrack(view_path, plan.view, size, threads, rate, "")
-        self._own = _CopiedTrack(path, seen, rate, plan.note)
-        self.note = plan.note
+        super().__init__(own, open_view)
+        key, layout = seen.key, self.view.coding.layout
+        size, encoding = (key.width, key.height), layout.encoding
         self._pictures = PacketPictures[int](key.codec, layout.pixel_format, size)
-        encoding = layout.encoding
         self._shown: Pixels = np.full(encoding.shape(*size), _GREY, encoding.dtype)
 
     def prove(self, seen: CameraMessage) -> CameraMessage:
@@ -434,15 +437,7 @@ class _ViewedTrack(Track):
 
     def close(self) -> None:
         self._show(self._pictures.rest())
-        self.view.close()
-        self._own.close()
-
-    def abandon(self) -> None:
-        self.view.abandon()
-        self._own.abandon()
-
-    def describe(self) -> dict[str, Any]:
-        return self._own.describe()
+        super().close()
 
 
 def _recipes(coding: Coding) -> Iterator[Recipe]:
