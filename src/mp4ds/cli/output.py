@@ -110,8 +110,8 @@ def complain(value: object) -> None:
 
 
 _MOST_ROWS = 20  # of a table on a terminal
+_TEXT = 20  # columns of a text that a terminal shows at least
 _MOST_LINES = 3  # of the names of other rows
-_SHORTEST = {"topic": 24, "type": 12, "text": 20}
 
 
 def print_table(
@@ -129,8 +129,8 @@ def print_table(
     Args:
         rows: A text for each column, by its heading. All have the same columns; the first one
             names a row.
-        texts: Columns that do not hold numbers -> ``topic``, ``type`` or ``text``, which a
-            terminal that is too narrow shortens.
+        texts: Columns that do not hold numbers -> ``topic``, ``type`` or ``text``: a terminal that
+            is too narrow gets short names of types, and texts without their ends.
         spare: Columns that such a terminal leaves out, as many as it has to, in this order.
         first: How many rows a terminal shows if there are too many for it, the others by name.
 
@@ -146,16 +146,28 @@ def print_table(
         for name in rows[0]
         if any(row[name] for row in rows[:most])
     }
-    kinds = {name: texts.get(name, "number") for name in columns}
-    widths = {name: max(map(_width, cells)) for name, cells in columns.items()}
     width = shutil.get_terminal_size().columns if is_terminal else sys.maxsize
-    is_cut = _total(widths) > width
-    if is_cut:
-        widths = _fitted(columns, kinds, spare, width)
+    is_cut = False
+    for name in ("", *spare):
+        widths = {name: max(map(_width, cells)) for name, cells in columns.items()}
+        least = (min(widths[own], _TEXT if texts.get(own) == "text" else width) for own in widths)
+        if sum(least) + 2 * len(widths) - 2 <= width:
+            break
+        is_cut = True
+        columns.pop(name, None)
+        for cells in (columns[own] for own in columns if texts.get(own) == "type"):
+            cells[:] = [re.sub(r"[\w.]+/(?:msg/)?", "", cell) for cell in cells]
     with printed():
         for number in range(most + 1):
-            cells = (_cell(columns[name][number], widths[name], kinds[name]) for name in widths)
-            line = "  ".join(cells).rstrip()
+            line = ""
+            for name, cells in columns.items():
+                space = " " * (widths[name] - _width(cells[number]))
+                line += cells[number] + space if name in texts else space + cells[number]
+                line += "  "
+            line = line.rstrip()
+            if _width(line) > width:
+                is_cut = True
+                line = f"{line[: width - 3]}..."
             print(click.style(line, bold=True) if is_terminal and not number else line)
     if folded := rows[most:]:
         heading = next(iter(rows[0]))
@@ -166,45 +178,9 @@ def print_table(
     return is_cut or bool(folded)
 
 
-def _fitted(
-    columns: dict[str, list[str]], kinds: Mapping[str, str], spare: Sequence[str], width: int
-) -> dict[str, int]:
-    """The columns that a terminal shows, and how wide; type names in them are shortened."""
-    for name, cells in columns.items():
-        if kinds[name] == "type":
-            cells[:] = [re.sub(r"[\w.]+/(?:msg/)?", "", cell) for cell in cells]
-    widths = {name: max(map(_width, cells)) for name, cells in columns.items()}
-    least = {name: min(size, _SHORTEST.get(kinds[name], size)) for name, size in widths.items()}
-    for name in spare:
-        if _total(least) > width:
-            least.pop(name, None)
-    found = {name: widths[name] for name in least}
-    while _total(found) > max(width, _total(least)):
-        longer = [name for name in found if found[name] > least[name]]
-        found[max(longer, key=lambda name: (kinds[name] == "text", found[name]))] -= 1
-    return found
-
-
-def _total(widths: Mapping[str, int]) -> int:
-    """Columns of a terminal that a table takes."""
-    return sum(widths.values()) + 2 * len(widths) - 2
-
-
 def _width(text: str) -> int:
     """Columns of a terminal that a text takes."""
     return len(text) + sum(east_asian_width(letter) in "WF" for letter in text)
-
-
-def _cell(text: str, width: int, kind: str) -> str:
-    """A text of a table in a given width; if too long, without its end, or a topic's middle."""
-    if _width(text) > width:
-        begin = text[: (width - 3) // 3 if kind == "topic" else width - 3]
-        end = text[len(text) - (width - 3 - len(begin)) :]
-        while _width(begin) + _width(end) > width - 3:  # of wide letters
-            begin, end = begin[:-1], end if begin else end[1:]
-        text = f"{begin}...{end}"
-    space = " " * (width - _width(text))
-    return space + text if kind == "number" else text + space
 
 
 def number(value: float | None, digits: int) -> str:
