@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,7 +38,6 @@ from mp4ds.packing.parts import (
     PartsFolder,
     PlanNote,
     digest_source,
-    parse_facts,
     part_facts,
 )
 from mp4ds.packing.planning import Piece, Plan
@@ -49,7 +47,6 @@ from mp4ds.records import Channel
 Report = Callable[[PackProgress], None]
 
 _POLL_SECONDS = 0.5
-_REPORT_SECONDS = 0.1
 _LISTED = 10
 _KEPT = "finished parts are kept: run the same command again to resume"
 
@@ -83,8 +80,6 @@ class PartedPack:
         self._done: dict[str, PartFacts] = {}
         self._before = 0
         self._written = 0
-        self._share = 0.0
-        self._next_report = 0.0
 
     def begin(self, *, anew: bool, alone: bool) -> None:
         """Take over the folder, which is locked.
@@ -125,7 +120,7 @@ class PartedPack:
             self.failures.append((piece.name, Mp4dsError(gone)))
         else:
             self.failures.append((piece.name, failure_of(error)))
-        self.tell(now=error is not None)
+        self.tell()
 
     def _note_part(self, piece: Piece, facts: PartFacts) -> None:
         self._done[piece.name] = facts
@@ -160,27 +155,23 @@ class PartedPack:
                 f"missing: {listed}. Run their shards, or pack without `join` to pack them here."
             )
 
-    def tell(self, phase: str = "packing", note: str = "", *, now: bool = False) -> None:
-        """Report progress, unless it was just reported."""
-        clock = time.monotonic()
-        if self.report is None or (clock < self._next_report and not now):
+    def tell(self, phase: str = "packing", note: str = "") -> None:
+        """Report progress."""
+        if self.report is None:
             return
-        self._next_report = clock + _REPORT_SECONDS
         messages, size = Counter[str](), 0
-        for facts in (*self._done.values(), *self._begun()):
+        for facts in self._done.values():
             for topic, (count, length) in facts.topics.items():
                 messages[topic] += count
                 size += length
         frames = self.plan.frames
         packed = sum(min(messages[topic], count or 0) for topic, count in frames.items())
         total = sum(count or 0 for count in frames.values())
-        # a part that was just renamed is neither among those begun nor known to be done yet
-        self._share = max(self._share, packed / total if total else 0.0)
         self.report(
             PackProgress(
                 dataset=self.target,
                 phase=phase,
-                done=self._share if total else None,
+                done=packed / total if total else None,
                 bytes_read=size,
                 bytes_total=sum(source.size for source in self.plan.sources),
                 bytes_written=self._written,
@@ -193,12 +184,6 @@ class PartedPack:
             )
         )
 
-    def _begun(self) -> Iterator[PartFacts]:
-        """What is packed of parts that are not done."""
-        for path in self.folder.path.glob(f".*/{FACTS_NAME}"):
-            with suppress(OSError, ValueError):  # it may be just then written, or removed
-                yield parse_facts(path.read_bytes())
-
     def finish(self, digests: Mapping[str, Digest]) -> PackSummary:
         """Put the parts together, and remove them.
 
@@ -210,7 +195,7 @@ class PartedPack:
             FormatError: A part was damaged after it was made; it will be made again.
             SourceError: The recording is damaged, or has changed.
         """
-        self.tell("joining", now=True)
+        self.tell("joining")
         try:
             with staged(self.target, force=self.force, owned=dataset_files) as made:
                 made.mkdir()
@@ -245,7 +230,7 @@ class PartedPack:
                     parts,
                     made,
                     changes=plan.origin(reader, whole, digests),
-                    report=lambda name: self.tell("joining", name, now=True),
+                    report=lambda name: self.tell("joining", name),
                 )
                 # last, since damage of a part would be taken for that of the index
                 _check_index(reader, parts, plan.options.selected)
@@ -392,7 +377,7 @@ def pack_parts(
             for piece in pack.plan.pieces[number - 1 :: shares]:
                 if piece in missing:
                     calls[workers.submit(packer, piece)] = pack, piece
-            pack.tell(now=True)  # so that all work is known from the beginning
+            pack.tell()  # so that all work is known from the beginning
         left = Counter(pack.target for pack, _ in calls.values())
         ready = [pack for pack in packs if not left[pack.target]]
         while ready or calls:

@@ -248,13 +248,18 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
             raise OptionError("`nearest` says how images are resized: give `resize`, too.")
         if self.derives and self.purpose is None and self.gop is None:
             object.__setattr__(self, "purpose", TRAINING)
-        if self.redaction and self.redaction.find:  # which may have changed since, or its model
+        if self.finds:
             object.__setattr__(self, "restart", True)
 
     @property
     def redaction(self) -> Redaction | None:
         """What to redact, parsed."""
         return None if self.redact is None else parse_redaction(self.redact)
+
+    @property
+    def finds(self) -> bool:
+        """Whether a function finds what to redact, which may have changed since, or its model."""
+        return self.redaction is not None and self.redaction.find is not None
 
     @property
     def derives(self) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -41,6 +41,7 @@ from mp4ds.files.sources import (
 from mp4ds.files.uploads import local_path, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.manifest import ReductionEntry
+from mp4ds.format.models import StreamSidecar
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS
@@ -226,7 +227,7 @@ def _copied(
         return _copy(paths[0], target, options)
     except Refused as reason:
         quality = options.quality or parse_quality(_quality_of(paths))
-        transcode = options.transcode or _has_transcoded(paths)
+        transcode = options.transcode or any(one.body == "jpeg" for one in _sidecars(paths))
         encoded = replace(options, quality=quality, transcode=transcode)
         summary = _encoded(paths, target, _checked(encoded, paths, may_copy=False), progress)
         return replace(summary, not_copied=str(reason))
@@ -320,7 +321,7 @@ def pack_share(
     """
     paths = _paths(sources)
     chosen = _checked(options or PackOptions(), paths, may_copy=False)
-    if chosen.redaction and chosen.redaction.find:
+    if chosen.finds:
         raise OptionError(
             "`redact` is a function, of which other shares may have another version: give a file "
             "of rules, or pack as a whole."
@@ -428,8 +429,7 @@ def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
     done = [entry.model_copy(update={"images": []}) for entry in manifest.reductions]
     asked = [entry.model_copy(update={"images": []}) for entry in reductions]
     hides = [one.told for one in manifest.redactions]
-    is_known = not (options.redaction and options.redaction.find)  # else it may have changed
-    if not (is_same and is_known and done == asked and hides == hidden):
+    if options.finds or not (is_same and done == asked and hides == hidden):
         raise TargetExistsError(target)
     return True
 
@@ -514,10 +514,13 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
     )
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         find_ffmpeg()  # fails before anything is read, saying how to get one
-    transcode = options.transcode or (not quality.lossless and _has_transcoded(paths))
+    transcode = options.transcode or (
+        not quality.lossless and any(one.body == "jpeg" for one in _sidecars(paths))
+    )
     view = options.view
     if view is None and quality.lossless and not options.is_fast:
-        view = _view_of_packets(paths)
+        packets = (one.view for one in _sidecars(paths) if one.body == "packet")
+        view = next((one.codec for one in packets if one), None)
     chosen = replace(
         options, quality=quality, codec=codec, view=view, transcode=transcode, images=images
     )
@@ -570,19 +573,10 @@ def _profiles(paths: Sequence[Path]) -> set[str]:
     }
 
 
-def _view_of_packets(paths: Sequence[Path]) -> str | None:
-    """The codec of the views that packets of the source datasets have; None if they have none."""
-    folders = [folder for path in paths if (folder := dataset_at(path))]
-    sidecars = (stream.sidecar for folder in folders for stream in _streams_of(folder))
-    return next((one.view.codec for one in sidecars if one.body == "packet" and one.view), None)
-
-
-def _has_transcoded(paths: Sequence[Path]) -> bool:
-    """Whether the source datasets have re-encoded JPEG files."""
-    folders = [folder for path in paths if (folder := dataset_at(path))]
-    return any(
-        stream.sidecar.body == "jpeg" for folder in folders for stream in _streams_of(folder)
-    )
+def _sidecars(paths: Sequence[Path]) -> Iterator[StreamSidecar]:
+    """The sidecars of the source datasets."""
+    for folder in filter(None, map(dataset_at, paths)):
+        yield from (stream.sidecar for stream in _streams_of(folder))
 
 
 def _planned(

@@ -478,7 +478,7 @@ class Packer:
         plan: Plan,
         piece: Piece,
         exact: Exact,
-        progress: Callable[[PartRecord], None],
+        progress: Callable[[PartRecord], None] = lambda _: None,
     ) -> None:
         self.reader, self.plan, self.exact = reader, plan, exact
         self.decisions = {} if piece.is_solo else plan.decisions

@@ -21,7 +21,6 @@ import re
 import shutil
 import stat
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -63,7 +62,6 @@ FACTS_NAME = "part.json"
 _ANEW = "Start over with `restart`."
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _NAMED = 3
-_TELL_SECONDS = 0.5
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 SHARED = "all machines must share the dataset's folder"
 
@@ -355,7 +353,7 @@ class PartsFolder:
 
 @dataclass(frozen=True)
 class PartFacts:
-    """What the manifest of a part does not tell; of one in progress, what is packed so far.
+    """What the manifest of a part does not tell.
 
     Attributes:
         topics: Messages and bytes of each topic, in the order of the recording.
@@ -379,13 +377,13 @@ class PartFacts:
         (part.folder / FACTS_NAME).write_text(json.dumps(asdict(facts)))
 
 
-parse_facts = json_parser(PartFacts)
+_parse_facts = json_parser(PartFacts)
 
 
 def part_facts(part: Path) -> PartFacts | None:
     """What became of a part; None if it is not there, or not whole."""
     try:
-        facts: PartFacts = parse_facts((part / FACTS_NAME).read_bytes())
+        facts: PartFacts = _parse_facts((part / FACTS_NAME).read_bytes())
         files = load_manifest(part / MANIFEST_NAME).files
         found = [(part / entry.name).lstat() for entry in files]
     except (OSError, ValueError):
@@ -449,16 +447,7 @@ class PartPacker:
         if self._reader is None:
             self._reader = self._plan.open()
 
-        next_time = 0.0
-
-        def tell(part: PartRecord) -> None:
-            nonlocal next_time
-            if (now := time.monotonic()) >= next_time:
-                next_time = now + _TELL_SECONDS
-                with suppress(OSError):
-                    PartFacts.write(part)
-
-        part = Packer(self._reader, into, self._plan, piece, exact, tell).run()
+        part = Packer(self._reader, into, self._plan, piece, exact).run()
         PartFacts.write(part)
         write_manifest(part, origin_of(self._reader, part), str(self._plan.options.quality))
 
