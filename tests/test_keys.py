@@ -59,8 +59,6 @@ KEYS: dict[str, tuple[bytes, tuple[Any, ...]]] = {
     "right": (ESC + b"[C", ("play_next",)),
     "right-application": (ESC + b"OC", ("play_next",)),
     "s": (b"s", ("play_next",)),
-    "left": (ESC + b"[D", ("step_back",)),
-    "b": (b"b", ("step_back",)),
     "up": (ESC + b"[A", ("set_rate", 2.75)),
     "down": (ESC + b"[B", ("set_rate", 2.27272727)),
     "t": (b"t", ("toggle_topic_pauses",)),

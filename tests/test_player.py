@@ -12,7 +12,6 @@ import mp4ds
 from coded_scenes import CODED
 from mp4ds.errors import OptionError
 from mp4ds.plugins.playing.options import PlayOptions
-from mp4ds.plugins.playing.pace import Pace
 from mp4ds.plugins.playing.player import open_player
 from mp4ds.plugins.ros.node import NodeNames
 from player_scenes import (
@@ -116,7 +115,6 @@ def test_topics(
         ({"clock_topics": ["/tf"], "clock": 5.0}, "`clock_topics` contradicts `clock`"),
         ({"skip_empty": -1.0}, "`skip_empty` -1"),
         ({"wait_for_all_acked": -1}, "`wait_for_all_acked` -1"),
-        ({"restamp": "then"}, "`restamp` 'then'"),
         ({"until_sec": float("nan")}, "`until_sec` nan"),
         ({"remap": ["/tf"]}, "is not a remapping"),
         ({"remap": ["/none:=/other"]}, "there is no such topic"),
@@ -266,17 +264,6 @@ def test_pause_holds_the_clock(drive: tuple[Path, list[Recorded]]) -> None:
     assert times == sorted(times)
 
 
-def test_step_back(drive: tuple[Path, list[Recorded]]) -> None:
-    with running(drive[0], paused=True, topics=[CAMERA]) as (player, publisher):
-        frames = [item for item in drive[1] if item[0] == CAMERA]
-        assert not player.step_back()
-        assert player.burst(5) == 5
-        assert player.step_back()
-        assert player.step_back()
-        assert player.play_next()
-        assert published(publisher)[5:] == [frames[3], frames[2], frames[3]]
-
-
 def test_seek(drive: tuple[Path, list[Recorded]]) -> None:
     with running(drive[0], paused=True, topics=[CAMERA]) as (player, publisher):
         frames = [item for item in drive[1] if item[0] == CAMERA]
@@ -341,29 +328,6 @@ def test_late_frames_are_dropped_and_counted(drive: tuple[Path, list[Recorded]])
     assert [item for item in published(publisher) if item[0] != CAMERA] == others
     assert summary.slowed_s == 0
     assert summary.messages[CAMERA] + summary.dropped == 20
-
-
-def test_restamp(drive: tuple[Path, list[Recorded]], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each stamp is moved as the pace tells: see `test_the_time_of_day_of_a_recorded_time`."""
-    monkeypatch.setattr(Pace, "wall_of", lambda _, time_ns: NOW + (time_ns - FIRST) // 10)
-    publisher, _ = run(drive[0], immediate=True, restamp="now")
-    expected = {(topic, log_time): payload for topic, payload, log_time in drive[1]}
-    count = 0
-    for sent in publisher.sent:
-        before = expected[sent.topic, sent.time_ns]
-        place = 4 if sent.topic == CAMERA else 8
-        if sent.topic == "/tf_static":
-            continue
-        old, new = (
-            int.from_bytes(data[place : place + 4], "little") * 10**9
-            + int.from_bytes(data[place + 4 : place + 8], "little")
-            for data in (before, sent.payload)
-        )
-        assert new == NOW + (old - FIRST) // 10
-        assert sent.payload[:place] == before[:place]
-        assert sent.payload[place + 8 :] == before[place + 8 :]
-        count += 1
-    assert count == 60
 
 
 def test_publishing_as_ros2(drive: tuple[Path, list[Recorded]]) -> None:

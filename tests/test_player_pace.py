@@ -57,19 +57,6 @@ class Hand:
     def monotonic(self) -> float:
         return self.now
 
-    def time_ns(self) -> int:
-        return round((1_900_000_000 + self.now) * NS)
-
-
-def test_the_time_of_day_of_a_recorded_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    hand = Hand(monkeypatch)
-    clock = Pace(10.0, steady=lambda: round(hand.now * NS))
-    clock.jump(START)
-    clock.resume()
-    hand.now += 2
-    for seconds, told in ((20, 0), (0, -2), (35, 1.5)):
-        assert clock.wall_of(START + seconds * NS) == hand.time_ns() + told * NS
-
 
 def test_no_clock_is_ahead_of_a_message_that_is_still_to_come(drive: Path) -> None:
     publisher = RecordingPublisher(world="ros2")

@@ -92,8 +92,8 @@ def play_command(
 ) -> None:
     """Play back datasets, publishing to ROS 1 or ROS 2.
 
-    Keys: space pauses or resumes, right and left publish the next or previous message, up and down
-    play faster or slower.
+    Keys: space pauses or resumes, right publishes the next message, up and down play faster or
+    slower.
 
     Options can be written as for `rosbag play` or `ros2 bag play`, such as --topics /a /b. With
     --ros2, -x means --exclude-regex, -s means --storage, and -i names a dataset; with --ros1, -p
@@ -118,15 +118,13 @@ def play_command(
 def player_keys(player: Player) -> Mapping[str, Callable[[], object]]:
     """The action of each key.
 
-    Space: pause or resume; right or ``s``: next message; left or ``b``: previous message; up and
-    down: 10 % faster and slower; ``t``: turn pausing for topics on or off.
+    Space: pause or resume; right or ``s``: next message; up and down: 10 % faster and
+    slower; ``t``: turn pausing for topics on or off.
     """
     return {
         " ": player.toggle_paused,
         "right": player.play_next,
         "s": player.play_next,
-        "left": player.step_back,
-        "b": player.step_back,
         "t": player.toggle_topic_pauses,
         "up": lambda: player.set_rate(_rounded(player.rate * _FASTER)),
         "down": lambda: player.set_rate(_rounded(player.rate / _FASTER)),

@@ -162,9 +162,6 @@ class PlayOptions(FrameOptions, NodeOptions):
         most=10_000,
     )
     drop: bool = option("Drop late frames instead of playing slower.", False)
-    restamp: str | None = option(
-        "Set header stamps to the time of publishing.", metavar="now", choices=("now",)
-    )
     lock_step: str = option(
         "Publish the next frame only after a message on this topic.", "", metavar="TOPIC"
     )

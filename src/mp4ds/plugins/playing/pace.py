@@ -111,10 +111,6 @@ class Pace:
         self._at -= round((waiting + suspended) * self._rate)
         return waiting
 
-    def wall_of(self, time_ns: int) -> int:
-        """The wall-clock time of a recording time, in nanoseconds since 1970."""
-        return time.time_ns() + int((time_ns - self.now()) / self._rate)
-
 
 class Ticks:
     """When /clock is to be published: at a fixed rate, if the machine keeps up.

@@ -6,7 +6,6 @@ import math
 import threading
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -19,7 +18,7 @@ from mp4ds.dataset.salvage import HOW_TO_SALVAGE, open_selected
 from mp4ds.errors import Refused, RemoteError, advising
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Pace, Ticks
-from mp4ds.plugins.playing.timeline import ReadAhead, Timeline, restamper
+from mp4ds.plugins.playing.timeline import ReadAhead, Timeline
 from mp4ds.plugins.ros.node import Node, Service, action, chosen_world, open_node, quick_switches
 from mp4ds.records import Channel, Message
 
@@ -142,13 +141,11 @@ class Player:
         self._pauses_for_topics = True
         self._paused_at: Message | None = None  # the message before which it paused
         self._last_frame: int | None = None  # log time of the last frame published
-        self._history: deque[int] = deque(maxlen=10_000)
         self._reached = self._start  # log time of the last message published
         self._ticks = Ticks(self._options.clock)
         self._next_report = 0.0
         self._installed: dict[int, tuple[Channel, bool]] = {}  # whether its type is, by id()
         self._done = PlaySummary()
-        self._restamped = restamper(self._pace.wall_of) if options.restamp else None
 
     # ------------------------------------------------------------ controls
 
@@ -215,23 +212,11 @@ class Player:
     def _can_step(self) -> bool:
         return self.is_paused and not (self._is_over or self._is_stopped)
 
-    def step_back(self) -> bool:
-        """While paused, go back by one message."""
-        with self._changed:
-            if not self.is_paused or len(self._history) < 2:
-                return False
-            last = self._history.pop()
-            while len(self._history) > 1 and self._history[-1] == last:
-                self._history.pop()
-            self._target, self._burst = self._history.pop(), None
-            return self.play_next()
-
     def seek(self, time_ns: int) -> int:
         """Continue at a recording time, or the nearest that is played; returns that time."""
         with self._changed:
             self._target = min(max(time_ns, self._start), self._end + 1)
             self._burst = None
-            self._history.clear()
             self._changed.notify_all()
             return min(self._target, self._end)
 
@@ -508,7 +493,6 @@ class Player:
 
     def _sent(self, due: Message, burst: _Burst | None) -> None:
         with self._changed:
-            self._history.append(due.log_time)
             self._reached = max(self._reached, due.log_time)
             if self.is_paused:
                 self._pace.jump(due.log_time)
@@ -526,8 +510,7 @@ class Player:
     def _send(self, due: Message, time_ns: int) -> None:
         if not self._is_installed(due.channel):
             return
-        payload = due.data if self._restamped is None else self._restamped(due)
-        self._node.publish(due.channel, payload, time_ns)
+        self._node.publish(due.channel, due.data, time_ns)
         topic = due.channel.topic
         self._done.messages[topic] = self._done.messages.get(topic, 0) + 1
 

@@ -1,9 +1,8 @@
-"""The messages of several datasets, merged, as they are published, from any time on; stamps."""
+"""The messages of several datasets, merged, as they are published, from any time on."""
 
 from __future__ import annotations
 
 import heapq
-import struct
 import threading
 import warnings
 from collections import deque
@@ -14,23 +13,13 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from mp4ds.bags.latched import LatchedMessages, has_late, latched_depth
-from mp4ds.bags.types import (
-    HEADER,
-    FieldShape,
-    field_shape,
-    fields_of,
-    name_of,
-    standard_of,
-    types_of,
-)
 from mp4ds.dataset.dataset import Ahead, Dataset
-from mp4ds.errors import ConversionError, OptionError, Refused
+from mp4ds.errors import OptionError
 from mp4ds.format.fields import DecodedColumns, everything, last_of
-from mp4ds.messages.wire import PrimitiveReader, WireError
 from mp4ds.plugins.playing.options import KINDS, PlayOptions, rooted
 from mp4ds.plugins.playing.pace import NS
 from mp4ds.plugins.ros.node import World
-from mp4ds.records import Channel, Message
+from mp4ds.records import Message
 from mp4ds.unpacking.republish import Republisher
 
 # ---------------------------------------------------------------- read ahead
@@ -330,79 +319,3 @@ class _Part:
                 kept[message.channel.id].add(message)
         messages = sorted(chain.from_iterable(kept.values()), key=lambda item: item.log_time)
         return map(self.republisher.converted, messages)
-
-
-# ---------------------------------------------------------------- stamps
-
-_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_ENCAPSULATION = 4
-
-
-def restamper(wall_of: Callable[[int], int]) -> Callable[[Message], bytes | memoryview]:
-    """What replaces the stamps in messages: of their header, or of their transforms' headers.
-
-    Equal stamps stay equal, and zero stays zero.
-
-    Args:
-        wall_of: Maps recording time to wall-clock time, both in nanoseconds.
-
-    Returns:
-        A function that returns the payload with new stamps; unchanged if it has none. It raises
-        ConversionError if the message is not of the channel's type, or a stamp is out of range.
-    """
-    known: dict[int, tuple[Channel, str]] = {}  # what has stamps, by id()
-
-    def restamped(message: Message) -> bytes | memoryview:
-        channel = message.channel
-        if id(channel) not in known:
-            known[id(channel)] = channel, _stamped(channel)
-        stamped = known[id(channel)][1]
-        if not stamped:
-            return message.data
-        is_ros1 = channel.message_encoding == "ros1"
-        made = bytearray(message.data)
-        order = "<" if is_ros1 or made[1:2] != b"\0" else ">"
-        stamp = struct.Struct(f"{order}{'I' if is_ros1 else 'i'}I")
-        try:
-            # a header is after its sequence number, or the encapsulation of CDR
-            for place in [4] if stamped == HEADER else _of_transforms(made, order, is_ros1):
-                seconds, nanoseconds = stamp.unpack_from(made, place)
-                if seconds or nanoseconds:
-                    time = wall_of(seconds * NS + nanoseconds)
-                    stamp.pack_into(made, place, *divmod(time, NS))
-        except (struct.error, WireError) as error:
-            problem = f"cannot replace the stamp of a message: {error}"
-            raise ConversionError(channel.topic, problem) from None
-        return memoryview(made)
-
-    return restamped
-
-
-def _stamped(channel: Channel) -> str:
-    """What has stamps in a channel's messages: `HEADER`, one of `_TRANSFORMS`, or nothing."""
-    schema = channel.schema
-    if channel.message_encoding not in ("ros1", "cdr") or schema is None or not schema.name:
-        return ""
-    name = name_of(schema)
-    if name in _TRANSFORMS:
-        return name
-    try:
-        fields = fields_of(types_of(schema, standard_of(channel.message_encoding)), name)
-        is_first = fields and field_shape(fields[0][1]) == FieldShape("", HEADER, 0, None, None)
-        return HEADER if is_first else ""
-    except Refused:
-        return ""
-
-
-def _of_transforms(data: bytearray, order: str, is_ros1: bool) -> Iterator[int]:
-    """Where the stamps of transforms are."""
-    start = 0 if is_ros1 else _ENCAPSULATION
-    reader = PrimitiveReader(memoryview(data), start, order, is_cdr=not is_ros1)
-    for _ in range(reader.integer("I")):
-        if is_ros1:
-            reader.take("I")  # seq
-        yield reader.align(4)
-        reader.take("I", 2)
-        for _name in ("frame_id", "child_frame_id"):
-            reader.raw(reader.integer("I"))
-        reader.take("d", 7)  # a translation and a quaternion
