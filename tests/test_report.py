@@ -20,8 +20,6 @@ import mp4ds
 from coded_scenes import CODED
 from commands import call
 from mp4ds.errors import OptionError, SourceError
-from mp4ds.format.models import Calibration
-from mp4ds.plugins.reporting.cameras import overlay_of
 from mp4ds.plugins.reporting.report import ReportOptions, report
 from mp4ds.plugins.reporting.stills import Look
 from report_scenes import (
@@ -82,42 +80,6 @@ def digests(folder: Path) -> dict[str, str]:
 # ---------------------------------------------------------------- calibrations
 
 
-def calibration(model: str, d: list[float], **values: Any) -> Calibration:
-    k = [500.0, 0, 300.0, 0, 480.0, 250.0, 0, 0, 1]
-    p = [450.0, 0, 310.0, 0, 0, 450.0, 240.0, 0, 0, 0, 1, 0]
-    given = {"frame_id": "c", "width": 640, "height": 480, "k": k, "p": p, "r": [1.0] * 9}
-    return Calibration(**{**given, "distortion_model": model, "d": d, **values})
-
-
-LENSES = {
-    "none": calibration("plumb_bob", [0.0] * 5),
-    "barrel": calibration("plumb_bob", [-0.31, 0.09, -0.001, 0.002, 0.0]),
-    "rational": calibration("rational_polynomial", [0.3, 0.2, 1e-3, 1e-3, 0.1, 0.5, 0.3, 0.05]),
-    "prism": calibration("plumb_bob", [0.1, 0, 0, 0, 0, 0, 0, 0, 1e-3, 2e-3, 1e-3, 0.0]),
-    "fisheye": calibration("equidistant", [-0.02, 0.01, -0.003, 0.0005]),
-}
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_the_grid_is_straight_without_distortion(name: str) -> None:
-    """By OpenCV, which takes the distortion of each point away."""
-    lens = LENSES[name]
-    overlay = overlay_of(lens, (640, 480), "/cam/image_raw")
-    assert not overlay["problem"]
-    assert len(overlay["lines"]) > 20
-    assert len(overlay["axes"]) == 2
-    k, d = np.array(lens.k).reshape(3, 3), np.array(lens.d)
-    for line in overlay["lines"]:
-        points = np.array(line).reshape(-1, 1, 2) * (640, 480) - 0.5
-        if name == "fisheye":
-            found = cv2.fisheye.undistortPoints(points, k, d)
-        else:
-            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9)
-            undistorted = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # before 5
-            found = undistorted(points, k, d, R=None, P=None, criteria=criteria)
-        assert found.reshape(-1, 2).std(axis=0).min() < 2e-4
-
-
 # ---------------------------------------------------------------- the page's files
 
 
@@ -147,7 +109,6 @@ def test_the_report_of_a_dataset(copy: Path) -> None:
             assert unpacked(columns["ticks"], count) == ticks
     _, colour = data["cameras"]
     assert len(colour["calibrations"]) == 1
-    assert colour["calibrations"][0]["overlay"]["lines"]
 
 
 def test_topics_and_their_sizes(copy: Path) -> None:

@@ -221,19 +221,6 @@ def test_plots_have_the_numbers_of_the_columns(page: Tab, recorded: Recorded) ->
     np.testing.assert_allclose(series(page, "offset"), offsets, rtol=1e-12)
 
 
-def test_the_calibration_grid_is_drawn(page: Tab) -> None:
-    canvas = "document.querySelectorAll('.camera canvas')[1]"
-    painted = (
-        f"(c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data"
-        f".reduce((sum, value, i) => sum + (i % 4 === 3 && value > 0), 0))({canvas})"
-    )
-    assert page.evaluate(painted) == 0
-    page.press("g")
-    assert page.evaluate(painted) > 500
-    page.press("g")
-    assert page.evaluate(painted) == 0
-
-
 # ---------------------------------------------------------------- sizes, names and troubles
 
 

@@ -21,9 +21,9 @@ var mp4dsReport = (() => {
     const video = facts.video ? element("video", {preload: "auto", playsinline: "", "aria-label": facts.name}) : null;
     if (video) video.muted = true;
     const still = facts.stills.length ? element("img", {alt: facts.name}) : null;
-    const canvas = element("canvas"), notice = element("div", {class: "nothing", text: `No picture: ${facts.note}`});
+    const notice = element("div", {class: "nothing", text: `No picture: ${facts.note}`});
     notice.hidden = Boolean(video || still);
-    const fit = element("div", {class: "fit"}, [...(video ? [video] : still ? [still] : []), canvas, notice]);
+    const fit = element("div", {class: "fit"}, [...(video ? [video] : still ? [still] : []), notice]);
     fit.style.aspectRatio = `${facts.width / facts.shown[0]} / ${facts.height / facts.shown[1]}`;
     fit.style.setProperty("--ratio", String(facts.width / facts.height));
     const values = {}, readout = element("dl", {class: "readout"});
@@ -44,7 +44,7 @@ var mp4dsReport = (() => {
     if (facts.caption) panel.append(element("div", {class: "caption", text: `Shown ${facts.caption}`}));
     if (still) panel.append(element("div", {class: "caption", text: `Stills: ${facts.note}`}));
     find("cameras").append(panel);
-    const camera = new mp4dsPlayer.Camera(facts, number, {video, still, badge, canvas, notice, panel, stage, close, values, colour, isSeen: true, onShown: told});
+    const camera = new mp4dsPlayer.Camera(facts, number, {video, still, badge, notice, panel, stage, close, values, colour, isSeen: true, onShown: told});
     head.addEventListener("click", () => lead(camera));
     close.addEventListener("click", event => { event.stopPropagation(); hide(camera, true); });
     stage.addEventListener("click", () => enlarge(camera));
@@ -61,7 +61,6 @@ var mp4dsReport = (() => {
     values.log.title = mp4dsTables.dateText(camera.logTime[n]);
     values.delay.textContent = camera.facts.untimed || `${mp4dsPlots.numberText(Number(camera.logTime[n] - camera.stamp[n]) / 1e6)} ms`;
     if (camera.still) showStill(camera, n);
-    drawGrid(camera);
   }
 
   /** Show the still that is nearest to a frame. */
@@ -69,31 +68,6 @@ var mp4dsReport = (() => {
     const nearest = camera.facts.stills.reduce((best, each) => Math.abs(each.frame - n) < Math.abs(best.frame - n) ? each : best);
     if (camera.still.getAttribute("src") !== nearest.file) camera.still.src = nearest.file;
     camera.badge.textContent = `still: frame ${nearest.frame}`;
-  }
-
-  function drawGrid(camera) {
-    let current = null;
-    for (const item of camera.facts.calibrations) if (item.from_frame <= Math.max(0, camera.shown)) current = item;
-    const key = find("grid").checked && current ? `${camera.facts.calibrations.indexOf(current)} ${camera.canvas.clientWidth}` : "";
-    if (camera.gridKey === key) return;
-    camera.gridKey = key;
-    const [context, width, height] = mp4dsPlots.prepare(camera.canvas);
-    if (!key || !current.overlay || current.overlay.problem) return;
-    const [w, h] = [width * camera.facts.shown[0], height * camera.facts.shown[1]], {lines, axes, center} = current.overlay;
-    for (const [widthOf, colour] of [[3, "rgb(0 0 0 / 45%)"], [1.2, "#ffd24a"]]) {
-      lines.forEach((line, number) => {
-        context.lineWidth = widthOf * (axes.includes(number) ? 1.7 : 1);
-        context.strokeStyle = colour;
-        context.beginPath();
-        for (let i = 0; i < line.length; i += 2) context[i ? "lineTo" : "moveTo"](line[i] * w, line[i + 1] * h);
-        context.stroke();
-      });
-    }
-    context.strokeStyle = "#ff5a5a";
-    context.lineWidth = 2;
-    context.beginPath();
-    context.arc(center[0] * w, center[1] * h, 6, 0, 7);
-    context.stroke();
   }
 
   /** Enlarge a camera to the width of the page; again: restore all. */
@@ -153,7 +127,6 @@ var mp4dsReport = (() => {
 
   function redraw() {
     for (const plot of Object.values(report.plots)) plot.request();
-    for (const camera of player.cameras) { camera.gridKey = null; if (!camera.isHidden) drawGrid(camera); }
     if (timeline) timeline.request();
   }
 
@@ -298,8 +271,6 @@ var mp4dsReport = (() => {
     find("play").addEventListener("click", () => player.toggle());
     find("back").addEventListener("click", () => player.step(-1));
     find("forward").addEventListener("click", () => player.step(1));
-    find("grid").addEventListener("change", () => player.cameras.forEach(drawGrid));
-    find("grid").disabled = !data.cameras.some(camera => camera.calibrations.some(item => item.overlay && !item.overlay.problem));
     find("goto").addEventListener("submit", event => {
       event.preventDefault();
       const time = timeOf(find("goto-time").value);
@@ -310,7 +281,7 @@ var mp4dsReport = (() => {
       if (event.target.closest("input[type=text], select") || event.ctrlKey || event.metaKey || event.altKey) return;
       const far = event.shiftKey ? 10 : 1;
       const actions = {" ": () => player.toggle(), ArrowLeft: () => player.step(-far), ArrowRight: () => player.step(far),
-        Home: () => player.go(0), End: () => player.go(player.end), g: () => find("grid").click(),
+        Home: () => player.go(0), End: () => player.go(player.end),
         e: () => player.lead && enlarge(player.lead), Escape: () => enlarge(null), h: () => player.lead && hide(player.lead, true)};
       const action = actions[event.key];
       if (!action) return;

@@ -111,7 +111,6 @@ var mp4dsTables = (() => {
         const lines = [`K  = ${rowsOf(item.k, 3)}`, `D  = ${item.d.map(numberOf).join(", ")}`, `R  = ${rowsOf(item.r, 3)}`, `P  = ${rowsOf(item.p, 4)}`];
         if (item.binning_x || item.binning_y) lines.push(`binning ${item.binning_x} x ${item.binning_y}`);
         if (item.roi) lines.push(`ROI ${item.roi.width}x${item.roi.height} at ${item.roi.x_offset}, ${item.roi.y_offset}`);
-        if (item.overlay && item.overlay.problem) lines.push(`no grid: ${item.overlay.problem}`);
         made.push(element("div", {class: "calibration"}, [
           element("h3", {text: camera.name}),
           element("p", {class: "muted", text: `${item.distortion_model || "no model"}, ${size}, frame ${item.frame_id || "(unnamed)"}, ${from}`}),
