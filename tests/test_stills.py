@@ -1,4 +1,4 @@
-"""Frames saved as images, and contact sheets."""
+"""Frames saved as images."""
 
 from __future__ import annotations
 
@@ -68,7 +68,6 @@ def test_the_nearest_frame_is_meant(drive: Path) -> None:
 
         def number(text: str) -> int:
             at = StillOptions(at=text).at
-            assert at is not None
             return number_at(stream, at)
 
         assert number(str(stamps[7])) == 7
@@ -92,9 +91,8 @@ def test_a_frame_is_saved_as_it_is(drive: Path, tmp_path: Path) -> None:
     with mp4ds.open(drive) as dataset:
         frame = dataset[COLOUR].at(int(dataset[COLOUR].stamps[0]) + 500_000_000)
     assert np.array_equal(read(out), frame.data)
-    (saved,) = summary.frames
-    assert (saved.index, saved.stamp_ns) == (frame.index, frame.stamp_ns)
-    assert saved.log_time_ns == frame.log_time_ns
+    assert (summary.index, summary.stamp_ns) == (frame.index, frame.stamp_ns)
+    assert summary.log_time_ns == frame.log_time_ns
     assert summary.size == (WIDTH, HEIGHT)
 
 
@@ -103,10 +101,8 @@ def test_a_frame_of_a_topic_that_changes_its_size(tmp_path: Path) -> None:
     summary = frames(dataset, tmp_path / "out.png", StillOptions(at="#5"))
     with mp4ds.open(dataset) as opened:
         whole = opened["/odd/image"]
-        assert summary.frames[0].stamp_ns == whole.stamps[5]
+        assert summary.stamp_ns == whole.stamps[5]
         assert np.array_equal(read(tmp_path / "out.png")[..., 0], whole[5].data)
-    with pytest.raises(OptionError, match="odd_image, odd_image-2"):
-        frames(dataset, tmp_path / "sheet.png", StillOptions(sheet=(2, 2)))
 
 
 SOME = {*COMMON, "rgb16", "yuyv", "8UC2", "32FC1", "bgra8", "bayer_gbrg16"}
@@ -137,47 +133,17 @@ def test_every_encoding_can_be_looked_at(encoding: str, tmp_path: Path) -> None:
     assert png.max() > 150  # dark ones of 16 bits, too, whose exact values look black
 
 
-# ---------------------------------------------------------------- sheets
-
-
-def test_a_sheet_shows_its_frames(drive: Path, tmp_path: Path) -> None:
-    out = tmp_path / "sheet.png"
-    summary = frames(drive, out, StillOptions(topic=COLOUR, sheet=(3, 2)))
-    numbers = [frame.index for frame in summary.frames]
-    assert numbers == [2, 7, 12, 17, 22, 27]
-    page = read(out)
-    assert (page.shape[1], page.shape[0]) == summary.size
-    found = []
-    with mp4ds.open(drive) as dataset:
-        for number in numbers:  # each is on the page, wherever
-            picture = dataset[COLOUR][number].data
-            match = cv2.matchTemplate(page, picture, cv2.TM_SQDIFF)
-            place = np.unravel_index(np.argmin(match), match.shape)
-            x, y = int(place[1]), int(place[0])
-            assert np.array_equal(page[y : y + HEIGHT, x : x + WIDTH], picture)
-            assert page[y + HEIGHT : y + HEIGHT + 16, x : x + WIDTH].max() > 150  # a label
-            found.append((y, x))
-    assert found == sorted(found)
-    assert len({y for y, _ in found}) == 2
-
-
 # ---------------------------------------------------------------- options and the command
 
 
 NO_TIMES = ("", "#x", "#-1", "now", "1e9", "+", "+1.0000000001", "-5", "2023-13-14T22:13:20")
-NO_SHEETS = ("5", "0x4", "5x", "x4", "5x4x3", "-1x3", "1000x1")
 
 
 @pytest.mark.parametrize(
     "options",
     [
         *({"at": text} for text in (*NO_TIMES, "1.5 s", "12:30", "٣")),
-        *({"sheet": text} for text in NO_SHEETS),
-        {},
-        {"at": "+1", "sheet": (2, 2)},
-        {"sheet": (2, 2), "exact": True},
         {"at": "+1", "exact": True, "resize": 0.5},
-        {"sheet": (401, 1)},
     ],
 )
 def test_options_that_are_wrong_or_do_not_go_together(options: dict[str, Any]) -> None:
@@ -204,6 +170,6 @@ def test_the_command(drive: Path, tmp_path: Path) -> None:
     assert done.code == 0, done.err
     assert f"frame 12 of {COLOUR}" in done.out
     assert call("frames", drive, "--topic", COLOUR, "--at", "+0.4", "-o", out).code == 2
-    told = call("frames", drive, "-t", COLOUR, "--sheet", "5x4", "-o", out, "--force", "--json")
-    assert len(json.loads(told.out)["frames"]) == 20
+    told = call("frames", drive, "-t", COLOUR, "-o", out, "--force", "--json")
+    assert json.loads(told.out)["index"] == 0
     assert call("frames", drive, "--topic", COLOUR, "--at", "+99", "-o", out, "-f").code == 2

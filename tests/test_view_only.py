@@ -86,9 +86,8 @@ def test_validate_counts_what_is_missing(with_views: Path, views: Path) -> None:
 
 
 def test_frames_and_the_report_show_the_views(views: Path, tmp_path: Path) -> None:
-    still, sheet = tmp_path / "still.png", tmp_path / "sheet.png"
+    still = tmp_path / "still.png"
     assert call("frames", views, "-t", LEFT, "--at", "#3", "-o", still).code == 0
-    assert call("frames", views, "-t", RIGHT, "--sheet", "2x2", "-o", sheet).code == 0
     exact = ("frames", views, "-t", LEFT, "--at", "#3", "--exact", "-o", tmp_path / "exact.png")
     refused(call(*exact), 2, "has no exact frames here")
     done = call("report", views, "-o", tmp_path / "page")

@@ -42,7 +42,7 @@ COMMANDS = {
         "report",
         "Make an HTML report: synchronised cameras, timing, topics, calibrations.",
     ),
-    "frames": ("report", "Save one frame as an image, or many frames as a contact sheet."),
+    "frames": ("report", "Save one frame as an image."),
     "evaluate": (
         "report",
         "Compare encoder settings on clips of a recording: quality, size and time.",

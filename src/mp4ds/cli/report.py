@@ -94,20 +94,13 @@ def _print_report(summary: ReportSummary) -> None:
 )
 @takes(StillOptions)
 def frames_command(dataset: str, output: Path, options: StillOptions) -> None:
-    """Save one frame as an image, or many frames as a contact sheet."""
+    """Save one frame as an image."""
     show(frames(dataset, output, options), _print_still)
 
 
 def _print_still(summary: StillSummary) -> None:
-    first, last = summary.frames[0], summary.frames[-1]
     place = path_text(summary.output)
-    if first is last:
-        say(f"{place}: frame {first.index} of {summary.topic}, stamp {first.stamp_ns} ns")
-    else:
-        say(
-            f"{place}: {len(summary.frames)} frames of {summary.topic}, from frame {first.index} "
-            f"to {last.index}"
-        )
+    say(f"{place}: frame {summary.index} of {summary.topic}, stamp {summary.stamp_ns} ns")
 
 
 # ---------------------------------------------------------------- evaluate

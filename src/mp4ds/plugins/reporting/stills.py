@@ -1,4 +1,4 @@
-"""``frames``: one frame as an image, or many as a contact sheet."""
+"""``frames``: a frame as an image."""
 
 from __future__ import annotations
 
@@ -12,32 +12,25 @@ from numpy.typing import NDArray
 
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.views import Resize, size_after, view_of
+from mp4ds.dataset.views import size_after, view_of
 from mp4ds.errors import FrameNotFoundError, OptionError, VideoError
 from mp4ds.files.outputs import begins_with, staged
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.options import (
     WHAT,
+    Options,
     Parsed,
-    Slice,
-    SliceOptions,
     Time,
     force,
     option,
     parse_resize,
     parse_time,
 )
-from mp4ds.video.images import ImageFile, Page, encoding_as
+from mp4ds.video.images import ImageFile, encoding_as
 
 _SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
-_MOST_FRAMES = 400  # of a sheet
-_MOST_SIDE = 16384  # pixels of a sheet
-_SHEET_WIDTH = 320  # of a frame on it
-_GAP, _LABEL, _TEXT = 6, 18, 12  # pixels of a sheet
-_PAGE, _INK = (24, 28, 32), (222, 226, 230)
 _BEYOND_NS = 10**9  # how far a time may be before the first frame, or after the last
 _QUALITY = 92
-_NS = 10**9
 
 
 # ---------------------------------------------------------------- looks
@@ -153,17 +146,7 @@ def _colour_table() -> Bytes:
     return table
 
 
-# ---------------------------------------------------------------- frames and sheets
-
-
-def _parse_sheet(value: str | tuple[int, int]) -> tuple[int, int]:
-    """Columns and rows of ``5x4``."""
-    if not isinstance(value, str):
-        return value
-    match = re.fullmatch(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})", value.strip().lower())
-    if not match:
-        raise OptionError(f"{value!r} is not COLUMNSxROWS, such as 5x4.")
-    return int(match[1]), int(match[2])
+# ---------------------------------------------------------------- frames
 
 
 def _parse_at(value: str | float | Time) -> Time | int:
@@ -174,82 +157,61 @@ def _parse_at(value: str | float | Time) -> Time | int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StillOptions(SliceOptions):
-    """Which frames to save, and how."""
+class StillOptions(Options):
+    """Which frame to save, and how."""
 
     topic: str = option("Camera topic, if there are several.", "", "-t", panel=WHAT)
-    at: Parsed[Time | int | None] = option(
+    at: Parsed[Time | int] = option(
         "Seconds from the first frame or since 1970, nanoseconds since 1970, an ISO date, or #N "
-        "for frame number N.",
+        "for frame number N; default: the first frame.",
+        0,
         panel=WHAT,
         metavar="TIME",
         parse=_parse_at,
     )
-    sheet: Parsed[tuple[int, int] | None] = option(
-        "Columns and rows of a contact sheet.", panel=WHAT, metavar="5x4", parse=_parse_sheet
-    )
     resize: Parsed[float | tuple[int, int] | None] = option(
-        "Size of the image, or of each frame on a sheet (default: 320 pixels wide).",
-        metavar="0.5|WxH",
-        parse=parse_resize,
+        "Size of the image.", metavar="0.5|WxH", parse=parse_resize
     )
     exact: bool = option("Keep the pixel values as recorded, as unpack --to images does.", False)
     force: bool = force()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (self.at is None) == (self.sheet is None):
-            raise OptionError("Give either `at` or `sheet`, such as `sheet` 5x4.")
-        if self.slice and not self.sheet:
-            raise OptionError("`start`, `end` and `duration` only work with `sheet`.")
-        if self.exact and (self.sheet or self.resize is not None):
-            raise OptionError("`exact` cannot be combined with `sheet` or `resize`.")
-        if self.sheet and not 1 <= self.sheet[0] * self.sheet[1] <= _MOST_FRAMES:
-            raise OptionError(f"`sheet` can have 1 to {_MOST_FRAMES} frames.")
-
-
-@dataclass(frozen=True)
-class SavedFrame:
-    """A frame in a saved image.
-
-    Attributes:
-        index: Its number.
-        stamp_ns: Header stamp, nanoseconds.
-        log_time_ns: Log time, nanoseconds.
-    """
-
-    index: int
-    stamp_ns: int
-    log_time_ns: int
+        if self.exact and self.resize is not None:
+            raise OptionError("`exact` cannot be combined with `resize`.")
 
 
 @dataclass(frozen=True)
 class StillSummary:
-    """A saved image.
+    """A saved frame.
 
     Attributes:
         output: The file.
         topic: Of the camera.
-        frames: In the order of a sheet, by rows.
-        size: Width and height, pixels.
+        index: Number of the frame.
+        stamp_ns: Its header stamp, nanoseconds.
+        log_time_ns: Its log time, nanoseconds.
+        size: Width and height of the image, pixels.
     """
 
     output: Path
     topic: str
-    frames: list[SavedFrame]
+    index: int
+    stamp_ns: int
+    log_time_ns: int
     size: tuple[int, int]
 
 
 def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> StillSummary:
-    """Save a frame, or a contact sheet of evenly spaced frames.
+    """Save a frame.
 
-    A frame is shown as it looks: mosaics are interpolated, 16-bit images are scaled so that the
+    It is shown as it looks: mosaics are interpolated, 16-bit images are scaled so that the
     brightest is white, depths and other measurements are in false colour.
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
         output: A ``.png`` or ``.jpg``.
-        options: Which frames, and how.
+        options: Which frame, and how.
 
     Raises:
         OptionError: An option is wrong, or the file cannot hold the image.
@@ -267,15 +229,10 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
         has_more = any(ENCODINGS[part.encoding].bytes_per_sample > 1 for part in topic.parts)
         if options.exact or not has_more:  # a view has no more than 8 bits
             topic = topic.in_layer("exact" if options.exact else "view")
-        if options.at is not None:
-            numbers = [number_at(topic, options.at)]
-            part, number = topic.place_of(numbers[0])
-            with closing(Topic([part])) as alone:  # which has one size and encoding
-                pixels, encoding = _still(alone, number, options)
-        elif options.sheet:
-            first, end = _places(topic, options.slice)
-            numbers = [first + n for n in spread(end - first, options.sheet[0] * options.sheet[1])]
-            pixels, encoding = _sheet(topic, numbers, options.sheet, options.resize), "rgb8"
+        index = number_at(topic, options.at)
+        part, number = topic.place_of(index)
+        with closing(Topic([part])) as alone:  # which has one size and encoding
+            pixels, encoding = _still(alone, number, options)
         data = ImageFile(encoding, kind, quality=_QUALITY).encode(pixels)
         with staged(
             target.absolute(),
@@ -286,10 +243,9 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
         return StillSummary(
             output=target,
             topic=topic.topic,
-            frames=[
-                SavedFrame(number, int(topic.stamps[number]), int(topic.log_times[number]))
-                for number in numbers
-            ],
+            index=index,
+            stamp_ns=int(topic.stamps[index]),
+            log_time_ns=int(topic.log_times[index]),
             size=(pixels.shape[1], pixels.shape[0]),
         )
 
@@ -323,20 +279,6 @@ def spread(count: int, wanted: int) -> list[int]:
     if count <= wanted:
         return list(range(count))
     return [(2 * number + 1) * count // (2 * wanted) for number in range(wanted)]
-
-
-def _places(topic: Topic, span: Slice) -> tuple[int, int]:
-    """The first frame of a slice, by header stamps, and the one after its last."""
-    stamps = topic.stamps
-    first, last = int(stamps.min()), int(stamps.max())
-    start, end = span.times(first, last, topic.topic)
-    inside = np.ones(len(stamps), np.bool_)
-    inside &= True if start is None else stamps >= start
-    inside &= True if end is None else stamps < end
-    numbers = np.flatnonzero(inside)
-    if not len(numbers):
-        raise OptionError(f"{topic.topic} has no frame in the slice.")
-    return int(numbers[0]), int(numbers[-1]) + 1
 
 
 def number_at(topic: Topic, at: Time | int) -> int:
@@ -376,37 +318,3 @@ def _still(topic: Topic, number: int, options: StillOptions) -> tuple[Pixels, st
         size = size_after(topic.topic, size, options.resize)
     look = Look(topic, size)
     return look.picture(topic.get([number])[0].data), "rgb8"
-
-
-def _sheet(
-    topic: Topic, numbers: list[int], sheet: tuple[int, int], resize: Resize
-) -> NDArray[np.uint8]:
-    """All frames in one picture, each with its number and time."""
-    width, height = topic.image_size
-    factor = min(1.0, _SHEET_WIDTH / width)
-    size = size_after(topic.topic, (width, height), factor if resize is None else resize)
-    cell = size[0] + _GAP, size[1] + _GAP + _LABEL
-    columns, rows = sheet
-    rows = -(-len(numbers) // columns)
-    whole = columns * cell[0] + _GAP, rows * cell[1] + _GAP + _LABEL
-    if max(whole) > _MOST_SIDE:
-        raise OptionError(
-            f"A sheet of {whole[0]}x{whole[1]} pixels exceeds {_MOST_SIDE} a side: give `resize`."
-        )
-    look = Look(topic, size)
-    page = Page(whole, paper=_PAGE, ink=_INK, text_size=_TEXT)
-    title = f"{topic.topic}  {look.caption}".strip()
-    page.write((_GAP, 3), _printable(title))
-    start = int(topic.stamps[0])
-    for place, number in enumerate(numbers):
-        frame = topic.get([number])[0]
-        x = _GAP + place % columns * cell[0]
-        y = _LABEL + _GAP + place // columns * cell[1]
-        page.put((x, y), look.picture(frame.data))
-        label = f"#{number}  {(frame.stamp_ns - start) / _NS:+.3f} s"
-        page.write((x, y + size[1] + 2), label)
-    return page.pixels()
-
-
-def _printable(text: str) -> str:
-    return "".join(letter if letter.isprintable() else "?" for letter in text)[:200]
