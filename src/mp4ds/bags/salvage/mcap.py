@@ -28,7 +28,15 @@ from mp4ds.bags.mcap_records import (
     parse,
     unpack_chunk,
 )
-from mp4ds.bags.salvage.scan import BLOCK, FileSalvage, Lose, RecordFrame, Scan, Window
+from mp4ds.bags.salvage.scan import (
+    BLOCK,
+    FileSalvage,
+    Lose,
+    RecordFrame,
+    Scan,
+    Window,
+    chunk_problem,
+)
 from mp4ds.errors import SourceError
 from mp4ds.records import Attachment, ChannelStats, Message, MetadataRecord
 
@@ -424,7 +432,7 @@ class McapSalvage(FileSalvage):
                 else:
                     self._other(part.kind, data)
         except DamageError as error:
-            problem = f"a chunk is damaged: {error}"
+            problem = chunk_problem(error)
             if not name_length:
                 if not self._scan.is_cut(frame):
                     self._tally.doubt = f"{error}: what was read of it may be altered"

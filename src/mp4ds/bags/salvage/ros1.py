@@ -22,7 +22,7 @@ from mp4ds.bags.ros1 import (
     other_format,
     split_header,
 )
-from mp4ds.bags.salvage.scan import FileSalvage, Lose, RecordFrame, Scan, Window
+from mp4ds.bags.salvage.scan import FileSalvage, Lose, RecordFrame, Scan, Window, chunk_problem
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record
 
@@ -291,7 +291,7 @@ class Ros1Salvage(FileSalvage):
                 elif part.kind == Op.CONNECTION and not self._connect(part, body):
                     raise DamageError("a connection record in it is damaged")
         except DamageError as error:
-            problem = f"a chunk is damaged: {error}"
+            problem = chunk_problem(error)
         self._leave_chunk(frame, frame.head + used, problem, proven=proven)
 
     def _listed(self, fields: Fields, body: bytes, offset: int) -> None:

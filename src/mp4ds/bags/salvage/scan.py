@@ -481,6 +481,12 @@ class Tally:
         return max(0, missing.total() - excess.total()), missing
 
 
+def chunk_problem(error: DamageError) -> str:
+    """What is wrong with a chunk, a phrase."""
+    limit = f" ({DECOMPRESSED} sets another)" if isinstance(error, OversizeError) else ""
+    return f"a chunk is damaged: {error}{limit}"
+
+
 def lost_by(error: DamageError) -> str:
     """What is wrong with messages whose payload cannot be decompressed, a phrase."""
     if isinstance(error, OversizeError):
