@@ -129,24 +129,6 @@ def test_after_a_gap_the_next_key_frame_is_awaited(name: str) -> None:
         assert parser.picture(packets[second].data).keyframe
 
 
-@pytest.mark.parametrize("codec", ["h264", "h265"])
-def test_parameters_sent_apart(codec: str) -> None:
-    """They are kept in mind; the packet that holds nothing else is no frame."""
-    kinds = (7, 8) if codec == "h264" else (32, 33, 34)
-    body = encode(ENCODINGS[codec], frames=1)[0].data
-    units = split(body)[0]
-    is_parameter = [UNITS[codec].unit_type(unit) in kinds for unit in units]
-    alone = join_plain([u for u, chosen in zip(units, is_parameter, strict=True) if chosen])
-    parser = CODECS[codec].parser()
-    assert "parameter sets were not sent" in refusal(parser.picture, without(codec, body, *kinds))
-    assert parser.parameters == b""
-    with pytest.raises(NoPicture):
-        parser.picture(alone)
-    assert parser.parameters == alone
-    assert parser.picture(without(codec, body, *kinds)).keyframe
-    assert parser.picture(body).keyframe
-
-
 @pytest.mark.parametrize("codec", ["h264", "h265", "av1"])
 def test_two_pictures_in_one_packet(codec: str) -> None:
     packets = encode(ENCODINGS[codec], frames=3)

@@ -290,21 +290,6 @@ def test_the_recommendation_reaches_the_target(whole: Evaluation) -> None:
         assert item.setting.crf == 8
 
 
-def test_the_data_set_is_reckoned(whole: Evaluation) -> None:
-    (camera,) = whole.cameras
-    rows = {row.form: row for row in camera.storage}
-    assert list(rows)[:5] == ["raw", "YUV 4:4:4", "RGB", "JPEG 90", "JPEG 75"]
-    assert camera.clip.rate is not None
-    frames = 9 * 10 * 3600 * camera.clip.rate
-    assert rows["raw"].frame_bytes == 480 * 360
-    assert rows["RGB"].frame_bytes == 3 * 480 * 360
-    assert rows["RGB"].gigabytes == pytest.approx(frames * 3 * 480 * 360 / 1e9)
-    assert rows["JPEG 75"].frame_bytes < rows["JPEG 90"].frame_bytes < rows["raw"].frame_bytes
-    ours = rows[camera.recommended[0].setting.name]
-    shown = next(i for i in camera.cells if i.setting == camera.recommended[0].setting)
-    assert ours.cpu_days == pytest.approx(shown.encode_cpu_seconds / 12 * frames / 86_400)
-
-
 def test_files(whole: Evaluation) -> None:
     folder, (camera,) = whole.output, whole.cameras
     lines = list(csv.DictReader((folder / "evaluation.csv").read_text().splitlines()))

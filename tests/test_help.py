@@ -7,33 +7,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 from commands import Result, call, program, refused
-from mp4ds.cli import COMMANDS, commands
-from mp4ds.cli.pack import import_command
-
-PANELS = ["Arguments", "What", "How", "Where", "Long jobs", "Options"]
 
 
 def run(*words: str, folder: Path) -> Result:
     return program("mp4ds", *words, cwd=folder, code=None, env={"COLUMNS": "80"})
-
-
-@pytest.mark.parametrize(
-    "command",
-    [*sorted(COMMANDS.keys() - {"import"}), *(f"import {one}" for one in import_command.commands)],
-)
-def test_options_stand_by_what_they_are_about(command: str) -> None:
-    name, *rest = command.split()
-    done = CliRunner(env={"COLUMNS": "80"}).invoke(commands, [name, *rest, "--help"])
-    assert done.exit_code == 0
-    assert max(map(len, done.stdout.splitlines())) <= 80
-    found = re.findall(r"^(\w[\w ]*):$", done.stdout, re.MULTILINE)
-    assert found == [name for name in PANELS if name in found]
-    assert "Options" in found
-    # no type or bound as the library calls it
-    assert not re.search(r"<[a-z]+( range)?>|x<=|x>=|\{|\]\]", done.stdout)
 
 
 def test_nothing_is_printed_but_errors(

@@ -21,16 +21,13 @@ from coded_tools import (
     scene,
 )
 from mp4ds.errors import VideoError
-from mp4ds.video import av1
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded import CodedPicture
-from mp4ds.video.h264 import join, join_plain, split
+from mp4ds.video.h264 import join_plain, split
 from mp4ds.video.packets import PacketReader, PacketWriter
 
 STEP = 33_333
 SIZE = (WIDTH, HEIGHT)
-FILLER = {"h264": b"\x0c\xff\xff\x80", "h265": b"\x4c\x01\xff\xff\x80"}
-SEI = {"h264": b"\x06\x05\x01\xaa\x80", "h265": b"\x4e\x01\x05\x01\xaa\x80"}
 
 
 def write(
@@ -83,38 +80,6 @@ def test_packets_come_back(name: str, tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- framing
-
-
-def reframed(codec: str, body: bytes, framing: str) -> bytes:
-    """A body with SEI and filler among its NAL units, behind other start codes."""
-    parser = CODECS[codec].parser
-    units = split(body)[0]
-    is_slice = [parser.unit_type(u) < (6 if codec == "h264" else 32) for u in units]
-    units.insert(is_slice.index(True), SEI[codec])
-    units.append(FILLER[codec])
-    lengths = (framing.split() * len(units))[: len(units)]
-    return join(units, " ".join([*lengths, "+2"] if framing == "6 3" else lengths))
-
-
-@pytest.mark.parametrize("framing", ["3", "4", "4 3", "6 3"])
-@pytest.mark.parametrize("name", ["h264", "h264-aud", "h264-slices", "h265", "h265-aud"])
-def test_start_codes(name: str, framing: str, tmp_path: Path) -> None:
-    codec = ENCODINGS[name].codec
-    bodies = [reframed(codec, packet.data, framing) for packet in encode(ENCODINGS[name])]
-    check(tmp_path / "a.mp4", codec, bodies)
-
-
-@pytest.mark.parametrize("delimited", [True, False, None])
-@pytest.mark.parametrize("metadata", [b"", b"\x2a\x06\x04\xb5\0\0\0\x80"])
-def test_temporal_delimiters_and_metadata(
-    delimited: bool | None, metadata: bytes, tmp_path: Path
-) -> None:
-    bodies = []
-    for number, packet in enumerate(encode(ENCODINGS["av1"])):
-        keep = number % 2 == 0 if delimited is None else delimited
-        bare = metadata + packet.data.removeprefix(av1.DELIMITER)
-        bodies.append(av1.DELIMITER + bare if keep else bare)
-    check(tmp_path / "a.mp4", "av1", bodies)
 
 
 @pytest.mark.parametrize("codec", ["h264", "h265"])

@@ -9,7 +9,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from commands import call, refused, tree
 from in_parts import InlineExecutor, facts, leftovers, use
 from mp4ds.errors import PartsFailedError
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.pack import pack_share
 from sources import SOURCES, scene
 
 IN_PARTS = PackOptions(window=3, codec="h264")
@@ -126,18 +124,6 @@ def test_a_copy_is_not_taken_for_what_was_begun_here(bag: Path, work: Path, tmp_
     shutil.rmtree(tmp_path / "moved")
     assert mp4ds.validate(tmp_path / "out", deep=True) == []
     assert leftovers(tmp_path) == []
-
-
-def test_machines_that_share_it_may_see_another_inode(
-    bag: Path, work: Path, tmp_path: Path
-) -> None:
-    work.rename(tmp_path / "moved")
-    shutil.copytree(tmp_path / "moved", work)
-    shutil.rmtree(tmp_path / "moved")
-    pack_share(bag, tmp_path / "out", (1, 1), IN_PARTS)
-    mp4ds.pack(bag, tmp_path / "out", replace(IN_PARTS, join=True))
-    mp4ds.pack(bag, tmp_path / "whole", PackOptions(codec="h264"))
-    assert facts(tmp_path / "out") == facts(tmp_path / "whole")
 
 
 PLANTED: dict[str, Callable[[dict[str, Any]], object]] = {

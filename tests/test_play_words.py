@@ -9,7 +9,6 @@ from pathlib import Path
 import click
 import pytest
 
-from commands import call
 from mp4ds.cli.play import play_command
 from mp4ds.errors import OptionError
 from mp4ds.plugins.ros.node import PLAIN, NodeNames, node_arguments
@@ -157,16 +156,3 @@ def test_the_table_has_every_option_of_ros1() -> None:
     told = subprocess.run([PLAY, "--help"], capture_output=True, text=True, check=False)
     options = set(re.findall(r"(?<![\w<-])--[a-z][a-z-]+", told.stdout + told.stderr)) - {"--help"}
     assert {key.partition(" ")[2] for key in rows() if key.startswith("ros1")} == options
-
-
-def test_the_table_says_what_is_here() -> None:
-    known = play_command.known
-    for key, (name, here) in rows().items():
-        if here.startswith("not supported:"):
-            option = next(item for item in play_command.params if name in item.opts)
-            value = [] if getattr(option, "is_flag", False) else ["x"]
-            assert "is not supported" in call("play", "drive", name, *value).err
-        else:
-            assert name in known, key
-        for told in re.findall(r"`(-{1,2}[a-z0-9-]+)", here):
-            assert told in known, f"{key}: {told}"

@@ -379,16 +379,6 @@ def test_jpeg_files_with_a_view_become_its_packets(packed: Pack) -> None:
     assert [m.payload for m in kept(made, messages)] == [r.payload("cdr") for r in made.cameras]
 
 
-def test_packets_with_a_view_stay_those_recorded(packed: Pack) -> None:
-    """They are a video already: nothing is gained by those of the view."""
-    made = packed("video-h264", "mcap-ros2-zstd", PackOptions(view="av1"))
-    summary, messages = made.unpack("mcap", "ffmpeg")
-    now = summary.republished[made.topic].topic
-    found = shown([message for message in messages if message.topic == now])
-    assert all(map(np.array_equal, found, truth(made.cameras)))
-    assert summary.notes == []
-
-
 # ---------------------------------------------------------------- raw images as files
 
 
@@ -749,22 +739,6 @@ def test_channels_of_ros1(packed: Pack, name: str, kind: str, source: str) -> No
             seqs = [record.values["header"]["seq"] for record in made.cameras]
             expected = [0] * len(seqs) if source == "mcap-ros2-zstd" else seqs
             assert [message.value.header.seq for message in found] == expected
-
-
-def test_two_publishers_of_a_topic(tmp_path: Path) -> None:
-    one = scene("mono8", frames=4)
-    two = [
-        Record(r.topic, r.msgtype, r.log_time + 7, r.values, publisher=1)
-        for r in scene("mono8", frames=4, seed=1).messages
-        if r.msgtype == IMAGE
-    ]
-    made = Packed(tmp_path, both(one, Scene(two)), "bag-none")
-    summary, messages = made.unpack("bag", "jpeg")
-    assert list(summary.republished) == ["/cam/image_raw"]
-    found = [message for message in messages if message.type_name == COMPRESSED]
-    check_times(made, found, "bag")
-    assert {m.metadata["callerid"] for m in found} == {"/first", "/second"}
-    assert {m.topic for m in found} == {"/cam/image_raw/compressed"}
 
 
 # ---------------------------------------------------------------- topics

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 from jsonschema.protocols import Validator
 from jsonschema.validators import extend
@@ -26,7 +24,7 @@ from mp4ds.format.fields import (
     document_of,
 )
 from mp4ds.format.manifest import Manifest
-from mp4ds.format.models import ChannelModel, StreamSidecar
+from mp4ds.format.models import StreamSidecar
 from mp4ds.format.sidecars import (
     dump_document,
     load_document,
@@ -36,10 +34,7 @@ from mp4ds.format.sidecars import (
 )
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import LAYOUTS
-from mp4ds.records import Channel, Schema
 from pixel_kinds import PAIRS, bound, rounded
-
-steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 Document = dict[str, Any]
 
@@ -436,28 +431,6 @@ def test_optional_keys_may_be_absent(kind: str, tmp_path: Path) -> None:
             document.pop("view", None)
         if key != "body":  # what belongs to PNG files, or to packets, then has no place
             assert document_of(load(write(tmp_path, document), kind)) == document
-
-
-Texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=30)
-
-
-@steady
-@given(
-    Texts,
-    st.sampled_from(["ros1", "cdr"]) | Texts,
-    st.dictionaries(Texts, Texts, max_size=4),
-    st.none() | st.binary(max_size=60) | Texts.map(str.encode),
-)
-def test_any_channel_returns_through_the_file(
-    topic: str, encoding: str, metadata: dict[str, str], definition: bytes | None
-) -> None:
-    schema = None if definition is None else Schema(topic, encoding, definition)
-    original = Channel(3, topic, encoding, schema, metadata)
-    document = stream()
-    document["channel"] = document_of(ChannelModel.from_record(original))
-    raw = dump_document(StreamSidecar.model_validate(document))
-    read = StreamSidecar.model_validate(yamlio.load(raw, "x.yaml"))
-    assert read.channel.to_record(3) == original
 
 
 # ---------------------------------------------------------------- what is refused

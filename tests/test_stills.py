@@ -12,7 +12,7 @@ import pytest
 
 import mp4ds
 from commands import call
-from mp4ds.errors import FrameNotFoundError, OptionError, TargetExistsError
+from mp4ds.errors import FrameNotFoundError, OptionError
 from mp4ds.options import parse_time
 from mp4ds.plugins.reporting.stills import (
     Look,
@@ -20,8 +20,8 @@ from mp4ds.plugins.reporting.stills import (
     frames,
     number_at,
 )
-from report_scenes import COLOUR, DEPTH, FRAMES, HEIGHT, WIDTH, blocks, pack_cameras, two_cameras
-from sources import COMMON, ENCODINGS, odd_scene, scene
+from report_scenes import COLOUR, FRAMES, HEIGHT, WIDTH, blocks, pack_cameras, two_cameras
+from sources import COMMON, ENCODINGS, scene
 
 START = 1_700_000_000_123_456_789
 
@@ -96,15 +96,6 @@ def test_a_frame_is_saved_as_it_is(drive: Path, tmp_path: Path) -> None:
     assert summary.size == (WIDTH, HEIGHT)
 
 
-def test_a_frame_of_a_topic_that_changes_its_size(tmp_path: Path) -> None:
-    dataset = pack_cameras(tmp_path, odd_scene("size-change"), quality="lossless")
-    summary = frames(dataset, tmp_path / "out.png", StillOptions(at="#5"))
-    with mp4ds.open(dataset) as opened:
-        whole = opened["/odd/image"]
-        assert summary.stamp_ns == whole.stamps[5]
-        assert np.array_equal(read(tmp_path / "out.png")[..., 0], whole[5].data)
-
-
 SOME = {*COMMON, "rgb16", "yuyv", "8UC2", "32FC1", "bgra8", "bayer_gbrg16"}
 
 
@@ -149,19 +140,6 @@ NO_TIMES = ("", "#x", "#-1", "now", "1e9", "+", "+1.0000000001", "-5", "2023-13-
 def test_options_that_are_wrong_or_do_not_go_together(options: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match="`"):
         StillOptions(**options)
-
-
-def test_what_cannot_be_saved(drive: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=r"is not a \.png"):
-        frames(drive, tmp_path / "out.gif", StillOptions(topic=COLOUR, at="#0"))
-    with pytest.raises(OptionError, match=f"`topic` of {COLOUR}, {DEPTH}|{DEPTH}, {COLOUR}"):
-        frames(drive, tmp_path / "out.png", StillOptions(at="#0"))
-    with pytest.raises(OptionError, match="no topic '/nowhere'"):
-        frames(drive, tmp_path / "out.png", StillOptions(topic="/nowhere", at="#0"))
-    (tmp_path / "out.png").write_bytes(b"mine")
-    with pytest.raises(TargetExistsError):
-        frames(drive, tmp_path / "out.png", StillOptions(topic=COLOUR, at="#0"))
-    assert (tmp_path / "out.png").read_bytes() == b"mine"
 
 
 def test_the_command(drive: Path, tmp_path: Path) -> None:

@@ -14,18 +14,15 @@ from google.protobuf import descriptor_pb2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap_protobuf.schema import build_file_descriptor_set
-from rosbags.highlevel import AnyReader
 
-from conftest import real
 from foxglove_wire import fill
-from mp4ds.bags.formats import open_reader
 from mp4ds.messages.transforms import (
     Transform,
     TransformCollector,
     transform_parser,
 )
 from mp4ds.messages.wire import WireError
-from mp4ds.records import Channel, Message, Schema
+from mp4ds.records import Channel, Schema
 from scenes import build, typestore
 
 TURN = (0.0, 0.0, math.sin(0.5), math.cos(0.5))
@@ -309,28 +306,3 @@ def test_any_graph_gives_the_ancestors(edges: list[tuple[int, int]], frames: lis
     found = collector.between(f"f{n}" for n in frames)
     assert {item.child for item in found} == above
     assert found == [item for item in collector.transforms if item.child in above]
-
-
-# ---------------------------------------------------------------- real recordings
-
-
-@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
-def test_a_real_recording(compression: str) -> None:
-    path = real(f"bags/example_turtle_{compression}.bag")
-    collector = TransformCollector()
-    with open_reader(path) as reader:
-        for record in reader.records():
-            if isinstance(record, Message):
-                collector.add(record.channel, record.data)
-    expected: dict[str, Any] = {}
-    with AnyReader([path]) as bag:
-        own = [connection for connection in bag.connections if connection.topic == "/tf_static"]
-        for connection, _, data in bag.messages(own):
-            for item in bag.deserialize(data, connection.msgtype).transforms:
-                expected[item.child_frame_id] = item
-    assert expected
-    for found, item in zip(collector.transforms, expected.values(), strict=True):
-        t, r = item.transform.translation, item.transform.rotation
-        assert found == Transform(
-            item.header.frame_id, item.child_frame_id, (t.x, t.y, t.z), (r.x, r.y, r.z, r.w)
-        )
