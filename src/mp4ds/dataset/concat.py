@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.bags.mcap import McapWriter
-from mp4ds.bags.protocols import WHOLE, RecordingSlice, in_span, write_record
+from mp4ds.bags.protocols import WHOLE, RecordingSlice, in_span, merged, write_record
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import Part, by_time
 from mp4ds.dataset.stream import Stream
@@ -64,6 +64,7 @@ from mp4ds.records import (
     OTHER_REASONS,
     Channel,
     Message,
+    Record,
     bounded,
 )
 from mp4ds.times import PresentationClock
@@ -665,22 +666,11 @@ def _channels(sources: Sequence[_Source]) -> list[dict[int, Channel]]:
 
 def _recorded_messages(
     sources: Sequence[_Source], channels: Sequence[Mapping[int, Channel]]
-) -> Iterator[Message]:
+) -> Iterator[Record]:
     """The messages for messages.mcap, by log time."""
-    chains: list[list[int]] = []  # of datasets that do not overlap: one at a time is read
-    ends: list[int] = []
-    for number, source in enumerate(sources):
-        begin, end = source.range or (0, 0)
-        place = next((i for i, before in enumerate(ends) if before <= begin), len(chains))
-        if place == len(chains):
-            chains.append([])
-            ends.append(end)
-        chains[place].append(number)
-        ends[place] = end
 
-    def messages(numbers: Sequence[int]) -> Iterator[Message]:
-        for number in numbers:
-            for message in sources[number].recorded_messages():
-                yield message.of_channel(channels[number][message.channel.id])
+    def messages(number: int) -> Iterator[Message]:
+        for message in sources[number].recorded_messages():
+            yield message.of_channel(channels[number][message.channel.id])
 
-    return by_time(*map(messages, chains))
+    return merged([source.range[0] if source.range else 0 for source in sources], messages)

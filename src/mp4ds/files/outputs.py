@@ -1,8 +1,11 @@
-"""Outputs get their final name only when complete, and replace only what mp4ds wrote."""
+"""Outputs get their final name only when complete, and replace only what mp4ds wrote.
+
+Those for URLs are completed on this machine, then copied there. The file that identifies an output
+comes last, so that an output without it is visibly incomplete.
+"""
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import hashlib
 import json
@@ -10,24 +13,28 @@ import os
 import re
 import shutil
 import socket
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
-from mp4ds.errors import TargetError, TargetExistsError, WriteError, counted
-from mp4ds.files.urls import remote
+from mp4ds.errors import (
+    Mp4dsError,
+    RemoteError,
+    TargetError,
+    TargetExistsError,
+    WriteError,
+    counted,
+    interrupted,
+)
+from mp4ds.files.urls import RemotePath, remote
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
-
-_AT_FDCWD = -100
-_UNABLE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EXDEV)
 
 
 def lock(file: IO[Any], *, shared: bool = False) -> bool:
@@ -66,42 +73,6 @@ def is_mine(stat: os.stat_result, folder: Path) -> bool:
     with suppress(OSError), tempfile.TemporaryFile(dir=folder) as file:
         return os.fstat(file.fileno()).st_uid == stat.st_uid
     return False
-
-
-_EXCHANGE = {"linux": 2, "darwin": 2}  # RENAME_EXCHANGE, RENAME_SWAP
-_TO_NEW = {"linux": 1, "darwin": 4}  # RENAME_NOREPLACE, RENAME_EXCL
-
-
-def rename_as(old: Path, new: Path, flags: dict[str, int]) -> bool:
-    """Rename atomically: swap two names, or only to a name that nothing has.
-
-    Args:
-        old: What to rename.
-        new: Its new name.
-        flags: `_EXCHANGE` or `_TO_NEW`: the flag of each system that can.
-
-    Returns:
-        Whether that was done; False if the system or file system cannot.
-
-    Raises:
-        FileExistsError: There is something under the new name.
-        OSError: It failed.
-    """
-    names = os.fsencode(old), os.fsencode(new)
-    try:
-        libc = ctypes.CDLL(None, use_errno=True)
-        if sys.platform == "darwin":
-            failed = libc.renamex_np(*names, flags["darwin"])
-        else:
-            failed = libc.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], flags["linux"])
-    except (AttributeError, OSError, TypeError):  # the system lacks the function or library
-        return False
-    if not failed:
-        return True
-    code = ctypes.get_errno()
-    if code in _UNABLE:
-        return False
-    raise OSError(code, os.strerror(code), str(old), None, str(new))
 
 
 # ---------------------------------------------------------------- owned
@@ -532,9 +503,9 @@ def _move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned:
     """Give an output its final name, replacing what is there.
 
     Args:
-        path: The complete output; afterwards what it replaced, if the system can swap names.
+        path: The complete output.
         target: Its final name.
-        old: Where to move what it replaces on other systems; on the same file system.
+        old: Where to move what it replaces, on the same file system.
         force: Replace what is there.
         owned: Returns which files of that mp4ds wrote.
 
@@ -544,34 +515,24 @@ def _move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned:
     """
     if not os.path.lexists(target):
         try:
-            if not rename_as(path, target, _TO_NEW):
-                path.rename(target)
-        except FileExistsError:
-            raise TargetExistsError(target) from None
+            path.rename(target) if path.is_dir() else target.hardlink_to(path)
+        except OSError:
+            if os.path.lexists(target):
+                raise TargetExistsError(target) from None
+            path.rename(target)  # of a file where there are no links, which would replace another
     elif not force:
         raise TargetExistsError(target)  # it appeared meanwhile
     else:
         check_replaceable(target, owned)
-        if not rename_as(path, target, _EXCHANGE):
-            old.parent.mkdir(exist_ok=True)
-            target.rename(old)
-            try:
-                path.rename(target)
-            except OSError:
-                with suppress(OSError):
-                    old.rename(target)
-                raise
+        old.parent.mkdir(exist_ok=True)
+        target.rename(old)
+        try:
+            path.rename(target)
+        except OSError:
+            with suppress(OSError):
+                old.rename(target)
+            raise
     sync_folder(target.parent)
-
-
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
-_NUMBER = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?")
-
-
-def csv_cell(text: str) -> str:
-    """Text of a recording for a CSV file: what a spreadsheet takes for a formula follows a '."""
-    is_formula = text.startswith(_FORMULA) and not _NUMBER.fullmatch(text)
-    return f"'{text}" if is_formula else text
 
 
 def digest_file(path: Path) -> tuple[int, str]:
@@ -583,3 +544,157 @@ def digest_file(path: Path) -> tuple[int, str]:
             digest.update(block)
             size += len(block)
     return size, digest.hexdigest()
+
+
+# ---------------------------------------------------------------- at URLs
+
+Made = TypeVar("Made")
+Report = Callable[[str, int, int], None]
+"""Called with the file being uploaded, bytes uploaded, and total bytes."""
+
+_PROBE = ".mp4ds-upload"
+
+
+def uploaded(
+    target: RemotePath,
+    make: Callable[[Path], Made],
+    *,
+    is_folder: bool = True,
+    last: str = "",
+    force: bool,
+    owned: Owned,
+    report: Report | None = None,
+) -> Made:
+    """Make an output on this machine, and copy it to a URL.
+
+    Args:
+        target: Where it goes.
+        make: Makes it at a local path, replacing what is there.
+        is_folder: Whether it is a folder.
+        last: For a folder, the file to copy last, without which it is incomplete.
+        force: Replace what is at the URL.
+        owned: Tells which files of that mp4ds wrote.
+        report: Called with the upload's progress.
+
+    Returns:
+        What `make` returns.
+
+    Raises:
+        TargetError: The target cannot be written or replaced, or another run is working on it.
+        RemoteError: It could not be uploaded; the output is kept here.
+    """
+    local = local_path(target)
+    with _claimed(local.parent, target):
+        old = _replaced(target, is_folder=is_folder, force=force, owned=owned)
+        _probe(target / _PROBE if is_folder else target.with_name(f"{target.name}{_PROBE}"))
+        made = make(local)
+        kept = f"The output is kept in {local}: copy it with a tool of your choice"
+        kept += f"({last} last), or run the command again." if last else ", or run again."
+        try:
+            _send(local, target, old, last, report)
+        except (TargetError, RemoteError) as error:
+            raise type(error)(target, str(error).rstrip("."), kept) from None
+        except (KeyboardInterrupt, SystemExit) as error:
+            raise interrupted(error, f"the upload is incomplete. {kept}") from None
+        if is_folder:
+            shutil.rmtree(local, ignore_errors=True)
+        else:
+            local.unlink(missing_ok=True)
+    return made
+
+
+def local_path(target: RemotePath) -> Path:
+    """Where the output for a URL is made: the same on all machines that share ``TMPDIR``.
+
+    Raises:
+        TargetError: Nothing can be uploaded there, or no folder can be created here.
+    """
+    if not target.is_writable:
+        problem = "is on a web server, which does not accept uploads"
+        raise TargetError(target, problem, "Give a location in a store, such as s3://.")
+    if target.parent == target:
+        raise TargetError(target, "is an entire bucket", "Give a folder in it.")
+    digest = hashlib.sha256(str(target).encode()).hexdigest()
+    folder = _own_folder() / f"{target.name[:60]}-{digest[:16]}"
+    folder.mkdir(exist_ok=True)
+    return folder / target.name
+
+
+def _own_folder() -> Path:
+    """The user's own folder in the system's temporary one, which nobody else can touch."""
+    folder = Path(tempfile.gettempdir()) / f"mp4ds-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        stat = folder.lstat()
+    except OSError as error:
+        raise TargetError(
+            folder, f"cannot be created: {error.strerror}", "Set TMPDIR to another folder."
+        ) from None
+    if not folder.is_dir() or folder.is_symlink() or stat.st_uid != os.getuid():
+        raise TargetError(folder, "belongs to another user", "Set TMPDIR to another folder.")
+    return folder
+
+
+@contextmanager
+def _claimed(folder: Path, target: RemotePath) -> Iterator[None]:
+    """Lock the folder while working in it; it is removed once empty."""
+    with (folder / _LOCK).open("w") as file:
+        try:
+            lock(file)
+        except BlockingIOError:
+            raise TargetError(
+                target, "another mp4ds is already making it here", "Wait for it, or stop it."
+            ) from None
+        try:
+            yield
+        finally:
+            if {path.name for path in folder.iterdir()} <= {_LOCK}:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _replaced(target: RemotePath, *, is_folder: bool, force: bool, owned: Owned) -> set[str]:
+    """Names of the files to replace, empty that of a file; see `outputs.check_target`."""
+    now = RemotePath(target.url)
+    if not now.exists():
+        return set()
+    if not force:
+        raise TargetExistsError(target)
+    old = refuse_not_ours(target, owned(now))
+    if not is_folder:
+        return {""}
+    begin = len(target.url) + 1
+    there = {path.url[begin:] for path in now.files()}
+    refuse_unknown_files(target, there - old)
+    return there
+
+
+def _probe(path: RemotePath) -> None:
+    """Check before the work whether the place can be written to."""
+    with tempfile.NamedTemporaryFile() as file:
+        path.upload(Path(file.name))
+    path.remove()
+
+
+def _send(local: Path, target: RemotePath, old: set[str], last: str, report: Report | None) -> None:
+    """Copy a file, whose name in the output is empty, or all files of a folder."""
+    for name in sorted(old - {""}, key=lambda name: name != last):
+        (target / name).remove()
+    if local.is_file():
+        files = {"": local.stat().st_size}
+    else:
+        paths = filter(Path.is_file, sorted(local.rglob("*")))
+        files = {path.relative_to(local).as_posix(): path.stat().st_size for path in paths}
+    done, total = 0, sum(files.values())
+    sent: list[RemotePath] = []
+    try:
+        for name in sorted(files, key=lambda name: name == last):
+            if report:
+                report(name or target.name, done, total)
+            sent.append(target / name)
+            sent[-1].upload(local / name)
+            done += files[name]
+    except BaseException:
+        for place in sent if "" not in old else ():  # a file that is not replaced stays
+            with suppress(Mp4dsError):
+                place.remove()
+        raise

@@ -30,7 +30,7 @@ from mp4ds.errors import (
     advising,
     path_text,
 )
-from mp4ds.files.outputs import check_target, digest_file, staged
+from mp4ds.files.outputs import check_target, digest_file, local_path, staged, uploaded
 from mp4ds.files.sources import (
     SourceHasher,
     is_unfinished,
@@ -38,7 +38,6 @@ from mp4ds.files.sources import (
     source_size,
     unchanged,
 )
-from mp4ds.files.uploads import local_path, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.manifest import ReductionEntry
 from mp4ds.format.models import StreamSidecar

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mp4ds.dataset.features import Statistics, sampled_statistics
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
+from mp4ds.dataset.vectors import Statistics, sampled_statistics
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, SampleError, VideoError
 from mp4ds.files.urls import remote

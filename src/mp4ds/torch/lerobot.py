@@ -13,12 +13,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mp4ds.dataset.features import (
+from mp4ds.dataset.stream import Layer
+from mp4ds.dataset.vectors import (
     ACTION,
     COLUMNS,
     SAMPLES,
     STATE,
     Feature,
+    Fields,
     Statistics,
     image_features,
     merged,
@@ -26,8 +28,6 @@ from mp4ds.dataset.features import (
     vector_feature,
     video_feature,
 )
-from mp4ds.dataset.stream import Layer
-from mp4ds.dataset.vectors import Fields
 from mp4ds.errors import OptionError, absent
 from mp4ds.files.urls import location
 from mp4ds.torch.datasets import FrameDataset, Offsets, Sample

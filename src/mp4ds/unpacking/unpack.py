@@ -25,8 +25,7 @@ from mp4ds.errors import (
     advising,
     interrupted,
 )
-from mp4ds.files.outputs import Owned, staged
-from mp4ds.files.uploads import uploaded
+from mp4ds.files.outputs import Owned, staged, uploaded
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.sidecars import MANIFEST_NAME, FileNames
 from mp4ds.options import WHAT, Selection, SliceOptions, force, jpeg_quality, latched, option
@@ -40,8 +39,7 @@ from mp4ds.records import (
     MetadataRecord,
     bounded,
 )
-from mp4ds.unpacking.image_folders import TopicImages, image_names
-from mp4ds.unpacking.pictures import KINDS, FrameOptions, shown_by_packets
+from mp4ds.unpacking.pictures import KINDS, FrameOptions, TopicImages, image_names, shown_by_packets
 from mp4ds.unpacking.republish import Republished, Republisher, check_kind
 
 SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}

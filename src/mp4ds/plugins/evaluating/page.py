@@ -15,7 +15,7 @@ from string import Template
 from typing import Any
 
 from mp4ds.errors import size_text
-from mp4ds.files.outputs import csv_cell, write_synced
+from mp4ds.files.outputs import write_synced
 from mp4ds.plugins.evaluating.trials import (
     CameraEvaluation,
     Cell,
@@ -23,6 +23,7 @@ from mp4ds.plugins.evaluating.trials import (
     StorageRow,
     mean_score,
 )
+from mp4ds.unpacking.pictures import csv_cell
 from mp4ds.video.scores import METRICS, ScoreSummary
 
 PLOTS = "plots"

@@ -15,21 +15,23 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from mp4ds.dataset.features import (
+from mp4ds.dataset.topic import Topic
+from mp4ds.dataset.vectors import (
     ACTION,
     COLUMNS,
     SAMPLES,
     STATE,
     Statistics,
+    Vectors,
+    fields_of,
     image_features,
     merged,
+    read_vectors,
     sampled_statistics,
     statistics_of,
     vector_feature,
     video_feature,
 )
-from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.vectors import Vectors, fields_of, read_vectors
 from mp4ds.errors import OptionError
 from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, DepthCodes
 from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, Integers, ros_type

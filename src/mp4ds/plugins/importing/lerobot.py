@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from mp4ds.dataset.features import COLUMNS
+from mp4ds.dataset.vectors import COLUMNS
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.packing.options import ImportOptions
 from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, LEROBOT_SCALE, DepthScale
