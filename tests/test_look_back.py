@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -19,11 +20,14 @@ from mp4ds.bags.formats import open_sources
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.errors import Mp4dsError, Refused, WriteError
 from mp4ds.packing.options import PackOptions
-from mp4ds.plugins.recording.lookback import LookBack
+from mp4ds.packing.spool import SpoolFolder
+from mp4ds.plugins.recording import record
+from mp4ds.plugins.recording.lookback import LookBack, Saved
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.recording.record import Recorder, RecordSummary
 from mp4ds.plugins.recording.spool import Piece
 from mp4ds.plugins.recording.triggers import Trigger
+from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message
 from player_scenes import START, make_drive, ros1_channel, ros2_channel
 from record_scenes import PlayedNode, played
@@ -186,6 +190,62 @@ def test_a_disk_that_is_full(
         assert sent[place][1] <= full - round(KEEP * S)
 
 
+@pytest.mark.parametrize("what", ["its folder", "a link", "packing", "joining"])
+def test_what_cannot_be_saved(
+    what: str, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stays, and is recovered; the recorder goes on, and saves the next one."""
+    sent = messages(drive)
+    failed: list[Path] = []
+
+    def failing(real: Callable[..., Any], is_due: Callable[..., bool]) -> Callable[..., Any]:
+        def call(self: Any, *rest: Any, **more: Any) -> Any:
+            if not failed and is_due(self, *rest):
+                failed.append(tmp_path)
+                raise OSError(errno.EDQUOT, "Disk quota exceeded")
+            return real(self, *rest, **more)
+
+        return call
+
+    owner, name, is_due = {
+        "its folder": (SpoolFolder, "begin", lambda self, _: any(tmp_path.glob("live*"))),
+        "a link": (Saved, "link", lambda self, _: self.folder.piece(2).exists()),
+        "packing": (ProcessExecutor, "submit", lambda self, *call: call[-1] == 2),
+        "joining": (ProcessExecutor, "submit", lambda self, call, *_: "_join" in repr(call)),
+    }[what]
+    monkeypatch.setattr(owner, name, failing(getattr(owner, name), is_due))
+    numbers = [len(sent) // 2, len(sent) - 5]
+    acts = dict.fromkeys(numbers, Recorder.snapshot)
+    summary, times = looked_back([drive], tmp_path / "live", acts, and_then=MORE)
+    (made,) = summary.datasets
+    assert again(made.dataset) == due(sent, times[1])
+    folders = sorted(tmp_path.glob("live*.recording"))
+    assert len(folders) == len(summary.failed) == (2 if what == "a link" else 1)
+    found: set[Row] = set()
+    assert any(f"{one}: " in summary.warnings[0] for one in folders)
+    for folder in folders:
+        assert any(f"Then run: mp4ds pack --salvage {folder} -o " in one for one in summary.failed)
+        mp4ds.pack(folder, folder.with_suffix(""), PackOptions(salvage=True))
+        rows = again(folder.with_suffix(""))
+        assert len(rows) == len({*rows})
+        found |= {*rows}
+    assert {*due(sent, times[0])} <= found <= {*sent}
+
+
+def test_names_that_others_take_meanwhile(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a second recorder with the same name and trigger: the next number is taken."""
+    monkeypatch.setattr(record, "_TIME", "now")
+    monkeypatch.setattr(os.path, "lexists", lambda path: False)  # not yet
+    (tmp_path / "live_now.recording").mkdir()
+    (tmp_path / "live_now_2.recording").mkdir()
+    sent = messages(drive)
+    numbers = [len(sent) // 2, len(sent) - 5]
+    summary, _ = looked_back([drive], tmp_path / "live", dict.fromkeys(numbers, Recorder.snapshot))
+    assert [one.dataset.name for one in summary.datasets] == ["live_now_3", "live_now_4"]
+
+
 def test_a_clock_that_jumps_back(drive: Path, tmp_path: Path) -> None:
     """As of a simulation that starts over: what is saved ends there, and old pieces go."""
     sent = messages(drive)
@@ -202,6 +262,7 @@ def test_a_clock_that_jumps_back(drive: Path, tmp_path: Path) -> None:
     summary, times = looked_back([drive], tmp_path / "live", acts, and_then=60, node=altering)
     before, after = (again(one.dataset) for one in summary.datasets)
     begin = times[0] - round(KEEP * S)
+    assert "the clock has jumped" in summary.warnings[0]
     assert before == [
         (topic, time + 3600 * S, data)
         for topic, time, data in sent
@@ -220,6 +281,7 @@ def test_a_clock_that_jumps_back(drive: Path, tmp_path: Path) -> None:
         ({"max_duration": 60}, "contradicts"),
         ({"max_splits": 2}, "contradicts"),  # it would delete what was saved
         ({"keep_last": 0}, "more than 0"),
+        ({"repeat_latched": True}, "saves latched messages with each dataset"),
         ({"trigger": ["/battery:percentage=0.2"]}, "neither TOPIC nor TOPIC:FIELD>VALUE"),
         ({"trigger": ["/battery:a..b>0"]}, "neither TOPIC nor TOPIC:FIELD>VALUE"),
         ({}, "cannot link files"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import subprocess
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import Any
 import pytest
 
 import mp4ds
-from commands import program
 from conftest import real
 from mp4ds.bags.formats import open_reader
 from mp4ds.records import Message
@@ -194,6 +194,17 @@ def test_without_a_master(tmp_path: Path) -> None:
     if why := missing():
         pytest.skip(why)
     env = {"PATH": "/usr/bin:/bin", "ROS_MASTER_URI": "http://127.0.0.1:1/"}
-    done = program(*ours(tmp_path / "live", "-a"), env=env, code=1)
-    assert "no ROS master answers" in done.err
+    command = ours(tmp_path / "live", "-a", "--keep-last", "60s")
+    process = subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True)
+    status = Path("/proc", str(process.pid), "status")
+
+    def is_ignored() -> bool:
+        mask = status.read_text().partition("SigIgn:")[2].split()[0]
+        return bool(int(mask, 16) >> (signal.SIGUSR1 - 1) & 1)
+
+    until(is_ignored, process)
+    process.send_signal(signal.SIGUSR1)  # a trigger that comes too early
+    _, said = process.communicate(timeout=WATCHDOG_S)
+    assert process.returncode == 1
+    assert "no ROS master answers" in said
     assert not list(tmp_path.iterdir())

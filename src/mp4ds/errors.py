@@ -147,10 +147,13 @@ class TargetError(PathError, OSError):
 class TargetExistsError(TargetError, FileExistsError):
     """The output exists and ``force`` was not given."""
 
-    def __init__(self, path: Path | str) -> None:
-        super().__init__(
-            path, "already exists", "Choose another name, or use `force` to replace it."
-        )
+    def __init__(
+        self,
+        path: Path | str,
+        problem: str = "already exists",
+        remedy: str = "Choose another name, or use `force` to replace it.",
+    ) -> None:
+        super().__init__(path, problem, remedy)
 
 
 class OptionError(Mp4dsError, ValueError):

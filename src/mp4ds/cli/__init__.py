@@ -201,6 +201,8 @@ _MOST_FILES = 65_536
 
 def prepare_process() -> None:
     """Make the process ready, before numpy is imported."""
+    if "record" in sys.argv[1:] and hasattr(signal, "SIGUSR1"):  # Windows has none
+        signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until there is something to save
     # no matrices are multiplied here, and idle threads cost time
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(20_000)  # imports create many objects but no garbage

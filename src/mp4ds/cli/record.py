@@ -127,9 +127,10 @@ def record_command(
                 else "interrupted; everything recorded is in datasets"
             ) from None
     show(summary, _print)
-    if options.keep_last and not summary.datasets:
+    if options.keep_last and not summary.datasets and not summary.failed:
         say("nothing was saved: there was no trigger")
-    if summary.dropped or summary.lost or summary.untimed or summary.is_short_of_space:
+    is_whole = not (summary.dropped or summary.lost or summary.untimed or summary.failed)
+    if not is_whole or summary.is_short_of_space:
         raise click.exceptions.Exit(1)
 
 
@@ -189,6 +190,8 @@ def _print(summary: RecordSummary) -> None:
         topics = ", ".join(topic.topic for topic in made.topics)
         why = f"no message arrived on {topics}" if topics else "no matching topic was published"
         say(f"{path_text(made.dataset)}: empty: {why}")
+    for problem in summary.failed:
+        say(problem)
     for topic, count in summary.dropped.items():
         say(f"{topic}: {counted(count, 'message')} dropped: the buffer was full")
     for topic, count in summary.lost.items():

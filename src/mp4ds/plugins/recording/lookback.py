@@ -7,17 +7,18 @@ much time of the processor, and spare no writing.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.latched import has_late, latched_before
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import with_own_payload
-from mp4ds.errors import TargetError
+from mp4ds.errors import TargetError, TargetExistsError
 from mp4ds.files.outputs import sync, sync_folder
 from mp4ds.format.manifest import Excerpt as SourceExcerpt
 from mp4ds.format.manifest import Source
@@ -26,6 +27,15 @@ from mp4ds.records import Channel, Excerpt, Message
 
 _PIECES = 10
 """Into so many a short window is divided, at least: how exactly the disk keeps to it."""
+
+_Made = TypeVar("_Made")
+
+
+def at_first_free(paths: Iterator[Path], make: Callable[[Path], _Made]) -> _Made:
+    """What is made at the first of endless paths that no other recorder takes meanwhile."""
+    while True:
+        with suppress(TargetExistsError):
+            return make(next(paths))
 
 
 class Saved(Split):
@@ -111,29 +121,41 @@ class LookBack(Split):
     Before a piece is removed, its latched messages go into piece 0, for the datasets to begin with.
     All that takes long, or reads, is done by a thread of its own, in order.
 
+    What cannot be saved stays in its folder.
+
     Args:
-        new_path: Gives the path of the next dataset.
+        target: Names its folder.
+        new_paths: Gives paths for the next dataset, endlessly.
         keep_ns: Log time to keep.
         more_ns: Log time after a trigger that is saved, too.
         spool: As for `Split`.
 
     Attributes:
         saved: The datasets, complete or not.
+        unsaved: Why something could not be saved, if so.
     """
 
     looks_back = True
 
     def __init__(
-        self, new_path: Callable[[], Path], keep_ns: int, more_ns: int, *spool: Any
+        self,
+        target: Path,
+        new_paths: Callable[[], Iterator[Path]],
+        keep_ns: int,
+        more_ns: int,
+        *spool: Any,
     ) -> None:
         self.saved: list[Saved] = []
+        self.unsaved: Exception | None = None
+        self._unsaved_spans: list[tuple[int, int]] = []  # log times, ns
+        self._time = 0  # the latest log time, ns
         self._saving: list[Saved] = []  # those that get more pieces
         self._kept: deque[Piece] = deque()  # that are complete
-        self._new_path = new_path
+        self._new_paths = new_paths
         self._keep_ns, self._more_ns = keep_ns, more_ns
         self._spool = spool
         self._keeper = ThreadPoolExecutor(1, "look-back")
-        super().__init__(new_path(), *spool)
+        super().__init__(target, *spool)
         self._window_ns = min(WINDOW_NS, keep_ns // _PIECES)
         self._close_piece(self._open.pop())
         self._check_links()
@@ -173,6 +195,9 @@ class LookBack(Split):
         """
         if self.error is not None:
             raise self.error
+        if self._span and abs(time - self._time) > self._keep_ns:
+            self._warn("the clock has jumped: of the time before, no more is looked back at")
+        self._time = time
         for saved in [one for one in self._saving if not one.start <= time < one.end]:
             if saved.is_over:
                 continue
@@ -184,24 +209,26 @@ class LookBack(Split):
         self._complete_until(time)
 
     def save(self, time: int, announced: Iterable[Channel]) -> None:
-        """Save what there is before a log time, ns, and what comes soon after.
-
-        Raises:
-            Mp4dsError: It cannot be saved.
-        """
+        """Save what there is before a log time, ns, and what comes soon after."""
         self._prune(time)
         start, end = max(0, time - self._keep_ns), time + self._more_ns
-        saved = Saved(start, end, self._new_path(), *self._spool)
+        try:
+            saved = at_first_free(
+                self._new_paths(), lambda path: Saved(start, end, path, *self._spool)
+            )
+        except FAILURES as error:
+            self._keep_unsaved(start, end, error)
+            return
         self.saved.append(saved)
         self._saving.append(saved)
-        self._later(saved.begin, self.folder.piece(0), [*self._kept], [*announced])
+        self._for(saved, saved.begin, self.folder.piece(0), [*self._kept], [*announced])
         for piece in self._open:
             self._include(saved, piece)
 
     def _include(self, saved: Saved, piece: Piece) -> None:
         if piece.start < saved.end:
             saved.awaited.add(piece.number)
-            self._later(saved.link, piece)
+            self._for(saved, saved.link, piece)
 
     def _begin(self, start: int) -> Piece:
         piece = super()._begin(start)
@@ -215,14 +242,14 @@ class LookBack(Split):
         self._kept.append(piece)
         for saved in [one for one in self._saving if piece.number in one.awaited]:
             saved.awaited.remove(piece.number)
-            self._later(saved.take, piece)
+            self._for(saved, saved.take, piece)
             self._finish(saved)
         self._prune(max(piece.span[1], piece.start))
 
     def _finish(self, saved: Saved) -> None:
         if saved.is_over and not saved.awaited:
             self._saving.remove(saved)
-            self._later(saved.finish)
+            self._for(saved, saved.finish)
 
     def _prune(self, time: int) -> None:
         """Remove the pieces that are too old at a log time, ns, or from before a clock's jump."""
@@ -245,7 +272,7 @@ class LookBack(Split):
         for saved in [*self._saving]:
             saved.is_over = True
             self._finish(saved)
-        self._later(self._remove)
+        self._later(self._remove, [*self._kept])
         self._keeper.shutdown()
         if self.error is not None:
             raise self.error
@@ -267,8 +294,33 @@ class LookBack(Split):
 
         self._keeper.submit(run)
 
+    def _for(self, saved: Saved, call: Callable[..., None], *arguments: Any) -> None:
+        """Do something for a dataset later; if it fails, its messages stay, and all goes on."""
+
+        def run() -> None:
+            try:
+                call(*arguments)
+            except FAILURES as error:
+                saved.error = saved.error or error
+                self._keep_unsaved(saved.start, saved.end, error)
+
+        self._later(run)
+
+    def _keep_unsaved(self, start: int, end: int, error: Exception) -> None:
+        self.unsaved = error
+        self._unsaved_spans.append((start, end))
+        self._warn(f"{self.folder.path}: keeps what could not be saved: {error}")
+
+    @property
+    def _latched_before_unsaved(self) -> Path:
+        return self.folder.piece(0).with_suffix(".before")
+
     def _forget(self, piece: Piece) -> None:
-        """Remove a piece but for its latched messages."""
+        """Remove a piece but for its latched messages; keep it if it could not be saved."""
+        first, last = piece.span
+        is_kept = any(first < end and start <= last for start, end in self._unsaved_spans)
+        if is_kept and not self._latched_before_unsaved.exists():
+            self._latched_before_unsaved.hardlink_to(self.folder.piece(0))
         if any(map(has_late, piece.channels.values())):
             before = self.folder.piece(0)
             new = before.with_suffix(".new")
@@ -287,9 +339,17 @@ class LookBack(Split):
             sync_folder(new.parent)  # or the piece before this might be there again
             new.replace(before)
             sync_folder(new.parent)
-        piece.writer.path.unlink()
+        if not is_kept:
+            piece.writer.path.unlink()
 
-    def _remove(self) -> None:
+    def _remove(self, kept: Sequence[Piece] = ()) -> None:
+        if self.unsaved is not None:
+            for piece in kept:
+                self._forget(piece)
+            with suppress(FileNotFoundError):  # nothing came in its time
+                self._latched_before_unsaved.replace(self.folder.piece(0))
+            self.lock.close()
+            return
         for number in range(self._count):
             self.folder.piece(number).unlink(missing_ok=True)
         self.lock.close()

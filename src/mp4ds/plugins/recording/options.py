@@ -69,14 +69,14 @@ class RecordOptions(NodeOptions):
         only=("ros1",),
     )
     limit: int | None = option(
-        "Record so many messages of each topic, and stop when all have them.",
+        "Record at most N messages of each topic; stop when all topics have them.",
         None,
         "-l",
         panel=WHAT,
         least=1,
     )
     duration: Parsed[float | None] = option(
-        "Stop after so many seconds; also 5m, 2h.",
+        "Stop after this long: seconds, 5m or 2h.",
         None,
         "--duration",
         panel=WHAT,
@@ -102,12 +102,12 @@ class RecordOptions(NodeOptions):
         panel=WHAT,
     )
     max_splits: int | None = option(
-        "Keep so many of these datasets, and delete the oldest ones that this recorder has made.",
+        "Keep at most N datasets; delete the oldest ones of this recorder.",
         panel=WHAT,
         least=1,
     )
     repeat_latched: bool = option(
-        "Begin each of these datasets with the latest latched messages.", False, panel=WHAT
+        "Begin each dataset after a split with the latest latched messages.", False, panel=WHAT
     )
     min_space: Parsed[int | None] = option(
         "Stop when the file system has less free space than this, such as 1G.",
@@ -117,7 +117,7 @@ class RecordOptions(NodeOptions):
         parse=parse_size,
     )
     keep_last: Parsed[float | None] = option(
-        "Look back: keep so many seconds (60s, 5m), and save them as a dataset at each trigger.",
+        "Keep only the last seconds (60s, 5m), and save them as a dataset at each trigger.",
         None,
         "--keep-last",
         panel=WHAT,

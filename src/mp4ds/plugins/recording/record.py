@@ -24,7 +24,7 @@ from mp4ds.format.sidecars import load_about
 from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.spool import remove_dataset
-from mp4ds.plugins.recording.lookback import LookBack
+from mp4ds.plugins.recording.lookback import LookBack, at_first_free
 from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.receiving import MessageBuffer, Source, TopicProgress
 from mp4ds.plugins.recording.spool import Split, sync_all
@@ -93,6 +93,7 @@ class RecordSummary:
 
     Attributes:
         datasets: One entry per dataset made.
+        failed: Looking back, why something that was to be saved is no dataset, and where it is.
         seconds: Duration of the recording.
         dropped: Messages dropped because the buffer was full, by topic.
         lost: Messages lost, as reported by the middleware, by topic.
@@ -102,6 +103,7 @@ class RecordSummary:
     """
 
     datasets: list[PackSummary] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
     seconds: float = 0.0
     dropped: dict[str, int] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
@@ -193,6 +195,10 @@ def _check(options: RecordOptions) -> None:
         options.max_duration or options.max_size or options.max_splits
     ):
         raise OptionError("`keep_last` contradicts `max_duration`, `max_size` and `max_splits`.")
+    if options.keep_last is not None and options.repeat_latched:
+        raise OptionError(
+            "`keep_last` saves latched messages with each dataset: leave out `repeat_latched`."
+        )
     if options.keep_last == 0:
         raise OptionError("`keep_last` must be more than 0 seconds.")
     if options.about is not None:
@@ -347,13 +353,18 @@ class Recorder:
             for split in self._all_splits:
                 split.lock.close()
         for split in self._all_splits:
-            if error := split.error or (self._error if split.made is None else None):
+            error = split.error or (self._error if split.made is None else None)
+            if error and (self._look_back is None or self._error is not None):
                 raise split.failure(error)
         if self._error is not None:
             raise self._error
         received = self._buffer.topics
+        failed = [one.left(one.error) for one in self._all_splits if one.error]
+        if self._look_back and self._look_back.unsaved:
+            failed.append(self._look_back.left(self._look_back.unsaved))
         return RecordSummary(
             datasets=[split.made for split in self._all_splits if split.made],
+            failed=[str(error) for error in failed],
             seconds=time.monotonic() - begun,
             dropped={name: one.dropped for name, one in received.items() if one.dropped},
             lost=dict(self._source.lost),
@@ -431,21 +442,22 @@ class Recorder:
         if now >= self._quiet_until and self.snapshot():
             self._quiet_until = now + max(_QUIET_S, self._options.and_then or 0)
 
-    def _new_path(self) -> Path:
-        """The path of the next dataset that is saved, where nothing is."""
+    def _new_paths(self) -> Iterator[Path]:
+        """Paths for the next dataset that is saved, where nothing is."""
         stem = f"{self._target.name}_{datetime.now():{_TIME}}"
         for number in count():
             path = self._target.with_name(f"{stem}_{number}" if number else stem)
             if not (os.path.lexists(path) or os.path.lexists(f"{path}{UNFINISHED}")):
-                return path
-        raise AssertionError
+                yield path
 
     def _begin_split(self) -> None:
         node, warn = self._node, self._source.warn
         spool = self._options, node.world, self._others, self._process, self._jobs, warn
         if self._options.keep_last:
-            spans = (self._options.keep_last, self._options.and_then or 0)
-            self._look_back = LookBack(self._new_path, *(round(s * _NS) for s in spans), *spool)
+            spans = [round(s * _NS) for s in (self._options.keep_last, self._options.and_then or 0)]
+            self._look_back = at_first_free(
+                self._new_paths(), lambda path: LookBack(path, self._new_paths, *spans, *spool)
+            )
             self._splits.append(self._look_back)
             return
         number, target = len(self._splits), self._target

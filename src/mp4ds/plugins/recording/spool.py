@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from mp4ds.bags.mcap import McapWriter
-from mp4ds.errors import Mp4dsError, TargetError, WriteError, path_text
+from mp4ds.errors import Mp4dsError, TargetExistsError, WriteError, path_text
 from mp4ds.files.outputs import check_target, sync, sync_folder
 from mp4ds.files.sources import RECORDING_NAME, UNFINISHED, salvage_command
 from mp4ds.format.manifest import Source
@@ -141,7 +141,7 @@ class Split:
                 piece.writer.add_metadata(record)
             self.flush()
         except FileExistsError:
-            raise TargetError(
+            raise TargetExistsError(
                 self.folder.path,
                 "already exists: a recording of this name was not finished",
                 "Choose another name, or recover that one first: "
@@ -308,6 +308,7 @@ class Split:
             self.folder.remove(self._count)
         except FAILURES as error:
             self.error = error
+            self._warn(f"{self.folder.path}: the dataset could not be made: {error}")
 
     def _sources(self) -> list[Source]:
         """What the dataset is a slice of."""
@@ -317,6 +318,10 @@ class Split:
         """What to raise because of an error; what was recorded stays where it is."""
         if isinstance(error, Mp4dsError) and error is not self.error:  # of the recorder
             return error
+        return self.left(error)
+
+    def left(self, error: Exception) -> WriteError:
+        """The error, with where its messages are, and how they become a dataset."""
         path, target = (shlex.quote(path_text(path)) for path in (self.folder.path, self.target))
         left = f"It holds what was recorded. Then run: mp4ds pack --salvage {path} -o {target}"
         return WriteError(self.folder.path, error, left)
