@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -446,6 +447,32 @@ def test_a_buffer_that_is_full(tmp_path: Path) -> None:
     with pytest.raises(EOFError):
         buffer.take(0.0)
     assert buffer.topics[message.channel.topic].messages == 5
+
+
+def test_a_disk_that_is_too_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was sent is there, or was dropped and counted: by topic, here and in the dataset."""
+    paths = write(tmp_path, of=scene("mono8", frames=40, width=256, height=256))
+    sent = Counter(message.channel.topic for message in messages(paths))
+    all_sent, write_message = threading.Event(), McapWriter.write
+
+    def wait_and_write(self: McapWriter, message: Message) -> None:
+        assert all_sent.wait(WATCHDOG_S)
+        write_message(self, message)
+
+    monkeypatch.setattr(McapWriter, "write", wait_and_write)
+    options = RecordOptions(all=True, buffer=1)
+    with played(node := PlayedNode(paths), (), tmp_path / "live", options) as recorder:
+        node.stop = lambda: (all_sent.set(), recorder.stop())
+        summary = recorder.run()
+    (made,) = summary.datasets
+    kept = Counter({one.topic: one.messages for one in made.topics})
+    assert summary.dropped["/cam/image_raw"] > 20
+    assert kept + Counter(summary.dropped) == sent
+    with mp4ds.open(tmp_path / "live") as dataset:
+        assert {tuple(one.topics): one.messages for one in dataset.manifest.losses} == {
+            (topic,): count for topic, count in summary.dropped.items()
+        }
+    assert mp4ds.validate(tmp_path / "live", deep=True) == []
 
 
 def test_times_that_no_recording_can_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

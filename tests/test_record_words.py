@@ -107,6 +107,8 @@ ALL = {"all": True}
         ),
         ("--ros2 -a -f cdr", ALL),
         ("--ros2 -a --snapshot-mode", {"keep_last": 60} | ALL),
+        ("--ros2 -a --snapshot-mode --max-cache-duration 5", {"keep_last": 5} | ALL),
+        ("--ros2 -a --max-cache-duration 5", ALL),
         ("-a --keep-last 90s --and-then 2m", {"keep_last": 90, "and_then": 120} | ALL),
         ("-a --keep-last 5 --trigger /go", {"keep_last": 5, "trigger": ("/go",)} | ALL),
     ],

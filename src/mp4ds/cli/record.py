@@ -67,6 +67,7 @@ _KEPT_S = 60.0
 @option("--size", type=int, hidden=True)
 @option("--snapshot-mode", "snapshots", is_flag=True, hidden=True)
 @option("--max-cache-size", "cache", type=int, hidden=True)
+@option("--max-cache-duration", "kept", type=float, default=_KEPT_S, hidden=True)
 @accepted("-j", "--bz2", "--lz4", "--tcpnodelay")
 @accepted("--storage", "--storage-preset-profile", "--storage-config-file", values=1)
 @accepted("--compression-mode", "--compression-format", "--chunksize", values=1)
@@ -82,6 +83,7 @@ def record_command(
     size: int | None,
     snapshots: bool,
     cache: int | None,
+    kept: float,
     ros: RosOptions,
     options: RecordOptions,
 ) -> None:
@@ -106,7 +108,7 @@ def record_command(
     if cache is not None:
         options = replace(options, buffer=max(1, cache // _MB))
     if snapshots and options.keep_last is None:
-        options = replace(options, keep_last=_KEPT_S)
+        options = replace(options, keep_last=kept)
     with ExitStack() as stack:
         report = stack.enter_context(node_progress(_rows, _warnings, is_shown=ros.progress))
         # a launch file cannot leave out an argument: an empty one is none

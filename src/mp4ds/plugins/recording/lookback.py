@@ -23,7 +23,7 @@ from mp4ds.files.outputs import sync, sync_folder
 from mp4ds.format.manifest import Excerpt as SourceExcerpt
 from mp4ds.format.manifest import Source
 from mp4ds.plugins.recording.spool import FAILURES, WINDOW_NS, Piece, Split, sync_all
-from mp4ds.records import Channel, Excerpt, Message
+from mp4ds.records import Channel, Excerpt, Loss, Message
 
 _PIECES = 10
 """Into so many a short window is divided, at least: how exactly the disk keeps to it."""
@@ -258,11 +258,12 @@ class LookBack(Split):
             self._packed_bytes += piece.bytes
             self._later(self._forget, piece)
 
-    def close(self, announced: Iterable[Channel]) -> None:
+    def close(self, announced: Iterable[Channel], losses: Sequence[Loss] = ()) -> None:
         """End all datasets, and remove what is in none of them.
 
         Args:
             announced: Channels, some of which may have no messages.
+            losses: What came and is not there; in which of the datasets, is not known.
 
         Raises:
             OSError: It cannot be written.

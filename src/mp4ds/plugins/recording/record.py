@@ -6,7 +6,7 @@ import os
 import shutil
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
@@ -38,7 +38,7 @@ from mp4ds.plugins.ros.node import (
     quick_switches,
 )
 from mp4ds.processes import ProcessExecutor
-from mp4ds.records import Channel, Message, MetadataRecord
+from mp4ds.records import Channel, Loss, Message, MetadataRecord
 from mp4ds.times import INT64_MAX
 from mp4ds.video.codecs import check_codec
 
@@ -276,6 +276,7 @@ class Recorder:
         self._look_back: LookBack | None = None
         self._triggers: deque[tuple[int, int]] = deque()  # times, and how many messages are before
         self._quiet_until = 0.0
+        self._told_dropped: Counter[str] = Counter()  # messages, by topic
         self._process = ProcessExecutor(1, nice=_NICE)
         self._jobs = ThreadPoolExecutor(1, "packing")  # waits for the process
         self._counted: dict[str, tuple[float, TopicProgress]] = {}  # when, and what
@@ -515,9 +516,17 @@ class Recorder:
         return [path for split in self._splits for path in split.written()]
 
     def _close_split(self) -> None:
-        self._splits[-1].close(self._announced())
+        self._splits[-1].close(self._announced(), self._newly_dropped())
         if most := self._options.max_splits:
             self._jobs.submit(self._remove_old, most)  # when it is made
+
+    def _newly_dropped(self) -> list[Loss]:
+        """Messages that were dropped since the last dataset."""
+        topics = dict(self._buffer.topics)
+        counts = Counter({topic: one.dropped for topic, one in topics.items()})
+        new, self._told_dropped = counts - self._told_dropped, counts
+        name, problem = self._splits[-1].target.name, "dropped: the recorder's buffer was full"
+        return [Loss(name, None, None, problem, new[topic], (topic,)) for topic in sorted(new)]
 
     def _remove_old(self, most: int) -> None:
         """Remove the oldest datasets that were made but for so many."""

@@ -32,7 +32,7 @@ from mp4ds.packing.spool import SpoolFolder, SpoolSettings
 from mp4ds.plugins.recording.options import RecordOptions
 from mp4ds.plugins.ros.node import World
 from mp4ds.processes import ProcessExecutor
-from mp4ds.records import Channel, Message, MetadataRecord
+from mp4ds.records import Channel, Loss, Message, MetadataRecord
 from mp4ds.times import INT64_MAX
 
 _NS = 10**9
@@ -124,6 +124,7 @@ class Split:
         self._open: list[Piece] = []  # all but the newest take what is late
         self._closed = [self.folder.path / RECORDING_NAME]  # since `written` told of them
         self._count = 0  # of pieces
+        self._losses: Sequence[Loss] = ()
         check_target(target, force=options.force, owned=dataset_files)
         settings = SpoolSettings(
             format="bag" if profile == "ros1" else "rosbag2",
@@ -252,15 +253,17 @@ class Split:
         self._close_piece(piece)
         self._jobs.submit(self._pack, piece)
 
-    def close(self, announced: Iterable[Channel]) -> None:
+    def close(self, announced: Iterable[Channel], losses: Sequence[Loss] = ()) -> None:
         """Complete all pieces, and have the dataset made when they are packed.
 
         Args:
             announced: Channels, some of which may have no messages.
+            losses: What came and is not there.
 
         Raises:
             OSError: It cannot be written.
         """
+        self._losses = losses
         for channel in announced:
             self._open[-1].writer.add_channel(channel)
         while self._open:
@@ -298,7 +301,13 @@ class Split:
         if self.error is not None:
             return
         options = self._options
-        join = partial(_join, force=options.force, about=options.about, sources=self._sources())
+        join = partial(
+            _join,
+            force=options.force,
+            about=options.about,
+            sources=self._sources(),
+            losses=self._losses,
+        )
         try:
             made = self._process.submit(join, self.folder.path, self._count, self.target).result()
             raw = self._raw_bytes
@@ -359,10 +368,11 @@ def _join(
     force: bool,
     about: str | None,
     sources: Sequence[Source],
+    losses: Sequence[Loss],
 ) -> PackSummary:
     """Make the dataset of all parts, which stay."""
     spool = SpoolFolder(folder)
     told = load_about(about) if about is not None else None
     with spool.locked(shared=True):
         parts = [spool.part(number) for number in range(count)]
-        return spool.join(parts, target, force=force, about=told, sources=sources)
+        return spool.join(parts, target, force=force, about=told, sources=sources, losses=losses)
