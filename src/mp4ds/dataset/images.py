@@ -147,8 +147,6 @@ class Images(ABC):
         format: str = "native",  # noqa: A002 - as users write it
         resize: Resize = None,
         crop: Crop = None,
-        *,
-        encoding: str | None = None,
     ) -> View:
         """A way of returning the frames.
 
@@ -156,8 +154,6 @@ class Images(ABC):
             format: See `Topic`.
             resize: See `Topic`.
             crop: See `Topic`.
-            encoding: What the pixels are, if their messages tell that better than the images'
-                encoding; of the same shape and type.
 
         Raises:
             OptionError: The format, crop or size is invalid, or not available for these frames.
@@ -169,12 +165,12 @@ class Images(ABC):
             )
         return view_of(
             self.topic,
-            ENCODINGS[encoding or self.encoding],
+            ENCODINGS[self.encoding],
             self.image_size,
             format=format,
             resize=resize,
             crop=crop,
-            shows_colours=self.shows_colours and encoding in (None, self.encoding),
+            shows_colours=self.shows_colours,
         )
 
     def pixels(self, picture: Picture, view: View, index: int, out: Pixels | None = None) -> Pixels:

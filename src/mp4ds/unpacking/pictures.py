@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from mp4ds.dataset.images import Images, VerbatimImages
 from mp4ds.dataset.rebuild import form_for
 from mp4ds.dataset.stream import Layer, Stream
 from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.views import Thinning, View
+from mp4ds.dataset.views import Thinning
 from mp4ds.errors import OptionError, Refused
 from mp4ds.format.fields import Choice, DecodedColumns, everything, marked, unbroken
 from mp4ds.format.models import Header, StreamSidecar
@@ -236,11 +236,11 @@ class ImageForm:
 
 
 Make = Callable[[Pixels], Given]
-"""Makes the new form of an image from its pixels in a view."""
+"""Makes the new form of an image from its pixels."""
 
 
-def _maker(stream: Stream, header: Header, form: ImageForm) -> tuple[View, Make]:
-    """How images with a header get their new form: the view of their pixels, and what makes it.
+def _maker(stream: Stream, header: Header, form: ImageForm) -> Make:
+    """What gives images with a header their new form.
 
     Raises:
         Refused: They have no such form; says why.
@@ -250,12 +250,10 @@ def _maker(stream: Stream, header: Header, form: ImageForm) -> tuple[View, Make]
     if is_inverse and len(header.prefix) != 2 * HEADER_BYTES:
         raise Refused("the parameters of its quantised depths are missing")
     recorded = encoding_of(sidecar, header)
-    view = stream.view(encoding=sidecar.image.encoding if is_inverse else recorded)
-    view = replace(view, scale=None)
     if form.kind == "raw":
         prefix = bytes.fromhex(header.prefix)
         as_metres = partial(metres_of, header=prefix) if is_inverse else None
-        return view, partial(raw_image, encoding=recorded, convert=as_metres)
+        return partial(raw_image, encoding=recorded, convert=as_metres)
     try:
         file = ImageFile(recorded, form.kind, quality=form.jpeg_quality)
     except OptionError:
@@ -263,7 +261,7 @@ def _maker(stream: Stream, header: Header, form: ImageForm) -> tuple[View, Make]
     told = format_of(recorded, form, has_mosaic=form.kind == "png")
     if form.in_place:
         told = header.format or ""
-    return view, lambda pixels: Given(CodedFields(told), file.encode(pixels))
+    return lambda pixels: Given(CodedFields(told), file.encode(pixels))
 
 
 def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
@@ -398,7 +396,7 @@ class Conversion:
 
     def _from_pixels(self, choice: Choice, verify: bool) -> Frames:
         """From raw images, checked against their digests."""
-        form, image, (_, make) = self.form, self.stream.sidecar.image, self._makers[0]
+        form, image, make = self.form, self.stream.sidecar.image, self._makers[0]
         size = {"width": image.width, "height": image.height, "step": image.step}
         fields = ImageFields(image.encoding, is_bigendian=image.is_bigendian, **size)
         for index, body in _bodies(self.stream, choice, verify):
@@ -419,8 +417,8 @@ class Conversion:
             is_strict = not stream.sidecar.keeps_packets
             for index, picture in stream.pictures(choice, is_strict=is_strict):
                 if picture is not None:
-                    view, make = self._makers[stream.columns.variant[index]]
-                    yield index, make(stream.pixels(picture, view, index))
+                    make = self._makers[stream.columns.variant[index]]
+                    yield index, make(stream.recorded_pixels(picture))
                     continue
                 packets = packets or files.enter_context(stream.open_packets())
                 yield index, stream.rebuilder.packet_payload(index, packets.packet(index))
