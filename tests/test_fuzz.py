@@ -40,7 +40,7 @@ def test_mutated_files_keep_the_rules(kinds: dict[str, Any], tmp_path: Path) -> 
     assert all(counts[name] for name in kinds)
 
 
-def test_a_connection_that_is_defined_anew_stays_the_first(tmp_path: Path) -> None:
+def test_a_connection_that_is_defined_anew_is_salvaged_as_two(tmp_path: Path) -> None:
     def connection(topic: bytes) -> tuple[Any, bytes]:
         return [(b"op", b"\7"), (b"conn", bytes(4)), (b"topic", topic)], b""
 
@@ -53,7 +53,7 @@ def test_a_connection_that_is_defined_anew_stays_the_first(tmp_path: Path) -> No
     path.write_bytes(fuzz_changes.build_bag([(b"lz4", records)], [connection(b"/a")]))
     out.mkdir()
     keys = fuzz_rules.read(path, salvage=True)
-    assert [key[0][0] for key in keys] == ["/a", "/a", "/a"]
+    assert [key[0][0] for key in keys] == ["/a", "/b", "/b"]
     assert fuzz_rules._check_pack(path, out, keys, "", salvage=True, deep=True)
 
 

@@ -409,7 +409,7 @@ def test_a_chunk_is_bounded_whatever_its_ratio(compression: str, tmp_path: Path)
     assert re.search(rf"declares {size} bytes but has \d+, over the limit of {GIB // 2}\.", refused)
     assert "set the environment variable MP4DS_MAX_DECOMPRESSED to a larger size" in refused
     problems = jail.records(path, salvage=True).problems
-    assert any("(MP4DS_MAX_DECOMPRESSED sets another)" in told for told in problems)
+    assert any("the limit (MP4DS_MAX_DECOMPRESSED sets another)" in told for told in problems)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,8 @@ import io
 import os
 import shutil
 from bz2 import BZ2Decompressor
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -141,6 +142,7 @@ _MACHINES: dict[str, Any] = {
     "lz4": lz4.frame.LZ4FrameDecompressor,
     "zstd": lambda: zstandard.ZstdDecompressor().decompressobj(),
 }
+_DAMAGE = (OSError, RuntimeError, EOFError, ValueError, zstandard.ZstdError)
 
 
 def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
@@ -154,10 +156,10 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
     Raises:
         DamageError: The data is damaged or of another size, or the compression is not known.
     """
-    return unpack_counted(compression, data, size)[0]
+    return _unpacked(compression, data, size)[0]
 
 
-def unpack_counted(compression: str, data: bytes | memoryview, size: int) -> tuple[bytes, int]:
+def _unpacked(compression: str, data: bytes | memoryview, size: int) -> tuple[bytes, int]:
     """The content of a compressed chunk, and how many bytes of the data it took."""
     if compression not in _MACHINES:
         raise DamageError(f"it is compressed with {compression!r}, which is not supported")
@@ -234,6 +236,79 @@ def _unzstd_unsized(data: bytes | memoryview) -> bytes:
     if not decompressor.eof or decompressor.unused_data or used < len(data):
         raise DamageError("zstd data is cut short, or holds more than one frame")
     return content.getvalue()
+
+
+# ---------------------------------------------------------------- damaged chunks
+
+_SMALL_PIECE = 64
+"""Bytes decompressed at a time from damaged data: the piece with the damage yields nothing."""
+
+_CLOSE = 16
+"""Bytes at the end, of a marker and a checksum, that are decompressed one by one."""
+
+_MAGIC = {b"BZh": "bz2", b"\x04\x22\x4d\x18": "lz4", ZSTD_MAGIC: "zstd"}
+
+
+def recover(compression: str, data: memoryview, size: int) -> tuple[bytes, int, str, bool]:
+    """Decompress as much as possible of a chunk.
+
+    Args:
+        compression: Its name: ``none`` or empty, ``bz2``, ``lz4`` or ``zstd``; if damaged, it is
+            inferred from the data.
+        data: As stored; may be cut short.
+        size: Expected size; no more is decompressed, and no more than data of this length can hold.
+
+    Returns:
+        What could be decompressed, from the beginning; bytes of the data that belong to it, 0 if
+        unknown; what is wrong, a phrase, empty if nothing is; and whether the content is correct,
+        though some of it may be missing.
+    """
+    if compression in ("", "none"):
+        content = bytes(data[:size])
+        problem = "" if len(content) == size else "a chunk is cut short"
+        return content, len(content), problem, True
+    most = most_held(len(data))
+    limit = f", the limit ({DECOMPRESSED} sets another)" if size > most else ""
+    size = min(size, most)
+    start = bytes(data[:4])
+    found = next((name for magic, name in _MAGIC.items() if start.startswith(magic)), compression)
+    if found not in _MACHINES:
+        problem = f"a chunk is compressed with {compression!r}, which is not supported"
+        return b"", 0, problem, True
+    with suppress(DamageError):
+        return (*_unpacked(found, data, size), "", True)
+    machine = _MACHINES[found]()
+    gathered = io.BytesIO()  # pieces in a list would need the memory twice
+    is_verified = found == "bz2"  # it has a checksum for each block
+    used, problem, is_sound = 0, f"the {found} data of a chunk is cut short", True
+    try:
+        for begin, end in _small_pieces(len(data)):
+            made = [machine.decompress(data[begin:end])]
+            while made[-1] and not machine.eof:  # bz2 compares a checksum with the last of a block
+                made.append(machine.decompress(b""))
+            gathered.writelines(made)
+            if gathered.tell() > size:
+                problem = f"the {found} data of a chunk unpacks to more than {size} bytes{limit}"
+                is_sound = is_verified
+                gathered.truncate(size)
+                break
+            if machine.eof:
+                used, problem = end - len(machine.unused_data or b""), ""
+                if gathered.tell() != size:
+                    problem = f"a chunk holds {gathered.tell()} bytes instead of {size}"
+                    is_sound = is_verified
+                break
+    except _DAMAGE:
+        problem, is_sound = f"the {found} data of a chunk is damaged", is_verified
+    return gathered.getvalue(), used, problem, is_sound
+
+
+def _small_pieces(length: int) -> Iterator[tuple[int, int]]:
+    body = max(0, length - _CLOSE)
+    for start in range(0, body, _SMALL_PIECE):
+        yield start, min(start + _SMALL_PIECE, body)
+    for start in range(body, length):
+        yield start, start + 1
 
 
 # ---------------------------------------------------------------- files compressed as a whole

@@ -381,8 +381,12 @@ def summary_place(stream: RecordStream) -> tuple[int, int]:
     return summary_start, checksum
 
 
-def read_summary(stream: RecordStream) -> McapSummary | None:
+def read_summary(stream: RecordStream, summary: McapSummary | None = None) -> McapSummary | None:
     """Read the summary section of a file; the stream's position is undefined afterwards.
+
+    Args:
+        stream: The file.
+        summary: An empty one to read into, which keeps what comes before damage.
 
     Returns:
         The summary, or None if the file has none, or it does not begin where the footer says.
@@ -395,7 +399,8 @@ def read_summary(stream: RecordStream) -> McapSummary | None:
     if not summary_start:
         return None
     stream.seek(summary_start)
-    summary = McapSummary(summary_start)
+    summary = summary or McapSummary()
+    summary.offset = summary_start
     while True:
         opcode, body = stream.next()
         if opcode == Opcode.FOOTER:

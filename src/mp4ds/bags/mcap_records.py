@@ -48,7 +48,7 @@ OF_SUMMARY = frozenset(
 CUT_SHORT_REMEDY = f"The recording was cut short: use `mcap recover`, or {SALVAGE}"
 FRAME = struct.Struct("<BQ")
 """Of a record: its opcode, and the length of its body."""
-CHUNK_HEAD = struct.Struct("<QQQII")
+_CHUNK_HEAD = struct.Struct("<QQQII")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Of a message: id of its channel, sequence number, log time, publish time."""
 
@@ -205,12 +205,12 @@ def unpack_chunk(body: bytes | memoryview) -> bytes | memoryview:
     """
     view = memoryview(body)
     try:
-        *_, size, crc, length = CHUNK_HEAD.unpack_from(view)
-        compression = str(view[CHUNK_HEAD.size :][:length], "utf-8")
-        (data_length,) = struct.unpack_from("<Q", view, CHUNK_HEAD.size + length)
+        *_, size, crc, length = _CHUNK_HEAD.unpack_from(view)
+        compression = str(view[_CHUNK_HEAD.size :][:length], "utf-8")
+        (data_length,) = struct.unpack_from("<Q", view, _CHUNK_HEAD.size + length)
     except (struct.error, UnicodeDecodeError):
         raise DamageError("a chunk is shorter than its fields") from None
-    data = view[CHUNK_HEAD.size + length + 8 :][:data_length]
+    data = view[_CHUNK_HEAD.size + length + 8 :][:data_length]
     if len(data) != data_length:
         raise DamageError("a chunk is shorter than its fields")
     content = unpack(compression, data, size) if compression else data

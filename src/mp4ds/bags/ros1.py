@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,6 +189,12 @@ def _damaged(path: Path, error: DamageError | OSError, place: str = "") -> Sourc
     if isinstance(error, OSError) and error.strerror:
         error = DamageError(f"it cannot be read: {error.strerror}")
     return unreadable(path, place, error, _COPY_AGAIN)
+
+
+def times_in(entries: NDArray[Any]) -> NDArray[np.int64]:
+    """The log times in an index, nanoseconds."""
+    times: NDArray[np.int64] = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
+    return times
 
 
 def connection_of(record: Fields, body: bytes) -> Channel:
@@ -560,7 +566,7 @@ def _sorted_index(raw: bytes | bytearray, chunk_runs: Sequence[int]) -> _Index:
     entries = np.frombuffer(raw, INDEX_ENTRY)
     runs = np.array(chunk_runs, np.int64).reshape(-1, 2)
     chunks = np.repeat(runs[:, 0].astype(np.int32), runs[:, 1])
-    times: NDArray[np.int64] = entries["sec"].astype(np.int64) * 10**9 + entries["nsec"]
+    times = times_in(entries)
     if times.max(initial=0) >= MAX_TIME:
         raise DamageError(
             "it has a message with a time past 2^32 seconds, which ROS cannot represent"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,9 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from mp4ds.bags.files import DamageError
+from mp4ds.bags.files import DamageError, recover
 from mp4ds.bags.mcap_index import McapSummary, read_summary, summary_place
 from mp4ds.bags.mcap_records import (
-    CHUNK_HEAD,
     FOOTER_BYTES,
     FRAME,
     MAGIC,
@@ -25,18 +25,11 @@ from mp4ds.bags.mcap_records import (
     PRIVATE_OPCODE,
     Declared,
     RecordStream,
+    chunk_records,
     parse,
     unpack_chunk,
 )
-from mp4ds.bags.salvage.scan import (
-    BLOCK,
-    FileSalvage,
-    Lose,
-    RecordFrame,
-    Scan,
-    Window,
-    chunk_problem,
-)
+from mp4ds.bags.salvage.scan import BLOCK, FileSalvage, Lose, RecordFrame, Scan, Window
 from mp4ds.errors import SourceError
 from mp4ds.records import Attachment, ChannelStats, Message, MetadataRecord
 
@@ -210,13 +203,17 @@ class _Scan(Scan):
 # ---------------------------------------------------------------- the summary
 
 
-def _read_summary(path: Path) -> McapSummary:
-    """The summary of a file; only its place if it is damaged, and nothing if that is unknown.
+def _read_summary(path: Path) -> tuple[McapSummary, McapSummary]:
+    """The summary of a file: where it matches its checksum, and as far as it can be read otherwise.
+
+    Returns:
+        The summary; only its place if it is damaged, and nothing if that is unknown. And a damaged
+        one up to the damage; empty for a sound one.
 
     Raises:
         SourceError: The file cannot be read.
     """
-    place = 0
+    place, read = 0, McapSummary()
     with (
         closing(RecordStream(path, MAX_RECORD_BYTES)) as stream,
         suppress(SourceError, DamageError),
@@ -224,9 +221,11 @@ def _read_summary(path: Path) -> McapSummary:
         found, checksum = summary_place(stream)
         if len(MAGIC) < found < stream.size - FOOTER_BYTES:
             place = found
-            if checksum in (0, _checksum(stream, place)):
-                return read_summary(stream) or McapSummary()
-    return McapSummary(place)
+            is_sound = checksum in (0, _checksum(stream, place))
+            is_found = read_summary(stream, read) is not None
+            if is_sound:
+                return (read if is_found else McapSummary()), McapSummary()
+    return McapSummary(place), read
 
 
 def _checksum(stream: RecordStream, start: int) -> int:
@@ -241,7 +240,64 @@ def _checksum(stream: RecordStream, start: int) -> int:
 
 # ---------------------------------------------------------------- a pass
 
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_MARGIN = 600 * 10**9  # ns; a damaged chunk may seem to end where the next one does
 _Found = Message | Attachment | MetadataRecord | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """The content recovered from a chunk.
+
+    Attributes:
+        content: Records.
+        is_plain: Whether it is not compressed.
+        head: Bytes of the chunk's body before its records.
+        used: Bytes of the chunk's body that were used, as far as known.
+        problem: What is wrong with it, a phrase; empty if nothing is.
+        is_doubtful: Whether the content may differ from what was recorded.
+        span: Earliest and latest log time that its messages can have, ns.
+        records: Opcodes and bodies, if verified by its checksum; otherwise empty.
+    """
+
+    content: bytes | memoryview
+    is_plain: bool
+    head: int
+    used: int
+    problem: str
+    is_doubtful: bool
+    span: tuple[int, int]
+    records: Sequence[tuple[int, memoryview]] = ()
+
+    @classmethod
+    def unpacked(cls, body: memoryview) -> _Chunk:
+        """Decompress the body of a chunk, which may be cut short."""
+        if len(body) < _CHUNK_HEAD.size + 8:
+            return cls(b"", False, 0, 0, "a chunk is cut short", False, (0, 0))
+        start, end, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
+        compression = bytes(body[_CHUNK_HEAD.size :][:name_length]).decode(errors="replace")
+        records = _CHUNK_HEAD.size + name_length
+        length = int.from_bytes(body[records : records + 8], "little")
+        is_plain = not compression
+        if is_plain:
+            start, end = start - _MARGIN, end + _MARGIN
+        if crc:
+            with suppress(DamageError):
+                content = unpack_chunk(body)
+                found = list(chunk_records(content))
+                used = records + 8 + length
+                span = (start, end)
+                return cls(content, is_plain, records + 8, used, "", False, span, found)
+        data, most = body[records + 8 :][:length], min(size, MAX_RECORD_BYTES)
+        content, used, damage, is_sound = recover(compression, data, most)
+        problem = damage
+        if crc and zlib.crc32(content) == crc:
+            problem = ""
+        elif crc and not problem:
+            problem = "a chunk does not match its checksum: what could be read of it may be altered"
+        used = records + 8 + used if used else 0
+        is_doubtful = bool(problem) and (not is_sound or not damage)
+        return cls(content, is_plain, records + 8, used, problem, is_doubtful, (start, end))
 
 
 def _message_count(statistics: mcap_records.Statistics | None) -> int | None:
@@ -277,7 +333,7 @@ class McapSalvage(FileSalvage):
         self._channels = declared.channels
         self._schemas = declared.schemas.values()
         self._skipped = declared.skipped
-        self._summary = _read_summary(path)
+        self._summary, self._doubtful = _read_summary(path)
         self._index_offset = self._summary.offset or None
         self._is_timed = self._summary.chunks.has_messages
         self._longest = most
@@ -312,7 +368,8 @@ class McapSalvage(FileSalvage):
         self._count = _message_count(summary.statistics)
         self._defined = set(summary.schemas)
         self._undefined: dict[int, int] = {}
-        self._chunk_end = 0  # of one whose records are in the file
+        # a damaged uncompressed chunk: where it begins and ends, and what is wrong
+        self._plain: tuple[int, int, str] | None = None
         if self._begins():
             self._read_header()
         ended = False
@@ -325,8 +382,10 @@ class McapSalvage(FileSalvage):
             else:
                 ended = False
                 yield from self._record(frame)
-            if self._window.offset >= self._chunk_end:  # else earlier messages may follow
+            if not self._tally.held:
                 yield None
+        self._leave_plain(Opcode.FOOTER)
+        yield from self._tally.settle()
         if not ended:
             self._tally.lost(self._window.offset, None, "the file ends before its footer")
         self._tally.close()
@@ -359,6 +418,9 @@ class McapSalvage(FileSalvage):
             self._lose(start, window.offset - start, "the last bytes are not those of an MCAP file")
 
     def _record(self, frame: RecordFrame) -> Iterator[_Found]:
+        self._leave_plain(frame.kind)
+        if frame.kind != Opcode.MESSAGE_INDEX and self._plain is None:
+            yield from self._tally.settle()
         if frame.kind == Opcode.CHUNK:
             yield from self._chunk(frame)
             return
@@ -368,11 +430,11 @@ class McapSalvage(FileSalvage):
             return
         try:
             if frame.kind == Opcode.MESSAGE:
-                yield from self._message(body, offset)
+                yield from self._take(body, offset, is_doubtful=self._plain is not None)
             elif frame.kind == Opcode.MESSAGE_INDEX:
                 self._listed(body, offset)
-            elif record := self._other(frame.kind, body):
-                yield record
+            else:
+                yield self._other(frame.kind, body)
         except DamageError as error:
             self._lose(offset, frame.size, str(error))
 
@@ -392,59 +454,91 @@ class McapSalvage(FileSalvage):
                 self._undefined[channel.id] = channel.schema_id
         return self._declared.other(opcode, body)
 
-    def _message(self, body: bytes | memoryview, offset: int) -> Iterator[Message]:
-        """A message, unless it is lost, as its channel is.
+    def _take(
+        self, body: bytes | memoryview, offset: int, *, is_doubtful: bool
+    ) -> Iterator[Message]:
+        """Yield a message, or hold it until an index confirms it.
 
         Raises:
             DamageError: It is shorter than its fields.
         """
         channel_id = int.from_bytes(body[:2], "little")
-        if channel_id not in self._declared.channels and len(body) >= MESSAGE_HEAD.size:
+        if is_doubtful and channel_id not in self._declared.channels:
+            return
+        message = self._message(channel_id, body, offset)
+        if message and is_doubtful:
+            self._tally.hold(channel_id, message)
+        elif message:
+            self._tally.gave(channel_id, message.log_time)
+            yield message
+
+    def _message(self, channel_id: int, body: bytes | memoryview, offset: int) -> Message | None:
+        """A message; None if it is lost.
+
+        Raises:
+            DamageError: It is shorter than its fields.
+        """
+        if not self._has_channel(channel_id) and len(body) >= MESSAGE_HEAD.size:
             self._tally.stray(channel_id)
             problem = f"messages of channel {channel_id}, whose record is missing"
             self._log.lost_of_kind(problem, offset, problem).add(1, ())
-            return
-        message = self._declared.message(body)
-        self._tally.gave(channel_id, message.log_time)
-        yield message
+            return None
+        return self._declared.message(body)
+
+    def _has_channel(self, channel_id: int) -> bool:
+        """Whether a channel is known; from a damaged summary as a last resort."""
+        record = self._doubtful.channels.get(channel_id)
+        if channel_id not in self._declared.channels and record is not None:
+            schema = self._doubtful.schemas.get(record.schema_id)
+            if schema is not None and schema.id not in self._defined:
+                self._defined.add(schema.id)
+                self._declared.add_schema(schema)
+            self._declared.add_channel(record)
+        return channel_id in self._declared.channels
 
     def _chunk(self, frame: RecordFrame) -> Iterator[_Found]:
-        """The messages of a compressed chunk.
-
-        The records of another are in the file like any other: damage to one does not hide others.
-        """
-        offset, used, problem = self._window.offset, 0, ""
+        """The messages of a chunk, as far as it can be decompressed."""
+        offset = self._window.offset
         have, proven = self._peek_chunk(frame)
-        body = have[frame.head :]
-        *_, crc, name_length = CHUNK_HEAD.unpack_from(body)
-        records = CHUNK_HEAD.size + name_length + 8
-        self._tally.open(None, offset + frame.size)
-        try:
-            content = unpack_chunk(body)
-            if not name_length:
-                self._tally.is_verified = crc != 0
-                self._enter(frame, records)
-                return
-            used = records + int.from_bytes(body[records - 8 : records], "little")
-            for part, data in self._inside(content):
-                if part.kind == Opcode.MESSAGE:
-                    yield from self._message(data, offset)
-                else:
-                    self._other(part.kind, data)
-        except DamageError as error:
-            problem = chunk_problem(error)
-            if not name_length:
-                if not self._scan.is_cut(frame):
-                    self._tally.doubt = f"{error}: what was read of it may be altered"
-                self._enter(frame, records)
-                return
-        self._leave_chunk(frame, frame.head + used, problem, proven=proven)
+        chunk = _Chunk.unpacked(have[frame.head :])
+        self._tally.open(None, offset + frame.size, chunk.span)
+        if chunk.is_plain and chunk.problem:
+            # Its records are in the file like any other: damage to one does not hide the others.
+            if chunk.is_doubtful:
+                self._plain = offset, offset + frame.size, chunk.problem
+            self._window.skip(frame.head + chunk.head)
+            return
+        problems = [chunk.problem] if chunk.problem else []
+        yield from self._content(chunk, offset, problems)
+        used = frame.head + chunk.used
+        self._leave_chunk(frame, used, problems, proven=proven, whole=not chunk.problem)
 
-    def _enter(self, frame: RecordFrame, records: int) -> None:
-        self._chunk_end = self._window.offset + frame.size
-        self._window.skip(frame.head + records)
+    def _leave_plain(self, kind: int) -> None:
+        """At the end of a damaged uncompressed chunk, record the damage if nothing else did."""
+        if self._plain is None:
+            return
+        start, end, problem = self._plain
+        offset = self._window.offset
+        if offset < end and kind not in self._scan.outer:
+            return
+        self._plain = None
+        if not self._tally.losses:
+            self._lose(start, min(offset, end) - start, problem)
+
+    def _content(self, chunk: _Chunk, offset: int, problems: list[str]) -> Iterator[_Found]:
+        """The records of a chunk."""
+        scanned = ((frame.kind, body) for frame, body in self._inside(chunk.content, problems))
+        for kind, body in chunk.records or scanned:
+            try:
+                if kind != Opcode.MESSAGE:
+                    self._other(kind, body)
+                else:
+                    yield from self._take(body, offset, is_doubtful=chunk.is_doubtful)
+            except DamageError as error:
+                problems.append(f"in a chunk, {error}")
 
     def _listed(self, body: bytes, offset: int) -> None:
         """Process a message index: what it lists was read, or is lost."""
         channel_id, length = struct.unpack_from("<HI", body)
-        self._tally.listed(channel_id, min(length, len(body) - 6) // 16, offset)
+        pairs = np.frombuffer(body, "<u8", count=min(length, len(body) - 6) // 8, offset=6)
+        self._tally.listed(channel_id, pairs[::2], offset)

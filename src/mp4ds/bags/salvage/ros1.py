@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from mp4ds.bags.files import DamageError, open_source, unpack_counted
+from mp4ds.bags.files import DamageError, open_source, recover
 from mp4ds.bags.protocols import later_starts
 from mp4ds.bags.ros1 import (
     CHUNK_COUNT,
@@ -21,8 +22,9 @@ from mp4ds.bags.ros1 import (
     connection_of,
     other_format,
     split_header,
+    times_in,
 )
-from mp4ds.bags.salvage.scan import FileSalvage, Lose, RecordFrame, Scan, Window, chunk_problem
+from mp4ds.bags.salvage.scan import FileSalvage, Lose, RecordFrame, Scan, Window
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record
 
@@ -110,6 +112,9 @@ class _Scan(Scan):
         return None
 
 
+_SEARCHED = 16 * 2**20
+
+
 def _connection(frame: RecordFrame, body: bytes) -> Channel | None:
     """The channel that a connection record declares; None if it is damaged."""
     try:
@@ -151,12 +156,14 @@ class Ros1Salvage(FileSalvage):
         return _Scan(window, lose)
 
     def _read_index(self) -> None:
-        """Read the index, if it is where the header says; an incomplete list of chunks is dropped.
+        """Read the index: all of it, or at least the connections found at the end of the file.
+
+        An incomplete list of chunks is dropped.
 
         Raises:
             SourceError: The bag is encrypted, or cannot be read.
         """
-        with Window(self.path) as window:
+        with Window.of_file(self.path) as window:
             window.skip(len(MAGIC))
             header, size = _Scan(window).here(), window.size
         chunks = None
@@ -173,10 +180,12 @@ class Ros1Salvage(FileSalvage):
         starts = {place: span[0] for place, (span, counts) in self._infos.items() if counts}
         places = np.array(list(starts), np.uint64)
         self._later = later_starts(places, np.array(list(starts.values()), np.uint64))
+        if not is_whole and self._due != 0:
+            self._search_connections(max(len(MAGIC), size - _SEARCHED))
 
     def _read_listed(self, offset: int) -> None:
         """Read the index at its expected place."""
-        with Window(self.path, offset) as window:
+        with Window.of_file(self.path, offset) as window:
             scan = _Scan(window)
             if scan.here() is None:
                 return
@@ -190,8 +199,24 @@ class Ros1Salvage(FileSalvage):
                     counts = body[: len(body) // CHUNK_COUNT.size * CHUNK_COUNT.size]
                     place = frame.fields.number(b"chunk_pos", 8)
                     self._infos[place] = span, dict(CHUNK_COUNT.iter_unpack(counts))
-                elif channel := _connection(frame, body):
-                    self._channels.setdefault(channel.id, channel)
+                else:
+                    self._declare(frame, body)
+
+    def _search_connections(self, offset: int) -> None:
+        """Search for connections from a byte on, if the index is not at its expected place."""
+        with Window.of_file(self.path, offset) as window:
+            scan = _Scan(window)
+            if offset > len(MAGIC):
+                scan.resync(offset, "", passed=0)
+            while frame := scan.next():
+                body = scan.body(frame)
+                if body is not None and frame.kind == Op.CONNECTION:
+                    self._declare(frame, body)
+
+    def _declare(self, frame: RecordFrame, body: bytes) -> None:
+        """Take a connection of the index, unless it is damaged; the first of a number counts."""
+        if channel := _connection(frame, body):
+            self._channels.setdefault(channel.id, channel)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
         """Counts and spans from the bag's index, including lost messages; otherwise empty."""
@@ -208,10 +233,14 @@ class Ros1Salvage(FileSalvage):
         """All messages, in the order of the file; None at each chunk."""
         self._listed_ahead = list(reversed(self._infos))
         self._contradicted: set[int] = set()
+        self._others: dict[tuple[object, ...], Channel] = {}
         self._begins()
         while frame := self._scan.next():
             self._found += 1
+            if frame.kind != Op.INDEX:
+                yield from self._tally.settle()
             yield from self._record(frame)
+        yield from self._tally.settle()
         if (self._due or 0) > self._window.offset:
             problem = f"the file ends before its index, which should begin at byte {self._due}"
             self._tally.lost(self._window.offset, None, problem)
@@ -237,6 +266,7 @@ class Ros1Salvage(FileSalvage):
         if frame.kind == Op.MESSAGE:
             message = self._message(frame, body, offset)
             if message:
+                self._tally.gave(frame.fields.number(b"conn"), message.log_time)
                 yield message
         elif frame.kind == Op.CONNECTION and not self._connect(frame, body):
             self._lose(offset, frame.size, "a connection record is damaged")
@@ -244,7 +274,7 @@ class Ros1Salvage(FileSalvage):
             self._listed(frame.fields, body, offset)
 
     def _message(self, frame: RecordFrame, body: bytes, offset: int) -> Message | None:
-        """A message, which is counted; None if it is lost."""
+        """A message; None if it is lost."""
         connection, log_time = frame.fields.number(b"conn"), frame.fields.time(b"time")
         channel = self._channels.get(connection)
         if log_time >= MAX_TIME:
@@ -260,16 +290,20 @@ class Ros1Salvage(FileSalvage):
             loss = self._log.lost_of_kind(connection, offset, problem)
             loss.add(1, ())
             return None
-        self._tally.gave(connection, log_time)
         return Message(channel, log_time, log_time, 0, body)
 
-    def _connect(self, frame: RecordFrame, body: bytes) -> bool:
-        """Take a connection record; False if it is damaged. The first of a number counts."""
+    def _connect(self, frame: RecordFrame, body: bytes, *, is_sure: bool = False) -> bool:
+        """Take a connection record; False if it is damaged."""
         channel = _connection(frame, body)
         if channel is None:
             return frame.fields.number(b"conn") in self._channels
         connection = channel.id
         if self._channels.setdefault(connection, channel).identity != channel.identity:
+            # a separate channel: messages of the other one may have been yielded already
+            if is_sure:
+                key = connection, channel.identity
+                other = replace(channel, id=2**32 + len(self._others))
+                self._channels[connection] = self._others.setdefault(key, other)
             problem = f"records of connection {connection} ({channel.topic}) contradict each other"
             if connection not in self._contradicted:
                 self._contradicted.add(connection)
@@ -277,33 +311,38 @@ class Ros1Salvage(FileSalvage):
         return True
 
     def _compressed(self, frame: RecordFrame) -> Iterator[Message]:
-        """The messages of a compressed chunk."""
-        offset, used, problem = self._window.offset, 0, ""
+        """The messages of a compressed chunk, as far as it can be decompressed."""
+        offset = self._window.offset
         have, proven = self._peek_chunk(frame)
         compression = frame.fields[b"compression"].decode(errors="replace")
         size = frame.fields.number(b"size")
-        try:
-            content, used = unpack_counted(compression, have[frame.head :], size)
-            for part, body in self._inside(content):
-                if part.kind == Op.MESSAGE:
-                    if message := self._message(part, body, offset):
-                        yield message
-                elif part.kind == Op.CONNECTION and not self._connect(part, body):
-                    raise DamageError("a connection record in it is damaged")
-        except DamageError as error:
-            problem = chunk_problem(error)
-        self._leave_chunk(frame, frame.head + used, problem, proven=proven)
+        content, used, problem, is_sound = recover(compression, have[frame.head :], size)
+        problems = [problem] if problem else []
+        for part, body in self._inside(content, problems):
+            if part.kind == Op.MESSAGE:
+                message = self._message(part, body, offset)
+                connection = part.fields.number(b"conn")
+                if message and is_sound:
+                    self._tally.gave(connection, message.log_time)
+                    yield message
+                elif message:
+                    self._tally.hold(connection, message)
+            elif part.kind == Op.CONNECTION and not self._connect(part, body, is_sure=not problems):
+                problems.append("a connection record is damaged")
+        used += frame.head
+        self._leave_chunk(frame, used, problems, proven=proven, whole=not problem)
 
     def _listed(self, fields: Fields, body: bytes, offset: int) -> None:
-        self._tally.listed(fields.number(b"conn"), len(body) // INDEX_ENTRY.itemsize, offset)
+        entries = np.frombuffer(body, INDEX_ENTRY, count=len(body) // INDEX_ENTRY.itemsize)
+        self._tally.listed(fields.number(b"conn"), times_in(entries), offset)
 
     def _enter(self, offset: int, end: int) -> None:
         """Begin a chunk that should end at a byte."""
         self._pass_listed(offset)
         if self._listed_ahead and self._listed_ahead[-1] == offset:
             self._listed_ahead.pop()
-        _, counts = self._infos.get(offset, (None, None))
-        self._tally.open(counts, end)
+        span, counts = self._infos.get(offset, (None, None))
+        self._tally.open(counts, end, span)
         self._earliest = self._later(offset - 1)
 
     def _pass_listed(self, end: int) -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import io
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
+from typing import Any, BinaryIO
+
+from numpy.typing import NDArray
 
 from mp4ds.bags.files import DECOMPRESSED, DamageError, OversizeError, open_source
 from mp4ds.bags.protocols import BagReader, HoldBack
@@ -30,26 +35,42 @@ class Window:
     """The part of a file ahead of the reader. A context manager.
 
     Args:
-        path: The file.
-        offset: Byte at which it begins.
+        source: A stream at byte `offset`.
+        path: Its name, for errors.
+        size: Bytes of the whole file.
+        offset: Position of the stream.
 
     Attributes:
         offset: Byte at which the window begins.
         size: Bytes of the whole file.
-
-    Raises:
-        SourceError: The file cannot be opened, is empty, or a git-lfs pointer.
     """
 
-    def __init__(self, path: Path, offset: int = 0) -> None:
-        self._source = open_source(path)
-        self._source.seek(offset)
+    def __init__(self, source: BinaryIO, path: Path, *, size: int, offset: int = 0) -> None:
+        self._source = source
         self._path = path
         self._data = b""
         self._at = 0
         self._ended = False
         self.offset = offset
-        self.size = path.stat().st_size
+        self.size = size
+
+    @classmethod
+    def of_file(cls, path: Path, offset: int = 0) -> Window:
+        """A window over a file.
+
+        Raises:
+            SourceError: It cannot be opened, is empty, or a git-lfs pointer.
+        """
+        stream = open_source(path)
+        stream.seek(offset)
+        return cls(stream, path, size=path.stat().st_size, offset=offset)
+
+    @classmethod
+    def of_content(cls, content: bytes) -> Window:
+        """A window over the decompressed content of a chunk."""
+        window = cls(io.BytesIO(), Path(), size=len(content))
+        window._data, window._ended = content, True
+        return window
 
     @property
     def left(self) -> int:
@@ -383,13 +404,16 @@ class LossLog:
 class Tally:
     """Messages read from a section of a file, usually a chunk, and those that an index lists.
 
+    Messages of a chunk with doubtful content are held until its index is read, and only those it
+    lists are returned: damaged data may decompress to something that only looks like messages.
+
     Args:
         log: Where losses are recorded.
         topic_of: The topic of a channel, None if unknown.
 
     Attributes:
+        held: The messages that are held, and their channels.
         losses: What was skipped of the section.
-        doubt: What is wrong with the section if nothing is found that it lacks, a phrase.
         is_verified: Whether the section is certainly complete: an index that says otherwise is
             wrong.
     """
@@ -397,6 +421,7 @@ class Tally:
     def __init__(self, log: LossLog, topic_of: Callable[[int], str | None]) -> None:
         self._log = log
         self._topic_of = topic_of
+        self.held: list[tuple[int, Message]] = []
         self._begin(None)
 
     def _begin(self, expected: Mapping[int, int] | None) -> None:
@@ -405,21 +430,28 @@ class Tally:
         self._strays: Counter[int] = Counter()
         self._index_is_whole = False
         self._listed: Counter[int] = Counter()
+        self._listed_times: Counter[tuple[int, int]] = Counter()  # only while messages are held
         self._end: int | None = None
-        self.doubt = ""
+        self._span: tuple[int, int] | None = None
         self.is_verified = False
         self.losses: list[Draft] = []
 
-    def open(self, expected: Mapping[int, int] | None, end: int) -> None:
-        """Begin a new section.
+    def open(
+        self,
+        expected: Mapping[int, int] | None,
+        end: int,
+        span: tuple[int, int] | None = None,
+    ) -> None:
+        """Begin a new section, once the previous one is settled.
 
         Args:
             expected: Messages by channel from an index at the end of the file, if any.
             end: Byte where it should end and its own index should begin.
+            span: Earliest and latest possible log time of its messages, ns, if known.
         """
         self.close()
         self._begin(expected)
-        self._end = end
+        self._end, self._span = end, span
 
     def extend(self, expected: Mapping[int, int] | None) -> None:
         """Another section begins within what is lost, and cannot be separated from this one."""
@@ -432,6 +464,25 @@ class Tally:
         """Count a message that was read, with its log time in ns."""
         self._log.gave(time)
         self._read[channel] += 1
+
+    def hold(self, channel: int, message: Message) -> None:
+        """Hold a message that may not be one."""
+        self.held.append((channel, message))
+
+    def settle(self) -> list[Message]:
+        """Decide which of the held messages to return."""
+        held, self.held = self.held, []
+        left, self._listed_times = self._listed_times, Counter()
+        first, last = self._span or (0, inf)
+        sound = []
+        for channel, message in held:
+            key = channel, message.log_time
+            is_listed = left[key] > 0
+            if is_listed if self._index_is_whole else first <= message.log_time <= last:
+                left[key] -= 1
+                sound.append(message)
+                self.gave(channel, message.log_time)
+        return sound
 
     def stray(self, channel: int) -> None:
         """Count a message of an unknown channel, separately from lost ones."""
@@ -448,15 +499,15 @@ class Tally:
             self._end = None
         return draft
 
-    def listed(self, channel: int, count: int, offset: int) -> None:
-        """Add the messages that an index at a byte lists."""
+    def listed(self, channel: int, times: NDArray[Any], offset: int) -> None:
+        """Add the messages that an index at a byte lists, by their log times, ns."""
         self._index_is_whole |= offset == self._end
-        self._listed[channel] += count
+        self._listed[channel] += len(times)
+        if self.held:
+            self._listed_times.update((channel, time) for time in times.tolist())
 
     def close(self) -> None:
         """End the section, and record what is lost of it."""
-        if self.doubt and not self.losses:
-            self._log.lost(None, None, self.doubt, join=False).add(0, ())
         indexes = [self._expected, self._listed if self._index_is_whole else None]
         found = [self._missing(index) for index in indexes if index is not None]
         if not found:
@@ -481,12 +532,6 @@ class Tally:
         return max(0, missing.total() - excess.total()), missing
 
 
-def chunk_problem(error: DamageError) -> str:
-    """What is wrong with a chunk, a phrase."""
-    limit = f" ({DECOMPRESSED} sets another)" if isinstance(error, OversizeError) else ""
-    return f"a chunk is damaged: {error}{limit}"
-
-
 def lost_by(error: DamageError) -> str:
     """What is wrong with messages whose payload cannot be decompressed, a phrase."""
     if isinstance(error, OversizeError):
@@ -502,8 +547,8 @@ class FileSalvage(BagReader):
 
     It never fails because of damage. For an intact recording, it gives the same as the usual
     reader. Messages come in log-time order if the index at the end of the file is readable, and
-    they are not too far out of it; otherwise in file order. A compressed chunk that is damaged is
-    lost. If a checksum shows that another is damaged but not where, the loss says so.
+    they are not too far out of it; otherwise in file order. Some doubtful messages are included: if
+    a checksum shows that a chunk is damaged but not where, the loss says so.
 
     Unlike other readers, it reads once at a time: its state is that of the last `records`.
 
@@ -543,7 +588,7 @@ class FileSalvage(BagReader):
         self._earliest: int | None = None  # log time from here on; None if no message follows
         held = HoldBack()
         given = 0
-        with Window(self.path) as window:
+        with Window.of_file(self.path) as window:
             self._window = window
             self._scan = self._scan_of(window, self._lose)
             for record in self._scanned():
@@ -596,44 +641,46 @@ class FileSalvage(BagReader):
         size = frame.size if proven else min(frame.size, MAX_UNPROVEN)
         return self._window.peek(size), proven
 
-    def _inside(self, content: bytes | memoryview) -> Iterator[tuple[RecordFrame, bytes]]:
-        """The records of a chunk that is sound.
+    def _inside(
+        self, content: bytes | memoryview, problems: list[str]
+    ) -> Iterator[tuple[RecordFrame, bytes]]:
+        """The records of a decompressed chunk; what is wrong with it is added to `problems`."""
+        scan = self._scan_of(
+            Window.of_content(bytes(content)),
+            lambda _offset, _size, problem: problems.append(f"in a chunk, {problem}"),
+        )
+        while frame := scan.next():
+            body = scan.body(frame)
+            if body is not None:
+                yield frame, body
 
-        Raises:
-            DamageError: It is not.
-        """
-        view = memoryview(content)
-        while len(view):
-            frame = self._scan.frame(view)
-            if frame is None or frame.size > len(view):
-                raise DamageError("a record in it is damaged")
-            yield frame, bytes(view[frame.head : frame.size])
-            view = view[frame.size :]
-
-    def _leave_chunk(self, frame: RecordFrame, used: int, problem: str, *, proven: bool) -> None:
+    def _leave_chunk(
+        self, frame: RecordFrame, used: int, problems: Sequence[str], *, proven: bool, whole: bool
+    ) -> None:
         """Advance past a chunk, and record what is lost of it.
 
         Args:
             frame: The chunk.
-            used: Bytes of it up to the end of its content; of its header if that is damaged.
-            problem: What is wrong with it, a phrase; empty if nothing is.
+            used: Bytes of it up to the end of its content, as far as known.
+            problems: What is wrong with it.
             proven: Whether it is certainly all there.
+            whole: Whether all of its content could be decompressed.
         """
         window, scan = self._window, self._scan
-        offset, whole = window.offset, used > frame.head
+        offset = window.offset
         if whole and used != frame.size and scan.is_followed(used):
             window.skip(used)  # the content is complete: the record's length is wrong
         elif proven and (whole or scan.is_followed(frame.size)):
             window.skip(frame.size)
         else:
             scan.resync(
-                offset if problem else offset + used,
-                problem or scan.cut_or_damaged(frame),
+                offset if problems else offset + used,
+                problems[0] if problems else scan.cut_or_damaged(frame),
                 passed=used,
                 kinds=scan.outer,
             )
             return
-        if problem:
-            self._lose(offset, window.offset - offset, problem)
+        if problems:
+            self._lose(offset, window.offset - offset, problems[0])
         else:
             self._tally.is_verified = True
