@@ -10,7 +10,6 @@ import re
 import secrets
 import threading
 import time
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -196,7 +195,6 @@ def _told(type_hash: str) -> str:
 
 _UNDER_WAY = 2**18  # unacknowledged bytes with keep_all; the library allows twice as many
 _HANDSHAKE_S = 0.2
-_MOMENT_S = 0.5
 _YEAR_S = 366 * 86400.0  # the longest wait that the library accepts
 
 
@@ -216,14 +214,12 @@ class _DdsWriter:
         self._kind = kind
         self._is_reliable = qos.is_reliable
         self._keeps_all = qos.is_reliable and qos.history == "keep_all"
-        self._under_way = self._written = 0
-        self._unsure: int | None = None  # messages written when a subscriber was found behind
+        self._under_way = 0
         self._seen: dict[int, float] = {}
         try:
             dds = Topic(participant, name, kind.writes)
             told = _told(kind.type_hash)
-            self.kept = max(qos.depth, kind.unacknowledged)
-            kept = _dds_qos(qos, told, unacknowledged=self.kept)
+            kept = _dds_qos(qos, told, unacknowledged=kind.unacknowledged)
             self._writer = DataWriter(participant, dds, qos=kept)
         except DDSException as error:
             problem = f"DDS refuses it or its QoS: {error.msg}"
@@ -245,7 +241,6 @@ class _DdsWriter:
             )
             raise RemoteError(self._name, problem)
         self._under_way += len(payload)
-        self._written += 1
         try:
             self._writer.write(self._kind.writes(payload))
         except DDSException as error:
@@ -263,26 +258,13 @@ class _DdsWriter:
     def wait(self, seconds: float) -> bool:
         if not self._is_reliable:
             return True
-        if done := self._acknowledged(seconds):
+        try:
+            done = bool(self._writer.wait_for_acks(int(min(seconds, _YEAR_S) * _NS)))
+        except AttributeError:
+            done = False  # how version 11 of the library reports a timeout
+        if done:
             self._under_way = 0
         return done
-
-    def _acknowledged(self, seconds: float) -> bool:
-        """Whether subscribers acknowledge in time what is written so far."""
-        try:
-            return bool(self._writer.wait_for_acks(int(min(seconds, _YEAR_S) * _NS)))
-        except AttributeError:
-            return False  # how version 11 of the library reports a timeout
-
-    def is_behind(self) -> bool:
-        """Whether a subscriber has been behind for more messages than are kept for it.
-
-        Waits for a moment, and is for another thread than that which writes.
-        """
-        before = self._written if self._unsure is None else self._unsure
-        is_well = not self._is_reliable or self._keeps_all or self._acknowledged(_MOMENT_S)
-        self._unsure = None if is_well else before
-        return not is_well and self._written - before >= self.kept
 
     def subscribers(self) -> int:
         """How many subscribers will get the next message.
@@ -354,8 +336,6 @@ class DdsNode(Ros2Node):
         self._lock = threading.RLock()
         self._found: dict[str, _Found] = {}
         self._describing: dict[Any, list[str]] = defaultdict(list)  # nodes, by participant
-        self._writers: dict[str, list[_DdsWriter]] = defaultdict(list)
-        self._told: set[str] = set()  # topics with a subscriber that is behind
         self._readers: list[tuple[Any, Callable[[Any], None]]] = []
 
     @property
@@ -364,30 +344,7 @@ class DdsNode(Ros2Node):
         return f"ROS 2, domain {self._domain} (Cyclone DDS)"
 
     def _make_writer(self, channel: Channel, qos: Qos) -> _DdsWriter:
-        writer = _DdsWriter(self._participant, channel.topic, message_type(channel), qos)
-        with self._lock:
-            self._writers[channel.topic].append(writer)
-            if len(self._writers) == 1:
-                self._start(self._watch)
-        return writer
-
-    def _watch(self) -> None:
-        """Warn of topics with a subscriber that loses messages, since it does not take them."""
-        while not self._ended.wait(_MOMENT_S):
-            with self._lock:
-                written = {topic: list(found) for topic, found in self._writers.items()}
-            for topic, writers in written.items():
-                if topic in self._told or self._ended.is_set():
-                    continue
-                for writer in writers:
-                    if writer.is_behind():
-                        self._told.add(topic)
-                        warnings.warn(
-                            f"{topic}: a subscriber hangs or is too slow: only the last "
-                            f"{writer.kept} messages are kept for it",
-                            stacklevel=2,
-                        )
-                        break
+        return _DdsWriter(self._participant, channel.topic, message_type(channel), qos)
 
     # ------------------------------------------------------------ receiving
 
@@ -543,7 +500,6 @@ class DdsNode(Ros2Node):
         self._end_threads()
         self._count_lost()
         self._readers.clear()
-        self._writers.clear()
         self._received.clear()
         self._publications = self._subscriptions = self._participant = None
 
