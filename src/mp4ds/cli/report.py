@@ -19,7 +19,7 @@ from mp4ds.cli.options import (
 )
 from mp4ds.cli.output import print_table, progress_of, say, show
 from mp4ds.dataset.dataset import datasets_in
-from mp4ds.errors import OptionError, counted, interrupted, path_text, size_text
+from mp4ds.errors import OptionError, counted, path_text, size_text
 from mp4ds.plugins.evaluating.evaluate import EvaluateOptions, evaluate
 from mp4ds.plugins.evaluating.page import findings_of
 from mp4ds.plugins.evaluating.trials import Evaluation
@@ -125,9 +125,8 @@ def print_evaluation(result: Evaluation) -> None:
             say(f"{best.why} for all cameras: {best.options} (score at least {best.score:.2f})")
         if not result.recommended:
             say("no setting reaches every camera's target")
-    known = f", {result.known} of them in an earlier run" if result.known else ""
-    tried = counted(result.tried + result.known, "setting")
-    say(f"{path_text(result.output)}/index.html: {tried} tried{known}")
+    tried = counted(result.tried, "setting")
+    say(f"{path_text(result.output)}/index.html: {tried} tried")
 
 
 @command()
@@ -137,13 +136,8 @@ def print_evaluation(result: Evaluation) -> None:
 def evaluate_command(source: str, output: str | None, options: EvaluateOptions) -> None:
     """Compare encoder settings on clips of a recording: quality, size and time.
 
-    Writes a folder with tables, plots and a page, and recommends options for `mp4ds pack`. To
-    resume an interrupted evaluation, run the same command again.
+    Writes a folder with tables, plots and a page, and recommends options for `mp4ds pack`.
     """
-    try:
-        with progress_of("evaluating") as tell:
-            result = evaluate(source, options, output=output, progress=tell)
-    except (KeyboardInterrupt, SystemExit) as error:
-        kept = "results so far are kept: run the same command again to resume"
-        raise interrupted(error, kept) from None
+    with progress_of("evaluating") as tell:
+        result = evaluate(source, options, output=output, progress=tell)
     show(result, print_evaluation)

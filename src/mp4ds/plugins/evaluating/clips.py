@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
-import xxhash
 from numpy.typing import NDArray
 
 from mp4ds.bags.formats import open_reader
@@ -187,7 +185,7 @@ def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
     if first is None:
         raise Refused("has no readable images in its clip")
     layout = _layout_of(first[0])
-    maker, clock, digest = PlaneMaker(layout.pixel_format), PresentationClock(), xxhash.xxh3_128()
+    maker, clock = PlaneMaker(layout.pixel_format), PresentationClock()
     encoding, width, height = first[0]
     size = width + width % 2, height + height % 2
     ticks: list[int] = []
@@ -195,15 +193,11 @@ def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
         for kind, pixels, stamp, log_time in chain([first], shots):
             if kind != first[0]:
                 continue
-            planes = maker.make(layout.to_picture(pixels))
-            spool.append(planes)
-            for plane in planes:
-                digest.update(plane.data)
+            spool.append(maker.make(layout.to_picture(pixels)))
             ticks.append(clock.tick(stamp, log_time))
         middle = (len(ticks) - 1) // 2
         detail = _detail(spool.frame(middle)[0])
     np.save(folder / TICKS, ticks)
-    digest.update(json.dumps(ticks).encode())
     gap = (ticks[-1] - ticks[0]) / TIMESCALE / max(1, len(ticks) - 1)
     return Clip(
         encoding=encoding,
@@ -213,7 +207,6 @@ def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
         rate=camera.rate,
         frames=len(ticks),
         seconds=len(ticks) * (gap or 1 / (camera.rate or 1.0)),
-        digest=digest.hexdigest(),
         detail=detail,
         detail_frame=middle,
         start=(int(camera.times[indices[0]]) - int(camera.times[0])) / _SECOND,

@@ -1,26 +1,23 @@
 """Compares encoder settings on clips of a recording: quality, size and time.
 
 A short clip of each camera is encoded as `mp4ds pack` would, with every setting of a grid, decoded,
-and compared with the encoder's input. Results are kept in the evaluation's folder, so that the same
-call resumes where it was interrupted.
+and compared with the encoder's input.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from mp4ds._version import __version__
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, counted
-from mp4ds.files.outputs import check_place, refuse_not_ours, work_folder, write_synced
+from mp4ds.files.outputs import listed_names, staged, write_listing
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.encodings import ENCODINGS
@@ -31,10 +28,9 @@ from mp4ds.plugins.evaluating.clips import (
     make_clip,
     open_cameras,
 )
-from mp4ds.plugins.evaluating.page import PLOTS, write_files
+from mp4ds.plugins.evaluating.page import write_files
 from mp4ds.plugins.evaluating.trials import (
     CEILING_MARGIN,
-    CELLS,
     PICTURES,
     CameraEvaluation,
     Cell,
@@ -200,9 +196,6 @@ def _has(codec: str, preset: str) -> bool:
 _SHORT = 30  # frames
 _JPEG_FRAMES = 20
 _DAY = 86_400
-_FOLDERS = (CELLS, PICTURES, PLOTS)
-_WORK = "work-"
-_NOTE_NAME = "mp4ds_evaluation.json"  # marks folders made by an evaluation
 
 
 def evaluate(
@@ -217,8 +210,8 @@ def evaluate(
     Args:
         source: A bag, rosbag2 folder, MCAP, dataset, or video; or a URL.
         options: How.
-        output: Folder of the results; None: ``NAME_evaluation`` in the current folder. Existing
-            results are reused.
+        output: Folder of the results; None: ``NAME_evaluation`` in the current folder. Those of
+            another evaluation are replaced.
         progress: Called now and then with a phrase, and the share of settings done.
 
     Returns:
@@ -236,35 +229,37 @@ def evaluate(
     options = options or EvaluateOptions()
     goal, settings, place = options.target, settings_of(options), location(source)
     ffmpeg = _ffmpeg(goal)
-    with open_cameras(place) as (found, left_out):
+    with ExitStack() as stack:
+        found, left_out = stack.enter_context(open_cameras(place))
         cameras = _selected(found, left_out, options)
         origin = min((int(camera.times[0]) for camera in found), default=0)
-        result = Evaluation(place, _folder(place, output), [], left_out, versions_of(ffmpeg))
+        target = _target(place, output)
+        result = Evaluation(place, target, [], left_out, versions_of(ffmpeg))
         names = FileNames()
-        with _work_in(result.output) as work:
-            run = _Run(options, settings, ffmpeg, result)
-            for number, camera in enumerate(cameras):
+        made = stack.enter_context(staged(target, force=True, owned=listed_names, sources=[place]))
+        (made / PICTURES).mkdir(parents=True)
+        run = _Run(options, settings, ffmpeg, result, made)
+        for number, camera in enumerate(cameras):
 
-                def tell(what: str, share: float, number: int = number) -> None:
-                    if progress is not None:
-                        topic = cameras[number].topic
-                        progress(f"{topic}: {what}", (number + share) / len(cameras))
+            def tell(what: str, share: float, number: int = number) -> None:
+                if progress is not None:
+                    topic = cameras[number].topic
+                    progress(f"{topic}: {what}", (number + share) / len(cameras))
 
-                name = names.name_for(camera.topic)
-                try:
-                    with TemporaryDirectory(dir=work) as folder:
-                        result.cameras.append(
-                            run.evaluate(camera, name, origin, Path(folder), tell)
-                        )
-                except Refused as reason:
-                    left_out[camera.topic] = str(reason)
+            name = names.name_for(camera.topic)
+            try:
+                with TemporaryDirectory(dir=made.parent) as folder:
+                    result.cameras.append(run.evaluate(camera, name, origin, Path(folder), tell))
+            except Refused as reason:
+                left_out[camera.topic] = str(reason)
         if not result.cameras:
             reasons = "; ".join(f"{topic} {reason}" for topic, reason in left_out.items())
             why = f": {reasons}" if reasons else ""
             raise SourceError(place, f"has no camera to try settings on{why}")
         rated = [(camera.cells, camera.reachable) for camera in result.cameras]
         result.recommended = recommend(rated, goal)
-        write_files(result, asdict(options))
+        write_files(result, made, asdict(options))
+        write_listing(made)
     return result
 
 
@@ -288,30 +283,9 @@ def _selected(
     return sorted(wanted, key=lambda camera: camera.topic)
 
 
-def _folder(source: Path, output: Path | str | None) -> Path:
+def _target(source: Path, output: Path | str | None) -> Path:
     name = output or f"{source.name if source.is_dir() else source.stem}_evaluation"
-    target = Path(os.path.abspath(name))  # noqa: PTH100 - keeps links, unlike resolve()
-    check_place(target, [source])
-    if os.path.lexists(target) and not _is_evaluation(target):
-        refuse_not_ours(target, None)
-    return target
-
-
-def _is_evaluation(path: Path) -> bool:
-    if any((path / name).is_symlink() for name in _FOLDERS):
-        return False
-    return path.is_dir() and ((path / _NOTE_NAME).is_file() or not any(path.iterdir()))
-
-
-@contextmanager
-def _work_in(folder: Path) -> Iterator[Path]:
-    """A folder for temporary files, inside that of the evaluation."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_synced(folder / _NOTE_NAME, json.dumps({"mp4ds": __version__}).encode())
-    for name in _FOLDERS:
-        (folder / name).mkdir(exist_ok=True)
-    with work_folder(folder, _WORK) as work:
-        yield work
+    return Path(os.path.abspath(name))  # noqa: PTH100 - keeps links, unlike resolve()
 
 
 # ---------------------------------------------------------------- one camera
@@ -325,6 +299,7 @@ class _Run:
     settings: Sequence[Setting]
     ffmpeg: Ffmpeg | None
     result: Evaluation
+    made: Path
 
     def evaluate(
         self,
@@ -355,7 +330,7 @@ class _Run:
         truth = f"{PICTURES}/{name}-original.png"
         with closing(clip.open(folder)) as frames:
             picture = clip.picture(frames.frame(clip.detail_frame), clip.recipe)
-            write_synced(self.result.output / truth, picture)
+            (self.made / truth).write_bytes(picture)
             # without which the scores of settings say little
             scores = scores_of(frames, frames, ffmpeg=self.ffmpeg, threads=options.encoder_threads)
         ceiling = {name: summary_of(values) for name, values in scores.items()}
@@ -392,9 +367,9 @@ class _Run:
         tell: Callable[[str, float], None],
     ) -> tuple[list[Cell], list[str]]:
         """What was measured, and notes about what could not be."""
-        threads, versions = self.options.encoder_threads, self.result.versions
+        threads, has_vmaf = self.options.encoder_threads, self.ffmpeg is not None
         trials = [
-            Trial(name, clip, setting, threads, versions, folder, self.result.output)
+            Trial(name, clip, setting, threads, has_vmaf, folder, self.made)
             for setting in self.settings
         ]
         cells: list[Cell] = []
@@ -403,11 +378,10 @@ class _Run:
         def count(done: int) -> None:
             tell(f"{done} of {len(trials)} settings", done / len(trials))
 
-        for trial, found, is_known in try_out(trials, self.options.jobs, count):
+        for trial, found in try_out(trials, self.options.jobs, count):
             if isinstance(found, Cell):
                 cells.append(found)
-                self.result.known += is_known
-                self.result.tried += not is_known
+                self.result.tried += 1
             else:
                 failures.setdefault(found, []).append(trial.setting.name)
         if not cells:

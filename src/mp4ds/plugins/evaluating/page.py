@@ -11,11 +11,11 @@ from dataclasses import asdict
 from html import escape
 from importlib.resources import files
 from math import ceil, floor, log10
+from pathlib import Path
 from string import Template
 from typing import Any
 
 from mp4ds.errors import size_text
-from mp4ds.files.outputs import write_synced
 from mp4ds.plugins.evaluating.trials import (
     CameraEvaluation,
     Cell,
@@ -30,26 +30,27 @@ PLOTS = "plots"
 """The folder of an evaluation for plots."""
 
 
-def write_files(result: Evaluation, options: dict[str, Any]) -> None:
+def write_files(result: Evaluation, folder: Path, options: dict[str, Any]) -> None:
     """Write all files into the folder of an evaluation.
 
     Args:
         result: What was found.
+        folder: Where the pictures are, and the other files will be.
         options: What was asked for.
 
     Raises:
         OSError: It cannot be written.
     """
-    folder = result.output
-    write_synced(folder / "evaluation.csv", table(result).encode())
+    (folder / PLOTS).mkdir()
+    (folder / "evaluation.csv").write_text(table(result), encoding="utf-8")
     values = {"options": options, **asdict(result)}
     text = json.dumps(values, default=str, indent=1)  # paths
-    write_synced(folder / "evaluation.json", f"{text}\n".encode())
+    (folder / "evaluation.json").write_text(f"{text}\n", encoding="utf-8")
     for camera in result.cameras:
         for kind in COSTS:
             path = folder / PLOTS / f"{camera.name}-{kind}.svg"
-            write_synced(path, plot(camera, kind).encode())
-    write_synced(folder / "index.html", page(result).encode())
+            path.write_text(plot(camera, kind), encoding="utf-8")
+    (folder / "index.html").write_text(page(result, folder), encoding="utf-8")
 
 
 def table(result: Evaluation) -> str:
@@ -312,11 +313,12 @@ def _round_step(step: float) -> float:
 # ---------------------------------------------------------------- page
 
 
-def page(result: Evaluation) -> str:
+def page(result: Evaluation, folder: Path) -> str:
     """The page.
 
     Args:
-        result: What was found; its pictures are read from its folder.
+        result: What was found.
+        folder: Where its pictures are.
 
     Raises:
         OSError: A picture cannot be read.
@@ -324,7 +326,7 @@ def page(result: Evaluation) -> str:
     template = Template(files(__package__).joinpath("page.html").read_text("utf-8"))
     sections = [*_head(result)]
     for camera in result.cameras:
-        sections += _section(result, camera)
+        sections += _section(folder, camera)
     title = escape(f"Evaluation of {result.source.name}")
     return template.substitute(title=title, body="\n".join(sections))
 
@@ -345,7 +347,7 @@ def _head(result: Evaluation) -> Iterator[str]:
     yield f"<p>Measured with {escape(versions)}.</p>"
 
 
-def _section(result: Evaluation, camera: CameraEvaluation) -> Iterator[str]:
+def _section(folder: Path, camera: CameraEvaluation) -> Iterator[str]:
     yield f"<h2>{escape(camera.topic)}</h2>"
     plots = "".join(f"<figure>{plot(camera, kind)}</figure>" for kind in COSTS)
     yield f'<div class="plots">{plots}</div>'
@@ -358,7 +360,7 @@ def _section(result: Evaluation, camera: CameraEvaluation) -> Iterator[str]:
         shown[f"{cell.setting.name}: {score}, {cell.kbps:.0f} kbit/s"] = cell.picture
     figures = []
     for words, name in shown.items():
-        data = base64.b64encode((result.output / name).read_bytes()).decode()
+        data = base64.b64encode((folder / name).read_bytes()).decode()
         figures.append(
             f'<figure><img src="data:image/png;base64,{data}" alt="{escape(words)}">'
             f"<figcaption>{escape(words)}</figcaption></figure>"

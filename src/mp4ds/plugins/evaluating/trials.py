@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
@@ -13,10 +12,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from mp4ds._version import __version__
-from mp4ds.files.outputs import write_synced
 from mp4ds.processes import ProcessExecutor, failure_of
 from mp4ds.video.codecs import LOSSY_GOP, QualityTarget, Recipe, recipe_for
 from mp4ds.video.encoder import VideoEncoder, tool_versions
@@ -31,16 +28,14 @@ from mp4ds.video.pixels import (
 )
 from mp4ds.video.scores import Ffmpeg, ScoreSummary, find_ffmpeg, scores_of, summary_of
 
-CELLS, PICTURES = "cells", "pictures"
-"""The folders of an evaluation for measurements, and for the details shown."""
+PICTURES = "pictures"
+"""The folder of an evaluation for the details shown."""
 
 FRAMES, TICKS = "frames.yuv", "ticks.npy"
 """The files of a clip: its frames (see `PlaneSpool`), and when each is shown, as in a packed
 video."""
 
 _ENLARGED = 2
-_NO_VMAF = "none"
-_DIGITS = 12  # of a digest in a name
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +78,6 @@ class Clip:
         rate: Frames per second of the camera; None if unknown.
         frames: How many there are.
         seconds: Their duration, the last one as long as the others.
-        digest: Of the frames, and when each is shown.
         detail: x, y, width and height of the detail shown.
         detail_frame: Number of the frame shown.
         start: Log time of the first frame, seconds from the camera's first one.
@@ -98,7 +92,6 @@ class Clip:
     rate: float | None
     frames: int
     seconds: float
-    digest: str
     detail: tuple[int, int, int, int]
     detail_frame: int
     start: float
@@ -165,7 +158,7 @@ class Trial:
         clip: The clip.
         setting: How to encode.
         threads: Of the encoder and of libvmaf.
-        versions: Of the software, see `versions_of`: others may give other results.
+        has_vmaf: Whether VMAF is computed.
         work: The folder with the files of the clip.
         output: The folder of the evaluation.
     """
@@ -174,42 +167,20 @@ class Trial:
     clip: Clip
     setting: Setting
     threads: int
-    versions: dict[str, str]
+    has_vmaf: bool
     work: Path
     output: Path
 
     @property
-    def name(self) -> str:
-        """Name of its files: the same for the same measurement, in another run too."""
-        key = hashlib.sha256(_TRIAL.dump_json(self, exclude={"work", "output"})).hexdigest()
-        return f"{self.camera}-{self.setting.name.replace(' ', '-')}-{key[:_DIGITS]}"
-
-    @property
     def picture(self) -> str:
         """Name of the PNG file of the detail, in the folder of the evaluation."""
-        return f"{PICTURES}/{self.name}.png"
-
-    @property
-    def path(self) -> Path:
-        """The file of its measurements."""
-        return self.output / CELLS / f"{self.name}.json"
-
-    def known(self) -> Cell | None:
-        """What an earlier run measured; None if it is not all there."""
-        try:
-            found = _CELL.validate_json(self.path.read_bytes())
-        except (OSError, ValidationError):
-            return None
-        return found if (self.output / self.picture).is_file() else None
-
-
-_CELL, _TRIAL = TypeAdapter(Cell), TypeAdapter(Trial)
+        return f"{PICTURES}/{self.camera}-{self.setting.name.replace(' ', '-')}.png"
 
 
 def try_out(
     trials: Sequence[Trial], jobs: int, on_done: Callable[[int], None] = lambda _: None
-) -> Iterator[tuple[Trial, Cell | str, bool]]:
-    """Run trials, except for those with existing results.
+) -> Iterator[tuple[Trial, Cell | str]]:
+    """Run trials.
 
     Args:
         trials: Different ones.
@@ -217,26 +188,15 @@ def try_out(
         on_done: Called with the number of trials done.
 
     Yields:
-        Each in turn, what was measured, or why that is not possible; and whether it was before.
-
-    Raises:
-        OSError: A result cannot be written.
+        Each in turn, and what was measured, or why that is not possible.
     """
-    known = {trial.name: cell for trial in trials if (cell := trial.known())}
-    new: dict[str, Cell | str] = {}
-    on_done(len(known))
     with ProcessExecutor(jobs) as executor:
-        calls = {executor.submit(run, it): it for it in trials if it.name not in known}
-        for call in as_completed(calls):
-            trial, error = calls[call], call.exception()
-            if error is not None:
-                new[trial.name] = str(failure_of(error))
-            else:
-                new[trial.name] = cell = call.result()
-                write_synced(trial.path, _CELL.dump_json(cell, indent=1))
-            on_done(len(known) + len(new))
-    for trial in trials:
-        yield trial, (known | new)[trial.name], trial.name in known
+        calls = {executor.submit(run, trial): trial for trial in trials}
+        for number, _ in enumerate(as_completed(calls), 1):
+            on_done(number)
+    for call, trial in calls.items():
+        error = call.exception()
+        yield trial, call.result() if error is None else str(failure_of(error))
 
 
 def versions_of(ffmpeg: Ffmpeg | None) -> dict[str, str]:
@@ -245,7 +205,7 @@ def versions_of(ffmpeg: Ffmpeg | None) -> dict[str, str]:
     Args:
         ffmpeg: Computes VMAF; None for no VMAF.
     """
-    vmaf = ffmpeg.version if ffmpeg else _NO_VMAF
+    vmaf = ffmpeg.version if ffmpeg else "none"
     return {**tool_versions(), "mp4ds": __version__, "vmaf": vmaf}
 
 
@@ -260,7 +220,7 @@ def run(trial: Trial) -> Cell:
         OSError: A file cannot be written.
     """
     clip, setting = trial.clip, trial.setting
-    ffmpeg = None if trial.versions["vmaf"] == _NO_VMAF else find_ffmpeg()
+    ffmpeg = find_ffmpeg() if trial.has_vmaf else None
     recipe = recipe_for(
         clip.picture_format,
         lossless=False,
@@ -275,7 +235,7 @@ def run(trial: Trial) -> Cell:
         def watched(decoded: Iterable[Planes]) -> Iterator[Planes]:
             for number, planes in enumerate(decoded):
                 if number == clip.detail_frame:
-                    write_synced(trial.output / trial.picture, clip.picture(planes, recipe))
+                    (trial.output / trial.picture).write_bytes(clip.picture(planes, recipe))
                 yield planes
 
         decoded = watched(decoded_planes(video))
@@ -420,8 +380,7 @@ class Evaluation:
         versions: Of the software that made the videos and scores.
         recommended: The smallest and the fastest setting that reach the targets of all cameras,
             with their lowest score; empty if none.
-        tried: Cells measured in this run.
-        known: Cells measured in an earlier one.
+        tried: Number of cells measured.
     """
 
     source: Path
@@ -431,7 +390,6 @@ class Evaluation:
     versions: dict[str, str]
     recommended: Sequence[Recommendation] = ()
     tried: int = 0
-    known: int = 0
 
 
 # ---------------------------------------------------------------- conclusions
