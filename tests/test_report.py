@@ -26,8 +26,6 @@ from report_scenes import (
     COLOUR,
     DEPTH,
     FRAMES,
-    HEIGHT,
-    WIDTH,
     blocks,
     pack_cameras,
     two_cameras,
@@ -114,23 +112,15 @@ def test_the_report_of_a_dataset(copy: Path) -> None:
 def test_topics_and_their_sizes(copy: Path) -> None:
     report(copy)
     with mp4ds.open(copy) as dataset:
-        expected: dict[str, int] = {}
-        for record in dataset.records():
-            if hasattr(record, "data"):
-                topic = record.channel.topic
-                expected[topic] = expected.get(topic, 0) + len(record.data)
         times = {c.topic: dataset.times()[c.id] for c in dataset.channels if c.topic == "/tf"}
     rows = {row["topic"]: row for row in data_of(copy)["topics"]}
     assert set(rows) >= {COLOUR, DEPTH, "/imu", "/tf", "/chatter", "/front/camera_info"}
-    assert rows["/imu"]["recorded_bytes"] == expected["/imu"]
     assert rows["/chatter"]["messages"] == FRAMES
     assert rows["/tf"]["rate_hz"] == pytest.approx(
         (FRAMES - 1) * 1e9 / (times["/tf"][-1] - times["/tf"][0])
     )
-    assert rows[COLOUR]["recorded_bytes"] == FRAMES * WIDTH * HEIGHT * 3
     stored = sum((copy / f"front_image_raw.{end}").stat().st_size for end in ("mp4", "yaml"))
     assert rows[COLOUR]["stored_bytes"] == stored
-    assert rows[COLOUR]["ratio"] == pytest.approx(FRAMES * WIDTH * HEIGHT * 3 / stored)
     assert rows["/front/camera_info"]["stored"] == "in front_image_raw.yaml"
 
 

@@ -55,8 +55,6 @@ def main() -> None:
             show_players(tab, folder)
             tab.open(f"{report.as_uri()}#t={SHOWN_S}", ready=_READY)
             tab.evaluate(_SETTLED)
-            tab.press("g", text="g")
-            tab.evaluate(_SETTLED)
             save(tab.screenshot(**REPORT), "report.png")
             tab.command(
                 "Emulation.setDeviceMetricsOverride",

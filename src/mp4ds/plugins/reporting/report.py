@@ -25,7 +25,6 @@ import numpy as np
 
 from mp4ds._version import __version__
 from mp4ds.dataset.dataset import Dataset, Paths, datasets_in
-from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.views import size_after
 from mp4ds.errors import (
@@ -48,7 +47,6 @@ from mp4ds.files.outputs import (
 )
 from mp4ds.files.urls import remote
 from mp4ds.format.fields import MESSAGES_NAME
-from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import WHERE, Options, force, option
 from mp4ds.plugins.info import Brief, brief, notes_of, topics_of
 from mp4ds.plugins.reporting.cameras import (
@@ -60,7 +58,6 @@ from mp4ds.plugins.reporting.cameras import (
 )
 from mp4ds.plugins.reporting.stills import Look, StillOptions, frames, spread
 from mp4ds.processes import each
-from mp4ds.records import Message
 from mp4ds.video.images import ImageFile
 
 _PAGE = files("mp4ds.plugins.reporting") / "page"
@@ -71,8 +68,6 @@ _FOLDER = "report"
 
 _DATA_SIGN = b"/* made by mp4ds report */\n"
 _MOST_NOTES = 200
-_MOST_READ = 2**30
-"""Maximum size of messages.mcap up to which it is read to measure each topic's share."""
 _STILLS, _PICTURES = "stills", "pictures"
 _PICTURE_WIDTH = 240
 _MOST_STILLS = 32  # of a camera
@@ -367,63 +362,23 @@ def _figures(dataset: Dataset, topics: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _topic_rows(dataset: Dataset) -> list[dict[str, Any]]:
-    """The topics by name, with the bytes that each had in the recording.
+    """The topics by name.
 
     Raises:
         FormatError: The dataset is damaged.
         SourceError: messages.mcap cannot be read.
     """
-    recorded = _recorded_bytes(dataset)
-    rows = []
-    for item in topics_of(dataset):
-        size = recorded.get(item.topic)
-        rows.append(
-            {
-                "topic": item.topic,
-                "type_name": item.type_name,
-                "messages": item.messages,
-                "rate_hz": item.rate_hz,
-                "stored": item.stored or MESSAGES_NAME,
-                "recorded_bytes": size,
-                "stored_bytes": item.bytes,
-                "ratio": size / item.bytes if size and item.bytes else None,
-            }
-        )
-    return rows
-
-
-def _recorded_bytes(dataset: Dataset) -> dict[str, int]:
-    """Bytes of each topic's messages as recorded, where known without reading a large file."""
-    sizes: Counter[str] = Counter(dict.fromkeys(dataset.all_topics, 0))
-    if dataset.manifest is not None:
-        if (dataset.path / MESSAGES_NAME).stat().st_size > _MOST_READ:
-            return {}
-        for record in dataset.messages_file.in_file_order():
-            if isinstance(record, Message):
-                sizes[record.channel.topic] += len(record.data)
-    unknown = set()
-    for stream in dataset.streams:
-        size = _image_bytes(stream)
-        if size is None:
-            unknown.add(stream.topic)
-        sizes[stream.topic] += size or 0
-        if stream.sidecar.camera_info is not None:
-            unknown.add(stream.sidecar.camera_info.channel.topic)
-    return {topic: size for topic, size in sizes.items() if topic not in unknown}
-
-
-def _image_bytes(stream: Stream) -> int | None:
-    """Bytes of a stream's images as recorded; None if files were converted to pixels.
-
-    Packets count as the size of their video.
-    """
-    sidecar = stream.sidecar
-    if sidecar.body == "pixels":
-        image = sidecar.image
-        return len(stream) * ENCODINGS[image.encoding].size(image.step, image.height)
-    if sidecar.body == "packet" and stream.video_path.is_file():
-        return stream.video_path.stat().st_size
-    return None
+    return [
+        {
+            "topic": item.topic,
+            "type_name": item.type_name,
+            "messages": item.messages,
+            "rate_hz": item.rate_hz,
+            "stored": item.stored or MESSAGES_NAME,
+            "stored_bytes": item.bytes,
+        }
+        for item in topics_of(dataset)
+    ]
 
 
 # ---------------------------------------------------------------- many datasets

@@ -95,10 +95,10 @@ var mp4dsTables = (() => {
   }
 
   function topics(place, data) {
-    const head = [["Topic", {long: true}], ["Type", {long: true}], ["Messages", NUMBER], ["Rate, Hz", NUMBER], ["Recorded", NUMBER], ["Stored", NUMBER],
-      ["Ratio", NUMBER], ["In", {long: true}]];
-    table(place, head, data.topics.map(row => [row.topic, row.type_name, grouped(row.messages), optional(row.rate_hz, 2), bytesText(row.recorded_bytes),
-      bytesText(row.stored_bytes), optional(row.ratio, 2), row.stored]));
+    const head = [["Topic", {long: true}], ["Type", {long: true}], ["Messages", NUMBER], ["Rate, Hz", NUMBER], ["Stored", NUMBER],
+      ["In", {long: true}]];
+    table(place, head, data.topics.map(row => [row.topic, row.type_name, grouped(row.messages), optional(row.rate_hz, 2),
+      bytesText(row.stored_bytes), row.stored]));
   }
 
   function calibrations(place, data) {
