@@ -30,7 +30,6 @@ from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.demo import demo
-from mp4ds.plugins.evaluating.clips import chosen, make_clip, open_cameras
 from mp4ds.plugins.evaluating.evaluate import (
     EvaluateOptions,
     evaluate,
@@ -40,6 +39,9 @@ from mp4ds.plugins.evaluating.trials import (
     Cell,
     Evaluation,
     Setting,
+    chosen,
+    make_clip,
+    open_cameras,
     recommend,
 )
 from mp4ds.video.codecs import QualityTarget

@@ -22,16 +22,11 @@ from mp4ds.files.urls import location
 from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import LONG, WHAT, Parsed, TopicOptions, jobs, option, parse_words
-from mp4ds.plugins.evaluating.clips import (
-    Camera,
-    chosen,
-    make_clip,
-    open_cameras,
-)
 from mp4ds.plugins.evaluating.page import write_files
 from mp4ds.plugins.evaluating.trials import (
     CEILING_MARGIN,
     PICTURES,
+    Camera,
     CameraEvaluation,
     Cell,
     Clip,
@@ -39,7 +34,10 @@ from mp4ds.plugins.evaluating.trials import (
     Setting,
     StorageRow,
     Trial,
+    chosen,
+    make_clip,
     mean_score,
+    open_cameras,
     reachable_score,
     recommend,
     try_out,

@@ -20,7 +20,7 @@ from mp4ds.dataset.vectors import COLUMNS
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.packing.options import ImportOptions
 from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, LEROBOT_SCALE, DepthScale
-from mp4ds.plugins.importing.lists import MAX_STAMP
+from mp4ds.plugins.importing.layouts import MAX_STAMP
 from mp4ds.plugins.importing.reader import ImagesReader
 from mp4ds.times import nearest
 from mp4ds.video.clips import Clip, open_video
