@@ -41,7 +41,7 @@ from measure import (
     size_of,
     spread,
 )
-from mp4ds.messages.encodings import ENCODINGS, NO_PARAMETERS, Parameters
+from mp4ds.messages.encodings import ENCODINGS, NO_PARAMETERS
 from mp4ds.messages.layouts import bind
 from mp4ds.video.pixels import PictureConverter, picture_to_frame
 from recordings import HERTZ, image_size, write_bag, write_mcap
@@ -199,9 +199,7 @@ def encode_bare(packed: Path, frames: Path, output: Path, threads: int) -> float
         (stream,) = dataset.streams
         sidecar, stamps = stream.sidecar, stream.stamps
     video, values = sidecar.video, sidecar.video.parameters
-    parameters = (
-        Parameters.from_values(values.model_dump(exclude_none=True)) if values else NO_PARAMETERS
-    )
+    parameters = values or NO_PARAMETERS
     layout = bind(video.layout, ENCODINGS[sidecar.image.encoding], parameters)
     converter, coded = PictureConverter(), video.pixel_format or layout.pixel_format
     ticks = ((stamps - stamps[0]) // 1000).tolist()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import mp4ds
 import reader
 from compare import compare
-from mp4ds.messages.encodings import ENCODINGS, Parameters
+from mp4ds.messages.encodings import ENCODINGS, LayoutParameters
 from mp4ds.messages.layouts import bind
 from mp4ds.messages.sources import MOSAICS
 from pixel_kinds import made_of
@@ -38,7 +38,7 @@ DEMOSAICED = {
 @pytest.mark.parametrize("mosaic", MOSAICS)
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8"])
 def test_colours_of_a_mosaic_are_those_of_opencv(encoding: str, mosaic: str) -> None:
-    layout = bind("from_mosaic8", ENCODINGS[encoding], Parameters(mosaic=mosaic))
+    layout = bind("from_mosaic8", ENCODINGS[encoding], LayoutParameters(mosaic=mosaic))
     tiles = bind("mosaic8", ENCODINGS["bayer_rggb8"]).to_picture(np.array(MOSAIC, np.uint8))
     out = np.empty((4, 4, 3), np.uint8)
     layout.to_pixels(tiles, out)
@@ -66,7 +66,7 @@ CONVERTED = {
 
 @pytest.mark.parametrize("rule", CONVERTED)
 def test_colours_of_yuv_are_those_of_the_library(rule: str) -> None:
-    layout = bind("from_yuv422", RGB, Parameters(rule=rule))
+    layout = bind("from_yuv422", RGB, LayoutParameters(rule=rule))
     luma, u, v = (np.array([row], np.uint8) for row in zip(*YUV, strict=True))
     out = np.empty((1, 2 * len(YUV), 3), np.uint8)
     layout.to_pixels((luma.repeat(2, axis=1), u, v), out)
@@ -90,7 +90,7 @@ def shades(kind: str, width: int, height: int, seed: int) -> tuple[NDArray[Any],
 @pytest.mark.parametrize("kind", ["dark", "bright", "all"])
 @pytest.mark.parametrize("mosaic", MOSAICS)
 def test_the_edges_of_a_mosaic_are_found(mosaic: str, kind: str) -> None:
-    layout = bind("from_mosaic8", RGB, Parameters(mosaic=mosaic))
+    layout = bind("from_mosaic8", RGB, LayoutParameters(mosaic=mosaic))
     tiles = bind("mosaic8", ENCODINGS["bayer_rggb8"])
     for width, height in ((64, 48), (33, 25), (5, 4)):
         made, again = np.empty((2, height, width, 3), np.uint8)

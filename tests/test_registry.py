@@ -13,7 +13,7 @@ import pytest
 
 from mp4ds.format.fields import Body
 from mp4ds.format.models import VIDEO_CODECS
-from mp4ds.messages.encodings import ENCODINGS, Parameters
+from mp4ds.messages.encodings import ENCODINGS, LayoutParameters
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind
 from mp4ds.messages.numbers import SCALES
 from mp4ds.messages.serializations import WIRES
@@ -157,7 +157,7 @@ def bound_layouts() -> Iterator[tuple[str, Layout]]:
             for values in PARAMETERS[LAYOUTS[name].parameters]:
                 if name in ("gbr_bits", "gbra_bits") and values["bits"] == 8:
                     continue  # no planes of colours have 8 bits
-                yield name, bind(name, encoding, Parameters.from_values(values))
+                yield name, bind(name, encoding, LayoutParameters.model_validate(values))
 
 
 def test_the_registry_lists_exactly_the_layouts() -> None:

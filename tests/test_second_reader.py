@@ -123,7 +123,7 @@ def test_every_exact_layout_is_what_the_spec_says(size: tuple[int, int]) -> None
                 if layout is None:
                     continue
                 seen.add(layout_name)
-                video = {"layout": layout_name, "parameters": layout.parameters.to_values()}
+                video = {"layout": layout_name, "parameters": layout.parameters.values}
                 order = "rgba" if name.startswith("rgb") else "bgra"
                 found = images.pixels(image, video, planes(layout.to_picture(pixels), order))
                 expected = patterns.reshape(*pixels.shape[:2], -1)
@@ -144,7 +144,7 @@ def test_what_a_view_predicts_of_a_source_is_what_the_spec_says(name: str, sourc
     layout = next(filter(None, layouts))
     assert layout.name.removeprefix("from_").rstrip("8") == source
     picture = layout.to_picture(pixels, (prediction, 8))
-    video = {"layout": layout.name, "parameters": layout.parameters.to_values()}
+    video = {"layout": layout.name, "parameters": layout.parameters.values}
     order = "rgba" if name == "rgb8" else "bgra"
     assert np.array_equal(images.pixels(image, video, planes(picture, order), prediction), pixels)
     again = np.empty_like(pixels)
@@ -191,7 +191,7 @@ def test_every_lossy_layout_is_what_the_spec_says(
         )
         own = np.empty(layout.encoding.shape(**image), layout.encoding.dtype)
         layout.to_pixels(maker.make(frame, 0), own)
-        video = {"layout": layout.name, "parameters": layout.parameters.to_values()}
+        video = {"layout": layout.name, "parameters": layout.parameters.values}
         video |= {"pixel_format": pixel_format, "color": {"matrix": matrix, "range": color_range}}
         told = images.pixels({"encoding": name, **image}, video, images.planes_of(frame)[1])
         assert np.array_equal(told, own.reshape(told.shape)), f"{layout.name} of {name}"

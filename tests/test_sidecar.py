@@ -399,7 +399,7 @@ PARAMETERS = [(encoding, layout) for encoding, layout in PAIRS if LAYOUTS[layout
 @pytest.mark.parametrize(("encoding", "layout"), PARAMETERS)
 def test_all_parameters_of_layouts_return(encoding: str, layout: str, tmp_path: Path) -> None:
     size = rounded(ENCODINGS[encoding], 8, 6)
-    values = bound(layout, ENCODINGS[encoding], *size).parameters.to_values()
+    values = bound(layout, ENCODINGS[encoding], *size).parameters.values
     assert set(values) == LAYOUTS[layout].parameters
     document = png()
     del document["body"]
@@ -410,7 +410,7 @@ def test_all_parameters_of_layouts_return(encoding: str, layout: str, tmp_path: 
     path = write(tmp_path, document)
     read = load_stream(path)
     assert document_of(read) == document
-    assert read.layout.parameters.to_values() == values
+    assert read.layout.parameters.values == values
     assert Draft202012Validator(json.loads(schema_text("stream"))).is_valid(document)
     for name in values:
         with pytest.raises(FormatError, match=name):

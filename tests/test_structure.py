@@ -81,7 +81,13 @@ HOMES = {
     "cyclonedds": ("plugins/ros",),
     "pyarrow": ("plugins/exporting", "plugins/importing"),
     "yaml": ("yamlio.py", "bags", "plugins/ros"),
-    "pydantic": ("format", "dataset/checks.py", "plugins/evaluating", "plugins/importing"),
+    "pydantic": (
+        "format",
+        "messages/encodings.py",
+        "dataset/checks.py",
+        "plugins/evaluating",
+        "plugins/importing",
+    ),
     "jsonschema": ("dataset/checks.py",),
 }
 

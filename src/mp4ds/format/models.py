@@ -27,15 +27,13 @@ from mp4ds.format.fields import (
     Side,
     Size,
     Uint32,
-    Uint64,
     Version,
     decode_base64,
     exceeds_padding,
 )
 from mp4ds.format.quality import Quality
-from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Parameters
+from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, NO_PARAMETERS, LayoutParameters
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, why_not
-from mp4ds.messages.numbers import MAX_TABLE
 from mp4ds.messages.png import PNG_ENCODINGS
 from mp4ds.messages.serializations import WIRES
 from mp4ds.messages.wire import CalibrationFields
@@ -262,39 +260,6 @@ class Color(Model):
     transfer: str = Field(description="Transfer characteristics.")
     matrix: str = Field(description="Matrix coefficients.")
     range: Literal["full", "limited"] = Field(description="Range of the samples.")
-
-
-class LayoutParameters(Model):
-    """What a layout needs to know of a stream."""
-
-    bits: Annotated[int, Field(ge=1, le=16)] | None = Field(
-        None, description="Bits of a value that are kept."
-    )
-    shift: Annotated[int, Field(ge=0, le=15)] | None = Field(
-        None, description="Zero bits below them in each sample of the image."
-    )
-    low: Annotated[int, Field(ge=1, le=8)] | None = Field(
-        None, description="How many of the bits are low ones, folded and stored apart."
-    )
-    table: Annotated[list[Uint64], Field(max_length=MAX_TABLE)] | None = Field(
-        None, description="The bit patterns that occur, or that levels show; increasing."
-    )
-    entries: Annotated[int, Field(ge=1, le=MAX_TABLE)] | None = Field(
-        None, description="Length of the list of values in each picture."
-    )
-    hole: Uint32 | None = Field(
-        None, description="Bit pattern of the float that stands for no measurement."
-    )
-    scale: str | None = Field(None, description="product or quotient: of metres.")
-    alpha: Annotated[int, Field(ge=0, le=255)] | None = Field(
-        None, description="Alpha of every pixel."
-    )
-    mosaic: str | None = Field(
-        None, description="Colours of its 2 x 2 block, by rows: rggb, bggr, gbrg or grbg."
-    )
-    rule: str | None = Field(
-        None, description="How colours were made of YUV (registry, Colours of YUV)."
-    )
 
 
 class VideoModel(Model):
@@ -554,10 +519,8 @@ class StreamSidecar(Model):
         Raises:
             ValueError: It does not suit the images, or its parameters.
         """
-        given = self.video.parameters
-        values = given.model_dump(exclude_none=True) if given else {}
         encoding = ENCODINGS[self.image.encoding]
-        return bind(self.video.layout, encoding, Parameters.from_values(values))
+        return bind(self.video.layout, encoding, self.video.parameters or NO_PARAMETERS)
 
 
 # ---------------------------------------------------------------- facts of a finished video

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
 from mp4ds.errors import Refused
 
@@ -292,69 +293,56 @@ Samples = NDArray[Any]
 Picture = tuple[Samples, ...]
 """What the video holds: one array (rows, columns[, channels]), or one per plane."""
 
+MAX_TABLE = 4096
+"""Maximum number of values in a table; bounds a sidecar's size."""
+
+_Uint64 = Annotated[int, Field(ge=0, le=2**64 - 1)]
+
 DEPTHS = (8, 10, 12, 14)
 """Bits per sample of pictures, other than 16."""
 
 
-@dataclass(frozen=True, slots=True)
-class Parameters:
-    """Parameters of a layout for a stream; a layout has exactly the ones it needs.
+class LayoutParameters(BaseModel):
+    """What a layout needs to know of a stream."""
 
-    Attributes:
-        bits: Bits per sample of the picture, or in use in those of the image.
-        shift: Zero bits below them in each sample of the image.
-        low: Number of low bits, folded and stored separately.
-        table: The bit patterns that occur, or that a picture's samples stand for, increasing.
-        entries: Length of the list of values in each picture.
-        hole: Bit pattern of the float that stands for no measurement.
-        scale: One of `mp4ds.messages.numbers.SCALES`.
-        alpha: Bit pattern of every pixel's alpha.
-        mosaic: What an image was made of, by the colours of its 2 x 2 block, such as ``rggb``.
-        rule: How colours were made of YUV, one of `mp4ds.messages.sources.CONVERSIONS`.
-    """
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    bits: int | None = None
-    shift: int | None = None
-    low: int | None = None
-    table: tuple[int, ...] | None = None
-    entries: int | None = None
-    hole: int | None = None
-    scale: str | None = None
-    alpha: int | None = None
-    mosaic: str | None = None
-    rule: str | None = None
+    bits: Annotated[int, Field(ge=1, le=16)] | None = Field(
+        None, description="Bits of a value that are kept."
+    )
+    shift: Annotated[int, Field(ge=0, le=15)] | None = Field(
+        None, description="Zero bits below them in each sample of the image."
+    )
+    low: Annotated[int, Field(ge=1, le=8)] | None = Field(
+        None, description="How many of the bits are low ones, folded and stored apart."
+    )
+    table: Annotated[tuple[_Uint64, ...], Field(max_length=MAX_TABLE, strict=False)] | None = Field(
+        None, description="The bit patterns that occur, or that levels show; increasing."
+    )
+    entries: Annotated[int, Field(ge=1, le=MAX_TABLE)] | None = Field(
+        None, description="Length of the list of values in each picture."
+    )
+    hole: Annotated[int, Field(ge=0, le=2**32 - 1)] | None = Field(
+        None, description="Bit pattern of the float that stands for no measurement."
+    )
+    scale: str | None = Field(None, description="product or quotient: of metres.")
+    alpha: Annotated[int, Field(ge=0, le=255)] | None = Field(
+        None, description="Alpha of every pixel."
+    )
+    mosaic: str | None = Field(
+        None, description="Colours of its 2 x 2 block, by rows: rggb, bggr, gbrg or grbg."
+    )
+    rule: str | None = Field(
+        None, description="How colours were made of YUV (registry, Colours of YUV)."
+    )
 
     @property
-    def names(self) -> frozenset[str]:
-        """Names of those that are set."""
-        return frozenset(f.name for f in fields(self) if getattr(self, f.name) is not None)
-
-    def only(self, names: Collection[str]) -> Parameters:
-        """Those of some names."""
-        return Parameters(**{name: getattr(self, name) for name in names})
-
-    def to_values(self) -> dict[str, Any]:
+    def values(self) -> dict[str, Any]:
         """As JSON values, without those that are not set."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name in self.names}
-        return values | ({"table": list(self.table)} if self.table is not None else {})
-
-    @classmethod
-    def from_values(cls, values: Mapping[str, Any]) -> Parameters:
-        """The inverse of `to_values`; `mp4ds.messages.layouts.bind` checks the values.
-
-        Raises:
-            ValueError: A name is unknown.
-        """
-        known = {f.name for f in fields(cls)}
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"unknown layout parameter {unknown[0]!r}")
-        given = dict(values)
-        if isinstance(given.get("table"), list):
-            given["table"] = tuple(given["table"])
-        return cls(**given)
+        return self.model_dump(mode="json", exclude_none=True)
 
 
-NO_PARAMETERS = Parameters()
+NO_PARAMETERS = LayoutParameters()
 
 
 def patterns(pixels: Pixels) -> Samples:
@@ -366,11 +354,6 @@ def native(pixels: Pixels) -> Samples:
     """The bit patterns of pixels in native byte order; a view where possible."""
     found = patterns(pixels)
     return found.astype(found.dtype.newbyteorder("="), copy=False)
-
-
-def is_integer(value: Any, top: int) -> bool:
-    """Whether a value of a sidecar is an integer from 0 to `top`."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= top
 
 
 class Values(ABC):
@@ -388,7 +371,7 @@ class Values(ABC):
 
     @classmethod
     @abstractmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
         """That with some parameters, which are those it needs.
 
         Raises:
@@ -396,7 +379,7 @@ class Values(ABC):
         """
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """Parameters that suit samples of a stream, at least one; None if there are none."""
         return NO_PARAMETERS
 
@@ -462,7 +445,7 @@ class Whole(Values):
         self.is_identity = not encoding.is_signed
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
         """No parameters are needed."""
         return cls(encoding)
 
@@ -496,13 +479,12 @@ class Narrow(Values):
         self._half = 1 << (bits + shift - 1) if signed else 0
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Narrow:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Narrow:
         """For so many bits above so many zero bits."""
-        bits, shift = parameters.bits, parameters.shift
-        is_known = is_integer(bits, 16) and bits in cls.depths
-        if not is_known or not is_integer(shift, 16 - (bits or 0)):
+        bits, shift = parameters.bits or 0, parameters.shift or 0
+        if bits not in cls.depths or bits + shift > 16:
             raise ValueError(f"no layout has {bits} bits above {shift} zero bits")
-        return cls(bits or 0, shift or 0, encoding.is_signed)
+        return cls(bits, shift, encoding.is_signed)
 
     def _shifted(self, pixels: Pixels) -> Samples:
         samples = native(pixels)
@@ -533,7 +515,7 @@ class Narrow(Values):
         return None
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The fewest bits for values that end at the highest bit, or at the twelfth.
 
         At the highest bit, the zeros below show the sensor's depth. Elsewhere a scene may just be
@@ -548,13 +530,13 @@ class Narrow(Values):
         zeros = (used & -used).bit_length() - 1
         bits = (used >> zeros).bit_length()
         if not encoding.is_signed and bits in DEPTHS and most >> zeros == (1 << bits) - 1:
-            return Parameters(bits=bits, shift=zeros)
+            return LayoutParameters(bits=bits, shift=zeros)
         # top bit of the values, and minimum zero bits below
         for top, least in ((16, 4), (12, 0), (16, 2)):
             bits = next((depth for depth in DEPTHS if depth >= top - zeros), 16)
             narrow = cls(bits, top - bits, encoding.is_signed)
             if zeros >= least and bits < 16 and not any(map(narrow.refuses, samples)):
-                return Parameters(bits=bits, shift=top - bits)
+                return LayoutParameters(bits=bits, shift=top - bits)
         return None
 
 
@@ -564,15 +546,15 @@ class NarrowPlanes(Narrow):
     depths = DEPTHS[1:]
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """As for grey, but at least 10 bits."""
         found = Narrow.fit(encoding, samples)
         if found is None or found.bits != 8:
             return found
-        return replace(found, bits=10, shift=max((found.shift or 0) - 2, 0))
+        return LayoutParameters(bits=10, shift=max((found.shift or 0) - 2, 0))
 
 
-_MOST_LOW, _MOST_HIGH = 8, 10  # bits that a plane of folded samples may have
+_MOST_HIGH = 10  # bits that a plane of folded samples may have
 _LOW_BITS = {12: 3, 14: 5, 16: 8}  # by measurement: the bits that are mostly noise
 
 
@@ -583,19 +565,21 @@ class NarrowFolded(Narrow):
     depths = (*DEPTHS, 16)
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Narrow:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Narrow:
         """For so many low bits of them, too."""
-        values, low = super().bind(encoding, parameters), parameters.low
-        if not low or not is_integer(low, _MOST_LOW) or not 1 <= values.bits - low <= _MOST_HIGH:
+        values, low = super().bind(encoding, parameters), parameters.low or 0
+        if not 1 <= values.bits - low <= _MOST_HIGH:
             raise ValueError(f"no layout has {low} low bits of {values.bits}")
         return values
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """All bits, or those in use if there are enough of them to separate noise from the rest."""
-        found = Narrow.fit(encoding, samples) or Parameters(bits=16, shift=0)
+        found = Narrow.fit(encoding, samples) or LayoutParameters(bits=16, shift=0)
         low = _LOW_BITS.get(found.bits or 0)
-        return None if low is None else replace(found, low=low)
+        return (
+            None if low is None else LayoutParameters(bits=found.bits, shift=found.shift, low=low)
+        )
 
 
 class Opaque(Values):
@@ -612,10 +596,8 @@ class Opaque(Values):
         self.alpha = alpha
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
         """For that alpha."""
-        if not is_integer(parameters.alpha, 255):
-            raise ValueError(f"an alpha of {parameters.alpha}, which is no byte")
         return cls(parameters.alpha or 0)
 
     def shape(self, pixels: Pixels) -> tuple[int, ...]:
@@ -638,9 +620,9 @@ class Opaque(Values):
         return None
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The alpha of the first pixel, if all have it."""
         alpha = int(samples[0][0, 0, 3])
         if any(cls(alpha).refuses(pixels) for pixels in samples):
             return None
-        return Parameters(alpha=alpha)
+        return LayoutParameters(alpha=alpha)

@@ -20,11 +20,11 @@ from mp4ds.messages.encodings import (
     NO_PARAMETERS,
     Arrangement,
     Encoding,
+    LayoutParameters,
     Narrow,
     NarrowFolded,
     NarrowPlanes,
     Opaque,
-    Parameters,
     Picture,
     Pixels,
     Prediction,
@@ -417,7 +417,7 @@ def _toned(encoding: Encoding) -> Packed:
     return Packed("gray" if encoding.channels == 1 else f"{_rgb_order(encoding)}24")
 
 
-def _fold(parameters: Parameters, first: Mosaic | Packed = Packed()) -> Fold:
+def _fold(parameters: LayoutParameters, first: Mosaic | Packed = Packed()) -> Fold:
     return Fold(parameters.bits or 16, parameters.low or 8, first)
 
 
@@ -440,7 +440,7 @@ class LayoutKind:
 
     name: str
     values: type[Values]
-    arrangement: Callable[[Encoding, Parameters], Arrangement]
+    arrangement: Callable[[Encoding, LayoutParameters], Arrangement]
     is_exact: bool = True
     is_shown: bool = False
 
@@ -452,7 +452,7 @@ class LayoutKind:
 
 def _shown(
     name: str,
-    arrangement: Callable[[Encoding, Parameters], Arrangement],
+    arrangement: Callable[[Encoding, LayoutParameters], Arrangement],
     values: type[Values] = Whole,
     *,
     exact: bool = True,
@@ -526,7 +526,7 @@ class Layout:
 
     name: str
     encoding: Encoding
-    parameters: Parameters
+    parameters: LayoutParameters
     is_exact: bool
     is_shown: bool
     pixel_format: str
@@ -600,7 +600,7 @@ class Layout:
             add_prediction(out, *prediction)
 
 
-def bind(name: str, encoding: Encoding, parameters: Parameters = NO_PARAMETERS) -> Layout:
+def bind(name: str, encoding: Encoding, parameters: LayoutParameters = NO_PARAMETERS) -> Layout:
     """The layout with that name for the images of a stream.
 
     Args:
@@ -614,9 +614,9 @@ def bind(name: str, encoding: Encoding, parameters: Parameters = NO_PARAMETERS) 
     if name not in (*encoding.exact, encoding.lossy):
         raise ValueError(f"layout {name} does not carry {encoding.name} images")
     kind = LAYOUTS[name]
-    if parameters.names != kind.parameters:
+    if parameters.values.keys() != kind.parameters:
         needed = ", ".join(sorted(kind.parameters)) or "none"
-        given = ", ".join(sorted(parameters.names)) or "none"
+        given = ", ".join(sorted(parameters.values)) or "none"
         raise ValueError(f"layout {name} needs the parameters {needed} and was given {given}")
     values = kind.values.bind(encoding, parameters)
     arrangement = kind.arrangement(encoding, parameters)

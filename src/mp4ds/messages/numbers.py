@@ -3,44 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
 
 from mp4ds.messages.encodings import (
+    MAX_TABLE,
     Arrangement,
     Encoding,
+    LayoutParameters,
     Narrow,
-    Parameters,
     Picture,
     Pixels,
     Samples,
     Values,
     Whole,
-    is_integer,
     native,
     patterns,
 )
-
-MAX_TABLE = 4096
-"""Maximum number of values in a table; bounds a sidecar's size."""
 
 SCALES = ("product", "quotient")
 """How metres were made from millimetres: ``k * 0.001f`` or ``k / 1000``."""
 
 
-def table_of(encoding: Encoding, parameters: Parameters) -> Samples:
+def table_of(encoding: Encoding, parameters: LayoutParameters) -> Samples:
     """The table of a layout, as patterns of an encoding's samples.
 
     Raises:
         ValueError: It is empty or too long, does not increase, or has other values.
     """
     table = parameters.table or ()
-    if not 1 <= len(table) <= MAX_TABLE:
-        raise ValueError(f"a table of {len(table)} values, not of 1 to {MAX_TABLE}")
+    if not table:
+        raise ValueError("a table of 0 values")
     top = 256**encoding.bytes_per_sample - 1
-    if not all(is_integer(value, top) for value in table):
+    if max(table) > top:
         raise ValueError(f"a table with values beyond 0 to {top}")
     array = np.array(table, f"u{encoding.bytes_per_sample}")
     if (array[1:] <= array[:-1]).any():
@@ -62,7 +59,7 @@ class PatternTable(Values):
         self.bits = 8 if len(table) <= 256 else 16
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
         """For that table."""
         return cls(table_of(encoding, parameters))
 
@@ -97,7 +94,7 @@ class PatternTable(Values):
         return None
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The patterns of the samples, if they are few; integers must also be sparse.
 
         If the second half of the samples has patterns missing in the first, later images would have
@@ -114,7 +111,7 @@ class PatternTable(Values):
         values = found.tolist()
         if not encoding.is_float and values[-1] - values[0] + 1 < 2 * len(values):
             return None  # a plain picture has hardly more values
-        return Parameters(table=tuple(values))
+        return LayoutParameters(table=tuple(values))
 
 
 _DARK, _BRIGHT = 16, 239  # levels between which values are shown that are close together
@@ -136,12 +133,12 @@ class Tone(PatternTable):
         self._between = (wide[:-1] + wide[1:] + 1) // 2
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
         """For so many bits above so many zero bits, and that table."""
-        bits, shift = parameters.bits or 0, parameters.shift
-        if not is_integer(bits, 16) or bits < 8 or not is_integer(shift, 16 - bits):
+        bits, shift = parameters.bits or 0, parameters.shift or 0
+        if bits < 8 or bits + shift > 16:
             raise ValueError(f"no layout shows {bits} bits above {shift} zero bits")
-        table, used = table_of(encoding, parameters), Narrow(bits, shift or 0, signed=False)
+        table, used = table_of(encoding, parameters), Narrow(bits, shift, signed=False)
         if len(table) != 256:
             raise ValueError(f"a table of {len(table)} values, not of 256")
         if reason := used.refuses(table):
@@ -157,7 +154,7 @@ class Tone(PatternTable):
         return self._used.refuses(pixels)
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The bits in use, and a curve.
 
         The median is shown in the middle, as far as that is between a linear curve and a quadratic
@@ -165,7 +162,7 @@ class Tone(PatternTable):
         samples have, since a camera may start in the dark. Only values that are close together, far
         from both, as temperatures are, get most of the levels.
         """
-        used = Narrow.fit(encoding, samples) or Parameters(bits=16, shift=0)
+        used = Narrow.fit(encoding, samples) or LayoutParameters(bits=16, shift=0)
         bits, shift = used.bits or 16, used.shift or 0
         values = np.concatenate([native(pixels)[::3, ::3].ravel() for pixels in samples]) >> shift
         low, middle, high = map(float, np.quantile(values, (0.001, 0.5, 0.999)))
@@ -179,7 +176,7 @@ class Tone(PatternTable):
             share = min(max(4 * middle / top - 1, 255 / top), 1)
             curve = top * (share * level / 255 + (1 - share) * (level / 255) ** 2)
         table = ((curve + 0.5).astype(int) << shift).tolist()
-        return replace(used, bits=bits, shift=shift, table=tuple(table))
+        return LayoutParameters(bits=bits, shift=shift, table=tuple(table))
 
 
 _EXPONENT = 0x7F800000  # all ones in NaN and infinity
@@ -211,11 +208,9 @@ class Metres(Values):
         self.hole, self.scale = hole, scale
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
         """For that hole and scale."""
         hole, scale = parameters.hole, parameters.scale
-        if not is_integer(hole, 2**32 - 1):
-            raise ValueError(f"a hole of {hole}, which is no pattern of 32 bits")
         if scale not in SCALES:
             raise ValueError(f"scale {scale!r} is not one of {', '.join(SCALES)}")
         return cls(hole or 0, scale)
@@ -247,7 +242,7 @@ class Metres(Values):
         return None
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The scale, and the hole that occurs."""
         hole = 0
         for pixels in samples:
@@ -261,13 +256,13 @@ class Metres(Values):
             if not any(metres.refuses(pixels[::16, ::16]) for pixels in samples) and not any(
                 metres.refuses(pixels) for pixels in samples
             ):
-                return Parameters(hole=hole, scale=scale)
+                return LayoutParameters(hole=hole, scale=scale)
         return None
 
 
 # ---------------------------------------------------------------- few values in an image
 
-FEWEST_ENTRIES, MOST_ENTRIES = 256, 4096
+FEWEST_ENTRIES, MOST_ENTRIES = 256, MAX_TABLE
 """Bounds of a list's length, which is a power of two."""
 
 _ROOM = 3 / 2  # entries per value of a sample image
@@ -287,15 +282,13 @@ class Few(Whole):
         self.entries = entries
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
         """For a list of so many entries."""
-        entries = parameters.entries
-        if not entries or not is_integer(entries, MOST_ENTRIES) or entries & (entries - 1):
+        entries = parameters.entries or 0
+        if entries < FEWEST_ENTRIES or entries & (entries - 1):
             raise ValueError(
-                f"a list of {entries} values, which is no power of two up to {MOST_ENTRIES}"
+                f"a list of {entries} values, which is no power of two from {FEWEST_ENTRIES} on"
             )
-        if entries < FEWEST_ENTRIES:
-            raise ValueError(f"a list of {entries} values, less than {FEWEST_ENTRIES}")
         return cls(encoding, entries)
 
     def refuses(self, pixels: Pixels) -> str | None:
@@ -306,7 +299,7 @@ class Few(Whole):
         return None
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """Allow for half as many values again; integers must be sparse."""
         most = 0
         for pixels in samples:
@@ -319,7 +312,7 @@ class Few(Whole):
         entries = FEWEST_ENTRIES
         while entries < most * _ROOM:
             entries *= 2
-        return Parameters(entries=entries) if entries <= MOST_ENTRIES else None
+        return LayoutParameters(entries=entries) if entries <= MOST_ENTRIES else None
 
 
 def distinct(samples: Samples) -> Samples:

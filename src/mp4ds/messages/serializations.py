@@ -355,7 +355,8 @@ def _checked(values: dict[str, Any]) -> dict[str, Any]:
             raise WireError(f"it has {len(values[name])} values in {name}, not {size}")
     if len(values.get("D", ())) > MAX_DISTORTION:
         raise WireError(f"it has {len(values['D'])} distortion parameters")
-    return {name.lower(): value for name, value in values.items()}
+    lists = {name.lower(): tuple(values[name]) for name in "DKRP" if name in values}
+    return values | lists
 
 
 def _declared(type_name: str, schema: bytes, kinds: Mapping[str, Kind]) -> Mapping[int, _Declared]:

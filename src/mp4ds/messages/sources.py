@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import Refused
 from mp4ds.messages.encodings import (
     Encoding,
-    Parameters,
+    LayoutParameters,
     Pixels,
     Samples,
     Values,
@@ -29,20 +29,16 @@ class Source(Values):
     """What the colours of an image were made of."""
 
     @abstractmethod
-    def source(self, pixels: Pixels) -> Samples | str:
-        """New samples that `decode` gives the pixels of, or why there are none."""
+    def prove(self, pixels: Pixels) -> Samples:
+        """New samples that `decode` gives the pixels of."""
 
     def refuses(self, pixels: Pixels) -> str | None:
-        """What `source` says if there are no samples."""
-        found = self.source(pixels)
-        return found if isinstance(found, str) else None
-
-    def prove(self, pixels: Pixels) -> Samples:
-        """New samples."""
-        found = self.source(pixels)
-        if isinstance(found, str):
-            raise Refused(found)
-        return found
+        """What `prove` says if there are no samples."""
+        try:
+            self.prove(pixels)
+        except Refused as reason:
+            return str(reason)
+        return None
 
 
 def _colours(pixels: Pixels, encoding: Encoding) -> Pixels:
@@ -191,7 +187,7 @@ class Demosaiced(Source):
         self.bits = 8 * encoding.bytes_per_sample
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
         """For that mosaic."""
         if parameters.mosaic not in MOSAICS:
             raise ValueError(f"mosaic {parameters.mosaic!r} is not one of {', '.join(MOSAICS)}")
@@ -213,22 +209,22 @@ class Demosaiced(Source):
         """Write the pixels."""
         _demosaic(samples, self.mosaic, _colours(patterns(out), self._encoding))
 
-    def source(self, pixels: Pixels) -> Samples | str:
+    def prove(self, pixels: Pixels) -> Samples:
         """The mosaic, if interpolation gives every colour."""
         made = np.empty(pixels.shape, native(pixels).dtype)
         samples = self.encode(pixels)
         self.decode(samples, made)
-        if np.array_equal(made, native(pixels)):
-            return samples
-        return f"it was not made of a mosaic ({self.mosaic})"
+        if not np.array_equal(made, native(pixels)):
+            raise Refused(f"it was not made of a mosaic ({self.mosaic})")
+        return samples
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The only mosaic that explains the inside of a few places, if it explains all images."""
         found = [name for name in MOSAICS if cls(encoding, name)._may_have_made(samples[0])]
         if len(found) != 1 or any(map(cls(encoding, found[0]).refuses, samples)):
             return None
-        return Parameters(mosaic=found[0])
+        return LayoutParameters(mosaic=found[0])
 
     def _may_have_made(self, pixels: Pixels) -> bool:
         for rows in _band_rows(len(pixels)):
@@ -505,7 +501,7 @@ class Converted(Source):
         self.rule = rule
 
     @classmethod
-    def bind(cls, encoding: Encoding, parameters: Parameters) -> Values:
+    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
         """For that rule."""
         if parameters.rule not in CONVERSIONS:
             raise ValueError(f"rule {parameters.rule!r} is not one of {', '.join(CONVERSIONS)}")
@@ -581,19 +577,19 @@ class Converted(Source):
         for color, made in enumerate(CONVERSIONS[self.rule].colours(blocks, chroma)):
             target[..., color] = np.clip(made, 0, 255).reshape(luma.shape)
 
-    def source(self, pixels: Pixels) -> Samples | str:
+    def prove(self, pixels: Pixels) -> Samples:
         """The YUV, if there is one for every colour."""
         if pixels.shape[1] % 2 or (self.is_tall and pixels.shape[0] % 2):
-            return "it has an odd side"
+            raise Refused("it has an odd side")
         solution = self._solved(pixels)
         if not solution.is_refuted:
             solution.complete()
         if solution.is_open.any():
-            return f"it was not made of YUV ({self.rule})"
+            raise Refused(f"it was not made of YUV ({self.rule})")
         return self._placed(solution, pixels)
 
     @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> Parameters | None:
+    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The rule that explains a few places with several chromas, and all images."""
         height, width = samples[0].shape[:2]
         if width % 2 or (cls.is_tall and height % 2):
@@ -605,7 +601,7 @@ class Converted(Source):
             if solution.is_refuted or len(np.unique(solution.chroma)) < _FEWEST_CHROMAS:
                 continue
             if not any(map(tried.refuses, samples)):
-                return Parameters(rule=name)
+                return LayoutParameters(rule=name)
         return None
 
 

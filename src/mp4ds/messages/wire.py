@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 NS = 10**9
@@ -38,7 +38,7 @@ class ImageFields:
     width: int
     height: int
     step: int
-    is_bigendian: int
+    is_bigendian: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,27 +264,10 @@ def make_fields(kind: type[Fields], values: Mapping[str, Any]) -> Fields:
     Raises:
         WireError: A value of a calibration is infinite or not a number, which YAML cannot hold.
     """
-    if kind is CodedFields:
-        return CodedFields(values["format"], values.get("width", 0), values.get("height", 0))
-    width, height = values["width"], values["height"]
-    if kind is ImageFields:
-        bigendian = values.get("is_bigendian", 0)
-        return ImageFields(values["encoding"], width, height, values["step"], bigendian)
-    d, k, r, p = (tuple(values[name]) for name in "dkrp")
-    if any(value - value != 0 for value in (*d, *k, *r, *p)):
+    if any(value - value != 0 for name in "dkrp" for value in values.get(name, ())):
         raise WireError("a calibration value is not finite")
-    return CalibrationFields(
-        height=height,
-        width=width,
-        distortion_model=values["distortion_model"],
-        d=d,
-        k=k,
-        r=r,
-        p=p,
-        binning_x=values.get("binning_x", 0),
-        binning_y=values.get("binning_y", 0),
-        roi=values.get("roi", (0, 0, 0, 0)),
-        roi_do_rectify=values.get("roi_do_rectify", 0),
+    return kind(
+        **{field.name: values[field.name] for field in fields(kind) if field.name in values}
     )
 
 

@@ -211,7 +211,7 @@ def _lossy_plans(
     coding = Coding(layout, recipe, options.group_frames)
     if target is None:
         plan = TrackPlan(coding, profile=str(quality), note=note)
-        return [plan, *([_general_plan(key, options)] if layout.parameters.names else [])]
+        return [plan, *([_general_plan(key, options)] if layout.parameters.values else [])]
     coder = WindowCoder(coding, (key.width, key.height), target, threads, rate)
     is_jpeg = key.body == "jpeg"
     try:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.errors import EncoderRefusedError, Refused
-from mp4ds.format.models import Color, LayoutParameters
+from mp4ds.format.models import Color
 from mp4ds.format.quality import Quality as Measured
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, Prediction, native
 from mp4ds.messages.layouts import layout_for
@@ -239,7 +239,6 @@ class _PictureTrack(Track):
 
     def describe(self) -> dict[str, Any]:
         layout, recipe = self.coding.layout, self.coding.recipe
-        values = layout.parameters.to_values()
         color = Color(
             primaries="bt709",
             transfer="bt709",
@@ -248,7 +247,7 @@ class _PictureTrack(Track):
         )
         return {
             "layout": layout.name,
-            "parameters": LayoutParameters.model_validate(values) if values else None,
+            "parameters": layout.parameters if layout.parameters.values else None,
             "codec": recipe.codec,
             "pixel_format": recipe.pixel_format,
             "width": self.size[0],

@@ -21,7 +21,7 @@ from mp4ds.messages import png
 from mp4ds.messages.encodings import (
     MAX_SIDE,
     Encoding,
-    Parameters,
+    LayoutParameters,
     Picture,
     Pixels,
 )
@@ -369,7 +369,7 @@ class Coding:
     def text(self) -> str:
         """All of it in words: the same for the same coding, in every process."""
         layout, recipe = self.layout, self.recipe
-        values, options = layout.parameters.to_values(), dict(recipe.options)
+        values, options = layout.parameters.values, dict(recipe.options)
         return f"{layout.name} {values} {recipe.encoder} {options} gop {self.gop}"
 
 
@@ -592,18 +592,18 @@ def difference_layouts(view: Layout) -> list[Layout]:
         In order of preference, with the general one.
     """
     encoding, of = view.encoding, view.parameters
-    known = Parameters(
-        bits=of.bits,
-        shift=of.shift,
-        low=None if of.bits is None else of.bits - 8,  # two planes of 8 bits, as PNG files have
-        alpha=None if of.alpha is None else 128,  # that of no difference
-    )
+    known = {
+        "bits": of.bits,
+        "shift": of.shift,
+        "low": None if of.bits is None else of.bits - 8,  # two planes of 8 bits, as PNG files have
+        "alpha": None if of.alpha is None else 128,  # that of no difference
+    }
     found = []
     for name in encoding.exact:
-        needed = LAYOUTS[name].parameters
-        if needed <= known.names:
+        needed = {key: known.get(key) for key in LAYOUTS[name].parameters}
+        if None not in needed.values():
             with suppress(ValueError):  # for so many bits
-                found.append(bind(name, encoding, known.only(needed)))
+                found.append(bind(name, encoding, LayoutParameters.model_validate(needed)))
     return found
 
 
