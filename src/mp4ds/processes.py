@@ -1,4 +1,4 @@
-"""Calls that run in processes of this machine."""
+"""Calls that run in processes of this machine, and calls of its system."""
 
 from __future__ import annotations
 
@@ -24,6 +24,25 @@ from mp4ds.errors import Mp4dsError, sentence_of
 _Item = TypeVar("_Item")
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
+
+
+_SWAP = 2  # RENAME_EXCHANGE of Linux, RENAME_SWAP of macOS
+_AT_FDCWD = -100
+
+
+def swap_names(one: Path, other: Path) -> bool:
+    """Give two files or folders the name of one another, at once.
+
+    Returns:
+        Whether that was done; False if the system or file system cannot.
+    """
+    names = os.fsencode(one), os.fsencode(other)
+    with suppress(AttributeError, OSError, TypeError):  # the system lacks the function or library
+        libc = ctypes.CDLL(None)
+        if sys.platform == "darwin":
+            return not libc.renamex_np(*names, _SWAP)
+        return not libc.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _SWAP)
+    return False
 
 
 def available_cores() -> int:

@@ -30,6 +30,7 @@ from mp4ds.errors import (
     interrupted,
 )
 from mp4ds.files.urls import RemotePath, remote
+from mp4ds.processes import swap_names
 
 try:
     import fcntl
@@ -280,9 +281,7 @@ def staged(
 
 @contextmanager
 def work_folder(parent: Path, prefix: str) -> Iterator[Path]:
-    """A private folder for this run, removed at the end.
-
-    Those left by killed runs are removed first.
+    """A private folder for this run, removed at its end; those of killed runs are removed first.
 
     Args:
         parent: Where it is made.
@@ -503,9 +502,9 @@ def _move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned:
     """Give an output its final name, replacing what is there.
 
     Args:
-        path: The complete output.
+        path: The complete output; afterwards what it replaced, if names can be swapped.
         target: Its final name.
-        old: Where to move what it replaces, on the same file system.
+        old: Where else to move what it replaces, on the same file system.
         force: Replace what is there.
         owned: Returns which files of that mp4ds wrote.
 
@@ -524,14 +523,15 @@ def _move_into_place(path: Path, target: Path, old: Path, *, force: bool, owned:
         raise TargetExistsError(target)  # it appeared meanwhile
     else:
         check_replaceable(target, owned)
-        old.parent.mkdir(exist_ok=True)
-        target.rename(old)
-        try:
-            path.rename(target)
-        except OSError:
-            with suppress(OSError):
-                old.rename(target)
-            raise
+        if not swap_names(path, target):  # which leaves no moment without either
+            old.parent.mkdir(exist_ok=True)
+            target.rename(old)
+            try:
+                path.rename(target)
+            except OSError:
+                with suppress(OSError):
+                    old.rename(target)
+                raise
     sync_folder(target.parent)
 
 
