@@ -123,6 +123,22 @@ def test_zeros_in_a_piece(unfinished: Path) -> None:
         assert 0 < len(dataset["/cam/image_raw"]) < FRAMES
 
 
+def test_zeros_in_the_summary_of_a_piece(unfinished: Path) -> None:
+    """What it repeats is in the chunks: a channel of it without a name is none."""
+    path = unfinished / PIECE
+    data = path.read_bytes()
+    start = data.rindex(b"/cam/image_raw") - 8  # of the fields of a channel
+    size = int.from_bytes(data[start - 8 : start], "little")
+    path.write_bytes(data[:start] + bytes(size) + data[start + size :])
+    result = salvaged(unfinished)
+    assert result.code == 0, result
+    assert f"lost: {PIECE} at byte " in result.out
+    assert "its summary is damaged" in result.out
+    mp4ds.unpack(unfinished.with_name("made"), None, unfinished.with_name("again.bag"))
+    source = [*(unfinished.parents[2] / "source").iterdir()]
+    assert compare(source, unfinished.with_name("again.bag")) == []
+
+
 def test_a_piece_that_is_missing(unfinished: Path) -> None:
     """It is counted as lost, as is what only a name that nobody else has given leads to."""
     (unfinished / PIECE).unlink()

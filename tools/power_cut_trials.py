@@ -186,7 +186,7 @@ class Judge:
         result = call(*words)
         if is_new and not is_forced:
             is_told = result.code and re.fullmatch(r"mp4ds: .* exists[^\n]+\n", result.err)
-            return "complete", problem + "" if is_told else f"is not refused: {result}", 0
+            return "complete", problem if is_told else f"is not refused: {result}", 0
         problem += result.err if result.code else self._wrong(output)
         return "replaced" if is_forced else "made again", problem, 0
 

@@ -348,6 +348,10 @@ class Declared:
         return None
 
 
+_OUTSIDE = {*(Opcode.HEADER, Opcode.METADATA, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.DATA_END)}
+"""What a recorder writes outside of chunks, before the summary."""
+
+
 def copy_verified(piece: Path, copy: Path) -> list[Loss]:
     """Copy what a recorder wrote, as far as it is certainly that: a power cut may leave zeros.
 
@@ -368,7 +372,7 @@ def copy_verified(piece: Path, copy: Path) -> list[Loss]:
         while head := source.read(FRAME.size):
             offset = source.tell() - len(head)
             kind, size = FRAME.unpack(head.ljust(FRAME.size, b"\0"))
-            is_whole = kind != 0 and size <= min(MAX_RECORD_BYTES, end - source.tell())
+            is_whole = kind in _OUTSIDE and size <= min(MAX_RECORD_BYTES, end - source.tell())
             body = source.read(size) if is_whole else b""
             if not is_whole:
                 losses.append(Loss(piece.name, offset, end - offset, "it ends within a record"))
@@ -381,7 +385,12 @@ def copy_verified(piece: Path, copy: Path) -> list[Loss]:
                 losses.append(Loss(piece.name, offset, len(head) + size, problem))
                 continue
             target.write(head + body)
-            if kind == Opcode.FOOTER:
-                target.write(source.read(len(MAGIC)))
+            if kind == Opcode.DATA_END:
+                place, summary = source.tell(), source.read(MAX_RECORD_BYTES)
+                checksum = int.from_bytes(summary[-len(MAGIC) - 4 : -len(MAGIC)], "little")
+                if zlib.crc32(summary[: -len(MAGIC) - 4]) == checksum:
+                    target.write(summary)
+                else:
+                    losses.append(Loss(piece.name, place, end - place, "its summary is damaged"))
                 break
     return losses
