@@ -21,8 +21,7 @@ from coded_tools import scene as packet_scene
 from commands import ROOT, program
 from mp4ds.errors import Mp4dsError, VideoError
 from mp4ds.video.codecs import Recipe, recipe_for
-from mp4ds.video.mp4 import read_sample_entry
-from mp4ds.video.packets import PacketReader, PacketWriter, join_segments
+from mp4ds.video.packets import PacketReader, PacketWriter, entry_of, join_segments
 from pictures import blocks as means_of_blocks
 from test_packets import write as write_packets
 from test_video import LOSSLESS, LOSSY, decode, encode, noise, same, scene_pictures, video_decoder
@@ -192,7 +191,7 @@ def test_the_file_is_as_one_encoder_writes_it(kind: Kind, joined: Joined, tmp_pa
     encode(uncut, recipe_of(kind), pictures_of(kind), kind[1], ticks=ticks, gop=GOP, threads=2)
     # the packets are others, and of AV1 the index has a box more
     assert differing(uncut, target) <= {"mdat", "stsz", "stss", "stco", "stsc", "btrt", "sdtp"}
-    assert read_sample_entry(target) == read_sample_entry(uncut)
+    assert entry_of(target) == entry_of(uncut)
     found = tree(target)
     parts = [tree(segment) for segment in segments]
     assert found["/mdat"] == b"".join(part["/mdat"] for part in parts)

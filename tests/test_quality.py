@@ -19,7 +19,7 @@ from definitions import IMAGE
 from in_parts import InlineExecutor, leftovers, use
 from mp4ds import yamlio
 from mp4ds.errors import ScoringError
-from mp4ds.format.quality import Quality
+from mp4ds.format.fields import Quality
 from mp4ds.packing.options import PackOptions
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.info import info

@@ -33,6 +33,7 @@ from mp4ds.format.fields import (
     MESSAGES_NAME,
     Columns,
     DecodedColumns,
+    Quality,
     columns_model,
     digests_model,
     exceeds_padding,
@@ -55,7 +56,6 @@ from mp4ds.format.models import (
     exact_name,
     video_facts,
 )
-from mp4ds.format.quality import Quality
 from mp4ds.format.sidecars import MANIFEST_NAME, FileNames, dump_document, verify_file
 from mp4ds.messages.transforms import Transform, TransformCollector
 from mp4ds.records import (
@@ -68,8 +68,8 @@ from mp4ds.records import (
     bounded,
 )
 from mp4ds.times import PresentationClock
-from mp4ds.video.mp4 import SampleEntry, read_sample_entry
-from mp4ds.video.packets import cut_segment, join_segments
+from mp4ds.video.mp4 import SampleEntry
+from mp4ds.video.packets import cut_segment, entry_of, join_segments
 
 Integers = NDArray[np.int64]
 _Identity = tuple[object, ...]
@@ -559,7 +559,7 @@ class _JoinedStream:
 
 
 def _entries(stream: Stream) -> list[SampleEntry]:
-    return [read_sample_entry(path) for path, _ in stream.videos]
+    return [entry_of(path) for path, _ in stream.videos]
 
 
 def _has_room(known: Mapping[str, object], models: Iterable[object]) -> bool:

@@ -23,6 +23,7 @@ from mp4ds.format.fields import (
     FileName,
     Model,
     Profile,
+    Quality,
     Sha256,
     Side,
     Size,
@@ -31,7 +32,6 @@ from mp4ds.format.fields import (
     decode_base64,
     exceeds_padding,
 )
-from mp4ds.format.quality import Quality
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, NO_PARAMETERS, LayoutParameters
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, why_not
 from mp4ds.messages.png import PNG_ENCODINGS

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.errors import EncoderRefusedError, Refused
+from mp4ds.format.fields import Quality as Measured
 from mp4ds.format.models import Color
-from mp4ds.format.quality import Quality as Measured
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, Prediction, native
 from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage

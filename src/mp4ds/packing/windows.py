@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.errors import Refused
-from mp4ds.format.quality import SCORE_STEPS
+from mp4ds.format.fields import SCORE_STEPS
 from mp4ds.packing.inspection import CameraMessage
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import LEAST_CRF, MAX_CRF, QualityTarget

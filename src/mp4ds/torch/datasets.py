@@ -26,8 +26,16 @@ from mp4ds.torch.cameras import (
     OpenCameras,
     Pictures,
 )
-from mp4ds.torch.recordings import Paths, Recording, each, one_of, recordings_of
-from mp4ds.torch.vectors import Pick, VectorReader, episodes_of
+from mp4ds.torch.recordings import (
+    Paths,
+    Pick,
+    Recording,
+    VectorReader,
+    each,
+    episodes_of,
+    one_of,
+    recordings_of,
+)
 
 Unit = Literal["frames", "seconds"]
 _MOST_SECONDS = 10**9

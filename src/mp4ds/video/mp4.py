@@ -80,18 +80,6 @@ def boxes(file: BinaryIO, start: int, end: int, *, outermost: bool = False) -> I
     raise DamagedBoxError(f"there are more than {_MOST_BOXES} boxes in one")
 
 
-def find_box(file: BinaryIO, kind: bytes, start: int, end: int, *, outermost: bool = False) -> Box:
-    """The first box of a kind; the arguments are those of `boxes`.
-
-    Raises:
-        DamagedBoxError: There is none, or one before it is damaged.
-    """
-    for box in boxes(file, start, end, outermost=outermost):
-        if box.kind == kind:
-            return box
-    raise DamagedBoxError(f"box {kind.decode('latin-1')} is missing")
-
-
 def why_unreadable(path: Path) -> str:
     """Why a file is no readable mp4, as a phrase; empty if its outermost boxes do not tell."""
     try:
@@ -147,7 +135,6 @@ class TrackColour:
 
 # ---------------------------------------------------------------- sample entry
 
-_TO_DESCRIPTION = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
 _ENTRY_BYTES = 78  # of a video's sample entry, between its header and the boxes in it
 _LONGEST_ENTRY = 1 << 20
 _CONFIGURATIONS = ("avcC", "hvcC", "av1C", "vpcC", "glbl")
@@ -228,47 +215,19 @@ class SampleEntry:
         return f"their codec configuration ({', '.join(kinds) or 'order or depth'})"
 
 
-def read_sample_entry(path: Path) -> SampleEntry:
-    """The description of the first track's packets.
-
-    Args:
-        path: An mp4, not trusted; at most 1 MiB of it is held.
-
-    Raises:
-        VideoError: ``file-missing``, or ``video-unreadable`` where there is not just one
-            description.
-        OSError: It cannot be read.
-    """
-    if not path.is_file():
-        raise VideoError("file-missing", path, "does not exist")
-    with path.open("rb") as file:
-        try:
-            box = Box(b"", 0, path.stat().st_size)
-            for kind in _TO_DESCRIPTION:
-                box = find_box(file, kind, box.start, box.end, outermost=kind == b"moov")
-            return parse_descriptions(file, box)
-        except DamagedBoxError as error:
-            raise VideoError(
-                "video-unreadable", path, f"has no usable track description: {error}"
-            ) from None
-
-
-def parse_descriptions(file: BinaryIO, stsd: Box) -> SampleEntry:
+def _parse_description(file: BinaryIO, stsd: Box) -> SampleEntry:
     """The only entry of a track's ``stsd``.
 
-    Args:
-        file: Where it is; at most 1 MiB of it is read.
-        stsd: Its place there.
-
     Raises:
-        DamagedBoxError: There is not just one, or it contradicts itself.
+        DamagedBoxError: It is too long, or contradicts itself.
+        Refused: There are several.
     """
     if stsd.size > _LONGEST_ENTRY:
         raise DamagedBoxError("it is too long")
     file.seek(stsd.start)
     data = file.read(stsd.size)
-    if data[4:8] != b"\0\0\0\1":
-        raise DamagedBoxError("there are several")
+    if int.from_bytes(data[4:8], "big") > 1:
+        raise Refused("its frames have several descriptions")
     file = io.BytesIO(data)
     entry = next(boxes(file, 8, len(data)), None)
     if entry is None or entry.size < _ENTRY_BYTES:
@@ -466,7 +425,7 @@ def _parse_track(movie: _Movie, track: Box, file_size: int) -> SampleTable:
     information = _required(media, b"minf")
     _check_references(movie, information)
     tables = movie.inside(movie.path(information, b"stbl"))
-    entry = _description(movie, _required(tables, b"stsd"))
+    entry = _parse_description(movie.file, _required(tables, b"stsd"))
     sizes = _sizes(movie, tables, file_size)
     places = _places(movie, tables, sizes, file_size)
     decoding, presentation = _times(movie, tables, len(sizes))
@@ -511,12 +470,6 @@ def _check_references(movie: _Movie, information: Box) -> None:
     for reference in boxes(movie.file, dref.start + 8, dref.end):
         if not movie.number(reference, 0) & _IN_THIS_FILE:
             raise Refused("its frames are in another file")
-
-
-def _description(movie: _Movie, stsd: Box) -> SampleEntry:
-    if movie.number(stsd, 4) > 1:
-        raise Refused("its frames have several descriptions")
-    return parse_descriptions(movie.file, stsd)
 
 
 def _sizes(movie: _Movie, tables: dict[bytes, Box], file_size: int) -> Integers:

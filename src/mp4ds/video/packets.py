@@ -27,7 +27,7 @@ from mp4ds.video.media import (
     raise_if_scarce,
     rate_hint,
 )
-from mp4ds.video.mp4 import SampleEntry, read_sample_entry
+from mp4ds.video.mp4 import SampleEntry
 
 _IVF = {"av1": b"AV01", "vp9": b"VP90"}
 
@@ -467,7 +467,7 @@ def _check(path: Path, codec: str, written: _Written, entry: SampleEntry, place:
     if not is_whole:
         problem = "could not be copied unchanged: a packet is damaged"
         raise VideoError("decode-failed", place, problem)
-    if difference := entry.differences(read_sample_entry(path)):
+    if difference := entry.differences(entry_of(path)):
         problem = f"differs from the segments it was made of in {difference}"
         raise VideoError("decode-failed", place, problem)
 
@@ -545,11 +545,21 @@ def _damage_told(path: Path, problem: str) -> Iterator[None]:
 
 
 def _common_entry(segments: Sequence[Path]) -> SampleEntry:
-    first = read_sample_entry(segments[0])
+    first = entry_of(segments[0])
     for segment in segments[1:]:
-        if difference := first.differences(read_sample_entry(segment)):
+        if difference := first.differences(entry_of(segment)):
             raise Mp4dsError(
                 f"{path_text(segment)}: cannot be joined to {path_text(segments[0])}: they differ "
                 f"in {difference}. Encode both with the same options, or keep them as two streams."
             )
     return first
+
+
+def entry_of(path: Path) -> SampleEntry:
+    """The description of a video's packets; empty where its index is not read.
+
+    Raises:
+        VideoError: ``file-missing`` or ``video-unreadable``.
+    """
+    with closing(Media(path)) as media:
+        return media.table.entry

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -132,87 +131,62 @@ def write_packet(frames: Sequence[CodedFrame]) -> str:
     return "+".join(",".join(map(str, frame.references)) or _KEY for frame in frames)
 
 
-class StructureRecorder:
-    """Finds the structures of a video from its packets, in the order coded.
+def find_structures(
+    codec: str, configuration: bytes, packets: Iterable[tuple[bytes, bool]]
+) -> Structures | None:
+    """The structures of a video.
 
     Memory is bounded by `MAX_CHARS` and eight bytes per group of pictures.
 
     Args:
         codec: Name in the registry.
         configuration: Of the track, as for its `StreamParser`.
+        packets: As the mp4 holds them, each with whether the file says that decoding can begin
+            there, in the order coded.
+
+    Returns:
+        None if the references of a frame are not known, or there are too many structures, or they
+        are too long.
     """
+    numbers: dict[str, int] = {}
+    groups = array("q")
+    try:
+        for text in _texts(codec, configuration, packets):
+            groups.append(numbers.setdefault(text, len(numbers)))
+            if len(numbers) > MAX_STRUCTURES or sum(map(len, numbers)) > MAX_CHARS:
+                return None
+    except UnknownStructure:
+        return None
+    return Structures(tuple(numbers), np.array(groups, np.int64)) if groups else None
 
-    def __init__(self, codec: str, configuration: bytes) -> None:
-        self._codec = codec
-        self._configuration = configuration
-        self._is_known = codec in CODECS and CODECS[codec].is_free
-        self._parser: StreamParser | None = None
-        self._packets: list[str] = []
-        self._chars = 0
-        self._numbers: dict[str, int] = {}
-        self._groups = array("q")
 
-    def add(self, packet: bytes | memoryview, *, key: bool) -> None:
-        """Add the next packet.
-
-        Args:
-            packet: As the mp4 holds it.
-            key: Whether the file says that decoding can begin here.
-        """
-        if not self._is_known:
-            return
-        try:
-            if key:
-                self._end_group()
-                self._parser = CODECS[self._codec].parser(self._configuration)
-            if self._parser is None:
-                raise UnknownStructure("it comes before the first key frame")
-            frames = self._parser.frames(packet, key=key)
-            text = write_packet(frames)
-        except UnknownStructure:
-            self._give_up()
-            return
-        self._packets.append(text)
-        self._chars += len(text) + 1
-        if self._chars > MAX_STRUCTURE_CHARS:
-            self._give_up()
-
-    def _end_group(self) -> None:
-        if not self._packets:
-            return
-        text = " ".join(self._packets)
-        self._packets, self._chars = [], 0
-        self._groups.append(self._numbers.setdefault(text, len(self._numbers)))
-        if len(self._numbers) > MAX_STRUCTURES or sum(map(len, self._numbers)) > MAX_CHARS:
-            raise UnknownStructure("it has too many structures")
-
-    def _give_up(self) -> None:
-        self._is_known = False
-        self._packets, self._numbers, self._groups = [], {}, array("q")
-
-    def finish(self) -> Structures | None:
-        """The structures found.
-
-        Returns:
-            None if the references of a frame are not known, or there are too many structures, or
-            they are too long.
-        """
-        try:
-            self._end_group()
-        except UnknownStructure:
-            self._give_up()
-        if not (self._is_known and self._groups):
-            return None
-        return Structures(tuple(self._numbers), np.array(self._groups, np.int64))
+def _texts(
+    codec: str, configuration: bytes, packets: Iterable[tuple[bytes, bool]]
+) -> Iterator[str]:
+    """The structure of each group."""
+    parser: StreamParser | None = None
+    texts: list[str] = []
+    for packet, is_key in packets:
+        if is_key:
+            if texts:
+                yield " ".join(texts)
+            texts, parser = [], CODECS[codec].parser(configuration)
+            chars = 0
+        if parser is None:
+            raise UnknownStructure("it comes before the first key frame")
+        texts.append(write_packet(parser.frames(packet, key=is_key)))
+        chars += len(texts[-1]) + 1
+        if chars > MAX_STRUCTURE_CHARS:
+            raise UnknownStructure("its structure is too long")
+    if texts:
+        yield " ".join(texts)
 
 
 # ---------------------------------------------------------------- digest
 
-_BLOCK = 2**20
-
 
 def digest_video(path: Path, codec: str) -> tuple[int, str, Structures | None]:
-    """Hash a video, and find what its frames refer to in the same bytes.
+    """Hash a video, and find what its frames refer to.
 
     Memory is one packet, and the video's index.
 
@@ -226,60 +200,29 @@ def digest_video(path: Path, codec: str) -> tuple[int, str, Structures | None]:
     Raises:
         OSError: It cannot be read.
     """
-    table = _table(path) if codec in CODECS and CODECS[codec].is_free else None
-    if table is None:
-        return *digest_file(path), None
-    recorder = StructureRecorder(codec, table.entry.configuration)
-    digest = hashlib.sha256()
-    size = 0
+    return *digest_file(path), _structures_in(path, codec)
+
+
+def _structures_in(path: Path, codec: str) -> Structures | None:
+    if codec not in CODECS or not CODECS[codec].is_free:
+        return None
+    try:
+        table = sample_table_of(path)
+    except (VideoError, Refused):
+        return None
+    if np.any(table.places[1:] < (table.places + table.sizes)[:-1]):
+        return None  # a forged index could have the whole file read for each packet
     with path.open("rb") as file:
-        number = 0
-        for is_packet, data in _parts(file, table):
-            digest.update(data)
-            size += len(data)
-            if is_packet:
-                recorder.add(data, key=bool(table.sync[number]))
-                number += 1
-    return size, digest.hexdigest(), recorder.finish()
+        return find_structures(codec, table.entry.configuration, _packets(file, table))
 
 
-def packets_in_groups(path: Path) -> NDArray[np.int64]:
-    """How many packets each group of pictures of a video has, shape (groups,).
-
-    Raises:
-        VideoError: Its index is damaged.
-        Refused: Its index is not read.
-        OSError: It cannot be read.
-    """
-    return packets_of_groups(sample_table_of(path))
+def _packets(file: BinaryIO, table: SampleTable) -> Iterator[tuple[bytes, bool]]:
+    columns = (table.places.tolist(), table.sizes.tolist(), table.sync.tolist())
+    for place, size, is_key in zip(*columns, strict=True):
+        file.seek(place)
+        yield file.read(size), is_key
 
 
 def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:
     """How many packets each group of pictures has, shape (groups,)."""
     return np.diff(np.append(np.flatnonzero(table.sync), len(table.sync)))
-
-
-def _table(path: Path) -> SampleTable | None:
-    """The index of a video whose packets are contiguous; None if that is unknown."""
-    try:
-        table = sample_table_of(path)
-    except (VideoError, Refused):
-        return None
-    ends = table.places + table.sizes
-    return table if np.all(table.places[1:] >= ends[:-1]) else None
-
-
-def _parts(file: BinaryIO, table: SampleTable) -> Iterator[tuple[bool, bytes]]:
-    """All bytes of a file: its packets, and blocks of what is between them."""
-    place = 0
-    for start, size in zip(table.places.tolist(), table.sizes.tolist(), strict=True):
-        while place < start:
-            data = file.read(min(_BLOCK, start - place))
-            if not data:
-                return  # it became shorter meanwhile
-            place += len(data)
-            yield False, data
-        yield True, file.read(size)
-        place += size
-    while data := file.read(_BLOCK):
-        yield False, data
