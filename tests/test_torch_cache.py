@@ -13,7 +13,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-import mp4ds.torch.cache as caches  # noqa: E402
+import mp4ds.torch.cameras as caches  # noqa: E402
 from mp4ds.torch import FrameDataset, FrameStream  # noqa: E402
 from mp4ds.video.access import FrameReader  # noqa: E402
 from test_torch import BOTH, FRAMES, LEFT, RIGHT, camera, loader, packed  # noqa: E402

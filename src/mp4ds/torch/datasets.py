@@ -18,10 +18,11 @@ from mp4ds.dataset.stream import Layer
 from mp4ds.dataset.vectors import Fields
 from mp4ds.dataset.views import Crop, Resize
 from mp4ds.errors import OptionError, absent, counted
-from mp4ds.torch.cache import CACHE_BYTES, FrameCache
 from mp4ds.torch.cameras import (
+    CACHE_BYTES,
     Backend,
     Dtype,
+    FrameCache,
     OpenCamera,
     OpenCameras,
     Pictures,

@@ -14,7 +14,7 @@ import av
 
 from mp4ds.errors import Mp4dsError, OptionError, Refused
 from mp4ds.video.av1 import Av1
-from mp4ds.video.coded import Ffv1, Jpeg, Png, StreamParser, Vp9
+from mp4ds.video.coded import Ffv1, Jpeg, StreamParser, Vp9
 from mp4ds.video.h264 import H264
 from mp4ds.video.h265 import H265
 
@@ -65,7 +65,7 @@ CODECS: Mapping[str, Codec] = {
     ),
     "vp9": Codec("vp9", Vp9, ("vp09",), "vp9", ("vp9", "libvpx-vp9")),
     "ffv1": Codec("ffv1", Ffv1, ("FFV1",), "ffv1"),
-    "png": Codec("png", Png, ("mp4v", "png "), "png"),
+    "png": Codec("png", StreamParser, ("mp4v", "png "), "png"),
     "mjpeg": Codec("mjpeg", Jpeg, ("mp4v", "jpeg"), names=("mjpeg", "jpeg", "jpg")),
 }  # fmt: skip
 """By the name in the registry."""

@@ -110,7 +110,7 @@ class StreamParser:
     """Parses the packets of one stream in order: a topic's by `picture`, an mp4's by `frames`.
 
     What is not overridden is right for a codec that has neither parameters nor framing, and whose
-    frames refer to the last one that may be referred to.
+    frames are all key frames, such as PNG files.
 
     Args:
         configuration: Of the mp4's track: the payload of ``avcC``, ``hvcC`` or ``av1C``. None for
@@ -200,7 +200,7 @@ class StreamParser:
             raise UnknownStructure(str(error)) from None
 
     def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        raise NotImplementedError
+        return self._link(len(data), begins=True, key=key)  # of an image
 
     def _forget(self) -> None:
         """Wait for a key frame."""
@@ -304,16 +304,6 @@ class Jpeg(StreamParser):
     def _picture(self, body: memoryview) -> CodedPicture:
         width, height, _ = parse_jpeg(body)
         return CodedPicture(width, height, keyframe=True)
-
-    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        return self._link(len(data), begins=True, key=key)
-
-
-class Png(StreamParser):
-    """PNG files: all are key frames."""
-
-    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        return self._link(len(data), begins=True, key=key)
 
 
 # ---------------------------------------------------------------- FFV1

@@ -36,7 +36,7 @@ from mp4ds.video.codecs import (
 )
 from mp4ds.video.colour import samples
 from mp4ds.video.decoder import open_packet_decoder
-from mp4ds.video.media import TIME_BASE, new_mp4, raise_if_scarce, rate_hint
+from mp4ds.video.media import TIME_BASE, Mp4Writer, new_mp4, raise_if_scarce, rate_hint
 from mp4ds.video.pixels import PictureConverter, PictureMaker, picture_to_frame
 
 _THREADS = Path("/proc/self/task")
@@ -85,7 +85,7 @@ _SLICE_BYTES = 10_000_000  # of samples, chroma counted whole; FFV1 takes some 1
 _SLICE_COUNTS = sorted({rows * n for rows in range(1, 17) for n in range(rows, 2 * rows + 1)})
 
 
-class VideoEncoder:
+class VideoEncoder(Mp4Writer):
     """One mp4 file being written. A context manager; leaving it completes the file.
 
     Args:
@@ -119,7 +119,7 @@ class VideoEncoder:
         self.recipe = recipe
         self._coded = coded
         self.frames = 0
-        self._maker = _FrameMaker(recipe, picture_format)
+        self._format, self._converter = picture_format, _converter(recipe)
         self.width, self.height = coded_size(recipe, width, height)
         self.options = {**_options(recipe, self.width, self.height), "g": str(gop)}
         self._container = new_mp4(path)
@@ -157,7 +157,9 @@ class VideoEncoder:
         Raises:
             OSError: It cannot be written.
         """
-        self._mux(self._encoded(self._maker.frame(picture, tick, TIME_BASE)))
+        frame = _frame(picture, self._format, self.recipe, self._converter, tick)
+        frame.time_base = TIME_BASE
+        self._mux(self._encoded(frame))
         self.frames += 1
 
     def _mux(self, packets: Sequence[Any]) -> None:
@@ -192,44 +194,22 @@ class VideoEncoder:
         """What a decoder needs besides the packets."""
         return bytes(self._stream.codec_context.extradata or b"")
 
-    def abandon(self) -> None:
-        """Close the unfinished file; the caller removes it."""
-        try:
-            self._container.close()
-        except (FFmpegError, OSError):
-            return
 
-    def __enter__(self) -> VideoEncoder:
-        return self
-
-    def __exit__(self, exc_type: type[BaseException] | None, *_: object) -> None:
-        if exc_type is None:
-            self.close()
-        else:
-            self.abandon()
+def _converter(recipe: Recipe) -> PictureConverter:
+    is_full = recipe.full_range  # a camera's own YUV keeps its range
+    return PictureConverter(source_full_range=is_full, full_range=is_full)
 
 
-class _FrameMaker:
-    """Makes the frames that the encoder of a recipe takes from pictures of a pixel format."""
-
-    def __init__(self, recipe: Recipe, picture_format: str) -> None:
-        self._recipe, self._format = recipe, picture_format
-        is_full = recipe.full_range  # a camera's own YUV keeps its range
-        self._converter = PictureConverter(source_full_range=is_full, full_range=is_full)
-
-    def frame(self, picture: Picture, pts: int, time_base: Fraction) -> av.VideoFrame:
-        """The frame of a picture that is shown at a time."""
-        recipe = self._recipe
-        frame = picture_to_frame(
-            picture,
-            self._format,
-            recipe.pixel_format,
-            self._converter,
-            full_range=recipe.full_range,
-        )
-        frame.pts, frame.time_base = pts, time_base
-        frame.color_range = color_range(recipe)
-        return frame
+def _frame(
+    picture: Picture, picture_format: str, recipe: Recipe, converter: PictureConverter, pts: int
+) -> av.VideoFrame:
+    """The frame that the encoder of a recipe takes."""
+    is_full = recipe.full_range
+    frame = picture_to_frame(
+        picture, picture_format, recipe.pixel_format, converter, full_range=is_full
+    )
+    frame.pts, frame.color_range = pts, color_range(recipe)
+    return frame
 
 
 @contextmanager
@@ -492,14 +472,13 @@ def _encoded(
     """
     rows, columns = pictures[0][0].shape[:2]
     width, height = coded_size(recipe, columns, rows)
-    maker, time_base = _FrameMaker(recipe, picture_format), Fraction(1, 30)
-    frames = (maker.frame(picture, n, time_base) for n, picture in enumerate(pictures))
+    converter = _converter(recipe)
+    frames = (_frame(p, picture_format, recipe, converter, n) for n, p in enumerate(pictures))
     if recipe.codec == "png":
         return None, list(map(_png_packet, frames))
     context: Any = av.CodecContext.create(recipe.encoder, "w")
     context.options = {**recipe.options, "g": str(len(pictures))}
-    context.time_base = time_base
-    context.framerate = Fraction(30)
+    context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
     with _refused(recipe, columns, rows):
         open_encoder(context, recipe, width, height, threads=threads)
         packets = [packet for f in chain(frames, [None]) for packet in context.encode(f)]

@@ -175,8 +175,6 @@ class PictureOrder:
 
 # ---------------------------------------------------------------- parsers of units
 
-_MAX_SETS = 64
-
 
 @dataclass(frozen=True, slots=True)
 class Sps:
@@ -222,7 +220,6 @@ class UnitParser(StreamParser, ABC):
         self._sets: dict[tuple[int, int], bytes] = {}
         self._sps: dict[int, Sps] = {}
         self._order = PictureOrder()
-        self._checked: set[bytes] = set()
         self._unfit = ""  # why references of pictures with these parameters are not understood
         super().__init__(configuration)
 
@@ -275,19 +272,6 @@ class UnitParser(StreamParser, ABC):
     @abstractmethod
     def _is_key(self, first: bytes, slices: Sequence[bytes]) -> bool:
         """Whether decoding can begin at a picture, by the arguments of `_check_order`."""
-
-    def _take_unit(self, unit: bytes) -> None:
-        """Look at a parameter set of an mp4, unless it is known."""
-        if unit in self._checked:
-            return
-        self._check_parameters(unit)
-        if len(self._checked) >= _MAX_SETS:
-            self._checked.clear()
-        self._checked.add(unit)
-
-    @abstractmethod
-    def _check_parameters(self, unit: bytes) -> None:
-        """Set `_unfit` if references of pictures with these parameters are not understood."""
 
     def _only(self, pictures: int, kinds: set[int]) -> int:
         """The type of slices of the only picture of a packet.
@@ -590,7 +574,7 @@ class H264(UnitParser):
         begins = self._only(pictures, kinds) == IDR
         return self._link(len(data), begins=begins, kept=kept, key=key)
 
-    def _check_parameters(self, unit: bytes) -> None:
+    def _take_unit(self, unit: bytes) -> None:
         if self.unit_type(unit) == SPS and not parse_sps(unit).frames_only:
             self._unfit = "it may hold fields, halves of an interlaced picture"
 

@@ -193,7 +193,7 @@ class H265(UnitParser):
             )
         return self._link(len(data), begins=kind in _IDR, kept=kept, key=key)
 
-    def _check_parameters(self, unit: bytes) -> None:
+    def _take_unit(self, unit: bytes) -> None:
         if len(unit) < 3:
             raise UnknownStructure("its H.265 parameters are malformed")
         kind = self.unit_type(unit)

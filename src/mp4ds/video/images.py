@@ -6,11 +6,11 @@ import io
 import re
 import struct
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import av
 import numpy as np
@@ -68,7 +68,6 @@ def _file(pixels: NDArray[np.uint8], kind: str, **options: int) -> bytes:
 
 _HEAD = 64
 _NETPBM = re.compile(rb"P([56])" + 3 * rb"(?:\s|#[^\n]*\n)+([0-9]{1,9})" + rb"\s")
-_PNG = b"\x89PNG\r\n\x1a\n"
 _TIFF_BITS = 258
 _CONVERT = "Convert it first, so that you decide how its values are mapped."
 
@@ -86,6 +85,20 @@ _DEEP = {
     **dict.fromkeys(("rgb48le", "rgb48be"), "rgb16"),
     **dict.fromkeys(("rgba64le", "rgba64be"), "rgba16"),
 }
+
+
+@contextmanager
+def _opened(source: Path | BinaryIO) -> Iterator[Any]:
+    """An image as Pillow opens it; whoever reads it bounds its sides."""
+    from PIL import Image
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            with Image.open(source, formats=STILL_FORMATS) as image:
+                yield image
+        except Image.DecompressionBombError as error:
+            raise ValueError(str(error)) from None
 
 
 def read_image(path: Path) -> tuple[str, Pixels]:
@@ -122,7 +135,7 @@ def coded_pixels(data: bytes | memoryview) -> tuple[str, Pixels]:
     Raises:
         Refused: It cannot be decoded.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import UnidentifiedImageError
 
     is_png = bytes(data[:8]) == png.SIGNATURE
     if is_png:
@@ -131,24 +144,18 @@ def coded_pixels(data: bytes | memoryview) -> tuple[str, Pixels]:
             channels = 1 if pixels.ndim == 2 else pixels.shape[2]
             return png.PNG_ENCODINGS[pixels.itemsize, channels], pixels
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(data), formats=STILL_FORMATS) as image:
-                check_size(*image.size)
-                if is_png and data[24] > 8:
-                    raise Refused("its PNG has 16 bits, of which Pillow would read only 8")
-                is_grey = image.mode in _GREY
-                return ("mono8" if is_grey else "rgb8"), np.asarray(
-                    image.convert("L" if is_grey else "RGB")
-                )
+        with _opened(io.BytesIO(data)) as image:
+            check_size(*image.size)
+            if is_png and data[24] > 8:
+                raise Refused("its PNG has 16 bits, of which Pillow would read only 8")
+            is_grey = image.mode in _GREY
+            pixels = np.asarray(image.convert("L" if is_grey else "RGB"))
+            return ("mono8" if is_grey else "rgb8"), pixels
     except Refused:
         raise
     except UnidentifiedImageError:
         raise Refused("it is no image of a known format") from None
-    except (
-        OSError, ValueError, SyntaxError, EOFError, LookupError, struct.error,
-        Image.DecompressionBombError,
-    ):  # fmt: skip
+    except (OSError, ValueError, SyntaxError, EOFError, LookupError, struct.error):
         raise Refused("its picture is damaged, or cut short") from None
 
 
@@ -158,43 +165,29 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         SourceError: It is not an image.
     """
-    from PIL import Image
-
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=STILL_FORMATS) as image:
-                width, height = image.size
-                return int(width), int(height)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        with _opened(path) as image:
+            width, height = image.size
+            return int(width), int(height)
+    except (OSError, ValueError, SyntaxError) as error:
         reason = getattr(error, "strerror", None) or error
         raise SourceError(path, f"cannot be read as an image: {reason}") from None
 
 
 def _still(path: Path, head: bytes) -> tuple[str, Pixels]:
-    from PIL import Image
-
-    with warnings.catch_warnings():
-        # the sides are bounded here
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        try:
-            with Image.open(path, formats=STILL_FORMATS) as image:
-                _check_size(path, *image.size)
-                if getattr(image, "n_frames", 1) > 1:
-                    raise SourceError(
-                        path, "holds several images", "Save each to a file of its own."
-                    )
-                if _is_deep_colour(image, head):
-                    return _deep_colour(path, "png" if image.format == "PNG" else "tiff")
-                if image.mode == "1":
-                    return "mono8", np.asarray(image.convert("L"))
-                if image.mode == "I" and image.format == "PNG":  # 16 bits, in older Pillow
-                    return "mono16", np.asarray(image).astype(np.uint16)
-                if image.mode not in _ENCODINGS:
-                    raise SourceError(path, f"has pixels of mode {image.mode}", _CONVERT)
-                return _ENCODINGS[image.mode], np.asarray(image)
-        except Image.DecompressionBombError as error:
-            raise SourceError(path, f"is too large: {error}") from None
+    with _opened(path) as image:
+        _check_size(path, *image.size)
+        if getattr(image, "n_frames", 1) > 1:
+            raise SourceError(path, "holds several images", "Save each to a file of its own.")
+        if _is_deep_colour(image, head):
+            return _deep_colour(path, "png" if image.format == "PNG" else "tiff")
+        if image.mode == "1":
+            return "mono8", np.asarray(image.convert("L"))
+        if image.mode == "I" and image.format == "PNG":  # 16 bits, in older Pillow
+            return "mono16", np.asarray(image).astype(np.uint16)
+        if image.mode not in _ENCODINGS:
+            raise SourceError(path, f"has pixels of mode {image.mode}", _CONVERT)
+        return _ENCODINGS[image.mode], np.asarray(image)
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
@@ -205,7 +198,7 @@ def _check_size(path: Path, width: int, height: int) -> None:
 def _is_deep_colour(image: Any, head: bytes) -> bool:
     """Whether Pillow would cut the samples of several channels to 8 bits."""
     if image.format == "PNG":
-        return head[:8] == _PNG and head[24] == 16 and head[25] != 0
+        return head[:8] == png.SIGNATURE and head[24] == 16 and head[25] != 0
     if image.format == "TIFF":
         bits = image.tag_v2.get(_TIFF_BITS, (8,))
         return len(bits) > 1 and max(bits) > 8

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import errno
 import os
+from abc import ABC, abstractmethod
+from contextlib import suppress
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import av
 import numpy as np
@@ -20,6 +22,8 @@ from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import AV_VERSION, CODECS, check_pyav
 from mp4ds.video.mp4 import SampleEntry, SampleTable, sample_table_of, why_unreadable
+
+_Writer = TypeVar("_Writer", bound="Mp4Writer")
 
 _FILES = (errno.EMFILE, errno.ENFILE)
 _ENOUGH_BYTES = 32 * 2**20
@@ -302,3 +306,28 @@ def new_mp4(path: Path) -> Any:
     }
     # ffmpeg takes a relative name with a colon for an address
     return av.open(str(path.absolute()), "w", format="mp4", options=options)
+
+
+class Mp4Writer(ABC):
+    """One mp4 being written. A context manager; leaving it completes the file."""
+
+    _container: Any = None
+
+    @abstractmethod
+    def close(self) -> None:
+        """Finish the file."""
+
+    def abandon(self) -> None:
+        """Close the unfinished file; the caller removes it."""
+        if self._container is not None:
+            with suppress(FFmpegError, OSError):
+                self._container.close()
+
+    def __enter__(self: _Writer) -> _Writer:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abandon()

@@ -21,6 +21,7 @@ from mp4ds.video.codecs import CODECS
 from mp4ds.video.media import (
     TIME_BASE,
     Media,
+    Mp4Writer,
     new_mp4,
     open_input,
     pixel_format_of,
@@ -32,7 +33,7 @@ from mp4ds.video.mp4 import SampleEntry
 _IVF = {"av1": b"AV01", "vp9": b"VP90"}
 
 
-class PacketWriter:
+class PacketWriter(Mp4Writer):
     """One mp4 of coded packets being written. A context manager; leaving it completes the file.
 
     The first body must be a key frame that the codec's `StreamParser` accepts.
@@ -63,7 +64,6 @@ class PacketWriter:
         self._path = path
         self._parameters = parameters
         self._rate = rate_hint(rate)
-        self._container: Any = None
         self._stream: Any = None
         self._written = _Written()
         self._first = self._last = b""
@@ -139,24 +139,6 @@ class PacketWriter:
                     raise VideoError(
                         "decode-failed", self._path, "does not hold the packets as written"
                     )
-
-    def abandon(self) -> None:
-        """Close the unfinished file; the caller removes it."""
-        if self._container is None:
-            return
-        try:
-            self._container.close()
-        except (FFmpegError, OSError):
-            return
-
-    def __enter__(self) -> PacketWriter:
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.abandon()
 
 
 def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:

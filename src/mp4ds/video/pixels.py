@@ -25,7 +25,6 @@ PLANES_FORMAT = "yuv420p"
 """Pixel format of planes."""
 
 _FULL_RANGE = 2  # in a frame's tags (H.273; ffmpeg's AVColorRange)
-_LUMA, _CHROMA = 0, 1
 
 
 def _tables(full_range: bool) -> tuple[list[NDArray[np.uint16]], list[NDArray[np.uint8]]]:
@@ -44,31 +43,18 @@ def _tables(full_range: bool) -> tuple[list[NDArray[np.uint16]], list[NDArray[np
 _WIDER, _NARROWER = zip(*(_tables(full_range) for full_range in (False, True)), strict=True)
 
 
-def widened(frame: av.VideoFrame, *, full_range: bool) -> av.VideoFrame:
-    """A 4:2:0 picture of 8 bits, converted to 10.
+def with_bits(frame: av.VideoFrame, pixel_format: str, *, full_range: bool) -> av.VideoFrame:
+    """A 4:2:0 picture of 8 bits, converted to 10, or one of 10 bits, rounded to 8.
 
     Args:
-        frame: Of ``yuv420p``.
+        frame: Of ``yuv420p`` or ``yuv420p10le``.
+        pixel_format: The other one.
         full_range: Whether its samples use their full range.
     """
-    made = av.VideoFrame(frame.width, frame.height, TEN_BITS)
+    tables = (_WIDER if pixel_format == TEN_BITS else _NARROWER)[full_range]
+    made = av.VideoFrame(frame.width, frame.height, pixel_format)
     for index in range(3):
-        table = _WIDER[full_range][_LUMA if index == 0 else _CHROMA]
-        samples(made, index)[...] = table[samples(frame, index)]
-    return made
-
-
-def narrowed(frame: av.VideoFrame, *, full_range: bool) -> av.VideoFrame:
-    """A 4:2:0 picture of 10 bits, rounded to 8.
-
-    Args:
-        frame: Of ``yuv420p10le``.
-        full_range: Whether its samples use their full range.
-    """
-    made = av.VideoFrame(frame.width, frame.height, PLANES_FORMAT)
-    for index in range(3):
-        table = _NARROWER[full_range][_LUMA if index == 0 else _CHROMA]
-        samples(made, index)[...] = table[samples(frame, index)]
+        samples(made, index)[...] = tables[min(index, 1)][samples(frame, index)]
     made.colorspace, made.color_range = frame.colorspace, frame.color_range
     return made
 
@@ -329,7 +315,7 @@ def picture_to_frame(
         picture, picture_format = colour.mosaic_planes(picture[0], pattern), "yuv420p"
     if pixel_format == TEN_BITS and (picture_format == "gray" or picture_format in CHROMA_SHIFTS):
         frame = picture_to_frame(picture, picture_format, "yuv420p", converter)
-        return widened(frame, full_range=full_range)
+        return with_bits(frame, TEN_BITS, full_range=full_range)
     if pixel_format == "yuv420p" and picture_format == "gray":
         return _gray_to_yuv(picture[0], pixel_format)
     if pixel_format in ("yuv420p", TEN_BITS) and picture_format not in CHROMA_SHIFTS:
@@ -458,7 +444,7 @@ class PictureMaker:
     def _planes(self, frame: av.VideoFrame) -> Picture:
         wanted, (width, height) = self._picture_format, self._picture_size
         if frame.format.name == TEN_BITS and wanted in ("gray", *CHROMA_SHIFTS):
-            frame = narrowed(frame, full_range=self._full_range)
+            frame = with_bits(frame, PLANES_FORMAT, full_range=self._full_range)
         expected = _DECODED_AS.get(wanted, (wanted,))
         if frame.format.name not in expected:
             problem = f"decodes to {frame.format.name}, not {' or '.join(expected)}"
@@ -545,7 +531,8 @@ def decoded_planes(path: Path) -> Iterator[Planes]:
         media.track.thread_count = 1
         for frame in media.container.decode(media.track):
             if frame.format.name == TEN_BITS:
-                frame = narrowed(frame, full_range=frame.color_range == _FULL_RANGE)
+                is_full = frame.color_range == _FULL_RANGE
+                frame = with_bits(frame, PLANES_FORMAT, full_range=is_full)
             if frame.format.name not in (PLANES_FORMAT, f"yuvj{PLANES_FORMAT[3:]}"):
                 raise VideoError(
                     "codec-mismatch", path, f"decodes to {frame.format.name}, not {PLANES_FORMAT}"
@@ -586,8 +573,8 @@ class PlaneSpool:
     def __init__(self, path: Path, width: int, height: int, *, frames: int | None = None) -> None:
         self.width, self.height = width, height
         self._size = width * height * 3 // 2
-        self._file = path.open("w+b" if frames is None else "rb", buffering=0)
         self._count = frames or 0
+        self._file = path.open("w+b" if frames is None else "rb")
 
     def __len__(self) -> int:
         return self._count
@@ -600,9 +587,7 @@ class PlaneSpool:
         """
         self._file.seek(self._count * self._size)
         for plane in planes:
-            data = np.ascontiguousarray(plane).data.cast("B")
-            while data:
-                data = data[self._file.write(data) :]
+            self._file.write(np.ascontiguousarray(plane).data)
         self._count += 1
 
     def __iter__(self) -> Iterator[Planes]:
@@ -614,14 +599,10 @@ class PlaneSpool:
         Raises:
             OSError: The file cannot be read.
         """
-        data = np.empty(self._size, np.uint8)
-        rest = data.data
-        self._file.seek(number * self._size)
-        while rest:
-            count = self._file.readinto(rest)
-            if not count:
-                raise OSError("frames kept on disk were truncated")
-            rest = rest[count:]
+        self._file.seek(number * self._size)  # which also writes what is buffered
+        data = np.frombuffer(self._file.read(self._size), np.uint8)
+        if len(data) != self._size:
+            raise OSError("frames kept on disk were truncated")
         return planes_in(data, self.width, self.height)
 
     def clear(self) -> None:

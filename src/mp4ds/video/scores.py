@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain, zip_longest
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,9 @@ def ssim(reference: Plane, decoded: Plane, *, bits: int = 8) -> float:
         decoded: Of the same shape and type.
         bits: Of a sample: 8 or 10.
     """
-    a, b = (_whole_blocks(plane) for plane in (reference, decoded))
+    rows, columns = (side // _BLOCK * _BLOCK for side in reference.shape)
+    # without incomplete blocks, and of integers wide enough for squares
+    a, b = (plane[:rows, :columns].astype(np.int64) for plane in (reference, decoded))
     sum_a, sum_b = _window_sums(a), _window_sums(b)
     squares = _window_sums(a * a + b * b)
     products = _window_sums(a * b)
@@ -75,14 +77,6 @@ def ssim(reference: Plane, decoded: Plane, *, bits: int = 8) -> float:
     luminance = (2.0 * sum_a * sum_b + c1) / (sums + c1)
     structure = (2.0 * covariance + c2) / (variances + c2)
     return float(np.mean(luminance * structure))
-
-
-def _whole_blocks(plane: Plane) -> NDArray[np.int64]:
-    """As integers wide enough for squares, without incomplete blocks."""
-    rows, columns = (side // _BLOCK * _BLOCK for side in plane.shape)
-    if min(rows, columns) < 2 * _BLOCK:
-        raise ValueError(f"planes of {plane.shape[1]}x{plane.shape[0]} samples have no window")
-    return plane[:rows, :columns].astype(np.int64)
 
 
 def _window_sums(values: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -346,7 +340,7 @@ def scores_of(
     """Compare each frame with its original; only one pair is in memory at a time.
 
     Args:
-        reference: The originals, all of one size, with even width and height of at least 16.
+        reference: The originals, at least one, all of one size, with even width and height.
         decoded: As many frames, of the same size and type.
         metrics: Some of `METRICS`.
         ffmpeg: From `find_ffmpeg`; None: VMAF is left out.
@@ -358,13 +352,15 @@ def scores_of(
         Scores of each frame by metric, shape (frames,).
 
     Raises:
-        ScoringError: They do not match, there are none, or libvmaf failed.
+        ScoringError: They are too small, or libvmaf failed.
     """
-    pairs = _pairs(reference, decoded)
-    first = next(pairs, None)
-    if first is None:
-        raise ScoringError("There are no frames to score.")
+    pairs = zip(reference, decoded, strict=True)
+    first = next(pairs)
     (height, width), (pixel_format, bits) = first[0][0].shape, _FORMATS[first[0][0].dtype]
+    if min(height, width) < SMALLEST:
+        raise ScoringError(
+            f"Frames of {width}x{height} are not scored: sides are {SMALLEST} or more."
+        )
     by_plane = [name for name in metrics if name in _OF_PLANES]
     measured: list[list[float]] = []
     with ExitStack() as stack:
@@ -388,44 +384,3 @@ def scores_of(
     if len(vmaf) != len(measured):
         raise ScoringError(f"libvmaf scored {len(vmaf)} of {len(measured)} frames.")
     return {"vmaf": vmaf, **found}
-
-
-def _pairs(
-    reference: Iterable[YuvFrame], decoded: Iterable[YuvFrame]
-) -> Iterator[tuple[YuvFrame, YuvFrame]]:
-    """Each frame and its original, checked.
-
-    Raises:
-        ScoringError: They do not match.
-    """
-    first: list[tuple[tuple[int, ...], np.dtype[Any]]] | None = None
-    for number, (original, made) in enumerate(zip_longest(reference, decoded)):
-        if original is None or made is None:
-            longer = "decoded frames" if original is None else "originals"
-            raise ScoringError(f"There are more {longer} than the {number} in the other sequence.")
-        if first is None:
-            first = _kind(original)
-            _check(original)
-        for name, frame in (("Original", original), ("Decoded frame", made)):
-            if _kind(frame) != first:
-                raise ScoringError(
-                    f"{name} {number} differs from the first original in size or type."
-                )
-        yield original, made
-
-
-def _kind(frame: YuvFrame) -> list[tuple[tuple[int, ...], np.dtype[Any]]]:
-    return [(plane.shape, plane.dtype) for plane in frame]
-
-
-def _check(frame: YuvFrame) -> None:
-    """Refuse frames that are not a `YuvFrame`."""
-    if len(frame) != 3 or frame[0].ndim != 2 or any(p.dtype not in _FORMATS for p in frame):
-        raise ScoringError("A frame is three planes of uint8 or uint16.")
-    rows, columns = frame[0].shape
-    if rows % 2 or columns % 2 or min(rows, columns) < SMALLEST:
-        raise ScoringError(
-            f"Frames of {columns}x{rows} are not scored: sides are even, {SMALLEST} or more."
-        )
-    if any(plane.shape != (rows // 2, columns // 2) for plane in frame[1:]):
-        raise ScoringError("Chroma planes do not have half the sides of luma.")
