@@ -538,10 +538,14 @@ def _common_entry(segments: Sequence[Path]) -> SampleEntry:
 
 
 def entry_of(path: Path) -> SampleEntry:
-    """The description of a video's packets; empty where its index is not read.
+    """The description of a video's packets.
 
     Raises:
         VideoError: ``file-missing`` or ``video-unreadable``.
     """
     with closing(Media(path)) as media:
-        return media.table.entry
+        entry = media.table.entry
+    if entry.codec:
+        return entry
+    problem = "has an index without frames, or of a kind that mp4ds does not write"
+    raise VideoError("video-unreadable", path, problem)
