@@ -539,7 +539,7 @@ FACTS = ("file", "size", "sha256", "references")
 
 
 def video_facts(path: Path, codec: str) -> dict[str, Any]:
-    """The values of `FACTS` for a finished video, which is read once.
+    """The values of `FACTS` for a finished video.
 
     Args:
         path: The video.

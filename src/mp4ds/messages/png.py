@@ -316,7 +316,7 @@ class PngRecipe:
     """How to make a PNG from its pixels.
 
     Attributes:
-        filters: Name of a rule of `png_filters.RULES`.
+        filters: Name of one of `RULES`.
         level: Deflate's level, 1 to 9.
         strategy: Deflate's strategy, 0 to 4.
         memory_level: Deflate's memory level, 8 or 9.
