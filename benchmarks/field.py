@@ -41,7 +41,16 @@ from rosbags.typesys import Stores, get_typestore
 import clips
 import mp4ds
 from loader_readers import write_lerobot_video
-from measure import parse_size, parser_of, print_machine, print_table, psnr, size_of
+from measure import (
+    figure_of,
+    parse_size,
+    parser_of,
+    print_machine,
+    print_table,
+    psnr,
+    save,
+    size_of,
+)
 from recordings import HERTZ, write_mcap
 
 TRANSPORT = {"qmax": "10", "b": "8242880", "g": "15", "bf": "0"}
@@ -193,14 +202,7 @@ def draw(found: Mapping[str, tuple[Sequence[float], str]], path: Path) -> None:
         found: Form -> raw size over size of each clip, and the PSNR as text.
         path: The SVG to make.
     """
-    import matplotlib
-
-    matplotlib.use("agg")
-    matplotlib.rcParams["svg.fonttype"] = "none"
-    matplotlib.rcParams["svg.hashsalt"] = "mp4ds"
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(9, 3.4))
+    figure, axes = figure_of((9, 3.4))
     for row, (form, (ratios, quality)) in enumerate(reversed(found.items())):
         color = "#1d6ff2" if form.startswith("mp4ds") else "#8a94a6"
         middle = geometric_mean(ratios)
@@ -213,12 +215,10 @@ def draw(found: Mapping[str, tuple[Sequence[float], str]], path: Path) -> None:
         axes.annotate(text, (max(ratios), row), fontweight=weight, **place)
     axes.set_yticks(range(len(found)), [*reversed(found)])
     axes.set(xscale="log", xlim=(1, 5000), xlabel="times smaller than raw; least to most")
-    axes.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%d"))
-    axes.grid(visible=True, axis="x", alpha=0.25)
+    axes.xaxis.set_major_formatter("{x:.0f}")
+    axes.grid(visible=False, axis="y")
     axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.tight_layout()
-    figure.savefig(path, metadata={"Date": None})
+    save(figure, path)
 
 
 def main() -> None:

@@ -58,7 +58,16 @@ from loader_readers import (
     peers_for,
     versions,
 )
-from measure import cpu_seconds, isolated, parse_size, parser_of, print_machine, print_table
+from measure import (
+    cpu_seconds,
+    figure_of,
+    isolated,
+    parse_size,
+    parser_of,
+    print_machine,
+    print_table,
+    save,
+)
 from recordings import HERTZ
 
 GOPS = (2, 30, 120, 240)
@@ -392,13 +401,9 @@ def curves_of(
 
 def draw(cells: Cells, sizes: Mapping[str, float], path: Path, pattern: str) -> None:
     """Draw bytes of a frame against frames per CPU second of a pattern, as an SVG."""
-    import matplotlib
+    from matplotlib import ticker
 
-    matplotlib.use("agg")
-    matplotlib.rcParams["svg.fonttype"] = "none"
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(9, 5))
+    figure, axes = figure_of((9, 5))
     for (codec, reader), curve in curves_of(cells, sizes, pattern).items():
         name = f"{codec}, {reader}" if reader else codec
         style = "--" if codec == "h264" else "-"
@@ -412,16 +417,13 @@ def draw(cells: Cells, sizes: Mapping[str, float], path: Path, pattern: str) -> 
             axes.annotate(text, (size, rate), xytext=(6, 4), textcoords="offset points")
     axes.set(xscale="log", yscale="log")
     for axis, ticks in zip((axes.xaxis, axes.yaxis), _TICKS, strict=True):
-        axis.set_major_locator(matplotlib.ticker.FixedLocator(ticks))
-        axis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%d"))
-        axis.set_minor_locator(matplotlib.ticker.NullLocator())
+        axis.set_major_locator(ticker.FixedLocator(ticks))
+        axis.set_major_formatter(ticker.FormatStrFormatter("%d"))
+        axis.set_minor_locator(ticker.NullLocator())
     axes.set(xlabel="kB a frame", ylabel=f"frames per CPU second, {PATTERNS[pattern]}")
-    axes.grid(visible=True, alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
     lines = [line for line in axes.get_lines() if len(line.get_xdata()) > 1]
     axes.legend(handles=lines, frameon=False, loc=(0.5, 0.15))
-    figure.tight_layout()
-    figure.savefig(path, metadata={"Date": None})
+    save(figure, path)
 
 
 if __name__ == "__main__":

@@ -81,6 +81,27 @@ def psnr(error: float) -> str:
     return f"{10 * math.log10(255**2 / error):.1f}" if error else "exact"
 
 
+def figure_of(size: tuple[float, float]) -> tuple[Any, Any]:
+    """A figure of matplotlib and its axes, with a grid; size in inches."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    matplotlib.rcParams["svg.fonttype"] = "none"
+    matplotlib.rcParams["svg.hashsalt"] = "mp4ds"
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=size)
+    axes.grid(visible=True, alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def save(figure: Any, path: Path) -> None:
+    """Save a figure as an SVG, without the date."""
+    figure.tight_layout()
+    figure.savefig(path, metadata={"Date": None})
+
+
 def print_machine() -> None:
     """What the figures were measured with."""
     model = platform.processor() or platform.machine()

@@ -1,6 +1,7 @@
 """`mp4ds record` beside ``rosbag record`` in ROS 1, from the same publisher in one run.
 
-    python benchmarks/recording.py [--seconds S] [--kills N] [--only SECTION ...] [--folder F]
+    python benchmarks/recording.py [--seconds S] [--kills N] [--hours H] [--only SECTION ...]
+                                   [--folder F] [--plot F.svg]
 
 needs ROS 1 (see `.ci/run`): a real master, in a network of its own where that is possible, a rospy
 node that publishes, and ROS's own recorder. Sections:
@@ -13,6 +14,8 @@ node that publishes, and ROS's own recorder. Sections:
 - look-back: four cameras of 1280x720 at 30 Hz, of which all is recorded, then only looked back at
   (``--keep-last 60s --and-then 10s``, triggers after 75 and 95 s): memory and disk over time, as
   CSV, and what the first 30 s cost.
+- long: two cameras of 320x240 at 1 Hz for 12 hours of their clock, as fast as they are packed, with
+  ``--max-duration 1h``; needs no ROS. Memory over time as CSV, and whether all datasets are valid.
 - kills: N times ``kill -9`` at a random moment: seconds between the last message that is there and
   the end, and whether all before are those that ``rosbag record`` has.
 """
@@ -24,6 +27,7 @@ import os
 import random
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -31,7 +35,7 @@ import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +44,20 @@ import xxhash
 from rosbags.rosbag1 import Reader
 
 import clips
-from measure import parser_of, print_machine, print_table, size_of
+from measure import figure_of, parser_of, print_machine, print_table, save, size_of
+from recordings import write_bag
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from mp4ds.format.sidecars import load_manifest
+from mp4ds.bags.formats import open_sources
+from mp4ds.bags.protocols import with_own_payload
+from mp4ds.dataset.checks import validate
+from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.plugins.recording import spool
+from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.recording.record import RecordProgress, open_recorder
+from mp4ds.records import Message
+from record_scenes import PlayedNode
 from roscore import RECORD, Core, missing, python
 from waiting import until
 
@@ -54,6 +67,11 @@ STEADY = (2, "640x480", 30, 200, 30)
 LOOK_BACK = (4, "1280x720", 30, 200, 30)
 OVERLOAD = (4, "2448x2048", 15, 0, 0)
 NS = 10**9
+BACKLOG_BYTES = 100_000_000
+"""Of messages that are not packed yet: how far a robot is ahead that waits."""
+
+Samples = list[tuple[float, float, float, float]]
+"""Seconds, MiB of the recorder, MiB of what packs, and MB on disk or hours recorded."""
 
 
 @dataclass
@@ -213,7 +231,7 @@ def beside(core: Core, folder: Path, seconds: float, *robot: Any) -> None:
 # ---------------------------------------------------------------- looking back
 
 
-def look_back(core: Core, folder: Path) -> None:
+def look_back(core: Core, folder: Path, plot: Path | None) -> None:
     """Record all, then look back, and print memory and disk over time."""
     rows = []
     looking = ("--keep-last", "60s", "--and-then", "10s")
@@ -224,21 +242,24 @@ def look_back(core: Core, folder: Path) -> None:
         source = publisher(core, *LOOK_BACK, seconds, 1)
         assert said(source) == "begun"
         print(" ".join(("record", *options)), "\n\nseconds,recorder MiB,packing MiB,disk MB")
-        rows.append((" ".join(options), *_watched(recorder, source, folder, triggers)))
+        samples: Samples = []
+        rows.append((" ".join(options), *_watched(recorder, source, folder, triggers, samples)))
         for path in sorted(folder.glob("live*/dataset.yaml")):
             frames = [stream.frames for stream in load_manifest(path).streams]
             print(f"- {path.parent.name}: {size_of(path.parent) / 1e6:.0f} MB, frames {frames}")
         print()
+    if plot:
+        draw(plot, samples)
     columns = ("", "CPU of a core", "MB/s to disk", "peak MiB", "peak disk MB", "exit code")
     print_table(columns, rows)
 
 
 def _watched(
-    recorder: Any, source: Any, folder: Path, triggers: list[float]
+    recorder: Any, source: Any, folder: Path, triggers: list[float], samples: Samples
 ) -> tuple[str, str, str, str, int]:
     """Print a line each second, until all is published and the recorder has ended."""
     begun, process = time.monotonic(), psutil.Process(recorder.pid)
-    before, told, memory, disk = Cost.of(recorder.pid), False, 0.0, 0.0
+    before, told = Cost.of(recorder.pid), False
     while recorder.poll() is None:
         time.sleep(1.0)
         at = time.monotonic() - begun
@@ -248,8 +269,8 @@ def _watched(
             sizes = [one.memory_info().rss / 2**20 for one in (process, *process.children())]
             links = {path.stat().st_ino: path.stat() for path in folder.rglob("live*/**/*.*")}
             held = sum(one.st_blocks * 512 for one in links.values()) / 1e6
-            memory, disk = max(memory, sum(sizes)), max(disk, held)
-            print(f"{at:.0f},{sizes[0]:.0f},{sum(sizes[1:]):.0f},{held:.0f}", flush=True)
+            samples.append((at, sizes[0], sum(sizes[1:]), held))
+            print(",".join(f"{one:.0f}" for one in samples[-1]), flush=True)
         if triggers and at >= triggers[0]:
             triggers.pop(0)
             recorder.send_signal(signal.SIGUSR1)
@@ -259,10 +280,108 @@ def _watched(
     return (
         f"{100 * (cost.cpu - before.cpu) / elapsed:.0f} %",
         f"{(cost.written - before.written) / 1e6 / elapsed:.0f}",
-        f"{memory:.0f}",
-        f"{disk:.0f}",
+        f"{max(one[1] + one[2] for one in samples):.0f}",
+        f"{max(one[3] for one in samples):.0f}",
         recorder.returncode,
     )
+
+
+def draw(path: Path, samples: Samples) -> None:
+    """Draw memory and disk of looking back over time."""
+    seconds, recorder, packing, disk = zip(*samples, strict=True)
+    figure, axes = figure_of((9, 3.4))
+    axes.stackplot(
+        seconds, recorder, packing, labels=("recorder", "what packs"), colors=("#1d6ff2", "#9cc2ff")
+    )
+    most = max(one + other for one, other in zip(recorder, packing, strict=True))
+    axes.set(xlabel="seconds", ylabel="memory, MiB", ylim=(0, 1.3 * most))
+    beside = axes.twinx()
+    beside.plot(seconds, [one / 1e3 for one in disk], color="#1f2937", label="on disk")
+    beside.set(ylabel="GB on disk", ylim=(0, None))
+    beside.spines["top"].set_visible(False)
+    figure.legend(frameon=False, loc="upper center", ncols=3)
+    save(figure, path)
+
+
+# ---------------------------------------------------------------- hours
+
+
+class Robot(PlayedNode):
+    """Two cameras at 1 Hz for hours of their clock, as fast as they are packed.
+
+    Args:
+        bag: A minute of one camera, repeated with other stamps.
+        hours: How long.
+    """
+
+    def __init__(self, bag: Path, hours: float) -> None:
+        super().__init__([bag])
+        self._hours = hours
+        self.is_behind = False  # the recorder
+        self._cameras = {
+            (one.id, camera): replace(one, id=2 * one.id + camera, topic=f"/cam{camera}{one.topic}")
+            for one in self._channels
+            for camera in (0, 1)
+        }
+        self._channels = [*self._cameras.values()]
+        with open_sources([bag]) as reader:
+            records = [one for one in reader.records() if isinstance(one, Message)]
+            self._told = [*map(with_own_payload, records)]
+        self.time = self.start = self._told[0].log_time
+
+    def _play(self) -> None:
+        for minute in range(round(60 * self._hours)):
+            for message in self._told:
+                while self.is_behind:
+                    time.sleep(0.01)
+                self.time = message.log_time + 60 * NS * minute
+                stamp = struct.pack("<II", *divmod(self.time, NS))
+                data = bytes(message.data[:4]) + stamp + bytes(message.data[12:])
+                self._tick(self.time)
+                for camera in (0, 1):
+                    channel = self._cameras[message.channel.id, camera]
+                    self._receivers[channel.topic](channel, data, self.time)
+        self.stop()
+
+
+def long(folder: Path, hours: float) -> None:
+    """Record hours, and print memory over time, and what there is in the end."""
+    bag, begun = folder / "minute.bag", time.monotonic()
+    samples: Samples = []
+    for path in folder.glob("long_*"):
+        shutil.rmtree(path)
+    scene = "cups" if clips.data_folder() else clips.DEMO
+    spec = clips.ClipSpec(scene, "bayer_rggb8", "low", 60, (320, 240))
+    bag.unlink(missing_ok=True)
+    write_bag(bag, clips.make(spec), spec.encoding, hertz=1.0)
+    robot, process = Robot(bag, hours), psutil.Process()
+
+    def watch(state: RecordProgress) -> None:
+        robot.is_behind = state.waiting_bytes + state.spool_bytes > BACKLOG_BYTES
+        at = time.monotonic() - begun
+        if not samples or at - samples[-1][0] >= 1:
+            with suppress(psutil.Error):  # a process has ended
+                children = sum(one.memory_info().rss for one in process.children())
+                rss = process.memory_info().rss / 2**20
+                samples.append((at, rss, children / 2**20, (robot.time - robot.start) / 3600e9))
+                print(",".join(f"{one:.2f}" for one in samples[-1]), flush=True)
+
+    spool.WINDOW_NS = 150 * NS  # with as many frames as five seconds have at 30 Hz
+    options = RecordOptions(all=True, max_duration=3600)
+    print("seconds,recorder MiB,packing MiB,hours recorded")
+    target = folder / "long"
+    with open_recorder((), target, options, node=robot, progress=watch) as recorder:
+        robot.stop = recorder.stop
+        summary = recorder.run()
+    ended = time.monotonic() - begun
+    tenth = len(samples) // 10
+    parts = [max(one[1] + one[2] for one in part) for part in (samples[:tenth], samples[-tenth:])]
+    print(f"\n- {hours:.1f} hours in {ended:.0f} s; dropped: {summary.dropped}")
+    print(f"- peak MiB of the first tenth and of the last: {parts[0]:.0f}, {parts[1]:.0f}")
+    made = [one.dataset for one in summary.datasets]
+    frames = sum(one.frames for path in made for one in load_manifest(path / MANIFEST_NAME).streams)
+    problems = [problem for path in made for problem in validate(path, deep=True)]
+    print(f"- {len(made)} datasets, {frames} frames; problems: {len(problems)}")
 
 
 # ---------------------------------------------------------------- kills
@@ -321,7 +440,7 @@ def _size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.glob("*"))
 
 
-SECTIONS = ("steady", "overload", "look-back", "kills")
+SECTIONS = ("steady", "overload", "look-back", "long", "kills")
 
 
 def main() -> None:
@@ -329,10 +448,13 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=60.0, help="of the steady recording")
     parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--hours", type=float, default=12.0, help="of the long one")
     parser.add_argument("--only", action="append", choices=SECTIONS, help="all by default")
     parser.add_argument("--folder", type=Path, help="keeps the recordings")
+    parser.add_argument("--plot", type=Path, metavar="SVG", help="of looking back, by matplotlib")
     arguments = parser.parse_args()
-    if why := missing():
+    sections = arguments.only or SECTIONS
+    if (why := missing()) and {*sections} != {"long"}:
         raise SystemExit(why)
     clips.check_data()
     print_machine()
@@ -341,15 +463,18 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         logs = Path(made, "logs")
         logs.mkdir()
-        for name in arguments.only or SECTIONS:
+        for name in sections:
             print(f"\n### {name}\n\n- load before: {os.getloadavg()[0]:.2f}\n", flush=True)
+            if name == "long":
+                long(folder, arguments.hours)
+                continue
             with closing(Core(logs)) as core:
                 if name == "steady":
                     beside(core, folder, arguments.seconds, *STEADY)
                 elif name == "overload":
                     beside(core, folder, 10.0, *OVERLOAD)
                 elif name == "look-back":
-                    look_back(core, folder)
+                    look_back(core, folder, arguments.plot)
                 else:
                     kills(core, folder, arguments.kills)
 
