@@ -261,6 +261,7 @@ def dataset() -> Document:
         "redactions": [
             {
                 "rules_sha256": "c" * 64,
+                "rules_text": "rules: []",
                 "function": "faces:find",
                 "rules": [2],
                 "topics": [
