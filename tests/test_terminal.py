@@ -190,3 +190,25 @@ def test_running_out_of_memory_is_not_damage(
         assert done.out == ""
         assert done.err.endswith("mp4ds: out of memory; try fewer --jobs\n"), done.err
         assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@LIMITED
+def test_more_cameras_than_open_files(tmp_path: Path) -> None:
+    """Each has a file while it is packed; as many may be open as the system lets."""
+    made = scene("mono8", frames=8, with_info=False, width=16, height=12).messages
+    images = [message for message in made if "image" in message.topic]
+    messages = [replace(m, topic=f"/cam{number}") for number in range(48) for m in images]
+    write_mcap(tmp_path / "d.mcap", Scene(sorted(messages, key=lambda m: m.log_time)))
+    limits = "ulimit -Sn 40; ulimit -Hn 40; "
+    for parts in ("", " --gop 2 --window 2"):
+        done = run(f"pack d.mcap -o d --force{parts}", "", tmp_path, limits)
+        assert done.code == 1
+        assert "too many files are open at once; `ulimit -n` allows more" in done.err
+        assert not (tmp_path / "d").exists()
+    done = run("pack d.mcap -o d --restart", "", tmp_path, "ulimit -Sn 40; ")
+    assert done.code == 0, done.err
+    assert mp4ds.validate(tmp_path / "d", deep=True) == []
+    done = run("unpack d --to mcap -o again.mcap", "", tmp_path, limits)
+    assert done.code == 1
+    assert "too many files are open at once; `ulimit -n` allows more" in done.err

@@ -163,7 +163,6 @@ class Media:
                 if p.pts is not None  # as of the packet that ends a video
             ]
         except (FFmpegError, OSError) as error:
-            raise_if_scarce(error)
             raise self._unreadable(error) from None
         given = [(*p[:2], p[3] if p[2] is None else p[2], *p[3:]) for p in packets]
         rows = np.array(given, np.int64).reshape(-1, 6)
@@ -181,6 +180,7 @@ class Media:
         )
 
     def _unreadable(self, error: Exception) -> VideoError:
+        raise_if_scarce(error)
         return VideoError("video-unreadable", self._path, f"cannot be read: {error}")
 
     def check(self, codec: str, coded_size: tuple[int, int] | None) -> None:
