@@ -109,16 +109,13 @@ def test_keys(drive: Path) -> None:
         shown.until("1 messages")
         shown.press(b"s\x1b[C")
         shown.until("3 messages")
-        shown.press(b"\x1b[D")  # back: the second frame once more
-        shown.until(r"0\.1 of .* 4 messages")
         shown.press(b"\x1b[A")
         shown.until(r"1\.1x paused")
         shown.press(b"\x1b[B\x1b[B")
         shown.until(r"0\.909\d*x paused")
         shown.press(b" ")
         assert shown.end() == 0
-        # 4 while it stood, then the third frame and all that follow
-        assert "22 messages in" in shown.text
+        assert "20 messages in" in shown.text
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])

@@ -387,7 +387,7 @@ DAMAGES: dict[str, tuple[Change, str]] = {
     "no tables": (without(*TABLES), "stbl is missing"),
     **{
         f"no {kind.decode()}": (without(*TABLES, kind), f"{kind.decode()} is missing")
-        for kind in (b"stsd", b"stts", b"stsc", b"stsz", b"stco")
+        for kind in (b"stts", b"stsc", b"stsz", b"stco")
     },
     **{
         f"{kind.decode()} with many rows": (
@@ -398,8 +398,9 @@ DAMAGES: dict[str, tuple[Change, str]] = {
     },
     **{
         f"{kind.decode()} of nothing": (in_table(kind, lambda _: b""), "too short")
-        for kind in (b"stsd", b"stts", b"ctts", b"stss", b"stsc", b"stsz", b"stco")
+        for kind in (b"stts", b"ctts", b"stss", b"stsc", b"stsz", b"stco")
     },
+    "stsd of nothing": (in_table(b"stsd", lambda _: b""), "damaged"),
     "no description": (in_table(b"stsd", put(4, packed(0))), "several|damaged"),
     "a short description": (in_table(b"stsd", lambda body: body[:60]), "damaged"),
     "a long description": (in_table(b"stsd", lambda body: body + bytes(1 << 20)), "too long"),

@@ -226,10 +226,11 @@ def _parse_description(file: BinaryIO, stsd: Box) -> SampleEntry:
         raise DamagedBoxError("it is too long")
     file.seek(stsd.start)
     data = file.read(stsd.size)
-    if int.from_bytes(data[4:8], "big") > 1:
+    count = int.from_bytes(data[4:8], "big")
+    if count > 1:
         raise Refused("its frames have several descriptions")
     file = io.BytesIO(data)
-    entry = next(boxes(file, 8, len(data)), None)
+    entry = next(boxes(file, 8, len(data)), None) if count else None
     if entry is None or entry.size < _ENTRY_BYTES:
         raise DamagedBoxError("a box is damaged")
     values_end = entry.start + _ENTRY_BYTES
