@@ -280,6 +280,7 @@ def test_a_clock_that_jumps_back(drive: Path, tmp_path: Path) -> None:
         ({"keep_last": None, "trigger": ["/go"]}, "need `keep_last`"),
         ({"max_duration": 60}, "contradicts"),
         ({"max_splits": 2}, "contradicts"),  # it would delete what was saved
+        ({"limit": 20}, "contradicts"),  # it would stop before anybody could trigger
         ({"keep_last": 0}, "more than 0"),
         ({"repeat_latched": True}, "saves latched messages with each dataset"),
         ({"trigger": ["/battery:percentage=0.2"]}, "neither TOPIC nor TOPIC:FIELD>VALUE"),

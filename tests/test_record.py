@@ -148,6 +148,12 @@ def wanted(*topics: str, **options: Any) -> Wanted:
     return Wanted(topics, RecordOptions(**options))
 
 
+def test_named_topics_are_waited_for() -> None:
+    """A limit is reached when they have come, too."""
+    assert Wanted(["/a", "/cam/*"], RecordOptions(limit=3)).due == {"/a"}
+    assert not Wanted([], RecordOptions(all=True, limit=3)).due
+
+
 def test_topics_that_are_wanted() -> None:
     chosen = wanted("cam/*", regex="imu$", exclude=["/cam/info"], exclude_regex="depth")
     topics = ("/cam/image", "/cam/info", "/cam/depth", "/front/imu", "/imu/raw")

@@ -473,7 +473,7 @@ def test_qos_that_hears_all_publishers() -> None:
         ([latched, reliable], True, False),
     ):
         asked = asked_qos(offered)
-        assert (asked.is_reliable, asked.is_latched, asked.depth) == (is_reliable, is_latched, 1000)
+        assert (asked.is_reliable, asked.is_latched, asked.depth) == (is_reliable, is_latched, 300)
 
 
 def test_names() -> None:

@@ -105,7 +105,6 @@ ALL = {"all": True}
             "--ros1 --node /slam -l 5 -L 2G --output-prefix run",
             {"of_node": "/slam", "limit": 5, "min_space": 2**31, "prefix": "run"},
         ),
-        ("--ros2 -a -f cdr", ALL),
         ("--ros2 -a --snapshot-mode", {"keep_last": 60} | ALL),
         ("--ros2 -a --snapshot-mode --max-cache-duration 5", {"keep_last": 5} | ALL),
         ("--ros2 -a --max-cache-duration 5", ALL),

@@ -49,7 +49,7 @@ _KEPT_S = 60.0
     },
     letters={
         "ros1": {"-e": "--match", "--regex": "--match"},
-        "ros2": {"-b": "--max-size", "-s": "--storage", "-f": "--serialization-format"},
+        "ros2": {"-b": "--max-size", "-s": "--storage"},
     },
 )
 @argument("topics", "TOPIC...", "Topic names, or globs in quotes; -a records all.", nargs=-1)

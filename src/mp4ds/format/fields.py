@@ -37,7 +37,6 @@ parsed as a whole."""
 Int64 = Annotated[int, Field(ge=INT64_MIN, le=INT64_MAX)]
 Time = Annotated[int, Field(ge=INT64_MIN, le=2**64 - 1)]
 Uint32 = Annotated[int, Field(ge=0, le=2**32 - 1)]
-Uint64 = Annotated[int, Field(ge=0, le=2**64 - 1)]
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
 Count = Annotated[int, Field(ge=0, le=MAX_FRAMES)]
 Size = Annotated[int, Field(ge=0, le=INT64_MAX)]

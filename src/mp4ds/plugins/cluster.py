@@ -39,9 +39,10 @@ def cluster_executor(address: str) -> Iterator[Executor]:
                 thread.submit(asyncio.run, _greet(address)).result()
             client = Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
         except Exception as error:  # of any kind, since it interprets what another server says
+            why = str(error.__cause__ or error) or type(error).__name__
             raise RemoteError(
                 address,
-                f"no Dask scheduler can be reached ({error or type(error).__name__})",
+                f"no Dask scheduler can be reached ({why})",
                 "Give tcp://HOST:PORT, and check that `dask scheduler` is running there and that "
                 "no firewall blocks it.",
             ) from None

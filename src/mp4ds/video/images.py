@@ -451,6 +451,3 @@ def _frame(array: NDArray[Any], pixel_format: str) -> av.VideoFrame:
     frame = av.VideoFrame(array.shape[1], array.shape[0], pixel_format)
     samples(frame)[...] = array
     return frame
-
-
-# ---------------------------------------------------------------- pages

@@ -241,6 +241,11 @@ class Wanted:
         is_of_node = topic in self.by_node
         return is_named or is_found or is_of_node or type_name in options.topic_types
 
+    @property
+    def due(self) -> frozenset[str]:
+        """Topics that were named, not by a pattern, as they are recorded."""
+        return frozenset(name for name in self._recorded.values() if not set(name) & set("*?["))
+
     def recorded_as(self, topic: str) -> str:
         """The name under which a topic is recorded."""
         return self._recorded.get(topic, topic)

@@ -199,6 +199,8 @@ def _check(options: RecordOptions) -> None:
         raise OptionError(
             "`keep_last` saves latched messages with each dataset: leave out `repeat_latched`."
         )
+    if options.keep_last is not None and options.limit:
+        raise OptionError("`keep_last` contradicts `limit`.")
     if options.keep_last == 0:
         raise OptionError("`keep_last` must be more than 0 seconds.")
     if options.about is not None:
@@ -265,6 +267,7 @@ class Recorder:
         self._others = others
         self._progress = progress
         self._buffer = MessageBuffer(options.buffer * 10**6, _LAST_NS[node.world], options.limit)
+        self._due = wanted.due
         self._source = Source(node, options, wanted, self._take)
         self._changed = threading.Event()
         self._is_stopped = False
@@ -397,7 +400,7 @@ class Recorder:
                     begun = time.monotonic()
                 if self._options.duration and time.monotonic() - begun >= self._options.duration:
                     self._is_stopped = True
-                if self._options.limit and self._buffer.has_all(list(self._source.topics)):
+                if self._options.limit and self._buffer.has_all({*self._source.topics, *self._due}):
                     self._is_stopped = True
                 usual = "looking back" if self._look_back else "recording"
                 state = f"waiting for {clock}" if clock else usual

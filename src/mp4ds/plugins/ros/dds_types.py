@@ -35,7 +35,8 @@ _TYPE_PATIENCE = 2_000_000_000  # ns to wait for another participant to describe
 _FEW, _MANY = 32, 1000
 """Messages kept for slow subscribers: a second of a camera, and of types without blobs."""
 
-_BLOBS = ("byte", "char", "int8", "octet", "uint8")
+_BLOBS = ("byte", "char", "int8", "octet", "uint8", "int16", "uint16", "float32")
+_LARGE = 1000  # elements
 _BASES = {
     "bool": "bool",
     "octet": "byte",
@@ -149,7 +150,11 @@ def message_type(channel: Channel) -> DdsType:
         return DdsType(_opaque_type(dds_name(name)), type_hash, False, False, _FEW)
     is_empty = found[name][1][0][0] == FILLER
     shapes = (field_shape(desc) for _, fields in found.values() for _, desc in fields)
-    is_large = any(one.bound == 0 and one.base in _BLOBS for one in shapes)
+    is_large = any(
+        one.base in _BLOBS
+        and (one.bound == 0 or (one.bound or 0) > _LARGE or (one.length or 0) > _LARGE)
+        for one in shapes
+    )
     return DdsType(real, type_hash, True, is_empty, _FEW if is_large else _MANY)
 
 

@@ -17,7 +17,7 @@ from mp4ds.records import QOS_KEY, Channel
 
 _NS = 10**9
 _MAX_DEPTH = 2**31 - 1
-_RECEIVED = 1000  # depth of a subscription: messages are taken out at once, if nothing hangs
+_RECEIVED = 300  # depth of a subscription: 10 s of a camera, if what takes messages out hangs
 _MAX_BYTES = 2**20
 _Loader: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _INFINITE_SECONDS = 2**31 - 1  # the smallest of the values that middlewares use for infinity
