@@ -25,7 +25,14 @@ import mp4ds
 from coded_scenes import CODED
 from commands import call, typed
 from mp4ds.cli.report import print_evaluation
-from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, TargetError
+from mp4ds.errors import (
+    OptionError,
+    Refused,
+    ScoringError,
+    SourceError,
+    TargetError,
+    TargetExistsError,
+)
 from mp4ds.messages.encodings import ENCODINGS as ENCODING_TABLE
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.packing.options import PackOptions
@@ -325,14 +332,16 @@ def test_the_page_needs_nothing_else(whole: Evaluation) -> None:
         assert len(re.findall(rf"<{tag}[ >]", text)) == text.count(f"</{tag}>")
 
 
-def test_another_one_replaces_it(tmp_path: Path) -> None:
+def test_force_replaces_another_one(tmp_path: Path) -> None:
     path, out = recording(tmp_path), tmp_path / "out"
     evaluate(path, replace(QUICK, crf=["20:22"]), output=out)
-    again = evaluate(path, QUICK, output=out)
+    with pytest.raises(TargetExistsError):
+        evaluate(path, QUICK, output=out)
+    again = evaluate(path, replace(QUICK, force=True), output=out)
     assert again.tried == len(list((out / "pictures").glob("*crf*"))) == 1
     (out / "own.txt").touch()
     with pytest.raises(TargetError):
-        evaluate(path, QUICK, output=out)
+        evaluate(path, replace(QUICK, force=True), output=out)
     assert (out / "own.txt").exists()
 
 
@@ -374,7 +383,7 @@ def test_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert "smallest: --quality crf=24 --codec h264 --preset ultrafast" in out
     assert (tmp_path / "drive_evaluation" / "index.html").is_file()
     assert out.rstrip().endswith("index.html: 1 setting tried")
-    values = json.loads(call(*given, "--json").out)
+    values = json.loads(call(*given, "--json", "--force").out)
     assert values["tried"] == 1
     for wrong in (("--crf", "x"), ("--target", "x=1"), ("--codecs", "vp9")):
         done = call(*given, *wrong)

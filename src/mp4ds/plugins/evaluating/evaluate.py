@@ -21,7 +21,7 @@ from mp4ds.files.outputs import listed_names, staged, write_listing
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.options import LONG, WHAT, Parsed, TopicOptions, jobs, option, parse_words
+from mp4ds.options import LONG, WHAT, Parsed, TopicOptions, force, jobs, option, parse_words
 from mp4ds.plugins.evaluating.page import write_files
 from mp4ds.plugins.evaluating.trials import (
     CEILING_MARGIN,
@@ -135,6 +135,7 @@ class EvaluateOptions(TopicOptions):
         least=_LEAST,
         most=_MOST,
     )
+    force: bool = force()
     gop: int = option("Maximum key frame interval in frames.", LOSSY_GOP, least=1, most=100_000)
     threads: int | None = option(
         "Threads per encoder; default: all cores.", panel=LONG, least=1, most=1024
@@ -234,7 +235,9 @@ def evaluate(
         target = _target(place, output)
         result = Evaluation(place, target, [], left_out, versions_of(ffmpeg))
         names = FileNames()
-        made = stack.enter_context(staged(target, force=True, owned=listed_names, sources=[place]))
+        made = stack.enter_context(
+            staged(target, force=options.force, owned=listed_names, sources=[place])
+        )
         (made / PICTURES).mkdir(parents=True)
         run = _Run(options, settings, ffmpeg, result, made)
         for number, camera in enumerate(cameras):
