@@ -103,6 +103,7 @@ def test_a_compiled_wheel_is_for_its_platform(unpacked: Path, tmp_path: Path) ->
     assert done.out.startswith(installed)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 def test_an_editable_install_is_compiled_where_it_runs(unpacked: Path, tmp_path: Path) -> None:
     source = shutil.copytree(unpacked, tmp_path / "source")
