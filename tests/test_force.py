@@ -131,7 +131,9 @@ def test_an_evaluation_goes_into_its_own_folder_only(
     folder(tmp_path / "out")
     with unchanged(tmp_path):
         refused(
-            call("evaluate", made / "drive", "-o", tmp_path / "out"), 2, "was not written by mp4ds"
+            call("evaluate", made / "drive", "-o", tmp_path / "out", "--force"),
+            2,
+            "was not written by mp4ds",
         )
 
 
