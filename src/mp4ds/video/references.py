@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +30,7 @@ _FRAME = r"(k|[1-9][0-9]{0,5}(,[1-9][0-9]{0,5})*)"
 _PACKET = rf"{_FRAME}(\+{_FRAME})*"
 STRUCTURE_PATTERN = rf"^k(\+{_FRAME})*( {_PACKET})*$"
 
+_BLOCK = 2**20
 _KEY = "k"
 
 Needs = tuple[int, ...]
@@ -200,10 +202,19 @@ def digest_video(path: Path, codec: str) -> tuple[int, str, Structures | None]:
     Raises:
         OSError: It cannot be read.
     """
-    return *digest_file(path), _structures_in(path, codec)
+    table = _table(path, codec)
+    if table is None:
+        return *digest_file(path), None
+    digest = hashlib.sha256()
+    with path.open("rb") as file:  # read once: it may be large, and far away
+        found = find_structures(
+            codec, table.entry.configuration, _packets(file, table, digest.update)
+        )
+        _pass(file, digest.update)
+        return file.tell(), digest.hexdigest(), found
 
 
-def _structures_in(path: Path, codec: str) -> Structures | None:
+def _table(path: Path, codec: str) -> SampleTable | None:
     if codec not in CODECS or not CODECS[codec].is_free:
         return None
     try:
@@ -212,15 +223,24 @@ def _structures_in(path: Path, codec: str) -> Structures | None:
         return None
     if np.any(table.places[1:] < (table.places + table.sizes)[:-1]):
         return None  # a forged index could have the whole file read for each packet
-    with path.open("rb") as file:
-        return find_structures(codec, table.entry.configuration, _packets(file, table))
+    return table
 
 
-def _packets(file: BinaryIO, table: SampleTable) -> Iterator[tuple[bytes, bool]]:
+def _packets(
+    file: BinaryIO, table: SampleTable, seen: Callable[[bytes], object]
+) -> Iterator[tuple[bytes, bool]]:
     columns = (table.places.tolist(), table.sizes.tolist(), table.sync.tolist())
     for place, size, is_key in zip(*columns, strict=True):
-        file.seek(place)
-        yield file.read(size), is_key
+        _pass(file, seen, place)
+        packet = file.read(size)
+        seen(packet)
+        yield packet, is_key
+
+
+def _pass(file: BinaryIO, seen: Callable[[bytes], object], end: int | None = None) -> None:
+    """Show what there is up to a place, or to the end of the file."""
+    while block := file.read(_BLOCK if end is None else min(_BLOCK, end - file.tell())):
+        seen(block)
 
 
 def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:
