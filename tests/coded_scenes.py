@@ -294,7 +294,6 @@ _FFMPEG = {  # what the field `encoding` says -> recipe
     "hevc_nvenc": "h265",
     "libsvtav1": "av1",
     "av1;yuv420p;bgr8;bayer_rggb8": "av1",
-    "vp9;yuv420p;bgr8;bgr8": "vp9",
     "mjpeg;yuvj420p;bgr8;bgr8": "mjpeg",
 }
 _VIDEOS: dict[str, MakeScene] = {
@@ -314,16 +313,15 @@ _VIDEOS: dict[str, MakeScene] = {
     "video-h265-called-hevc": partial(_video, "h265", "hevc"),
     "video-av1": partial(_video, "av1", "av1"),
     "video-av1-no-delimiter": partial(_video, "av1", "av1", _each(encoders.without_delimiter)),
-    "video-vp9": partial(_video, "vp9", "vp9"),
     **{
         f"video-{codec}-mid-gop": partial(_video, codec, codec, lambda given: given[GOP // 2 :])
-        for codec in ("h264", "h265", "av1", "vp9")
+        for codec in ("h264", "h265", "av1")
     },
     **{
         f"video-{codec}-lost": partial(
             _video, codec, codec, lambda given: [*given[: GOP + 1], *given[GOP + 2 :]]
         )
-        for codec in ("h264", "h265", "av1", "vp9")
+        for codec in ("h264", "h265", "av1")
     },
     "video-h264-bframes": partial(_video, "h264-bframes", "h264"),
     "video-h265-bframes": partial(_video, "h265-bframes", "h265"),
@@ -335,7 +333,7 @@ _VIDEOS: dict[str, MakeScene] = {
 }
 _OTHERS |= {
     "video-h264-avcc": partial(_video, "h264", "h264", _each(encoders.length_prefixed)),
-    "video-unknown": partial(_video, "vp9", "vp11"),
+    "video-vp9": partial(_video, "vp9", "vp9"),
     "ffmpeg-unknown": partial(_video, "h264", "vendor codec", msgtype=PACKET),
     "video-empty": partial(
         _video, "h264", "h264", _each(lambda packet: Packet(b"", packet.number, packet.is_key))

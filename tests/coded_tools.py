@@ -76,8 +76,6 @@ ENCODINGS = {
     "av1-low-delay": Encoding(
         "av1", "libsvtav1", {"preset": "12", "svtav1-params": "pred-struct=1"}
     ),
-    "vp9": Encoding("vp9", "libvpx-vp9", {"deadline": "realtime", "cpu-used": "8"}),
-    "vp9-rgb": Encoding("vp9", "libvpx-vp9", {"lossless": "1"}, "gbrp"),
     "mjpeg": Encoding("mjpeg", "mjpeg", pixel_format="yuvj420p"),
 }
 DECODERS = {"h265": "hevc", "av1": "libdav1d"}
@@ -109,13 +107,6 @@ def jpeg(pixels: NDArray[np.uint8], mode: str | None = None, **options: Any) -> 
     image = Image.frombytes(mode, pixels.shape[1::-1], pixels) if mode else Image.fromarray(pixels)
     image.save(file, "JPEG", **options)
     return file.getvalue()
-
-
-def superframe(hidden: bytes, shown: bytes) -> bytes:
-    """Two VP9 frames as one packet, the first made one that is not shown (annex B)."""
-    frames = (hide(hidden), shown)
-    marker = bytes([0b110_01_001])  # sizes of two bytes, two frames
-    return b"".join((*frames, marker, *(len(f).to_bytes(2, "little") for f in frames), marker))
 
 
 def hide(frame: bytes) -> bytes:

@@ -106,7 +106,7 @@ FOXGLOVE: Mapping[str, MakeScene] = {
         name: partial(foxglove_scene, CODED[name])
         for name in (
             *("video-h264", "video-h264-mid-gop", "video-h264-bframes", "video-h265"),
-            *("video-av1", "video-vp9", "video-empty"),
+            *("video-av1", "video-empty"),
         )
     },
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +13,18 @@ from coded_tools import (
     ENCODINGS,
     IN_ORDER,
     encode,
-    hide,
     mutations,
     refusal,
-    superframe,
 )
 from conftest import real
 from encoders import Packet
 from mp4ds.video import av1
 from mp4ds.video.codecs import CODECS
-from mp4ds.video.coded import REORDERED, NoPicture, StreamParser, split_superframe
+from mp4ds.video.coded import REORDERED, StreamParser
 from mp4ds.video.h264 import H264, join_plain, split
 from mp4ds.video.h265 import H265
 
-VIDEO = [name for name in IN_ORDER if ENCODINGS[name].codec in ("h264", "h265", "av1", "vp9")]
+VIDEO = [name for name in IN_ORDER if ENCODINGS[name].codec in ("h264", "h265", "av1")]
 UNITS = {"h264": H264, "h265": H265}
 
 
@@ -138,22 +135,6 @@ def test_two_pictures_in_one_packet(codec: str) -> None:
     assert "more than one picture" in refusal(parser.picture, both)
 
 
-def test_a_picture_that_is_not_shown() -> None:
-    packets = [packet.data for packet in encode(ENCODINGS["vp9"], frames=4, gop=9)]
-    parser = CODECS["vp9"].parser()
-    parser.picture(packets[0])
-    with pytest.raises(NoPicture, match="shows no picture"):
-        parser.picture(hide(packets[1]))
-    both = superframe(packets[1], packets[2])
-    assert list(split_superframe(memoryview(both))) == [hide(packets[1]), packets[2]]
-    assert not parser.picture(both).keyframe
-    assert parser.picture(packets[3]).width == 64
-    several = bytearray(both)
-    several[0] |= 2
-    assert "more than one picture" in refusal(parser.picture, bytes(several))
-    assert "superframe" in refusal(parser.picture, b"\x86" + both)
-
-
 # ---------------------------------------------------------------- AV1
 
 
@@ -192,29 +173,7 @@ def test_what_no_mp4_keeps_of_av1(body: bytes, reason: str) -> None:
     assert reason in refusal(CODECS["av1"].parser().picture, body)
 
 
-# ---------------------------------------------------------------- VP9
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (lambda body: b"", "empty"),
-        (lambda body: b"\0" + body, "marker"),
-        (lambda body: body[:1], "inside of a header"),
-        (lambda body: body[:2] + b"\0" + body[3:], "sync code"),
-        (lambda body: body + b"\xc9\0\0\0\0\xc9", "superframe"),
-        (lambda body: bytes([body[0] | 0x30]) + body[1:], ""),
-    ],
-)
-def test_what_is_no_vp9(change: Callable[[bytes], bytes], reason: str) -> None:
-    body = encode(ENCODINGS["vp9"], frames=1)[0].data
-    assert not refusal(CODECS["vp9"].parser().picture, body)
-    refused = refusal(CODECS["vp9"].parser().picture, change(body))
-    assert reason in refused
-    assert refused
-
-
-@pytest.mark.parametrize("name", ["vp9", "vp9-rgb", "av1", "h264", "h265"])
+@pytest.mark.parametrize("name", ["av1", "h264", "h265"])
 def test_damage_is_refused_or_read(name: str) -> None:
     packets = encode(ENCODINGS[name], frames=2)
     for packet in packets:

@@ -571,7 +571,7 @@ def test_a_folder_whose_name_looks_like_something_else(
 KINDS: dict[str, tuple[str, Scene]] = {
     "h264": ("mcap-ros2-none", CODED["video-h264"](frames=6)),
     "av1": ("mcap-ros2-none", CODED["video-av1"](frames=6)),
-    "vp9": ("bag-none", CODED["ffmpeg-vp9-yuv420p-bgr8-bgr8"](frames=6)),
+    "ffmpeg": ("bag-none", CODED["ffmpeg-libx264"](frames=6)),
     "jpeg": ("bag-none", CODED["jpeg-rgb"](frames=6)),
     "jpeg-grey": ("bag-none", CODED["jpeg-gray"](frames=6)),
     "png": ("bag-none", CODED["png-gray-cv2"](frames=6)),
@@ -679,7 +679,6 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
         }.items()
     },
     "framing-av1-none": ("av1", header(framing=""), NOT_AS_RECORDED),
-    "framing-vp9": ("vp9", header(framing="4"), NOT_AS_RECORDED),
     "framing-jpeg": ("jpeg", header(framing="td"), NOT_AS_RECORDED),
     # what stands before a picture
     "prefix-long": ("depth", header(prefix="00" * 33), BAD_DOCUMENT),
@@ -791,11 +790,11 @@ FORGED: dict[str, tuple[str, Change, set[str]]] = {
     ),
     # columns of packets
     "pts-beyond": (
-        "vp9",
+        "ffmpeg",
         put("columns", "pts", value=column(2**63 - 1, 1, "0*5")),
         {"column-invalid"},
     ),
-    "pts-none": ("vp9", drop("columns", "pts"), BAD | {"column-invalid"}),
+    "pts-none": ("ffmpeg", drop("columns", "pts"), BAD | {"column-invalid"}),
     # formats and templates
     "format-none": ("jpeg", header(format=None), NOT_AS_RECORDED),
     "format-huge": ("jpeg", header(format="x" * 2**22), NOT_AS_RECORDED),

@@ -66,7 +66,7 @@ VIDEOS = [
     ("a.mov", "libx265", {"x265-params": "bframes=0:log-level=error"}, "h265"),
     ("a.mkv", "libx264", {"bf": "0"}, "h264"),
     ("a.mkv", "libsvtav1", {"preset": "12", "svtav1-params": "fast-decode=1"}, "av1"),
-    ("a.webm", "libvpx-vp9", {"deadline": "realtime"}, "vp9"),
+    ("a.webm", "libsvtav1", {"preset": "12"}, "av1"),
     ("a.mkv", "mjpeg", {}, "mjpeg"),
     ("a.mov", "mjpeg", {}, "mjpeg"),
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import shutil
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
@@ -362,13 +363,14 @@ def rewrite(path: Path, codec: str, number: int, damaged: bytes) -> None:
 
 def test_packets_that_the_muxer_refuses(tmp_path: Path) -> None:
     """VP9 frames that are not shown wait for one that is, but no more than eight."""
-    path = tmp_path / "a.mp4"
-    bodies = [p.data for p in encode_packets(ENCODINGS["vp9"], frames=14, gop=20)]
-    write_packets(path, "vp9", bodies)
-    for number in range(1, 14):
-        rewrite(path, "vp9", number, hide(bodies[number]))
+    case = TESTS.parent / "conformance/cases/datasets/packets"
+    path = Path(shutil.copy(case / "video_vp9_cam_video.mp4", tmp_path))
+    with PacketReader(path, codec="vp9") as reader:
+        bodies = list(reader.packets())
+    for number, body in enumerate(bodies):
+        rewrite(path, "vp9", number, hide(body))
     with pytest.raises(VideoError, match=r"packet \d+ is damaged") as caught:
-        join_segments([path], range(14), tmp_path / "j.mp4")
+        join_segments([path] * 3, range(3 * len(bodies)), tmp_path / "j.mp4")
     assert caught.value.place == str(path)
     assert not (tmp_path / "j.mp4").exists()
 
@@ -425,7 +427,7 @@ PLAYED = [
     *((codec, kind, False) for codec in ("h264", "av1") for kind in ("rgb24", "yuv420p")),
 ]
 PLAYED_IDS = [IDS[KINDS.index(kind)] for kind in PLAYED]
-PACKETS_PLAYED = ["h264", "av1", "vp9"]
+PACKETS_PLAYED = ["h264", "av1"]
 SOUGHT = (0, 5, 6, 7, 10, 3)  # the last of a segment, the first, ...
 
 

@@ -75,7 +75,7 @@ def as_rgb(frame: av.VideoFrame) -> np.ndarray[Any, Any]:
 DECODERS = {"av1": "libdav1d", "h265": "hevc"}
 PACKETS = [
     *("video-h264", "video-h264-slices", "video-h264-headers-once", "video-h264-mid-gop"),
-    *("video-h265", "video-av1", "video-av1-no-delimiter", "video-vp9", "ffmpeg-libx265"),
+    *("video-h265", "video-av1", "video-av1-no-delimiter", "ffmpeg-libx265"),
 ]
 
 

@@ -15,7 +15,6 @@ from coded_tools import (
     WIDTH,
     decodes,
     encode,
-    hide,
     jpeg,
     refusal,
     scene,
@@ -108,17 +107,6 @@ def test_parameters_that_were_sent_before(codec: str, tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- refusals and faults
-
-
-def test_packets_that_a_muxer_joins_are_missed(tmp_path: Path) -> None:
-    """The muxer joins a VP9 frame that is not shown with the next; the parser refuses it."""
-    frames = [packet.data for packet in encode(ENCODINGS["vp9"], frames=4, gop=9)]
-    writer = PacketWriter(tmp_path / "a.mp4", "vp9", width=WIDTH, height=HEIGHT)
-    for number, frame in enumerate((frames[0], hide(frames[1]), frames[2], frames[3])):
-        writer.write(frame, number * STEP, keyframe=not number)
-    with pytest.raises(VideoError) as caught:
-        writer.close()
-    assert caught.value.code == "frame-count"
 
 
 @pytest.mark.parametrize("fault", ["tick", "size", "content"])

@@ -129,7 +129,6 @@ CASES: dict[str, Case] = {
     "packets ffmpeg": Case("ffmpeg-libx264", {}, "h264", ("yuv420p",), **H26X, browser=True),
     "packets h265": Case("video-h265", {}, "hevc", ("yuv420p",), None, "tv", is_left=True),
     "packets av1": Case("video-av1", {}, "av1", ("yuv420p",), None, "tv", browser=True),
-    "packets vp9": Case("video-vp9", {}, "vp9", ("yuv420p",), None, "tv", browser=True),
 }
 PLAYED = [name for name, case in CASES.items() if case.browser]
 

@@ -159,9 +159,8 @@ def test_packets_of_which_some_are_left_out(name: str, tmp_path: Path) -> None:
         assert row[2] == IMAGE or row == recorded
 
 
-@pytest.mark.parametrize("name", ["video-h264", "video-vp9"])
-def test_a_slice_that_does_not_begin_with_a_key_frame(name: str, tmp_path: Path) -> None:
-    sources = SOURCES["mcap-ros2-zstd"](tmp_path, CODED[name]())
+def test_a_slice_that_does_not_begin_with_a_key_frame(tmp_path: Path) -> None:
+    sources = SOURCES["mcap-ros2-zstd"](tmp_path, CODED["video-h264"]())
     mp4ds.pack(sources, tmp_path / "all")
     small = PackOptions(resize=0.5)
     mp4ds.pack(sources, tmp_path / "small", small)

@@ -101,10 +101,6 @@ RECIPES = {
     "x265-b4-2-layers": x265("bframes=4:temporal-layers=2:open-gop=0"),
     "x265-b4-3-layers": x265("bframes=4:temporal-layers=3:open-gop=0:b-adapt=0"),
     "x265-leading": x265("bframes=4:open-gop=0:radl=2:scenecut=0:gop-lookahead=4"),
-    "vp9": Recipe("vp9", "libvpx-vp9", (("cpu-used", "8"), ("row-mt", "0"))),
-    "vp9-live": Recipe(
-        "vp9", "libvpx-vp9", (("deadline", "realtime"), ("cpu-used", "8"), ("lag-in-frames", "0"))
-    ),
     "ffv1": Recipe("ffv1", "ffv1", (("level", "3"), ("slicecrc", "1"), ("context", "1"))),
     "ffv1-gray16": Recipe("ffv1", "ffv1", (("level", "3"),), "gray16le"),
     "ffv1-golomb": Recipe("ffv1", "ffv1", (("level", "3"), ("coder", "rice"))),
@@ -297,9 +293,6 @@ def after_key(clip: Clip, data: bytes) -> str:
         ("x265-b4", with_length(b"\x2a\x01\x80"), "refer to what is before"),
         ("x265-b4", with_length(b"\x44\x01\xf0") + with_length(b"\x02\x01\x80"), "not shown"),
         ("x265-b4", with_length(b"\x42\x01"), "malformed"),
-        ("vp9", b"", "empty"),
-        ("vp9", b"\0\0", "marker"),
-        ("vp9", b"\x84\0", "no picture"),
         ("ffv1", b"\0", "short"),
     ],
 )
@@ -554,9 +547,7 @@ def test_av1_key_frames_shown_later() -> None:
 # ---------------------------------------------------------------- damage
 
 
-@pytest.mark.parametrize(
-    "name", ["svt-8", "x264-slices", "x265-b4-3-layers", "vp9", "ffv1", "mjpeg"]
-)
+@pytest.mark.parametrize("name", ["svt-8", "x264-slices", "x265-b4-3-layers", "ffv1", "mjpeg"])
 def test_damage_is_refused_or_read(name: str) -> None:
     clip = encoded(RECIPES[name])
     for packet in clip.packets[:8]:

@@ -25,6 +25,8 @@ from mp4ds.unpacking.unpack import UnpackOptions
 from round_trips import journey, own_target, unpacked
 from sources import PERIOD, SOURCES, START, TRAITS, odd_scene, scene, write_bag
 
+ROOT = Path(__file__).parents[1]
+
 
 def manifest(dataset: Path) -> Manifest:
     return load_manifest(dataset / "dataset.yaml")
@@ -84,6 +86,22 @@ def test_coded_images(kind: str, tmp_path: Path) -> None:
     before = journey(first, SOURCES["mcap-ros2-zstd"], CODED[kind](frames=6), "mcap")
     mp4ds.pack(before.dataset, tmp_path / "dataset")
     assert compare(before.sources, unpacked(tmp_path, "mcap")) == []
+
+
+def test_vp9_of_version_1(tmp_path: Path) -> None:
+    """Its packets are read, and copied; anew they are stored as messages."""
+    case, topic = ROOT / "conformance/cases/datasets/packets", "/video_vp9/cam/video"
+    mp4ds.unpack(case, "mcap", tmp_path / "first.mcap")
+    for name, source, verbatim in (
+        ("copied", case, {}),
+        ("anew", tmp_path / "first.mcap", {"its codec 'vp9' is not one that becomes a video": 4}),
+    ):
+        made = mp4ds.pack(source, tmp_path / name)
+        (told,) = (one for one in made.topics if one.topic == topic)
+        assert {why: count for why, (count, _) in told.verbatim.items()} == verbatim
+        assert mp4ds.validate(tmp_path / name, deep=True) == []
+        mp4ds.unpack(tmp_path / name, "mcap", tmp_path / "again.mcap", UnpackOptions(force=True))
+        assert compare([tmp_path / "first.mcap"], [tmp_path / "again.mcap"]) == []
 
 
 def test_log_times_that_do_not_tell_the_order(tmp_path: Path) -> None:

@@ -239,7 +239,7 @@ SOME = {*COMMON, "rgb16", "yuyv", "nv12", "8UC2", "32FC1", "64FC3", "bgra8", "ba
 
 
 CODED_KINDS = [
-    *("jpeg-rgb", "video-h265", "video-vp9", "video-h264-mid-gop", "png-rgba-cv2"),
+    *("jpeg-rgb", "video-h265", "video-h264-mid-gop", "png-rgba-cv2"),
     "depth-16UC1-rvl",
 ]
 

@@ -264,7 +264,7 @@ ROS_SCENES: dict[str, Callable[..., Scene]] = {
             *("jpeg-rgb", "jpeg-exif-trailing", "png-rgb-cv2", "png-gray-pillow", "png-rgba-cv2-9"),
             *("png-16-bit-cv2", "depth-16UC1-png", "depth-16UC1-rvl", "depth-32FC1-rvl"),
             *("video-h264-aud-sei", "video-h264-3-byte", "video-h265", "video-av1"),
-            *("video-av1-no-delimiter", "video-vp9", "ffmpeg-libx264", "ffmpeg-libsvtav1"),
+            *("video-av1-no-delimiter", "ffmpeg-libx264", "ffmpeg-libsvtav1"),
         )
     },
 }

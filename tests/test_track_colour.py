@@ -18,7 +18,7 @@ from mp4ds.video.access import FrameReader
 from mp4ds.video.mp4 import TrackColour, sample_table_of
 from test_references import FRAMES, HEIGHT, RECIPES, WIDTH, encoded_file
 
-NAMES = ("x264-b0-none-ref4-w2", "x265-b0", "svt-8", "vp9", "ffv1", "mjpeg")
+NAMES = ("x264-b0-none-ref4-w2", "x265-b0", "svt-8", "ffv1", "mjpeg")
 BT709, BT601 = (1, 1, 1), (6, 6, 6)
 Tags = tuple[int, int, str]
 

@@ -78,7 +78,7 @@ def pixels_of(stream: Any) -> Iterator[tuple[int, Any]]:
 VIEWED = [
     *("jpeg-rgb", "jpeg-gray", "jpeg-420", "jpeg-422", "jpeg-444", "jpeg-progressive"),
     *("jpeg-no-huffman-tables", "jpeg-mixed-sizes", "jpeg-exif-trailing", "jpeg-corrupt-one"),
-    *("video-h265", "video-vp9", "video-h264-headers-apart", "video-h264-resized"),
+    *("video-h265", "video-h264-headers-apart", "video-h264-resized"),
     *("video-h264-mid-gop", "video-h264-lost", "video-av1-lost", "ffmpeg-libx265"),
     *("ffmpeg-hevc-yuv420p-bgr8-rgb8", "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"),
 ]
@@ -227,7 +227,6 @@ ALONE = {
     "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8": "jpeg",
     "video-h265": "packet",
     "video-h264": "packet",
-    "video-vp9": "packet",
     "ffmpeg-libx265": "packet",
     "png-gray-pillow": "png",
 }

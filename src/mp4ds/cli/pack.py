@@ -412,7 +412,7 @@ def images_command(folder: str, output: str, images: ImportOptions, options: Pac
 def video_command(video: str, output: str, images: ImportOptions, options: PackOptions) -> None:
     """Make a dataset from a video of any other program.
 
-    Its packets are copied: H.264, H.265, AV1 and VP9 become CompressedVideo, Motion JPEG
+    Its packets are copied: H.264, H.265 and AV1 become CompressedVideo, Motion JPEG
     CompressedImage. Times are those of the video, or of a list.
     """
     _import(video, output, images, options)

@@ -13,7 +13,7 @@ from av.error import FFmpegError
 
 from mp4ds.errors import FormatError, Refused, SourceError, reason_of
 from mp4ds.records import MetadataRecord
-from mp4ds.video.codecs import CODECS, PACKET_CODECS
+from mp4ds.video.codecs import CODECS, COPIED_CODECS
 from mp4ds.video.coded import REORDERED, StreamParser
 from mp4ds.video.decoder import VideoDecoder, VideoFile, read_video_file
 from mp4ds.video.media import Media, raise_if_scarce
@@ -131,8 +131,8 @@ class Clip:
     def _check_packets(self) -> None:
         """Refuse a video whose packets cannot be messages."""
         file = self.file
-        if file.codec not in PACKET_CODECS:
-            raise self._refusal(f"is coded as {file.codec}, not {', '.join(PACKET_CODECS)}")
+        if file.codec not in COPIED_CODECS:
+            raise self._refusal(f"is coded as {file.codec}, not {', '.join(COPIED_CODECS)}")
         if file.is_reordered:
             raise self._refusal(f"cannot be copied: {REORDERED}")
         if self._may_change and not hasattr(Packet, "has_sidedata"):

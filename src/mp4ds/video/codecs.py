@@ -14,7 +14,7 @@ import av
 
 from mp4ds.errors import Mp4dsError, OptionError, Refused
 from mp4ds.video.av1 import Av1
-from mp4ds.video.coded import Ffv1, Jpeg, StreamParser, Vp9
+from mp4ds.video.coded import Ffv1, Jpeg, StreamParser
 from mp4ds.video.h264 import H264
 from mp4ds.video.h265 import H265
 
@@ -35,7 +35,7 @@ class Codec:
     Attributes:
         ffmpeg: Its name in ffmpeg.
         parser: Of its packets.
-        entries: Four letters of the sample entries of an mp4.
+        entries: Four letters of the sample entries of an mp4 whose packets the parser knows.
         decoder: ffmpeg's name of the decoder for single frames; empty: the one of `JpegDecoder`.
         names: In messages: of the codec, or of an encoder that makes it; none: no message has it.
         is_free: Whether a frame may be independent of the one before it, which is worth recording.
@@ -63,15 +63,18 @@ CODECS: Mapping[str, Codec] = {
         "av1", Av1, ("av01",), "libdav1d",
         ("av1", "libsvtav1", "libaom-av1", "librav1e"), is_free=True, is_split=True,
     ),
-    "vp9": Codec("vp9", Vp9, ("vp09",), "vp9", ("vp9", "libvpx-vp9")),
+    "vp9": Codec("vp9", StreamParser, (), "vp9"),  # of datasets of version 1: it is not parsed
     "ffv1": Codec("ffv1", Ffv1, ("FFV1",), "ffv1"),
     "png": Codec("png", StreamParser, ("mp4v", "png "), "png"),
     "mjpeg": Codec("mjpeg", Jpeg, ("mp4v", "jpeg"), names=("mjpeg", "jpeg", "jpg")),
 }  # fmt: skip
 """By the name in the registry."""
 
-PACKET_CODECS = tuple(name for name, codec in CODECS.items() if codec.names)
+COPIED_CODECS = tuple(name for name, codec in CODECS.items() if codec.names)
 """Codecs whose packets are stored in a video track as they are."""
+
+PACKET_CODECS = (*COPIED_CODECS, "vp9")
+"""Those that a track may have as recorded."""
 
 
 def packet_codec(message_format: str) -> str:

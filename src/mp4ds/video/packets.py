@@ -30,8 +30,6 @@ from mp4ds.video.media import (
 )
 from mp4ds.video.mp4 import SampleEntry
 
-_IVF = {"av1": b"AV01", "vp9": b"VP90"}
-
 
 class PacketWriter(Mp4Writer):
     """One mp4 of coded packets being written. A context manager; leaving it completes the file.
@@ -40,7 +38,7 @@ class PacketWriter(Mp4Writer):
 
     Args:
         path: The file to make, by the first body.
-        codec: One of `mp4ds.video.codecs.PACKET_CODECS`.
+        codec: One of `mp4ds.video.codecs.COPIED_CODECS`.
         width: Columns of the pictures.
         height: Rows of the pictures.
         parameters: Parameter sets or sequence header, as in `StreamParser.parameters`; used if the
@@ -145,12 +143,12 @@ def _probe(codec: str, parameters: bytes, plain: bytes) -> Any:
     """The first body opened as a video, for what an mp4 says about its track."""
     data = plain if CODECS[codec].parser.has_parameters(plain) else parameters + plain
     container = CODECS[codec].ffmpeg
-    if codec in _IVF:
+    if codec == "av1":
         container = "ivf"
         # header of the file with rate and count, then size and time of the frame
         data = b"".join(
             (
-                struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, _IVF[codec], 0, 0, 30, 1, 1, 0),
+                struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, b"AV01", 0, 0, 30, 1, 1, 0),
                 struct.pack("<IQ", len(data), 0),
                 data,
             )
@@ -282,8 +280,8 @@ class PacketReader:
         """One packet in self-contained form, for decoding without the mp4.
 
         H.264 and H.265 come as Annex B with start codes of four bytes, AV1 as temporal units that
-        begin with a delimiter; all with the parameters of the stream before each key frame. VP9
-        packets and images come as they are.
+        begin with a delimiter; all with the parameters of the stream before each key frame. Others
+        come as they are.
 
         Args:
             index: 0 <= index < len(self); of a video without B-frames, such as mp4ds writes.
