@@ -18,7 +18,7 @@ from mp4ds.packing.packer import Packer
 from mp4ds.plugins.importing import ros_mp4
 from mp4ds.plugins.importing.ros_mp4 import import_ros_mp4
 from sources import SOURCES, scene
-from test_version0 import FIXTURE
+from test_import_ros_mp4 import FIXTURE
 
 OLD_NS = 1_700_000_000_123_456_789
 

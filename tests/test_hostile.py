@@ -272,34 +272,6 @@ def test_not_a_version(version: bytes, pair: Path) -> None:
     refused(pair, "version-unsupported")
 
 
-VERSION_0 = """\
-bagname: x.bag
-topic_name: [/info, /image]
-camera_info: {frameid: c, height: 48, width: 64, distortion_model: plumb_bob, D: [0.1],
-  K: [1, 0, 0, 0, 1, 0, 0, 0, 1], R: [1, 0, 0, 0, 1, 0, 0, 0, 1],
-  P: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]}
-img_timestamp: [1.5, 2.5]
-"""
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("[1.5, 2.5]", '["1/0"]'),
-        ("[1.5, 2.5]", '["1e99999999"]'),
-        ("[1.5, 2.5]", "[[1]]"),
-        ("[1.5, 2.5]", "{a: 1}"),
-        ("width: 64", "width: 1e999999999"),
-        ("width: 64", "width: {}"),
-        ("D: [0.1]", "D: [[1]]"),
-    ],
-)
-def test_a_hostile_version_0(old: str, new: str, pair: Path) -> None:
-    assert old in VERSION_0
-    pair.write_text(VERSION_0.replace(old, new))
-    refused(pair, "migration-failed", "yaml-invalid", *BAD_DOCUMENT)
-
-
 # ---------------------------------------------------------------- numbers that ask for memory
 
 GEOMETRY: dict[str, tuple[Change, set[str]]] = {

@@ -5,33 +5,29 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
-from fractions import Fraction
 from functools import cache
 from importlib.resources import files
-from pathlib import Path, PurePath
-from typing import Annotated, Any, TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import xxhash
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from mp4ds import yamlio
 from mp4ds.errors import FormatError, SourceError, VersionError
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
-from mp4ds.format.fields import FORMAT_VERSION, Model, document_of, parse_version
+from mp4ds.format.fields import FORMAT_VERSION, document_of, parse_version
 from mp4ds.format.manifest import About, FileEntry, Manifest
 from mp4ds.format.models import EXACT_SUFFIX, StreamSidecar
-from mp4ds.times import encode_column
 
 Document = dict[str, Any]
 
 
 def version_of(document: Document) -> str | None:
     """The version that a document claims; None if it claims none."""
-    if "mp4ds" in document:
-        version = document["mp4ds"]
-        return version if isinstance(version, str) else None
-    return "0" if set(document) >= {"topic_name", "img_timestamp"} else None
+    version = document.get("mp4ds")
+    return version if isinstance(version, str) else None
 
 
 def migrate(document: Document, place: str) -> Document:
@@ -42,105 +38,15 @@ def migrate(document: Document, place: str) -> Document:
     """
     while (version := version_of(document)) in MIGRATIONS:
         try:
-            document = MIGRATIONS[str(version)](document, place)
-        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-            reason = f"{type(error).__name__}: {error}"
-            if isinstance(error, ValidationError):
-                reason = ": ".join(model_problems(error)[0])
+            document = MIGRATIONS[str(version)](document)
+        except ValueError as error:
             raise FormatError(
-                "migration-failed", place, f"is not a complete file of version {version} ({reason})"
+                "migration-failed", place, f"is not a complete file of version {version} ({error})"
             ) from None
     return document
 
 
-class _CameraInfo0(BaseModel):
-    """What is used of version 0's camera_info."""
-
-    model_config = ConfigDict(strict=True)
-
-    frameid: Annotated[str, BeforeValidator(str)]
-    distortion_model: Annotated[str, BeforeValidator(str)]
-    width: int
-    height: int
-    D: list[FiniteFloat]
-    K: list[FiniteFloat]
-    R: list[FiniteFloat]
-    P: list[FiniteFloat]
-
-
-class _Sidecar0(Model):
-    """Version 0: one stream, float seconds of record time, the first camera_info."""
-
-    bagname: Any = None
-    topic_name: Annotated[list[str], Field(min_length=2, max_length=2)]
-    camera_info: _CameraInfo0
-    img_timestamp: list[FiniteFloat]
-
-
-def _from_0(document: Document, place: str) -> Document:
-    old = _Sidecar0.model_validate(document)
-    info_topic, image_topic = old.topic_name
-    info = old.camera_info
-    # round half even of the exact product: the nearest nanosecond to the stored float
-    times = [round(Fraction(seconds) * 10**9) for seconds in old.img_timestamp]
-    column = encode_column(times)
-    return {
-        "mp4ds": "1.0",
-        "kind": "stream",
-        "profile": "crf=22",
-        "stamps": "record-float",
-        "frames": len(times),
-        "channel": _channel_0(image_topic, "sensor_msgs/Image"),
-        "wire": "ros1",
-        "image": {
-            "encoding": "bgr8",
-            "width": info.width,
-            "height": info.height,
-            "step": 3 * info.width,
-            "is_bigendian": 0,
-        },
-        "headers": [{"frame_id": info.frameid}],
-        "video": {
-            "file": PurePath(place).with_suffix(".mp4").name,
-            "layout": "bgr24",
-            "codec": "av1",
-            "pixel_format": "yuv420p",
-            "width": info.width,
-            "height": info.height,
-            # that tool left the conversion to ffmpeg, which then takes BT.601, limited
-            "color": {
-                "primaries": "bt709",
-                "transfer": "bt709",
-                "matrix": "smpte170m",
-                "range": "limited",
-            },
-        },
-        "camera_info": {
-            "channel": _channel_0(info_topic, "sensor_msgs/CameraInfo"),
-            "wire": "ros1",
-            "messages": 0,
-            "calibrations": [
-                {"frame_id" if key == "frameid" else key.lower(): value for key, value in info}
-            ],
-        },
-        "columns": {
-            "log_time": column,
-            "stamp": column,
-            "seq": {"start": 0, "step": 1, "values": f"0*{len(times) - 1}" if times[1:] else ""},
-        },
-    }
-
-
-def _channel_0(topic: str, type_name: str) -> Document:
-    return {
-        "topic": topic,
-        "message_encoding": "ros1",
-        "schema": {"name": type_name, "encoding": "", "text": ""},
-        "metadata": {},
-    }
-
-
-def _from_1_0(old: Document, place: str) -> Document:
+def _from_1_0(old: Document) -> Document:
     """Version 1.0: no header has padding."""
     headers = old.get("headers")
     if isinstance(headers, list) and any(isinstance(h, dict) and "padding" in h for h in headers):
@@ -148,7 +54,7 @@ def _from_1_0(old: Document, place: str) -> Document:
     return {**old, "mp4ds": "1.1"}
 
 
-def _from_1_1(old: Document, place: str) -> Document:
+def _from_1_1(old: Document) -> Document:
     """Version 1.1: no stream has a view."""
     entries = old.get("streams")
     listed = entries if isinstance(entries, list) else []
@@ -157,11 +63,7 @@ def _from_1_1(old: Document, place: str) -> Document:
     return {**old, "mp4ds": "2.0"}
 
 
-MIGRATIONS: dict[str, Callable[[Document, str], Document]] = {
-    "0": _from_0,
-    "1.0": _from_1_0,
-    "1.1": _from_1_1,
-}
+MIGRATIONS: dict[str, Callable[[Document], Document]] = {"1.0": _from_1_0, "1.1": _from_1_1}
 """Version that a step starts from -> the step."""
 
 
@@ -222,6 +124,13 @@ def load_document(path: Path) -> dict[str, Any]:
         raise FormatError("file-missing", path, f"cannot be read: {error.strerror}") from None
     document = migrate(yamlio.load(data, str(path)), str(path))
     version = version_of(document)
+    if version is None and "img_timestamp" in document:
+        raise FormatError(
+            "version-unsupported",
+            path,
+            "was made by the tool published with the paper; `mp4ds import ros-mp4 VIDEO "
+            f"{path.name} -o DATASET` makes a dataset of it and its video",
+        )
     if version is None:
         raise FormatError(
             "version-unsupported",
@@ -280,20 +189,13 @@ def _without_news(document: dict[str, Any], path: Path) -> dict[str, Any]:
     return document
 
 
-def load_stream(path: Path, *, video: str | None = None) -> StreamSidecar:
+def load_stream(path: Path) -> StreamSidecar:
     """Read a stream's sidecar.
-
-    Args:
-        path: The file.
-        video: Name of the video that it is for, where that is another one than it tells.
 
     Raises:
         FormatError: Any code of `load_document`, or ``model-invalid``.
     """
-    document = load_document(path)
-    if video is not None and isinstance(document.get("video"), dict):
-        document["video"]["file"] = video
-    return _model(StreamSidecar, document, path)
+    return _model(StreamSidecar, load_document(path), path)
 
 
 def load_manifest(path: Path) -> Manifest:

@@ -1,12 +1,13 @@
-"""Version 0, the YAML of the tool published with the paper, is read for ever.
+"""The video and YAML of the tool published with the paper, and what is read of them.
 
-``fixtures/v0`` was written by `write_pair` below and is never written again: its bytes are
-what a reader of any later version has to take.
+``fixtures/ros_mp4`` was written by `write_pair` below and is never written again: its bytes are
+what `mp4ds import ros-mp4` has to take.
 """
 
 from __future__ import annotations
 
 import hashlib
+import tempfile
 from collections.abc import Sequence
 from decimal import ROUND_HALF_EVEN, Context, Decimal
 from pathlib import Path
@@ -19,15 +20,13 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader
 
 import mp4ds
-from mp4ds.format.sidecars import migrate
-from mp4ds.times import decode_column
+from mp4ds.plugins.importing.ros_mp4 import read_pair
 
 steady = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
-FIXTURE = Path(__file__).parent / "fixtures" / "v0"
+FIXTURE = Path(__file__).parent / "fixtures" / "ros_mp4"
 SHA256 = {
     "drive.yaml": "919d5d08c3a7ffc54d502ee703d51ea2deca670d51215a4a9fa30a141b17f24e",
     "drive.mp4": "ca20341cfe972db74862bf3d496a125513790a65d964cc6cf5140ebcf130801a",
@@ -122,29 +121,13 @@ def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return FIXTURE / "drive.yaml" if request.param == "kept" else write_pair(tmp_path)
 
 
-def test_it_is_valid(pair: Path) -> None:
-    for path in (pair, pair.with_suffix(".mp4")):
-        assert mp4ds.validate(path, deep=True) == []
-
-
 @pytest.mark.parametrize("suffix", [".yaml", ".mp4"])
-def test_it_opens(pair: Path, suffix: str) -> None:
-    with mp4ds.open(pair.with_suffix(suffix)) as dataset:
-        assert dataset.topics == [TOPICS[1]]
-        stream = dataset[TOPICS[1]]
-        assert len(stream) == 12
-        assert dataset.streams[0].sidecar.stamps == "record-float"
-        assert dataset.streams[0].sidecar.profile == "crf=22"
-        expected = [nanoseconds(stamp) for stamp in STAMPS]
-        assert stream.stamps.tolist() == expected
-        assert stream.log_times.tolist() == expected
-        calibration = stream[0].intrinsics
-        assert calibration is not None
-        written = document()["camera_info"]
-        assert (calibration.width, calibration.height) == (WIDTH, HEIGHT)
-        assert calibration.distortion_model == "plumb_bob"
-        for name in "DKRP":
-            assert getattr(calibration, name.lower()) == written[name]
+def test_it_has_to_be_imported(suffix: str, pair: Path) -> None:
+    with pytest.raises(mp4ds.FormatError, match="`mp4ds import ros-mp4 VIDEO drive") as caught:
+        mp4ds.open(pair.with_suffix(suffix))
+    assert caught.value.code == "version-unsupported"
+    problems = mp4ds.validate(pair.with_suffix(suffix))
+    assert [problem.code for problem in problems] == ["version-unsupported"]
 
 
 def by_bt601(frame: av.VideoFrame) -> NDArray[np.float64]:
@@ -162,11 +145,12 @@ def by_bt601(frame: av.VideoFrame) -> NDArray[np.float64]:
     return np.stack([b, g, r], axis=-1).clip(0, 255)
 
 
-def test_its_frames_decode_with_their_colours(pair: Path) -> None:
+def test_its_frames_decode_with_their_colours(pair: Path, tmp_path: Path) -> None:
     """Untagged, so as ffmpeg converts by default: BT.601, limited range."""
     with av.open(str(pair.with_suffix(".mp4"))) as container:
         shown = [by_bt601(frame) for frame in container.decode(video=0)]
-    with mp4ds.open(pair) as dataset:
+    mp4ds.import_ros_mp4(pair.with_suffix(".mp4"), pair, tmp_path / "dataset")
+    with mp4ds.open(tmp_path / "dataset") as dataset:
         frames = list(dataset[TOPICS[1]])
         for number, frame in enumerate(frames):
             assert (frame.encoding, frame.frame_id) == ("bgr8", "GS3_left_L")
@@ -178,29 +162,6 @@ def test_its_frames_decode_with_their_colours(pair: Path) -> None:
             assert np.array_equal(dataset[TOPICS[1]][number].data, frames[number].data)
 
 
-def test_it_unpacks_to_a_bag(pair: Path, tmp_path: Path) -> None:
-    output = tmp_path / "again.bag"
-    summary = mp4ds.unpack(pair, "bag", output)
-    assert summary.messages == {TOPICS[1]: 12}
-    with mp4ds.open(pair) as dataset:
-        frames = list(dataset[TOPICS[1]])
-    with AnyReader([output]) as reader:
-        assert [(c.topic, c.msgtype) for c in reader.connections] == [
-            (TOPICS[1], "sensor_msgs/msg/Image")
-        ]
-        rows = list(reader.messages())
-        for number, (connection, time, raw) in enumerate(rows):
-            message: Any = reader.deserialize(raw, connection.msgtype)
-            assert time == nanoseconds(STAMPS[number])
-            assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == time
-            assert message.header.seq == number
-            assert message.header.frame_id == "GS3_left_L"
-            assert (message.encoding, message.step) == ("bgr8", 3 * WIDTH)
-            assert (message.width, message.height) == (WIDTH, HEIGHT)
-            assert np.array_equal(message.data, frames[number].data.ravel())
-    assert len(rows) == 12
-
-
 # ---------------------------------------------------------------- times
 
 
@@ -210,19 +171,13 @@ def test_it_unpacks_to_a_bag(pair: Path, tmp_path: Path) -> None:
 @example([0.0, 5e-10, 1.5e-9, 2.5e-9, 0.1, 1e-300, 4294967294.9999995])
 @example([1712647128.0274732] * 3)
 def test_times_are_rounded_exactly(stamps: list[float]) -> None:
-    text = yaml.dump(document(stamps))
-    assert yaml.safe_load(text)["img_timestamp"] == stamps
-    migrated = migrate(document(stamps), "drive.yaml")
-    column = migrated["columns"]["stamp"]
-    values = decode_column(column["start"], column["step"], column["values"], len(stamps)).tolist()
-    assert values == [nanoseconds(stamp) for stamp in stamps]
-    assert migrated["frames"] == len(stamps)
-
-
-@pytest.mark.parametrize("frames", [11, 13])
-def test_another_number_of_frames_is_a_problem(frames: int, tmp_path: Path) -> None:
-    problems = mp4ds.validate(write_pair(tmp_path, frames=frames))
-    assert [problem.code for problem in problems] == ["frame-count"]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "drive.yaml")
+        write_text(path, document(stamps))
+        stream = read_pair(path)
+    expected = [nanoseconds(stamp) for stamp in stamps]
+    for column in (stream.columns.stamp, stream.columns.log_time):
+        assert column.decode(stream.frames).tolist() == expected
 
 
 # ---------------------------------------------------------------- broken files
@@ -243,14 +198,18 @@ def camera(**changes: Any) -> Document:
     ("content", "word"),
     [
         (broken(camera_info=...), "camera_info: "),
-        (broken(camera_info={}), "camera_info.frameid: "),
-        (camera(distortion_model=...), "distortion_model: "),
-        (camera(K=["x"] * 9), "camera_info.K.0: "),
+        (broken(camera_info={}), "camera_info has no 'frameid'"),
+        (camera(distortion_model=...), "distortion_model"),
+        (camera(K=["x"] * 9), "k.0: "),
+        (camera(width={}), "width: "),
+        (camera(width=0), "width: "),
         (broken(topic_name=TOPICS[:1]), "topic_name: "),
         (broken(topic_name=[1, 2]), "topic_name.0: "),
-        (broken(img_timestamp=[]), ""),
+        (broken(img_timestamp=[]), "img_timestamp: "),
         (broken(img_timestamp=[True]), "img_timestamp.0: "),
-        (broken(img_timestamp=[1e300]), ""),
+        (broken(img_timestamp=["1/0"]), "img_timestamp.0: "),
+        (broken(img_timestamp=[1e300]), "outside the range"),
+        (broken(img_timestamp=[-1.5]), "outside the range"),
         (broken(surprise=1), "surprise: "),
     ],
 )
@@ -259,12 +218,10 @@ def test_broken_files_are_refused_in_a_sentence(
 ) -> None:
     path = tmp_path / "drive.yaml"
     write_text(path, content)
-    with pytest.raises(mp4ds.FormatError) as caught:
-        mp4ds.open(path)
-    assert caught.value.code == "migration-failed"
+    with pytest.raises(mp4ds.SourceError) as caught:
+        mp4ds.import_ros_mp4(FIXTURE / "drive.mp4", path, tmp_path / "dataset")
     sentence = str(caught.value)
-    assert sentence.startswith(f"{path}: is not a complete file of version 0")
+    assert sentence.startswith(f"{path}: is not a complete YAML file of the tool published")
     assert word in sentence
     assert "\n" not in sentence
-    problems = mp4ds.validate(path)
-    assert [problem.code for problem in problems] == ["migration-failed"]
+    assert list(tmp_path.iterdir()) == [path]
