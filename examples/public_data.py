@@ -2,9 +2,8 @@
 
 python examples/public_data.py KIND SOURCE OUT [--rate HZ] [--frames N] [--crf A:B:STEP]
 
-KIND is euroc, tum (folders as they are downloaded), images (any folder, with --rate), or
-mcap (a recording, such as one of nuScenes). docs/public-data.md says where to get each. OUT gets
-two datasets (lossless, visual), an evaluation of encoder settings with VMAF where that is
+KIND is recording (a bag or MCAP, such as one of EuRoC, TUM RGB-D or nuScenes) or images (a folder
+of one camera, with --rate). docs/public-data.md says where to get each. OUT gets two datasets (lossless, visual), an evaluation of encoder settings with VMAF where that is
 installed, a report, and an export; a table is printed.
 """
 
@@ -17,16 +16,13 @@ from pathlib import Path
 
 import mp4ds
 
-EXPORTS = {"euroc": "euroc", "tum": "tum", "images": "euroc", "mcap": "euroc"}
-"""Kind -> the format that it is exported to: its own, where it has one."""
-
 
 def main() -> None:
     """Go through all steps and print what each came to."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("kind", choices=EXPORTS)
+    parser.add_argument("kind", choices=["recording", "images"])
     parser.add_argument("source", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--rate", help="of a plain folder of images")
@@ -42,7 +38,7 @@ def main() -> None:
 def steps(options: argparse.Namespace) -> Iterator[tuple[str, str]]:
     """What is done, and what it came to."""
     images = None
-    if options.kind != "mcap":
+    if options.kind == "images":
         images = mp4ds.ImportOptions(rate=options.rate)
     sizes = {}
     for quality in ("lossless", "visual"):
@@ -68,10 +64,10 @@ def steps(options: argparse.Namespace) -> Iterator[tuple[str, str]]:
     yield from evaluation(exact, options)
     summary = mp4ds.report(exact)
     yield "report", f"{summary.index}, {len(summary.cameras)} cameras"
-    form = EXPORTS[options.kind]
-    exported = mp4ds.export(exact, form, options.out / form, mp4ds.ExportOptions(force=True))
+    target = options.out / "euroc"
+    exported = mp4ds.export(exact, "euroc", target, mp4ds.ExportOptions(force=True))
     left = sum(count for reasons in exported.left_out.values() for count in reasons.values())
-    yield f"export {form}", f"{sum(exported.messages.values())} messages held, {left} left out"
+    yield "export euroc", f"{sum(exported.messages.values())} messages held, {left} left out"
 
 
 def evaluation(dataset: Path, options: argparse.Namespace) -> Iterator[tuple[str, str]]:

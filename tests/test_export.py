@@ -223,20 +223,27 @@ def test_pycolmap_distorts_as_opencv(model: str, tmp_path: Path) -> None:
         assert camera.img_from_cam(point) == pytest.approx(expected, abs=1e-3)
 
 
-# ---------------------------------------------------------------- and imported again
+# ---------------------------------------------------------------- lenses, rows, and images again
 
+RADIAL = "radial-tangential"
 LENSES = {
     "plumb_bob": ([*D, 0.5], "plumb_bob", [*D, 0.5]),
-    "Brown Conrady": ([*D, 0.0], "plumb_bob", [*D, 0.0]),
+    "Brown Conrady": ([*D, 0.0], RADIAL, D),
     "rational_polynomial": ([*D, *range(1, 5)], "rational_polynomial", [*D, *range(1, 5)]),
     "equidistant": (D, "equidistant", D),
     "vendor": ([1.0], "vendor", [1.0]),
-    "": ([], "plumb_bob", [0.0] * 5),
+    "": ([], RADIAL, [0.0] * 4),
 }
-"""As recorded -> coefficients, and model and coefficients as imported."""
-IMPORTED = {  # layout -> topics of the cameras, of the IMU, of the poses
-    "euroc": (("/cam0/image_raw", "/cam1/image_raw", "/cam2/image_raw"), "/imu0", "/pose0"),
-    "tum": (("/rgb/image_raw", "/depth/image_raw"), "/accelerometer", "/groundtruth"),
+"""As recorded -> coefficients, and model and coefficients as EuRoC has them."""
+CAMERAS = {  # layout -> folders of images, and their topics; lists of the IMU and the poses
+    "euroc": (
+        [("mav0/cam0/data", COLOUR), ("mav0/cam1/data", GREY), ("mav0/cam2/data", DEPTH)],
+        ("mav0/imu0/data.csv", ",", 6, "mav0/pose0/data.csv", 1, [0, 0, 1, 0, 0, 0]),
+    ),
+    "tum": (
+        [("rgb", COLOUR), ("depth", DEPTH)],
+        ("accelerometer.txt", None, 3, "groundtruth.txt", 1, [0, 0, 0, 0, 0, 1]),
+    ),
 }
 
 
@@ -254,46 +261,39 @@ def with_lens(model: str, *, rectified: bool) -> Scene:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_calibrations_are_imported_again(model: str, tmp_path: Path) -> None:
+def test_lenses_of_euroc(model: str, tmp_path: Path) -> None:
     made = with_lens(model, rectified=model != "Brown Conrady")
     source = pack_drive(tmp_path, Scene([m for m in made.messages if m.topic.startswith("/front")]))
     mp4ds.export(source, "euroc", tmp_path / "out")
-    images = mp4ds.PackOptions(images=mp4ds.ImportOptions())
-    mp4ds.pack(tmp_path / "out", tmp_path / "again", images)
-    with mp4ds.open(tmp_path / "again") as dataset:
-        found = dataset["/cam0/image_raw"].intrinsics_at(0)
+    sensor = yaml.safe_load((tmp_path / "out/mav0/cam0/sensor.yaml").read_text())
     _, name, d = LENSES[model]
-    assert (found.distortion_model, found.d) == (name, d)
-    assert found.k == pytest.approx([FX, 0, CX, 0, FX, CY, 0, 0, 1])
-    assert found.r == [1, 0, 0, 0, 1, 0, 0, 0, 1]
-    assert found.p == pytest.approx([FX, 0, CX, 0, 0, FX, CY, 0, 0, 0, 1, 0])
+    assert (sensor["distortion_model"], sensor["distortion_coefficients"]) == (name, d)
+    assert sensor["intrinsics"] == pytest.approx([FX, FX, CX, CY])
 
 
-@pytest.mark.parametrize("to", IMPORTED)
-def test_import_takes_what_export_wrote(to: str, dataset: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("to", CAMERAS)
+def test_images_are_imported_again_and_rows_are_as_sent(
+    to: str, dataset: Path, tmp_path: Path
+) -> None:
     export(dataset, to, tmp_path / "out", poses=ODOMETRY)
-    images = mp4ds.PackOptions(images=mp4ds.ImportOptions())
-    mp4ds.pack(tmp_path / "out", tmp_path / "again", images)
-    cameras, imu, poses = IMPORTED[to]
-    recorded = (COLOUR, DEPTH) if to == "tum" else (COLOUR, GREY, DEPTH)
-    with mp4ds.open(tmp_path / "again") as again:
-        for camera, topic in zip(cameras, recorded, strict=True):
-            frames = list(again[camera])
+    cameras, (imu, comma, z, poses, x, turn) = CAMERAS[to]
+    for number, (folder, topic) in enumerate(cameras):
+        images = mp4ds.PackOptions(images=mp4ds.ImportOptions())
+        mp4ds.pack(tmp_path / "out" / folder, tmp_path / f"{number}", images)
+        with mp4ds.open(tmp_path / f"{number}") as again:
+            frames = list(again["/camera/image_raw"])
             assert [frame.stamp_ns for frame in frames] == stamps_of(MADE, topic)
-            for number, frame in enumerate(frames):
-                assert (frame.data == pixels_of(topic, number)).all()
-        found = [message.decoded for message in again.messages([imu])]
-        sent = [message.values for message in MADE.messages if message.topic == IMU]
-        assert sorted(one.linear_acceleration.z for one in found) == sorted(
-            one["linear_acceleration"]["z"] for one in sent
-        )
-        found = [message.decoded for message in again.messages([poses])]
-        places = [
-            (one.header.stamp.sec * 10**9 + one.header.stamp.nanosec, one.pose.position.x)
-            for one in found
-        ]
-        assert places == [pose_at(number) for number in range(FRAMES + 1)]
-        assert {one.pose.orientation.w for one in found} == {1.0}
+            for place, frame in enumerate(frames):
+                assert (frame.data == pixels_of(topic, place)).all()
+    sent = [message.values for message in MADE.messages if message.topic == IMU]
+    rows = np.loadtxt(tmp_path / "out" / imu, delimiter=comma)
+    assert sorted(rows[:, z]) == sorted(one["linear_acceleration"]["z"] for one in sent)
+    lines = (tmp_path / "out" / poses).read_text().splitlines()
+    words = [re.split("[, ]", line) for line in lines if not line.startswith("#")]
+    assert [(int(row[0].replace(".", "")), float(row[x])) for row in words] == [
+        pose_at(number) for number in range(FRAMES + 1)
+    ]
+    assert {tuple(map(float, row[2:])) for row in words} == {tuple(map(float, turn))}
 
 
 def test_cameras_without_a_common_frame(dataset: Path, tmp_path: Path) -> None:

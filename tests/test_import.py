@@ -29,7 +29,7 @@ from in_parts import InlineExecutor, facts, leftovers, use
 from mp4ds.errors import SourceError
 from mp4ds.format.sidecars import load_manifest
 from mp4ds.packing.options import ImportOptions
-from mp4ds.plugins.importing.layouts import open_images
+from mp4ds.plugins.importing.images import open_images
 from mp4ds.video.images import read_image
 from test_import_ros_mp4 import FIXTURE, STAMPS, TOPICS, document, nanoseconds, write_text
 
@@ -334,7 +334,8 @@ def test_jpeg_files_are_kept_beside_others(tmp_path: Path) -> None:
 
 
 def test_in_parts_is_as_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    place = euroc(tmp_path)
+    place = tmp_path / "MH_01/mav0/cam0/data"
+    plain(place, [f"{START + number * 50_000_128}.png" for number in range(5)])
     options = mp4ds.PackOptions(images=mp4ds.ImportOptions(), codec="ffv1", gop=2)
     mp4ds.pack(place, tmp_path / "whole", options)
     use(monkeypatch, InlineExecutor())
@@ -349,232 +350,22 @@ def test_in_parts_is_as_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert facts(tmp_path / "parts") == facts(tmp_path / "whole")
     assert mp4ds.validate(tmp_path / "parts", deep=True) == []
     assert leftovers(tmp_path) == []
-
-
-# ---------------------------------------------------------------- EuRoC
-
-SENSOR = """\
-#Default camera sensor yaml file.
-sensor_type: camera
-comment: VI-Sensor cam0 (MT9M034)
-
-# Sensor extrinsics wrt. the body-frame.
-T_BS:
-  cols: 4
-  rows: 4
-  data: [0.0, -1.0, 0.0, -0.0216401454975,
-         1.0, 0.0, 0.0, -0.064676986768,
-         0.0, 0.0, 1.0, 0.00981073058949,
-         0.0, 0.0, 0.0, 1.0]
-
-rate_hz: 20
-resolution: [32., 24]
-camera_model: pinhole
-intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv
-distortion_model: radial-tangential
-distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
-"""
-FRAMES = 5
-
-
-def euroc(tmp_path: Path) -> Path:
-    root = tmp_path / "MH_01"
-    for name, shift in (("cam0", 0), ("cam1", 100)):
-        rows = ["#timestamp [ns],filename"]
-        for number in range(FRAMES):
-            time = START + number * 50_000_128 + shift
-            save(root / "mav0" / name / "data" / f"{time}.png", image(number + shift))
-            rows.append(f"{time},{time}.png")
-        (root / "mav0" / name / "data.csv").write_text("\r\n".join(rows) + "\r\n")
-        (root / "mav0" / name / "sensor.yaml").write_text(SENSOR)
-    for name, header, rows in (
-        ("imu0", "#timestamp [ns],w_RS_S_x [rad s^-1],...", IMU),
-        ("state_groundtruth_estimate0", "#timestamp, p_RS_R_x [m], ...", TRUTH),
-        ("leica0", "#timestamp [ns], p_RS_R_x [m]", ["1403636579763555584,1,2,3"]),
-    ):
-        (root / "mav0" / name).mkdir()
-        (root / "mav0" / name / "data.csv").write_text("\n".join([header, *rows]) + "\n")
-    (root / "mav0" / "body.yaml").write_text("comment: a MAV\n")
-    return root
-
-
-IMU = [
-    "1403636579758555392,-0.099134701513277898,0.14730578886832138,0.02722713633111154,"
-    "8.1476917083333333,-0.37592158333333331,-2.4026292499999999",
-    "1403636579763555584,-0.1,0.2,0.3,8,-0.5,1e-3",
-]
-TRUTH = [
-    "1403636580838555648,4.688319,-1.786938,0.783338,0.534108,-0.153029,-0.827383,-0.082152,"
-    "-0.027876,0.033207,0.800006,-0.003172,0.021267,0.078502,-0.025266,0.136696,0.075593"
-]
-
-
-def test_euroc(tmp_path: Path) -> None:
-    root = euroc(tmp_path)
-    found = imported(root, tmp_path)
-    assert set(found) == {
-        "/tf_static", "/cam0/image_raw", "/cam0/camera_info", "/cam1/image_raw",
-        "/cam1/camera_info", "/imu0", "/state_groundtruth_estimate0",
-    }  # fmt: skip
-    for name, shift in (("cam0", 0), ("cam1", 100)):
-        due = [START + number * 50_000_128 + shift for number in range(FRAMES)]
-        assert [time for time, _ in found[f"/{name}/image_raw"]] == due
-        assert [time for time, _ in found[f"/{name}/camera_info"]] == due
-        for number, (_, message) in enumerate(found[f"/{name}/image_raw"]):
-            assert (message.encoding, message.header.frame_id) == ("mono8", name)
-            assert np.array_equal(pixels_of(message), image(number + shift))
-        info = found[f"/{name}/camera_info"][0][1]
-        assert list(info.d) == [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0]
-        assert list(info.k) == [458.654, 0, 367.215, 0, 457.296, 248.375, 0, 0, 1]
-        assert info.distortion_model == "plumb_bob"
-    for (time, imu), text in zip(found["/imu0"], IMU, strict=True):
-        words = text.split(",")
-        assert time == int(words[0])
-        turn, force = imu.angular_velocity, imu.linear_acceleration
-        assert [turn.x, turn.y, turn.z, force.x, force.y, force.z] == list(map(float, words[1:]))
-        assert imu.orientation_covariance[0] == -1
-    ((time, pose),) = found["/state_groundtruth_estimate0"]
-    words = TRUTH[0].split(",")
-    assert time == int(words[0])
-    place, turned = pose.pose.position, pose.pose.orientation
-    assert [place.x, place.y, place.z] == list(map(float, words[1:4]))
-    assert [turned.w, turned.x, turned.y, turned.z] == list(map(float, words[4:8]))
-    ((_, tree),) = found["/tf_static"]
-    assert [(item.header.frame_id, item.child_frame_id) for item in tree.transforms] == [
-        ("body", "cam0"),
-        ("body", "cam1"),
-    ]
-    shift, turn = tree.transforms[0].transform.translation, tree.transforms[0].transform.rotation
-    assert [shift.x, shift.y, shift.z] == [-0.0216401454975, -0.064676986768, 0.00981073058949]
-    assert np.allclose([turn.x, turn.y, turn.z, turn.w], [0, 0, 0.5**0.5, 0.5**0.5], atol=1e-15)
-    check_euroc_manifest(root, tmp_path / "ds")
-
-
-def check_euroc_manifest(root: Path, dataset: Path) -> None:
-    manifest = load_manifest(dataset / "dataset.yaml")
-    assert [item.child for item in manifest.transforms] == ["cam0", "cam1"]
-    sources = {item.name: (item.size, item.sha256) for item in manifest.sources}
-    images = sorted((root / "mav0" / "cam0" / "data").iterdir())
+    (source,) = load_manifest(tmp_path / "parts" / "dataset.yaml").sources
+    images = sorted(place.iterdir())
     listing = "".join(f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.name}\n" for p in images)
-    assert sources["MH_01/mav0/cam0/data"] == (
+    assert (source.name, source.size, source.sha256) == (
+        "data",
         sum(path.stat().st_size for path in images),
         hashlib.sha256(listing.encode()).hexdigest(),
     )
-    text = (root / "mav0" / "cam0" / "data.csv").read_bytes()
-    assert sources["MH_01/mav0/cam0/data.csv"] == (len(text), hashlib.sha256(text).hexdigest())
-    assert len(sources) == 9
-    kept = attachments(dataset / "messages.mcap")
-    assert kept["MH_01/mav0/cam0/sensor.yaml"].decode() == SENSOR
-
-
-@pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_sensors_as_opencv_writes_them(end: str, tmp_path: Path) -> None:
-    """Its header is no directive of YAML, and it tags matrices."""
-    root = euroc(tmp_path)
-    tagged = SENSOR.replace("T_BS:", "T_BS: !!opencv-matrix").replace(
-        "4\n  data", "4\n  dt: d\n  data"
-    )
-    text = f"%YAML:1.0\n---\n{tagged}".replace("\n", end)
-    (root / "mav0" / "cam0" / "sensor.yaml").write_bytes(text.encode())
-    (root / "mav0" / "cam1" / "sensor.yaml").write_text(f"%YAML:1.0\n{SENSOR}")
-    mp4ds.pack(root, tmp_path / "ds", folder())
-    with mp4ds.open(tmp_path / "ds") as dataset:
-        for stream in dataset.streams:
-            (calibration,) = stream.sidecar.camera_info.calibrations
-            assert calibration.k[0] == 458.654
-    assert [item.child for item in load_manifest(tmp_path / "ds/dataset.yaml").transforms] == [
-        *("cam0", "cam1")
-    ]
-    kept = attachments(tmp_path / "ds" / "messages.mcap")
-    assert kept["MH_01/mav0/cam0/sensor.yaml"] == text.encode()
-
-
-def test_euroc_tells_what_it_leaves_out(tmp_path: Path) -> None:
-    root = euroc(tmp_path)
-    save(root / "mav0" / "cam0" / "data" / "1.png", image(0))
-    summary = mp4ds.pack(root / "mav0", tmp_path / "ds", folder())
-    assert summary.skipped == {
-        "files in data of cam0 that data.csv does not list": 1,
-        "files of leica0, which is not a camera, IMU or pose": 1,
-        "rows of state_groundtruth_estimate0 of which only the pose was taken": 1,
-    }
-
-
-# ---------------------------------------------------------------- TUM
-
-
-def test_tum(tmp_path: Path) -> None:
-    root = tmp_path / "xyz"
-    colour, depth = [image(n, 3) for n in range(2)], [image(n, 1, "u2") for n in range(2)]
-    for number in range(2):
-        save(root / "rgb" / f"130503110{number}.175304.png", colour[number])
-        save(root / "depth" / f"130503110{number}.160407.png", depth[number])
-    (root / "rgb.txt").write_text(
-        "# color images\n# timestamp filename\n1305031100.175304 rgb/1305031100.175304.png\n"
-        "1305031101.175304 rgb/1305031101.175304.png\n"
-    )
-    (root / "depth.txt").write_text(
-        "1305031100.160407 depth/1305031100.160407.png\n"
-        "1305031101.160407 depth/1305031101.160407.png\n"
-    )
-    (root / "groundtruth.txt").write_text(
-        "# x\n1305031098.6659 1.3563 0.6305 1.6380 0.6132 0.5962 -0.3311 -0.3986\n"
-    )
-    (root / "accelerometer.txt").write_text("1305031098.5 0.1 8.9 -3.7\n")
-    (tmp_path / "cam.yaml").write_text(ROS_CALIBRATION)
-    found = imported(root, tmp_path, calibration=str(tmp_path / "cam.yaml"))
-    assert [time for time, _ in found["/rgb/image_raw"]] == [
-        1305031100_175304000,
-        1305031101_175304000,
-    ]
-    for number, (_, message) in enumerate(found["/rgb/image_raw"]):
-        assert message.encoding == "rgb8"
-        assert np.array_equal(pixels_of(message, channels=3), colour[number])
-    for number, (_, message) in enumerate(found["/depth/image_raw"]):
-        assert message.encoding == "16UC1"
-        assert np.array_equal(pixels_of(message, "<u2"), depth[number])
-    assert len(found["/rgb/camera_info"]) == len(found["/depth/camera_info"]) == 2
-    ((time, pose),) = found["/groundtruth"]
-    assert time == 1305031098_665900000
-    assert (pose.pose.position.z, pose.pose.orientation.w) == (1.6380, -0.3986)
-    ((_, imu),) = found["/accelerometer"]
-    assert (imu.linear_acceleration.y, imu.angular_velocity_covariance[0]) == (8.9, -1)
+    done = call("import", "images", tmp_path / "MH_01", "-o", tmp_path / "ds")
+    refused(done, 2, "there are some in mav0/cam0/data")
 
 
 # ---------------------------------------------------------------- bad input
 
 
-SPOILT: dict[str, tuple[str, bytes | None, str]] = {
-    "missing-image": ("cam0/data/*", None, "does not exist"),
-    "bad-stamp": ("cam0/data.csv", b"#t\n12x,1.png\n", "line 2: '12x' is not a time"),
-    "outside": ("cam0/data.csv", b"1,../../x.png\n", "outside"),
-    "no-name": ("cam0/data.csv", b"123456\n", "line 1 is not a time and a file name"),
-    "late": ("cam0/data.csv", b"9999999999999999999,x.png\n", "2038"),
-    "bad-yaml": ("cam0/sensor.yaml", b"a: [1\n", "YAML"),
-    "no-model": ("cam0/sensor.yaml", b"intrinsics: [1, 2, 3, 4]\n", "camera_model: Field required"),
-    "no-rotation": ("cam0/sensor.yaml", b"T_BS: %a\n" % ([2] * 16), "rotation is not valid"),
-    "short-imu": ("imu0/data.csv", b"1403636579758555392,1,2\n", "has 3 values, not 7"),
-    "long-line": ("imu0/data.csv", b"1,1,2,3,4,5,6,%s7\n" % (b" " * 65_600), "line 1 is too long"),
-    "no-number": ("imu0/data.csv", b"1,1,2,3,4,5,x\n", "than numbers"),
-    "damaged-image": ("cam0/data/*", b"\x89PNG", "cannot be read as an image"),
-    # Pillow runs Ghostscript for it, whatever the file is called
-    "postscript": ("cam0/data/*", POSTSCRIPT, "cannot identify image file"),
-}
-"""A file of a folder of EuRoC, what is in it instead (None: it is gone), and words of the error."""
-
-
-@pytest.mark.parametrize("case", SPOILT)
-def test_bad_folders_are_refused_in_a_sentence(case: str, tmp_path: Path) -> None:
-    place, content, words = SPOILT[case]
-    path = next((euroc(tmp_path) / "mav0").glob(place))
-    path.unlink()
-    if content is not None:
-        path.write_bytes(content)
-    refused(call("import", "images", tmp_path / "MH_01", "-o", tmp_path / "ds"), 2, words)
-    assert [path.name for path in tmp_path.iterdir()] == ["MH_01"]
-
-
-PLAIN_BAD: dict[str, tuple[list[str], str, str, str]] = {
+BAD: dict[str, tuple[list[str], str | bytes, str, str]] = {
     "no-images": ([], "", "", "holds no images"),
     "no-times": (["a.png"], "", "", "--rate HZ"),
     "frame-numbers": (["0.png", "1.png"], "", "", "--rate HZ"),
@@ -592,22 +383,34 @@ PLAIN_BAD: dict[str, tuple[list[str], str, str, str]] = {
     "other-encoding": (["a.png"], "", "--rate 2 --encoding rgb8", "cannot be rgb8"),
     "jpeg-encoding": (["a.jpg"], "", "--rate 2 --encoding mono8", "JPEG"),
     "no-topic": (["a.png"], "", "--rate 2 --topic /", "is not a topic name"),
+    "no-stamp": (["a.png"], "#t\nt f\nx a.png\n", "--stamps t", "line 3 has no time"),
+    "bad-stamp": (["a.png"], "1. a.png\n2x a.png\n", "--stamps t", "line 2: '2x' is not a time"),
+    "outside": (["a.png"], "1.5 ../../x.png\n", "--stamps t", "outside"),
+    "short": (["a.png"], "1.5 a.png\n1.6\n", "--stamps t", "line 2 has 1 values"),
+    "late": (["a.png"], "9999999999999999999,a.png\n", "--stamps t", "2038"),
+    "long-line": (["a.png"], f"1.5 {' ' * 65_600}a.png\n", "--stamps t", "line 1 is too long"),
+    "damaged": (["a.png"], b"\x89PNG", "--rate 2", "cannot be read as an image"),
+    # Pillow runs Ghostscript for it, whatever the file is called
+    "postscript": (["a.png"], POSTSCRIPT, "--rate 2", "cannot identify image file"),
 }
-"""Images, a list of times ``t``, options, and words of the error."""
+"""Images, a list of times ``t`` or bytes of the first image, options, and words of the error."""
 
 
-@pytest.mark.parametrize("case", PLAIN_BAD)
-def test_bad_plain_folders_are_refused(
+@pytest.mark.parametrize("case", BAD)
+def test_bad_folders_are_refused_in_a_sentence(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names, times, options, words = PLAIN_BAD[case]
+    names, times, options, words = BAD[case]
     monkeypatch.chdir(tmp_path)
     Path("in").mkdir()
     plain(Path("in"), names)
-    if times:
+    if isinstance(times, bytes):
+        Path("in", names[0]).write_bytes(times)
+    elif times:
         Path("t").write_text(times)
+    before = {path.name for path in tmp_path.iterdir()}
     refused(call("import", "images", "in", "-o", "ds", *options.split()), 2, words)
-    assert {path.name for path in tmp_path.iterdir()} == {"in", *["t"] * bool(times)}
+    assert {path.name for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize(

@@ -114,6 +114,6 @@ def test_a_short_pack_imports_what_its_recording_needs(tmp_path: Path) -> None:
     others = [
         *("click", "rich", "jsonschema", "google.protobuf", "sqlite3", "fsspec", "PIL"),
         *("rosbags.rosbag2", "mp4ds.bags.rosbag2", "mp4ds.bags.convert"),
-        *("mp4ds.plugins.importing.layouts", "mp4ds.plugins.importing.ros_mp4"),
+        *("mp4ds.plugins.importing.images", "mp4ds.plugins.importing.ros_mp4"),
     ]
     assert [name for name in others if name in loaded] == []

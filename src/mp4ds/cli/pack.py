@@ -46,7 +46,7 @@ from mp4ds.packing.pack import is_packed
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.exporting.export import export
 from mp4ds.plugins.exporting.job import ExportOptions, ExportSummary
-from mp4ds.plugins.importing.layouts import episodes_in
+from mp4ds.plugins.importing.images import episodes_in
 from mp4ds.records import Loss, latched_text
 from mp4ds.unpacking.unpack import UnpackOptions, UnpackProgress, UnpackSummary, unpack, unpack_each
 
@@ -393,14 +393,13 @@ def _import_episodes(folder: str, output: str, images: ImportOptions, options: P
 
 
 @command("images")
-@argument("folder", "FOLDER", "Folder of images, plain or in a known layout.")
+@argument("folder", "FOLDER", "Folder of images.")
 @output_option("DATASET", "Folder to create.", required=True)
-@_imports("plain", "euroc", "tum")
+@_imports("plain")
 def images_command(folder: str, output: str, images: ImportOptions, options: PackOptions) -> None:
     """Make a dataset from a folder of timestamped images.
 
-    EuRoC and TUM RGB-D folders are imported with all their cameras. Lossless by default. To
-    resume a long import that was interrupted, run the same command again.
+    Lossless by default. To resume a long import that was interrupted, run the same command again.
     """
     _import(folder, output, images, options)
 

@@ -76,7 +76,7 @@ class ImportOptions(Options):
     calibration: str | None = option(
         "Calibration as saved by ROS's camera_calibration.",
         metavar="YAML",
-        only=("plain", "tum", "video"),
+        only=("plain", "video"),
     )
     topic: str | None = option(
         "Topic of the raw images; default: /camera/image_raw. That of JPEG files ends in "

@@ -522,7 +522,7 @@ def _open_whole(paths: Sequence[Path], images: ImportOptions | None, *, salvage:
         raise OptionError(
             f"Only one folder or video can be imported at a time, but {len(paths)} were given."
         )
-    reader: BagReader = plugin("importing.layouts:open_images")(paths[0], images)
+    reader: BagReader = plugin("importing.images:open_images")(paths[0], images)
     return reader
 
 

@@ -28,7 +28,7 @@ from mp4ds.messages.serializations import is_camera, kind_of
 from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.inspection import MessageInspector, depends_on_others
 from mp4ds.packing.options import ImportOptions
-from mp4ds.plugins.importing.layouts import open_images
+from mp4ds.plugins.importing.images import open_images
 from mp4ds.processes import ProcessExecutor, failure_of
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import TIMESCALE, PresentationClock

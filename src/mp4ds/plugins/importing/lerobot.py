@@ -20,7 +20,7 @@ from mp4ds.dataset.vectors import COLUMNS
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.packing.options import ImportOptions
 from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, LEROBOT_SCALE, DepthScale
-from mp4ds.plugins.importing.layouts import MAX_STAMP
+from mp4ds.plugins.importing.images import MAX_STAMP
 from mp4ds.plugins.importing.reader import ImagesReader
 from mp4ds.times import nearest
 from mp4ds.video.clips import Clip, open_video
@@ -180,6 +180,8 @@ def open_episode(folder: Path, options: ImportOptions) -> ImagesReader:
         times = table["timestamp"].to_numpy()
         stamps = _stamps(times)
         tasks = table["task_index"].to_numpy()
+    if all(feature["dtype"] != "video" for feature in known.features.values()):
+        raise SourceError(folder, "holds no images")
     for key, feature in known.features.items():
         if key in COLUMNS:
             continue
@@ -200,7 +202,6 @@ def open_episode(folder: Path, options: ImportOptions) -> ImagesReader:
     _add_tasks(reader, folder / _TASKS, tasks, stamps)
     if others := {*held} - {*known.features, *COLUMNS}:
         reader.left_out["columns that are not features"] = len(others)
-    reader.finish()
     return reader
 
 

@@ -21,9 +21,8 @@ from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.files.sources import source_name, source_size
-from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
+from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.serializations import plain_message
-from mp4ds.messages.transforms import Transform
 from mp4ds.messages.wire import (
     NS,
     CalibrationFields,
@@ -48,14 +47,7 @@ from mp4ds.unpacking.republish import Types
 from mp4ds.video.clips import Clip
 from mp4ds.video.images import read_image
 
-FILE_LIST = "images.csv"
-"""Name of the attachment that lists which message was made from which file."""
-
-_IMAGE = "sensor_msgs/msg/Image"
-_COMPRESSED = "sensor_msgs/msg/CompressedImage"
 _INFO = "sensor_msgs/msg/CameraInfo"
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_TF_STATIC = "/tf_static"
 _JPEG = (".jpg", ".jpeg")
 
 # dtype -> message of std_msgs, and the code of its data
@@ -69,25 +61,6 @@ _NUMBERS = {
 }  # fmt: skip
 
 _WIRE, _PREFIX = "cdr-le", b"\x00\x01\x00\x00"
-_NO_TURN = (0.0, 0.0, 0.0, 1.0)
-_UNMEASURED = (-1.0, *(0.0 for _ in range(8)))  # the covariance of what is not measured
-_UNKNOWN = (0.0,) * 9  # the covariance of what is, if nobody says
-
-# kind of a table -> type of its messages, and the numbers of a row as they follow its header
-_TABLES: Mapping[str, tuple[str, Callable[[Sequence[float]], Sequence[float]]]] = {
-    # angular velocity x, y, z in rad/s, then acceleration x, y, z in m/s^2
-    "imu": (
-        "sensor_msgs/msg/Imu",
-        lambda row: (*_NO_TURN, *_UNMEASURED, *row[:3], *_UNKNOWN, *row[3:], *_UNKNOWN),
-    ),
-    # acceleration x, y, z in m/s^2
-    "accelerometer": (
-        "sensor_msgs/msg/Imu",
-        lambda row: (*_NO_TURN, *_UNMEASURED, 0.0, 0.0, 0.0, *_UNMEASURED, *row, *_UNKNOWN),
-    ),
-    # position x, y, z in metres, then the quaternion x, y, z, w
-    "pose": ("geometry_msgs/msg/PoseStamped", lambda row: row),
-}
 
 
 @contextmanager
@@ -145,9 +118,6 @@ class ImagesReader(BagReader):
 
     Attributes:
         files: What it was read from, including folders of images.
-        kept: Files to store as they are, because messages do not hold all of them.
-        transforms: Poses of sensors.
-        metadata: What containers say about videos.
         left_out: What is left out: a phrase -> how many.
     """
 
@@ -160,26 +130,19 @@ class ImagesReader(BagReader):
     def __init__(self, folder: Path) -> None:
         self.path = folder
         self.files: list[Path] = []
-        self.kept: list[Path] = []
-        self.transforms: list[Transform] = []
-        self.metadata: list[MetadataRecord] = []
+        self._kept: list[Path] = []
+        self._metadata: list[MetadataRecord] = []
         self._skipped = self.left_out = Counter[str]()
         self._tracks: list[_Track] = []
 
     # ------------------------------------------------ for layouts
 
     def add_file(self, path: Path, *, is_kept: bool = False) -> None:
-        """Note a file or folder of images that was read."""
+        """Note a file or folder of images that was read; messages do not hold all that is kept."""
         if path.resolve() not in {file.resolve() for file in self.files}:
             self.files.append(path)
         if is_kept:
-            self.kept.append(path)
-
-    def leave_out(self, path: Path, what: str) -> None:
-        """Count files that do not become messages."""
-        files = [path] if path.is_file() else [item for item in path.rglob("*") if item.is_file()]
-        if files:
-            self.left_out[f"files of {what}"] += len(files)
+            self._kept.append(path)
 
     def add_camera(
         self,
@@ -187,9 +150,8 @@ class ImagesReader(BagReader):
         frame_id: str,
         images: Sequence[Path],
         stamps: NDArray[np.int64],
-        *,
-        calibration: CalibrationFields | None = None,
-        encoding: str | None = None,
+        calibration: CalibrationFields | None,
+        encoding: str | None,
     ) -> None:
         """Add the images of a camera, in any order.
 
@@ -205,16 +167,15 @@ class ImagesReader(BagReader):
             OptionError: The encoding cannot be that of its files.
         """
         order = np.argsort(stamps, kind="stable")
-        stamps, paths = stamps[order], [images[number] for number in order.tolist()]
-        is_jpeg = np.array([path.suffix.lower() in _JPEG for path in paths], bool)
+        is_jpeg = np.array([path.suffix.lower() in _JPEG for path in images], bool)[order]
         if encoding and is_jpeg.any():
             raise OptionError(
                 f"{topic} has JPEG files, which are kept as they are: `encoding` {encoding} "
                 "cannot apply to them."
             )
 
-        def add(topic: str, type_name: str, chosen: NDArray[np.bool_]) -> None:
-            own, times = [paths[number] for number in np.flatnonzero(chosen)], stamps[chosen]
+        def add(topic: str, type_name: str, chosen: NDArray[np.int64]) -> None:
+            own, times = [images[number] for number in chosen.tolist()], stamps[chosen]
 
             def make(number: int) -> bytes:
                 fields, body = _image(own[number], encoding)
@@ -223,10 +184,9 @@ class ImagesReader(BagReader):
             if own:
                 self._add(topic, type_name, times, make, own)
 
-        add(topic, _IMAGE, ~is_jpeg)
-        add(f"{topic}/compressed", _COMPRESSED, is_jpeg)
-        if paths:
-            self._add_calibration(topic, frame_id, stamps, calibration)
+        add(topic, "sensor_msgs/msg/Image", order[~is_jpeg])
+        add(f"{topic}/compressed", "sensor_msgs/msg/CompressedImage", order[is_jpeg])
+        self._add_calibration(topic, frame_id, stamps[order], calibration)
 
     def add_clip(
         self,
@@ -272,7 +232,7 @@ class ImagesReader(BagReader):
 
         self._tracks.append(_Track(channel, stamps, make, frame_bytes=clip.frame_bytes))
         self._add_calibration(topic, frame_id, stamps, calibration)
-        self.metadata.append(clip.metadata)
+        self._metadata.append(clip.metadata)
         self.left_out.update(clip.left_out)
         # otherwise, each of the pieces would read all of the file to know its frames
         self.is_indexed &= clip.file.is_indexed or kind == "compressed-video"
@@ -369,35 +329,6 @@ class ImagesReader(BagReader):
                 lambda number: _camera_message(_INFO, frame_id, fields, int(stamps[number])),
             )
 
-    def add_table(
-        self,
-        topic: str,
-        kind: str,
-        frame_id: str,
-        stamps: NDArray[np.int64],
-        rows: NDArray[np.float64],
-    ) -> None:
-        """Add the measurements of a sensor, in any order.
-
-        Args:
-            topic: Its topic.
-            kind: ``imu``, ``accelerometer`` or ``pose``.
-            frame_id: Coordinate frame.
-            stamps: Nanoseconds, int64, shape (rows,).
-            rows: float64, shape (rows, values).
-        """
-        type_name, values_of = _TABLES[kind]
-        order = np.argsort(stamps, kind="stable")
-        times, values = stamps[order], rows[order]
-
-        def make(number: int) -> bytes:
-            writer = PrimitiveWriter(_PREFIX, "<", is_cdr=True)
-            _put_header(writer, int(times[number]), frame_id)
-            writer.put("d", *values_of(values[number].tolist()))
-            return writer.getvalue()
-
-        self._add(topic, type_name, times, make)
-
     def _add(
         self,
         topic: str,
@@ -411,24 +342,6 @@ class ImagesReader(BagReader):
         qos = LATCHED_QOS if latched else ""
         channel = ros2_channel(len(self._tracks), topic, type_name, qos)
         self._tracks.append(_Track(channel, stamps, make, files))
-
-    def finish(self) -> None:
-        """Add the transforms, after everything else.
-
-        Raises:
-            SourceError: There are no images.
-        """
-        if not any(track.files or track.frame_bytes for track in self._tracks):
-            raise SourceError(self.path, "holds no images")
-        if self.transforms:
-            payload = _transforms_message(self._start, self.transforms)
-            channel = ros2_channel(len(self._tracks), _TF_STATIC, _TRANSFORMS, LATCHED_QOS)
-            stamps = np.array([self._start], np.int64)
-            self._tracks.insert(0, _Track(channel, stamps, lambda _: payload))
-
-    @property
-    def _start(self) -> int:
-        return min(int(track.stamps[0]) for track in self._tracks if len(track.stamps))
 
     # ------------------------------------------------ for readers
 
@@ -444,7 +357,7 @@ class ImagesReader(BagReader):
         with reading(self.path):
             if excerpt.others:
                 yield from self._attachments()
-                yield from self.metadata
+                yield from self._metadata
             for time, place, number in heapq.merge(*orders):
                 track = self._tracks[place]
                 if track.files:
@@ -455,17 +368,17 @@ class ImagesReader(BagReader):
 
     def _attachments(self) -> Iterator[Attachment]:
         """What messages cannot hold: the original calibrations, and the file names."""
+        start = min(int(track.stamps[0]) for track in self._tracks if len(track.stamps))
         if any(track.files for track in self._tracks):
-            yield self._attachment(FILE_LIST, "text/csv", self._file_list())
-        for path in self.kept:
+            yield Attachment("images.csv", "text/csv", start, start, self._file_list())
+        for path in self._kept:
             is_yaml = path.suffix in (".yaml", ".yml")
-            media_type = "application/yaml" if is_yaml else "text/plain"
-            yield self._attachment(source_name(path, self.path), media_type, path.read_bytes())
-
-    def _attachment(self, name: str, media_type: str, data: bytes) -> Attachment:
-        return Attachment(name, media_type, self._start, self._start, data)
+            kind = "application/yaml" if is_yaml else "text/plain"
+            name = source_name(path, self.path)
+            yield Attachment(name, kind, start, start, path.read_bytes())
 
     def _file_list(self) -> bytes:
+        """Which message was made from which file."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(("topic", "stamp_ns", "file"))
@@ -490,33 +403,19 @@ def _image(path: Path, encoding: str | None) -> tuple[Fields, bytes]:
         return CodedFields("jpeg"), path.read_bytes()
     found, pixels = read_image(path)
     wanted = ENCODINGS[encoding or found]
-    if not _suits(wanted, pixels):
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    is_whole = wanted.rows == 1  # image files cannot hold YUV planes
+    if not is_whole or (channels, pixels.dtype) != (wanted.channels, np.dtype(wanted.dtype)):
         raise SourceError(path, f"has {found} pixels, which cannot be {wanted.name}")
     height, width = pixels.shape[:2]
     step = width * wanted.pixel_bytes
     return ImageFields(wanted.name, width, height, step, is_bigendian=0), pixels.tobytes()
 
 
-def _suits(encoding: Encoding, pixels: Pixels) -> bool:
-    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    is_whole = encoding.rows == 1  # image files cannot hold YUV planes
-    return is_whole and channels == encoding.channels and pixels.dtype == np.dtype(encoding.dtype)
-
-
 def _camera_message(
     type_name: str, frame_id: str, fields: Fields, stamp: int, body: bytes = b""
 ) -> bytes:
     return plain_message(_WIRE, type_name, frame_id, fields, Slots(stamp), body)
-
-
-def _transforms_message(stamp: int, transforms: Sequence[Transform]) -> bytes:
-    writer = PrimitiveWriter(_PREFIX, "<", is_cdr=True)
-    writer.put("I", len(transforms))
-    for item in transforms:
-        _put_header(writer, stamp, item.parent)
-        writer.string(item.child)
-        writer.put("d", *item.translation, *item.rotation)
-    return writer.getvalue()
 
 
 def _put_header(writer: PrimitiveWriter, stamp: int, frame_id: str) -> None:
