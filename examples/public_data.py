@@ -3,8 +3,9 @@
 python examples/public_data.py KIND SOURCE OUT [--rate HZ] [--frames N] [--crf A:B:STEP]
 
 KIND is recording (a bag or MCAP, such as one of EuRoC, TUM RGB-D or nuScenes) or images (a folder
-of one camera, with --rate). docs/public-data.md says where to get each. OUT gets two datasets (lossless, visual), an evaluation of encoder settings with VMAF where that is
-installed, a report, and an export; a table is printed.
+of one camera, with --rate). docs/public-data.md says where to get each. OUT gets two datasets
+(lossless, visual), an evaluation of encoder settings with VMAF where that is installed, a report,
+and an export; a table is printed.
 """
 
 from __future__ import annotations

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import mp4ds
 from mp4ds.errors import OptionError
 from mp4ds.packing.calibrations import (
     choose_pairs,
     pair_camera_infos,
 )
 from mp4ds.records import Channel, Schema
+from scenes import Scene, scene
+from sources import write_bag
 
 RAW = ("sensor_msgs/Image", "sensor_msgs/msg/Image", "foxglove.RawImage", "foxglove_msgs/RawImage")
 CODED = (
@@ -136,3 +141,20 @@ def test_chosen_pairs() -> None:
 def test_choices_that_cannot_be(choices: list[str], sentence: str) -> None:
     with pytest.raises(OptionError, match=sentence):
         choose_pairs(choices, channels("/a", "/b", "/x_info", "/y_info", "/chat"))
+
+
+def test_names_that_tell_nothing_are_paired_on_request(tmp_path: Path) -> None:
+    names = {"/cam/image_raw": "/eye", "/cam/camera_info": "/lens"}
+    made = scene("mono8")
+    renamed = [replace(one, topic=names.get(one.topic, one.topic)) for one in made.messages]
+    write_bag(tmp_path / "drive.bag", Scene(renamed, made.silent))
+    summary = mp4ds.pack(tmp_path / "drive.bag", tmp_path / "alone")
+    (note,) = next(topic.notes for topic in summary.topics if topic.topic == "/lens")
+    assert "no images are known to be its own" in note
+    options = mp4ds.PackOptions(camera_info=["/eye=/lens"])
+    mp4ds.pack(tmp_path / "drive.bag", tmp_path / "dataset", options)
+    with mp4ds.open(tmp_path / "dataset") as dataset:
+        found = dataset["/eye"].intrinsics_at(0)
+    (first, *_) = (one for one in renamed if one.topic == "/lens")
+    assert found is not None
+    assert found.k == first.values["k"]

@@ -23,7 +23,7 @@ from mp4ds.errors import OptionError, PartsFailedError, RemoteError, SourceError
 from mp4ds.files.ranges import BLOCK, KEPT_BYTES, Blocks, RemoteFile
 from mp4ds.packing.options import PackOptions
 from mp4ds.packing.packer import Packer
-from mp4ds.plugins.info import info, intrinsics
+from mp4ds.plugins.info import info
 from mp4ds.records import Message
 from remote_servers import Request, Server, web_server
 from remote_stores import Put, folder_url, put, s3, s3_running, stores, web
@@ -161,17 +161,14 @@ def test_windows_are_packed_by_other_processes(tmp_path: Path, put: Put) -> None
 
 
 @pytest.mark.parametrize("source", ["bag-lz4", "mcap-ros2-zstd", "rosbag2-mcap-split"])
-def test_info_and_intrinsics_say_the_same(
-    source: str, tmp_path: Path, web: Server, put: Put
-) -> None:
+def test_info_says_the_same(source: str, tmp_path: Path, web: Server, put: Put) -> None:
     (path,) = SOURCES[source](tmp_path / "web", scene("mono8"))
-    for look in (info, intrinsics):
-        here = look(path)
-        for url in (put(path), f"{web.url}/{path.name}"):
-            there = look(url)
-            assert str(there.path) == url
-            there.path = path
-            assert there == here
+    here = info(path)
+    for url in (put(path), f"{web.url}/{path.name}"):
+        there = info(url)
+        assert str(there.path) == url
+        there.path = path
+        assert there == here
 
 
 @pytest.fixture(scope="module")

@@ -59,7 +59,6 @@ COMMANDS = {
     "pack-parts": "pack RECORDING -o OUT --gop 2 --window 2",
     "info": "info RECORDING",
     "info-dataset": "info DATASET",
-    "intrinsics": "info RECORDING --intrinsics",
     "validate": "validate DATASET --deep",
     "unpack": "unpack DATASET --to mcap -o OUT.mcap",
     "unpack-images": "unpack DATASET --to images -o OUT",

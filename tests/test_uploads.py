@@ -311,7 +311,6 @@ def test_the_command_line(source: Path, folder_url: str, put: Put, s3: Server) -
     packed = run("pack", recording, "-o", dataset, "--codec", "h264", "--preset", "ultrafast")
     assert packed["dataset"] == dataset
     assert run("info", dataset)["kind"] == "dataset"
-    assert run("info", dataset, "--intrinsics")["path"] == dataset
     assert run("validate", dataset, "--deep") == {
         "path": dataset,
         "deep": True,

@@ -40,29 +40,19 @@ _TEXTS = {
     required=True,
 )
 @option(
-    "--intrinsics",
-    "what",
-    flag_value="intrinsics",
-    panel=HOW,
-    help="Print the cameras' calibrations as Python code.",
-)
-@option(
     "--checksums",
-    "what",
-    flag_value="checksums",
+    is_flag=True,
     panel=HOW,
     help="Print the SHA-256 of a dataset's files in the format of sha256sum.",
 )
 @takes(SliceOptions)
-def info_command(paths: Sequence[str], what: str | None, options: SliceOptions) -> None:
+def info_command(paths: Sequence[str], checksums: bool, options: SliceOptions) -> None:
     """Show what is in a recording or a dataset."""
     found = _found(paths)
-    if len(found) > 1 and (options.slice or what):
+    if len(found) > 1 and (options.slice or checksums):
         raise OptionError("These options work with one recording or dataset only.")
     with progress_of("reading") as tell:
-        if what == "intrinsics":
-            show(facts.intrinsics(paths[0]), _print_intrinsics)
-        elif what == "checksums":
+        if checksums:
             show(_checksums(found[0]), _print_checksums)
         elif len(found) == 1:
             show(facts.info(found[0], options.slice), _print_info)
@@ -231,83 +221,3 @@ def _info_row(topic: facts.TopicInfo) -> dict[str, str]:
         "content": topic.content,
         "stored": topic.stored,
     }
-
-
-# ---------------------------------------------------------------- calibrations
-
-_MODELS = {
-    "plumb_bob": "D in the order of OpenCV",
-    "rational_polynomial": "D in the order of OpenCV",
-    "equidistant": "for cv2.fisheye",
-}
-
-
-def _print_intrinsics(result: facts.Intrinsics) -> None:
-    """Print the calibrations of all cameras, one after another, and the static transforms."""
-    say(f"# {path_text(result.path)}: {result.kind}, {counted(len(result.cameras), 'camera')}")
-    say("import numpy as np")
-    for camera in result.cameras:
-        _print_camera(camera)
-    if result.transforms:
-        _print_transforms(result)
-
-
-def _print_camera(camera: facts.CameraCalibrations) -> None:
-    say("")
-    sizes = ", ".join(f"{width}x{height}" for width, height in camera.sizes) or "size not known"
-    if camera.topic:
-        say(f"# {camera.topic}: {sizes}, frame {camera.frame_id!r}")
-    else:
-        say(f"# {camera.info_topic}: calibrations without an image topic")
-    if not camera.calibrations:
-        say("# no calibration")
-    for calibration in camera.calibrations:
-        _print_calibration(camera.info_topic, calibration)
-    if camera.more:
-        say(f"# ... and {camera.more} more calibration changes")
-
-
-def _print_calibration(topic: str, calibration: facts.ListedCalibration) -> None:
-    since = (
-        f"from message {calibration.message} at {calibration.log_time} ns"
-        if calibration.message is not None
-        else "not from a message"
-    )
-    model = calibration.distortion_model
-    hint = f" ({_MODELS[model]})" if model in _MODELS else ""
-    say(
-        f"# {topic}, {since}: {calibration.width}x{calibration.height}, "
-        f"{model or 'no distortion model'}{hint}, frame {calibration.frame_id!r}"
-    )
-    if calibration.k[0][0] == 0:
-        say("# not calibrated: K is zero")
-    _print_matrix("K", calibration.k)
-    say(f"D = np.array({calibration.d})")
-    _print_matrix("R", calibration.r)
-    _print_matrix("P", calibration.p)
-    if calibration.binning:
-        say("binning = ({}, {})".format(*calibration.binning))
-    if calibration.roi:
-        say(f"roi = {calibration.roi}")
-    if calibration.k_effective or calibration.p_effective:
-        say("# for the recorded images, cropped to the ROI and binned (REP 104):")
-        _print_matrix("K_effective", calibration.k_effective or calibration.k)
-        _print_matrix("P_effective", calibration.p_effective or calibration.p)
-
-
-def _print_matrix(name: str, rows: Sequence[Sequence[float]]) -> None:
-    start = f"{name} = np.array(["
-    lines = (",\n" + " " * len(start)).join(str(list(row)) for row in rows)
-    for line in f"{start}{lines}])".split("\n"):
-        say(line)
-
-
-def _print_transforms(result: facts.Intrinsics) -> None:
-    say("")
-    say("# static transforms: a point p of the child is rotation * p + translation in the parent;")
-    say("# (parent, child, translation x y z in metres, rotation x y z w)")
-    say("transforms = [")
-    for item in result.transforms:
-        values = f"{list(item.translation)}, {list(item.rotation)}"
-        say(f"    ({item.parent!r}, {item.child!r}, {values}),")
-    say("]")

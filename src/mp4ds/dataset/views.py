@@ -14,38 +14,12 @@ from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
-from mp4ds.messages.wire import CalibrationFields
 from mp4ds.options import ENCODING, WHAT, Options, Parsed, option, parse_resize
 from mp4ds.video.images import Renderer, encoding_as, shown_format
 from mp4ds.video.pixels import Scale
 
-Matrix = list[list[float]]
 _Part = tuple[int, int, int, int]
 _Size = tuple[int, int]
-
-
-def effective(calibration: CalibrationFields) -> tuple[Matrix, Matrix]:
-    """K and P for the recorded images, rather than for the full resolution.
-
-    The principal point moves by the offset of the region of interest, then everything in pixels is
-    divided by the binning, as in REP 104 and image_geometry's PinholeCameraModel.
-
-    Args:
-        calibration: K and P for the full resolution, with ROI and binning.
-
-    Returns:
-        K, 3 x 3, and P, 3 x 4.
-    """
-    x_offset, y_offset, _, _ = calibration.roi
-    scales = [1.0 / max(1, binning) for binning in (calibration.binning_x, calibration.binning_y)]
-    matrices = []
-    for values in (calibration.k, calibration.p):
-        matrix = np.array(values).reshape(3, -1)
-        matrix[0, 2] -= x_offset
-        matrix[1, 2] -= y_offset
-        matrix[:2] *= np.array(scales)[:, None]
-        matrices.append(matrix.tolist())
-    return matrices[0], matrices[1]
 
 
 # names of lens models by ROS and other drivers, in lower case with underscores
@@ -90,7 +64,11 @@ def adapted(calibration: Calibration, crop: _Part, size: _Size) -> Calibration:
         size: Width and height of the picture.
     """
     x, y, width, height = crop
-    k, p = (np.array(matrix) for matrix in effective(calibration.fields))
+    recorded = calibration.fields
+    k, p = (np.array(values).reshape(3, -1) for values in (recorded.k, recorded.p))
+    for matrix in (k, p):  # of the full resolution: as in REP 104, first the region, then binning
+        matrix[:2, 2] -= recorded.roi[:2]
+        matrix[:2] /= np.maximum(1, [[recorded.binning_x], [recorded.binning_y]])
     for row, offset, scale in ((0, x, size[0] / width), (1, y, size[1] / height)):
         for matrix in (k, p):
             # by the third row, which is 0 in the matrices of an uncalibrated camera

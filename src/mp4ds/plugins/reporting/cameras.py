@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import FormatError, Refused, VideoError
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.plugins.info import calibration_changes
 from mp4ds.times import Integers, differences, intervals
 from mp4ds.video.media import Media, pixel_format_of
 from mp4ds.video.mp4 import sample_table_of
@@ -282,16 +281,19 @@ class ReportedCamera:
 
     def _calibrations(self) -> dict[str, Any]:
         """Each calibration that differs from the previous one, and its first frame."""
-        info, changes = self.stream.sidecar.camera_info, calibration_changes(self.stream)
-        listed: list[dict[str, Any]] = []
-        for number, (item, _, log_time) in enumerate(changes[:_MOST_CALIBRATIONS]):
-            made = item.model_dump(exclude={"template"})
-            made["from_frame"] = 0  # the first one also applies before it
-            if number and log_time is not None:
-                made["from_frame"] = int(np.searchsorted(self.stream.log_times, log_time))
-            listed.append(made)
+        info, infos = self.stream.sidecar.camera_info, self.stream.infos
+        known = info.calibrations if info else []
+        frames = [0] * len(known)  # without messages
+        if infos is not None:
+            places = np.flatnonzero(np.diff(infos.columns.variant, prepend=-1))
+            known = [known[variant] for variant in infos.columns.variant[places].tolist()]
+            frames = np.searchsorted(self.stream.log_times, infos.columns.log_time[places]).tolist()
+            frames[:1] = [0]  # the first one also applies before it
         return {
-            "calibrations": listed,
+            "calibrations": [
+                item.model_dump(exclude={"template"}) | {"from_frame": frame}
+                for item, frame in zip(known, frames, strict=True)
+            ][:_MOST_CALIBRATIONS],
             "calibration_topic": info.channel.topic if info else "",
-            "calibrations_more": max(0, len(changes) - _MOST_CALIBRATIONS),
+            "calibrations_more": max(0, len(known) - _MOST_CALIBRATIONS),
         }
