@@ -357,16 +357,3 @@ def test_pictures_that_cannot_be_decoded_are_published_as_recorded(tmp_path: Pat
     (reasons,) = summary.as_recorded.values()
     recorded = [sent for sent in publisher.sent if sent.topic in summary.as_recorded]
     assert len(recorded) == reasons["its picture cannot be decoded"] > 0
-
-
-@pytest.mark.parametrize(("options", "frames"), [({"every": 3}, 7), ({"max_rate": 10.0}, 10)])
-def test_fewer_frames_on_purpose(
-    drive: tuple[Path, list[Recorded]], options: dict[str, Any], frames: int
-) -> None:
-    publisher, summary = run(drive[0], immediate=True, **options)
-    images = [sent for sent in publisher.sent if sent.topic == CAMERA]
-    assert len(images) == frames
-    assert summary.thinned == {CAMERA: 20 - frames}
-    others = [item for item in drive[1] if item[0] != CAMERA]
-    assert [item for item in published(publisher) if item[0] != CAMERA] == others
-    assert set(published(publisher)) <= set(drive[1])

@@ -23,7 +23,7 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.planning import open_recording
 from mp4ds.plugins.info import info
 from mp4ds.records import Message
-from mp4ds.unpacking.pictures import at_most
+from mp4ds.times import at_most
 from republished import psnr
 from scenes import Scene, scene
 from sources import SOURCES, write_bag

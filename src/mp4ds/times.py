@@ -245,6 +245,47 @@ def usual_interval(steps: Floats) -> float | None:
     return float(np.median(advancing)) if len(advancing) else None
 
 
+class RateLimit:
+    """Which frames of a camera to keep for a maximum rate.
+
+    A grid of points, 1 / rate apart, begins at the first frame. For each point the first frame is
+    kept that comes less than half of the camera's usual interval (and of the grid's) before it, or
+    after it. So a 30 Hz camera loses nothing at 30 Hz, even if its frames come a little early or
+    late, and keeps two of three frames at 20 Hz. After a gap, or when time goes backwards, the grid
+    starts over.
+
+    Args:
+        rate: Hz.
+        usual: The usual interval, nanoseconds; None if unknown.
+    """
+
+    def __init__(self, rate: float, usual: float | None) -> None:
+        self._period = max(1, round(_NS / rate))
+        self._early = min(self._period, int(usual or self._period)) // 2
+        self._due: int | None = None
+
+    def keeps(self, time: int) -> bool:
+        """Whether to keep the next frame, by its time in nanoseconds."""
+        due, period, early = self._due, self._period, self._early
+        if due is None or time >= due + period or time < due - period - early:
+            due = time
+        elif time < due - early:
+            return False
+        self._due = due + period
+        return True
+
+
+def at_most(rate: float, times: Integers) -> NDArray[np.bool_]:
+    """Which frames of a camera to keep for a maximum rate; see `RateLimit`.
+
+    Args:
+        rate: Hz.
+        times: Nanoseconds, shape (frames,).
+    """
+    limit = RateLimit(rate, usual_interval(intervals(times)))
+    return np.array([limit.keeps(time) for time in times.tolist()], np.bool_)
+
+
 def lost_frames(steps: Floats) -> Integers:
     """Estimated number of lost frames in each interval.
 

@@ -306,8 +306,6 @@ def _print_unpack(summary: UnpackSummary, noun: str) -> None:
     for topic, reasons in summary.unconvertible.items():
         for reason, count in reasons.items():
             say(f"{topic}: {counted(count, 'message')} left out: {reason}")
-    for topic, count in summary.thinned.items():
-        say(f"{topic}: {counted(count, 'message')} left out")
     if summary.converted:
         say(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
     for what, count in summary.omitted.items():

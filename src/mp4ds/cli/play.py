@@ -164,8 +164,6 @@ def _print(summary: PlaySummary) -> None:
             say(f"{topic}: {count} published as recorded: {reason}")
     for topic, count in summary.not_installed.items():
         say(f"{topic}: {count} not played: the message type is not installed")
-    for topic, count in summary.thinned.items():
-        say(f"{topic}: {count} frames left out on request")
     total = sum(summary.messages.values())
     text = f"{total} messages in {summary.seconds:.1f} s"
     if summary.loops:

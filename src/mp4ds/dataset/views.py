@@ -221,8 +221,8 @@ _NS = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Thinning(Options):
-    """How to leave out images."""
+class Reduction(Options):
+    """How to leave out images, and make them smaller."""
 
     every: int = option(
         "Keep only every Nth frame, starting with the first.",
@@ -233,6 +233,13 @@ class Thinning(Options):
     )
     max_rate: float | None = option(
         "Maximum frames per second.", panel=WHAT, metavar="HZ", changes=ENCODING
+    )
+
+    resize: Parsed[float | tuple[int, int] | None] = option(
+        "Scale images down, and the calibrations with them.",
+        metavar="0.5|WxH",
+        parse=parse_resize,
+        changes=ENCODING,
     )
 
     def __post_init__(self) -> None:
@@ -247,28 +254,13 @@ class Thinning(Options):
             and 0 < rate <= _NS
         ):
             raise OptionError(f"`max_rate` {rate!r} is not a rate: use Hz, such as 10.")
+        if self.resize is not None:
+            _check_size(self.resize)
 
     @property
     def leaves_out(self) -> bool:
         """Whether there may be fewer images."""
         return self.every > 1 or self.max_rate is not None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reduction(Thinning):
-    """How to leave out images, and make them smaller."""
-
-    resize: Parsed[float | tuple[int, int] | None] = option(
-        "Scale images down, and the calibrations with them.",
-        metavar="0.5|WxH",
-        parse=parse_resize,
-        changes=ENCODING,
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.resize is not None:
-            _check_size(self.resize)
 
     @property
     def reduces(self) -> bool:

@@ -43,8 +43,8 @@ from mp4ds.packing.calibrations import find_pairs
 from mp4ds.packing.inspection import CameraMessage, MessageInspector
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record
-from mp4ds.times import intervals, usual_interval
-from mp4ds.unpacking.pictures import Kind, RateLimit, named_encoding, raw_image
+from mp4ds.times import RateLimit, intervals, usual_interval
+from mp4ds.unpacking.pictures import Kind, named_encoding, raw_image
 from mp4ds.unpacking.republish import Types
 from mp4ds.video.decoder import PacketPictures
 

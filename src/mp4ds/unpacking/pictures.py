@@ -19,9 +19,8 @@ from mp4ds.dataset.images import Images, VerbatimImages
 from mp4ds.dataset.rebuild import form_for
 from mp4ds.dataset.stream import Layer, Stream
 from mp4ds.dataset.topic import Topic
-from mp4ds.dataset.views import Thinning
 from mp4ds.errors import OptionError, Refused
-from mp4ds.format.fields import Choice, DecodedColumns, everything, marked, unbroken
+from mp4ds.format.fields import Choice, everything, unbroken
 from mp4ds.format.models import Header, StreamSidecar
 from mp4ds.messages.depth import (
     DEPTHS,
@@ -34,11 +33,8 @@ from mp4ds.messages.depth import (
 from mp4ds.messages.encodings import ENCODINGS, Pixels, pixel_view
 from mp4ds.messages.wire import CodedFields, Fields, ImageFields
 from mp4ds.options import TopicOptions, option
-from mp4ds.times import intervals, sound_times, usual_interval
 from mp4ds.video.codecs import CODECS, VISUAL
 from mp4ds.video.images import ImageFile
-
-_NS = 1_000_000_000
 
 # ---------------------------------------------------------------- kinds
 
@@ -128,12 +124,12 @@ def packet_format(form: ImageForm, sidecar: StreamSidecar, pixel_format: str) ->
     return ";".join((codec, pixel_format, before, shown))
 
 
-# ---------------------------------------------------------------- fewer
+# ---------------------------------------------------------------- layers
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameOptions(Thinning, TopicOptions):
-    """Which topics, and which of their images: of each stream separately."""
+class FrameOptions(TopicOptions):
+    """Which topics, and which of their images."""
 
     quality: str | None = option(
         "visual: the images of the views of lossless cameras; default: as recorded.",
@@ -144,57 +140,6 @@ class FrameOptions(Thinning, TopicOptions):
     def layer(self) -> Layer | None:
         """Which frames are read of cameras that have a view; None: exact ones where they are."""
         return "view" if self.quality else None
-
-    def kept(self, columns: DecodedColumns) -> NDArray[np.bool_]:
-        """Which frames are kept, shape (frames,); see `at_most` for a maximum rate."""
-        is_kept = np.zeros(len(columns.stamp), np.bool_)
-        is_kept[:: self.every] = True
-        if self.max_rate is not None:
-            chosen = np.flatnonzero(is_kept)
-            times = sound_times(columns.stamp, columns.log_time)
-            is_kept[chosen] = at_most(self.max_rate, times[chosen])
-        return is_kept
-
-
-class RateLimit:
-    """Which frames of a camera to keep for a maximum rate.
-
-    A grid of points, 1 / rate apart, begins at the first frame. For each point the first frame is
-    kept that comes less than half of the camera's usual interval (and of the grid's) before it, or
-    after it. So a 30 Hz camera loses nothing at 30 Hz, even if its frames come a little early or
-    late, and keeps two of three frames at 20 Hz. After a gap, or when time goes backwards, the grid
-    starts over.
-
-    Args:
-        rate: Hz.
-        usual: The usual interval, nanoseconds; None if unknown.
-    """
-
-    def __init__(self, rate: float, usual: float | None) -> None:
-        self._period = max(1, round(_NS / rate))
-        self._early = min(self._period, int(usual or self._period)) // 2
-        self._due: int | None = None
-
-    def keeps(self, time: int) -> bool:
-        """Whether to keep the next frame, by its time in nanoseconds."""
-        due, period, early = self._due, self._period, self._early
-        if due is None or time >= due + period or time < due - period - early:
-            due = time
-        elif time < due - early:
-            return False
-        self._due = due + period
-        return True
-
-
-def at_most(rate: float, times: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which frames of a camera to keep for a maximum rate; see `RateLimit`.
-
-    Args:
-        rate: Hz.
-        times: Nanoseconds, shape (frames,).
-    """
-    limit = RateLimit(rate, usual_interval(intervals(times)))
-    return np.array([limit.keeps(time) for time in times.tolist()], np.bool_)
 
 
 # ---------------------------------------------------------------- forms
@@ -343,38 +288,32 @@ class Conversion:
         stream: The stream.
         form: The form.
 
+    Attributes:
+        frames: Gives the wanted frames, in order; packets come with those they refer to, from a key
+            frame on. It is also told whether to check the whole video first, for when no digest
+            would reveal damage. It raises a `FormatError` where the stream is damaged.
+
     Raises:
         Refused: They cannot be converted; says why.
     """
 
+    frames: Callable[[Choice, bool], Frames]
+
     def __init__(self, stream: Stream, form: ImageForm) -> None:
         self.stream, self.form = stream, form
-        self._frames: Callable[[Choice, bool], Frames]
         headers = stream.sidecar.headers
         if KINDS[form.kind].family == "video":
             self._shown = shown_by_packets(stream)
             _check_video(self._shown, form)
-            self._frames = self._packets
+            self.frames = self._packets
         elif holds_files(stream, form.kind):
             encodings = [encoding_of(stream.sidecar, header) for header in headers]
             self._formats = [format_of(one, form, has_mosaic=True) for one in encodings]
-            self._frames = self._files
+            self.frames = self._files
         else:
             self._makers = [_maker(stream, header, form) for header in headers]
             is_raw = stream.sidecar.body == "pixels"
-            self._frames = self._from_pixels if is_raw else self._from_pictures
-
-    def frames(self, choice: Choice, *, verify: bool) -> Frames:
-        """The wanted frames, in order; packets come with those they refer to, from a key frame on.
-
-        Args:
-            choice: Which are wanted.
-            verify: Check the whole video first, for when no digest would reveal damage.
-
-        Raises:
-            FormatError: The stream is damaged.
-        """
-        return self._frames(choice, verify)
+            self.frames = self._from_pixels if is_raw else self._from_pictures
 
     def _packets(self, choice: Choice, verify: bool) -> Frames:
         """The packets of the video, self-contained from each key frame on."""
@@ -488,7 +427,6 @@ def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int,
 
 _STAMPS_NAME = "stamps.csv"
 _HEAD = ["file", "stamp_ns", "log_time_ns", "frame_id"]
-_SUFFIXES = {"jpeg": "jpg", "png": "png"}
 _NOT_DECODED = "its picture cannot be decoded"
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 _NUMBER = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?")
@@ -500,88 +438,41 @@ def csv_cell(text: str) -> str:
     return f"'{text}" if is_formula else text
 
 
-@dataclass(frozen=True)
-class _Files:
-    """How frames of one size and encoding become files.
-
-    Attributes:
-        part: The frames: a stream, or images stored verbatim.
-        numbers: Their numbers in the topic, shape (frames,).
-        is_kept: Which are written, shape (frames,).
-        kind: ``png`` or ``jpeg``.
-        file: Encodes them; None if their files are written as recorded.
-    """
-
-    part: Images
-    numbers: NDArray[np.int64]
-    is_kept: NDArray[np.bool_]
-    kind: str
-    file: ImageFile | None
-
-    def all(self) -> Iterator[tuple[int, bytes | memoryview | None]]:
-        """The files, each with its frame's number in the part; None: it has no picture."""
-        part, file = self.part, self.file
-        if isinstance(part, Stream):
-            part.verify_pictures()
-            if file is None:
-                yield from files_of(part, marked(self.is_kept))
-                return
-            is_strict = not part.sidecar.keeps_packets
-            for index, picture in part.pictures(marked(self.is_kept), is_strict=is_strict):
-                made = None
-                if picture is not None:
-                    made = file.encode(part.recorded_pixels(picture))
-                yield index, made
-        elif isinstance(part, VerbatimImages):
-            for index, shown in part.all_shown():
-                if self.is_kept[index]:
-                    yield index, file.encode(shown.pixels) if file else shown.file
-
-
 class TopicImages:
     """The images of a topic, in videos and verbatim, about to be written.
 
     Args:
         frames: The topic.
-        options: Which of its frames are left out, counted in the topic.
         image_format: ``png`` or ``jpeg``; None: JPEG files as recorded, others as png.
         jpeg_quality: Of new JPEG files, 1 to 100.
 
     Attributes:
         topic: The topic.
-        thinned: How many of them are left out because fewer were requested.
+        count: How many are written, unless some cannot be decoded.
         refused: How many cannot be written, by reason.
 
     Raises:
         FormatError: The dataset is damaged.
     """
 
-    def __init__(
-        self, frames: Topic, options: FrameOptions, image_format: str | None, jpeg_quality: int
-    ) -> None:
+    def __init__(self, frames: Topic, image_format: str | None, jpeg_quality: int) -> None:
         self.topic = frames.topic
-        self.thinned, self.refused = 0, Counter[str]()
+        self.count, self.refused = 0, Counter[str]()
         self._digits = len(str(len(frames) - 1))
-        self._files: list[_Files] = []
-        is_kept = options.kept(DecodedColumns.of_frames(frames.stamps, frames.log_times))
+        # each with the numbers of its frames in the topic, and what encodes them; None: they are
+        # JPEG files, written as recorded
+        self._parts: list[tuple[Images, NDArray[np.int64], ImageFile | None]] = []
         for place, part in enumerate(frames.parts):
-            numbers = frames.numbers_of(place)
-            kept = is_kept[numbers]
-            self.thinned += part.count(~kept)
-            keeps_files = part.are_jpeg_files and image_format != "png"
-            kind = "jpeg" if keeps_files else image_format or "png"
             try:
                 file = None
-                if not keeps_files:
+                if not part.are_jpeg_files or image_format == "png":
+                    kind = image_format or "png"
                     file = ImageFile(part.encoding, kind, quality=jpeg_quality)
-                self._files.append(_Files(part, numbers, kept, kind, file))
             except OptionError as error:
-                self.refused[str(error).rstrip(".")] += part.count(kept)
-
-    @property
-    def count(self) -> int:
-        """How many are written, unless some cannot be decoded."""
-        return sum(files.part.count(files.is_kept) for files in self._files)
+                self.refused[str(error).rstrip(".")] += part.count()
+            else:
+                self._parts.append((part, frames.numbers_of(place), file))
+                self.count += part.count()
 
     def write(self, folder: Path, on_file: Callable[[], None]) -> int:
         """Write one file per frame, named by its number in the topic, and stamps.csv.
@@ -598,14 +489,14 @@ class TopicImages:
         """
         folder.mkdir()
         rows: dict[int, list[str | int]] = {}
-        for files in self._files:
-            part = files.part
-            for index, data in files.all():
+        for part, numbers, encoder in self._parts:
+            suffix = encoder.suffix if encoder else "jpg"
+            for index, data in _files_of(part, encoder):
                 if data is None:
                     self.refused[_NOT_DECODED] += 1
                     continue
-                number = int(files.numbers[index])
-                name = f"{number:0{self._digits}d}.{_SUFFIXES[files.kind]}"
+                number = int(numbers[index])
+                name = f"{number:0{self._digits}d}.{suffix}"
                 (folder / name).write_bytes(data)
                 stamp, log_time = int(part.stamps[index]), int(part.log_times[index])
                 rows[number] = [name, stamp, log_time, csv_cell(part.frame_id(index))]
@@ -613,6 +504,25 @@ class TopicImages:
         with (folder / _STAMPS_NAME).open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([_HEAD, *(rows[number] for number in sorted(rows))])
         return len(rows)
+
+
+def _files_of(
+    part: Images, encoder: ImageFile | None
+) -> Iterator[tuple[int, bytes | memoryview | None]]:
+    """The files of images, each with its number; None: it has no picture."""
+    if isinstance(part, VerbatimImages):
+        for index, shown in part.all_shown():
+            yield index, encoder.encode(shown.pixels) if encoder else shown.file
+    elif isinstance(part, Stream):
+        part.verify_pictures()
+        if encoder is None:
+            yield from files_of(part)
+            return
+        for index, picture in part.pictures(is_strict=not part.sidecar.keeps_packets):
+            made = None
+            if picture is not None:
+                made = encoder.encode(part.recorded_pixels(picture))
+            yield index, made
 
 
 def image_names(folder: Path) -> set[str] | None:

@@ -7,17 +7,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mp4ds.bags.convert import ENCODINGS, Converter
 from mp4ds.bags.types import SCHEMA_ENCODINGS, make_store, standard_of, types_of
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.messages import ChannelGroup, MessageSource, Part
 from mp4ds.dataset.rebuild import message_at
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import ConversionError, FormatError, OptionError, Refused
-from mp4ds.format.fields import Choice, everything, marked
+from mp4ds.errors import ConversionError, FormatError, Refused
+from mp4ds.format.fields import Choice, everything
 from mp4ds.messages.serializations import TRANSPORTS, is_camera, plain_message
 from mp4ds.messages.wire import NS, Fields, Slots, WireError
 from mp4ds.records import HASH_KEY, Channel, Message, Schema
@@ -25,7 +22,6 @@ from mp4ds.unpacking.pictures import (
     FAMILIES,
     KINDS,
     Conversion,
-    FrameOptions,
     Given,
     ImageForm,
     Kind,
@@ -65,7 +61,6 @@ def free_topic(topic: str, kind: str, taken: Collection[str]) -> str:
 
 _NOT_DECODED = "its picture cannot be decoded"
 _OTHER_FORMS = "Use `images` raw, jpeg or png."
-_REFERS = "video packets depend on each other, so none can be left out; use another form"
 
 
 @dataclass(frozen=True)
@@ -83,42 +78,8 @@ class Republished:
     instead_of: str = ""
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """How the messages of a stream are written.
-
-    Attributes:
-        stream: The stream.
-        conversion: Of its images; None if they stay as recorded.
-        is_kept: Which of them are kept; None for all.
-    """
-
-    stream: Stream
-    conversion: Conversion | None
-    is_kept: NDArray[np.bool_] | None
-
-    @property
-    def new_kind(self) -> str:
-        """Kind of the messages if they go to a new channel; else empty."""
-        form = self.conversion.form if self.conversion else None
-        return form.kind if form and not form.in_place else ""
-
-    def chosen(self, choice: Choice) -> Choice:
-        """Those of some frames that are kept."""
-        return choice if self.is_kept is None else marked(self.is_kept, choice)
-
-    def fewer(self, channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
-        """Messages as recorded, some of them left out."""
-        if choice is everything and self.stream.sidecar.digests is None:
-            self.stream.verify_video()
-        return self.stream.messages(channel, self.chosen(choice))
-
-
 class Republisher:
     """Converts the messages of a dataset: planned on creation, done while reading.
-
-    Messages of which some are left out stay as recorded, byte for byte. Calibrations are left out
-    with the images whose stamps they have.
 
     Args:
         dataset: The dataset.
@@ -127,7 +88,6 @@ class Republisher:
         converts_all: Whether other channels are converted to it, too.
         kind: What to convert images to, one of `KINDS`; None for as recorded.
         jpeg_quality: Of new JPEG files, 1 to 100.
-        options: Which images to leave out.
         renamed: The name that a topic goes out by.
 
     Attributes:
@@ -137,10 +97,6 @@ class Republisher:
         republished: The result for each topic.
         as_recorded: Camera topics with messages that stay as recorded: reason -> how many. Grows
             while the messages are read.
-        thinned: Topics with messages left out -> how many.
-
-    Raises:
-        OptionError: None of that kind can be left out.
     """
 
     def __init__(
@@ -152,11 +108,8 @@ class Republisher:
         converts_all: bool,
         kind: str | None = None,
         jpeg_quality: int = 95,
-        options: FrameOptions | None = None,
         renamed: Callable[[str], str] = lambda topic: topic,
     ) -> None:
-        self._options = options or FrameOptions()
-        check_kind(kind, self._options)
         self._kind = kind
         self._world = world
         self._jpeg_quality = jpeg_quality
@@ -168,24 +121,18 @@ class Republisher:
         self.sources: dict[Part, MessageSource] = {}
         self.republished: dict[str, Republished] = {}
         self.as_recorded: defaultdict[str, Counter[str]] = defaultdict(Counter)
-        self.thinned = Counter[str]()
         chosen = [item for item in dataset.image_channels() if selected(item.channel.topic)]
         self._cameras = {item.channel.id for item in chosen}
-        planned = [(item, self._plans(item)) for item in chosen]
+        planned = [(item, [*map(self._conversion, item.streams)]) for item in chosen]
         emptied = {
             item.channel.id
-            for item, plans in planned
-            if sum(bool(plan.new_kind) for plan in plans) == len(item.streams)
-            and not item.recorded_count
+            for item, conversions in planned
+            if all(one and not one.form.in_place for one in conversions) and not item.recorded_count
         }
         staying = [channel for channel in dataset.channels if channel.id not in emptied]
         self.channels = [channel for channel in staying if selected(channel.topic)]
         self._declare(dataset, planned, {channel.topic for channel in staying})
-        for _, plans in planned:
-            for plan in plans:
-                self._thin_calibrations(plan, selected)
-        self.thinned = +self.thinned  # without those of which all are kept
-        if kind or self._options.leaves_out:
+        if kind:
             self._count_verbatim(dataset, selected)
 
     @property
@@ -228,40 +175,26 @@ class Republisher:
 
     # ------------------------------------------------------------ what is given how
 
-    def _plans(self, group: ChannelGroup) -> list[_Plan]:
-        """The streams of a channel that are converted or thinned, and how."""
-        plans = [self._plan(stream) for stream in group.streams]
-        for plan in plans:
-            if plan.is_kept is not None:
-                self.thinned[plan.stream.topic] += plan.stream.count(~plan.is_kept)
-        return [plan for plan in plans if plan.conversion or plan.is_kept is not None]
-
-    def _plan(self, stream: Stream) -> _Plan:
+    def _conversion(self, stream: Stream) -> Conversion | None:
+        """How the images of a stream are converted; None: they stay as recorded."""
         is_replaced = stream.sidecar.replaces_packets
-        kind = self._kind or (_kind_of(stream, self._options) if is_replaced else "")
-        is_kept = None
-        if self._options.leaves_out:
-            is_kept = self._options.kept(stream.columns)
-        if kind:
-            is_done = self._is_done(stream, kind)
-            try:
-                if not is_done or is_replaced:
-                    world = self._world
-                    if is_done and stream.channel.message_encoding != ENCODINGS[world]:
-                        world = "ros2" if world == "ros1" else "ros1"
-                    form = ImageForm(kind, world, self._jpeg_quality, in_place=is_done)
-                    return _Plan(stream, Conversion(stream, form), is_kept)
-                if is_kept is None:
-                    raise Refused(f"they are already {KINDS[kind].noun}")
-            except Refused as reason:
-                if is_replaced:
-                    problem = f"its view has no such form: {reason}"
-                    raise ConversionError(stream.topic, problem, _OTHER_FORMS) from None
-                self.as_recorded[stream.topic][str(reason)] += stream.count(is_kept)
-        if is_kept is not None and _refers(stream):
-            self.as_recorded[stream.topic][_REFERS] += stream.count()
-            is_kept = None
-        return _Plan(stream, None, is_kept)
+        kind = self._kind or (_kind_of(stream) if is_replaced else "")
+        if not kind:
+            return None
+        is_done = self._is_done(stream, kind)
+        try:
+            if is_done and not is_replaced:
+                raise Refused(f"they are already {KINDS[kind].noun}")
+            world = self._world
+            if is_done and stream.channel.message_encoding != ENCODINGS[world]:
+                world = "ros2" if world == "ros1" else "ros1"
+            return Conversion(stream, ImageForm(kind, world, self._jpeg_quality, in_place=is_done))
+        except Refused as reason:
+            if is_replaced:
+                problem = f"its view has no such form: {reason}"
+                raise ConversionError(stream.topic, problem, _OTHER_FORMS) from None
+            self.as_recorded[stream.topic][str(reason)] += stream.count()
+            return None
 
     def _is_done(self, stream: Stream, kind: str) -> bool:
         """Whether the messages already have a kind, in either ROS."""
@@ -284,50 +217,34 @@ class Republisher:
         return self._types[world, kind]
 
     def _declare(
-        self, dataset: Dataset, planned: list[tuple[ChannelGroup, list[_Plan]]], taken: set[str]
+        self,
+        dataset: Dataset,
+        planned: list[tuple[ChannelGroup, list[Conversion | None]]],
+        taken: set[str],
     ) -> None:
         """Make the new channels, whose topics are none of those taken, and sources for all."""
         next_id = 1 + max((channel.id for channel in dataset.channels), default=0)
         topics: dict[tuple[str, str], str] = {}
-        for item, plans in planned:
+        for item, conversions in planned:
             recorded = item.channel
             made: dict[str, Channel] = {}
-            for kind in dict.fromkeys(plan.new_kind for plan in plans if plan.new_kind):
-                wanted = republished_topic(recorded.topic, recorded.type_name, kind)
-                if (recorded.topic, kind) not in topics:
-                    topics[recorded.topic, kind] = free_topic(wanted, kind, taken)
-                    taken.add(topics[recorded.topic, kind])
-                topic = topics[recorded.topic, kind]
-                types = self._types_of(self._world, kind)
-                made[kind] = types.channel(recorded, next_id + len(self._made), topic)
-                self._made.add(made[kind].id)
-                self.channels.append(made[kind])
-                instead_of = wanted if topic != wanted else ""
-                known = Republished(topic, made[kind].type_name, instead_of)
-                self.republished.setdefault(recorded.topic, known)
-            for plan in plans:
-                self.sources[plan.stream] = plan.fewer
-                if conversion := plan.conversion:
-                    channel = made.get(plan.new_kind)
-                    source = partial(self._messages, plan, conversion, channel)
-                    self.sources[plan.stream] = source
-
-    def _thin_calibrations(self, plan: _Plan, selected: Callable[[str], bool]) -> None:
-        """Leave out the calibrations that only have the stamps of images that are left out.
-
-        Those whose stamps no image has are kept.
-        """
-        stream, infos = plan.stream, plan.stream.infos
-        if infos is None or plan.is_kept is None or not selected(infos.channel.topic):
-            return
-        stamps, frames = infos.columns.stamp, stream.stamps
-        is_wanted = ~np.isin(stamps, frames) | np.isin(stamps, frames[plan.is_kept])
-        self.thinned[infos.channel.topic] += int((~is_wanted).sum())
-
-        def messages(channel: Channel, choice: Choice) -> Iterator[tuple[int, Message]]:
-            return infos.messages(channel, marked(is_wanted, choice))
-
-        self.sources[infos] = messages
+            for conversion in filter(None, conversions):
+                kind = conversion.form.kind
+                if not conversion.form.in_place and kind not in made:
+                    wanted = republished_topic(recorded.topic, recorded.type_name, kind)
+                    if (recorded.topic, kind) not in topics:
+                        topics[recorded.topic, kind] = free_topic(wanted, kind, taken)
+                        taken.add(topics[recorded.topic, kind])
+                    topic = topics[recorded.topic, kind]
+                    types = self._types_of(self._world, kind)
+                    made[kind] = types.channel(recorded, next_id + len(self._made), topic)
+                    self._made.add(made[kind].id)
+                    self.channels.append(made[kind])
+                    instead_of = wanted if topic != wanted else ""
+                    known = Republished(topic, made[kind].type_name, instead_of)
+                    self.republished.setdefault(recorded.topic, known)
+                channel = None if conversion.form.in_place else made[kind]
+                self.sources[conversion.stream] = partial(self._messages, conversion, channel)
 
     def _count_verbatim(self, dataset: Dataset, selected: Callable[[str], bool]) -> None:
         cameras = {channel.topic for channel in dataset.channels if is_camera(channel)}
@@ -339,18 +256,17 @@ class Republisher:
 
     def _messages(
         self,
-        plan: _Plan,
         conversion: Conversion,
         made: Channel | None,
         recorded: Channel,
         choice: Choice,
     ) -> Iterator[tuple[int, Message]]:
         """The messages of a stream, each with its ordinal in the recorded channel."""
-        stream = plan.stream
+        stream = conversion.stream
         columns, headers = stream.columns, stream.sidecar.headers
         types = self._types_of(conversion.form.world, conversion.form.kind)
         count = 0
-        for index, frame in conversion.frames(plan.chosen(choice), verify=choice is everything):
+        for index, frame in conversion.frames(choice, choice is everything):
             count += 1
             ordinal = int(columns.ordinal[index])
             if not isinstance(frame, Given):
@@ -366,39 +282,16 @@ class Republisher:
             except WireError as error:
                 raise ConversionError(recorded.topic, f"message {index}: {error}") from None
             yield ordinal, message_at(columns, index, made or recorded, payload)
-        due = stream.count(plan.is_kept)
+        due = stream.count()
         if choice is everything and count != due:
             problem = f"has {count} frames or more, not {due}"
             raise FormatError("frame-count", stream.video_path, problem)
 
 
-def check_kind(kind: str | None, options: FrameOptions) -> None:
-    """Refuse to leave out frames of copied video.
-
-    Raises:
-        OptionError: Says what to do.
-    """
-    if kind and KINDS[kind].family == "video" and options.leaves_out:
-        raise OptionError(
-            f"`every` and `max_rate` cannot be combined with `images` {kind}, which copies the "
-            "video. Use raw, jpeg or png."
-        )
-
-
-def _kind_of(stream: Stream, options: FrameOptions) -> str:
-    """The kind of packets that a view replaces; raw images if some are left out."""
-    if options.leaves_out:
-        return "raw"
+def _kind_of(stream: Stream) -> str:
+    """The kind of packets that a view replaces."""
     name = stream.channel.type_name.replace(".", "/").rpartition("/")[2]
     return next(kind for kind, own in KINDS.items() if own.type_name.endswith(f"/{name}"))
-
-
-def _refers(stream: Stream) -> bool:
-    """Whether a stream has messages that are useless without earlier ones."""
-    if not stream.sidecar.keeps_packets:
-        return False
-    with stream.open_packets() as reader:
-        return not all(reader.keyframes)
 
 
 # ---------------------------------------------------------------- types

@@ -40,7 +40,7 @@ from mp4ds.records import (
     bounded,
 )
 from mp4ds.unpacking.pictures import KINDS, FrameOptions, TopicImages, image_names, shown_by_packets
-from mp4ds.unpacking.republish import Republished, Republisher, check_kind
+from mp4ds.unpacking.republish import Republished, Republisher
 
 SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
 """How the default name of an output ends, by what it is unpacked to."""
@@ -99,7 +99,6 @@ class UnpackSummary:
             recorded: reason -> how many.
         unconvertible: Topics with messages left out because the target cannot hold them:
             reason -> how many.
-        thinned: Topics with messages left out because fewer were requested -> how many.
         latched: Latched messages from before the slice, by topic.
         latched_left_out: Latched topics whose messages from before it are too large.
         losses: What could not be read, if a damaged dataset is salvaged.
@@ -113,7 +112,6 @@ class UnpackSummary:
     left_out: list[str] = field(default_factory=list)
     republished: dict[str, Republished] = field(default_factory=dict)
     as_recorded: dict[str, dict[str, int]] = field(default_factory=dict)
-    thinned: dict[str, int] = field(default_factory=dict)
     unconvertible: dict[str, dict[str, int]] = field(default_factory=dict)
     latched: dict[str, int] = field(default_factory=dict)
     latched_left_out: list[str] = field(default_factory=list)
@@ -195,7 +193,7 @@ def _unpack_here(
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
             part = slice_of(whole, chosen.slice, chosen.selected)
-            if to == "images" or chosen.images or chosen.leaves_out or _has_replaced(whole, chosen):
+            if to == "images" or chosen.images or _has_replaced(whole, chosen):
                 # whose frames are counted from the slice's first one
                 with sliced(whole, part, path.parent, chosen.selected) as opened:
                     if to == "images":
@@ -358,7 +356,6 @@ def _check(to: str, options: UnpackOptions) -> None:
         raise OptionError(f"`storage` works with `to` rosbag2, not with `to` {to}.")
     if options.images and to == "images":
         raise OptionError("`images` is for recordings; with `to` images, use `image_format`.")
-    check_kind(options.images, options)
     if options.salvage and options.slice:
         raise OptionError(
             "`salvage` restores a whole dataset: pack what it restores, and unpack a slice of that."
@@ -422,7 +419,6 @@ def _unpack_recording(
         converts_all=to in _WORLDS and to != source,
         kind=options.images,
         jpeg_quality=options.jpeg_quality,
-        options=options,
     )
     reader.sources = republisher.sources
     storage = ""
@@ -452,7 +448,6 @@ def _unpack_recording(
                 done += 1
                 if progress and done % 16 == 0:
                     progress(UnpackProgress(done, total))
-        found += sum(republisher.thinned.values())
         if dataset.is_salvaged:
             _account_for(total - found, summary.losses)
         elif found != total:
@@ -461,7 +456,6 @@ def _unpack_recording(
     summary.omitted.update(Counter(writer.omitted) + Counter(republisher.omitted))
     summary.republished.update(republisher.republished)
     summary.as_recorded.update({t: dict(why) for t, why in republisher.as_recorded.items()})
-    summary.thinned.update(republisher.thinned)
 
 
 def _total(dataset: Dataset, reader: BagReader, selected: Selection) -> int:
@@ -597,14 +591,10 @@ def _unpack_images(
     for topic in filter(options.selected, dataset.camera_topics):
         without = dataset.verbatim(topic)[1]
         if topic in dataset:
-            images = TopicImages(
-                dataset[topic], options, options.image_format, options.jpeg_quality
-            )
+            images = TopicImages(dataset[topic], options.image_format, options.jpeg_quality)
             found.append(images)
             if images.refused:
                 refused[topic] = "; ".join(images.refused)
-            if images.thinned:
-                summary.thinned[topic] = images.thinned
         if without:
             summary.unconvertible[topic] = {f"no picture: {why}": n for why, n in without.items()}
     if refused and not options.skip_unconvertible:

@@ -22,7 +22,7 @@ from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import WHAT, Parsed, SliceOptions, force, option
-from mp4ds.times import intervals, sound_times, synchronize, usual_interval
+from mp4ds.times import at_most, intervals, sound_times, synchronize, usual_interval
 from mp4ds.unpacking.pictures import FrameOptions, is_inverse_depth
 from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
@@ -457,9 +457,11 @@ class ExportJob:
             self.leave_out(stream.topic, _INVERSE, len(stream))
             return
         columns = stream.columns
-        kept = np.flatnonzero(self.options.kept(columns))
-        self.leave_out(stream.topic, _THINNED, len(stream) - len(kept))
         times = sound_times(columns.stamp, columns.log_time)
+        kept = np.arange(0, len(stream), self.options.every)
+        if self.options.max_rate is not None:
+            kept = kept[at_most(self.options.max_rate, times[kept])]
+        self.leave_out(stream.topic, _THINNED, len(stream) - len(kept))
         if times is not columns.stamp:
             self.note(f"{stream.topic}: its stamps do not increase, so log times are used instead")
         kept = kept[np.argsort(times[kept], kind="stable")]

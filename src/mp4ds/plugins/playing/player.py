@@ -58,7 +58,6 @@ class PlaySummary:
         stopped: Whether it was stopped before the end.
         as_recorded: Images that could not be converted as requested and were published as
             recorded: topic -> reason -> number.
-        thinned: Number of frames left out as requested, by topic.
     """
 
     messages: dict[str, int] = field(default_factory=dict)
@@ -69,7 +68,6 @@ class PlaySummary:
     loops: int = 0
     stopped: bool = False
     as_recorded: dict[str, dict[str, int]] = field(default_factory=dict)
-    thinned: dict[str, int] = field(default_factory=dict)
 
 
 _NODES = {"ros1": "mp4ds_play", "ros2": "rosbag2_player"}
@@ -262,7 +260,6 @@ class Player:
         is_whole = self._is_resting or not self._is_stopped
         self._done.stopped = not (is_whole and self._node.is_alive)
         for republisher in self._timeline.republishers:
-            self._done.thinned.update(republisher.thinned)
             for topic, reasons in republisher.as_recorded.items():
                 self._done.as_recorded[topic] = dict(reasons)
         return self._done

@@ -269,7 +269,6 @@ class _Part:
             converts_all=True,
             kind=KINDS[options.publish_as] if options.publish_as else None,
             jpeg_quality=options.jpeg_quality,
-            options=options,
             renamed=options.renamed,
         )
         self.channels = [self.republisher.outgoing(item) for item in self.republisher.channels]
