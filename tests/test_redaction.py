@@ -22,10 +22,10 @@ from compare_redacted import compare, parsed, pixels, read
 from conftest import real
 from foxglove_scenes import FOXGLOVE, FOXGLOVE_SOURCES
 from mp4ds import Box, PackOptions
+from mp4ds.dataset.redaction import placed, redact
 from mp4ds.errors import Mp4dsError, OptionError, SourceError
 from mp4ds.format.sidecars import dump_document, load_manifest
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.packing.redaction import placed, redact
 from pictures import GENERIC
 from scenes import Scene, odd_scene, scene
 from sources import SOURCES

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mp4ds.dataset.dataset import Dataset as Dataset
     from mp4ds.dataset.dataset import open_dataset as open
     from mp4ds.dataset.messages import RecordedMessage as RecordedMessage
+    from mp4ds.dataset.redaction import Box as Box
     from mp4ds.dataset.stream import Stream as Stream
     from mp4ds.dataset.topic import Frame as Frame
     from mp4ds.dataset.topic import Topic as Topic
@@ -59,7 +60,6 @@ if TYPE_CHECKING:
     from mp4ds.packing.pack import pack as pack
     from mp4ds.packing.pack import pack_each as pack_each
     from mp4ds.packing.pack import pack_share as pack_share
-    from mp4ds.packing.redaction import Box as Box
     from mp4ds.plugins.evaluating.evaluate import EvaluateOptions as EvaluateOptions
     from mp4ds.plugins.evaluating.evaluate import evaluate as evaluate
     from mp4ds.plugins.evaluating.trials import Evaluation as Evaluation
@@ -85,6 +85,7 @@ _HOMES = {
     "dataset.checks": "Problem validate",
     "dataset.dataset": "Dataset open",
     "dataset.messages": "RecordedMessage",
+    "dataset.redaction": "Box",
     "dataset.stream": "Stream",
     "dataset.topic": "Frame Topic",
     "errors": (
@@ -95,7 +96,6 @@ _HOMES = {
     ),
     "packing.options": "ImportOptions PackOptions PackSummary",
     "packing.pack": "pack pack_each pack_share",
-    "packing.redaction": "Box",
     "plugins.evaluating.evaluate": "EvaluateOptions evaluate",
     "plugins.evaluating.trials": "Evaluation",
     "plugins.exporting.export": "export",

@@ -22,8 +22,8 @@ from mp4ds.bags.formats import limits_of
 from mp4ds.dataset.dataset import Dataset, datasets_in
 from mp4ds.dataset.images import shown_by
 from mp4ds.dataset.messages import MessagesFile, Part, recorded_storage
+from mp4ds.dataset.redaction import differences, holds_pixels
 from mp4ds.dataset.stream import Stream
-from mp4ds.dataset.untouched import differences, holds_pixels
 from mp4ds.errors import (
     ConversionError,
     FormatError,

@@ -67,7 +67,7 @@ class Dataset:
         manifest: Of the folder; None for one video.
         streams: Its streams; none for a video without a sidecar, see `mp4ds.open`.
         messages_file: Its messages.mcap; without contents where there is none.
-        is_salvaged: Whether messages may be missing; see `mp4ds.dataset.salvage`.
+        is_salvaged: Whether messages may be missing; see `mp4ds.dataset.recording`.
         damage: Which damaged file was left out, as no selected topic needs it; empty if none was.
 
     Args:

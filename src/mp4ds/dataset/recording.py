@@ -1,13 +1,15 @@
-"""A dataset as a recording: read to be packed again or restored, sliced, copied."""
+"""A dataset as a recording: read to be packed again or restored, sliced, copied, salvaged."""
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +19,25 @@ from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import WHOLE, BagReader, RecordingSlice, stats_of
 from mp4ds.dataset.concat import concat
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.messages import MessageSource, Part
-from mp4ds.errors import OptionError, Refused, advising
+from mp4ds.dataset.messages import MessagesFile, MessageSource, Part, recorded_format
+from mp4ds.dataset.stream import Layer, Stream, open_stream
+from mp4ds.errors import (
+    FormatError,
+    OptionError,
+    Refused,
+    SourceError,
+    SourceNotFoundError,
+    VersionError,
+    advising,
+)
 from mp4ds.files.outputs import digest_file
-from mp4ds.format.manifest import About, EarlierDataset
-from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME
+from mp4ds.files.urls import location, remote
+from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
+from mp4ds.format.manifest import About, EarlierDataset, Manifest, StreamEntry, Verbatim
+from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_manifest, verify_file
+from mp4ds.messages.serializations import calibration_topics, is_camera
 from mp4ds.options import Slice
-from mp4ds.records import Channel, ChannelStats, Excerpt, Message, Record, Schema
+from mp4ds.records import Channel, ChannelStats, Excerpt, Loss, Message, Record, Schema
 from mp4ds.video.codecs import VISUAL
 
 
@@ -248,3 +262,233 @@ def _with_shared(dataset: Dataset, selected: Callable[[str], bool]) -> set[str]:
     while more := [own for own in shared if own & kept and not own <= kept]:
         kept.update(*more)
     return kept
+
+
+# ---------------------------------------------------------------- damaged
+
+_FORMAT = re.compile(rb"^format: (bag|rosbag2|mcap)\r?$", re.MULTILINE)
+_ALTERED = "does not match its SHA-256"
+
+
+HOW_TO_SALVAGE = (
+    "`mp4ds validate --deep` finds all damage, and `mp4ds unpack --salvage` restores what can be "
+    "read."
+)
+"""What to do about a damaged dataset."""
+
+
+def open_selected(
+    path: Path | str,
+    selected: Callable[[str], bool],
+    *,
+    layer: Layer | None = None,
+    verify_messages: bool = False,
+) -> Dataset:
+    """Open a dataset; damage to files with nothing of the selected topics is noted, and no error.
+
+    Args:
+        path: See `Dataset`.
+        selected: Whether a topic is wanted.
+        layer: See `Dataset`.
+        verify_messages: Compare messages.mcap with its SHA-256, too.
+
+    Raises:
+        SourceNotFoundError: The path does not exist.
+        FormatError: It is damaged, and selected topics have, or may have, something to lose.
+    """
+    try:
+        dataset = Dataset(path, layer=layer)
+        _ = dataset.channels  # opens messages.mcap
+        if verify_messages:
+            dataset.verify_messages()
+        return dataset
+    except VersionError:
+        raise
+    except FormatError as error:
+        try:
+            dataset, losses = open_damaged(path, selected=selected, layer=layer)
+        except (SourceError, FormatError):
+            raise error from None
+        # nothing vouches for what is still there of a damaged messages.mcap
+        file = dataset.messages_file
+        there = [
+            item.topic for item in file.channels if file.is_salvaged and file.counts.get(item.id)
+        ]
+        lost = (loss for loss in losses if loss.file != MESSAGES_NAME or loss.messages != 0)
+        if any(map(selected, there)) or any(lost):
+            raise
+        dataset.damage = f"damaged, but not needed for the selected topics: {error}"
+        return dataset
+
+
+def open_damaged(
+    path: Path | str,
+    *,
+    selected: Callable[[str], bool],
+    layer: Layer | None = None,
+) -> tuple[Dataset, list[Loss]]:
+    """A dataset, some files of which cannot be read. What can be read of its videos: see `examine`.
+
+    Args:
+        path: See `Dataset`.
+        selected: Whether a topic is wanted; damage to others is not reported.
+        layer: See `Dataset`.
+
+    Returns:
+        The dataset, and what is lost by files that cannot be read at all, and of messages.mcap.
+
+    Raises:
+        SourceNotFoundError: The path does not exist.
+        SourceError: It is at a URL.
+        FormatError: Nothing of it can be read, or a newer version wrote it.
+    """
+    place = location(path)
+    if remote(place):
+        raise SourceError(place, "cannot be salvaged from a remote location", "Download it first.")
+    if not place.exists():
+        raise SourceNotFoundError(place)
+    folder = place.parent if place.name == MANIFEST_NAME else place
+    if not folder.is_dir():
+        dataset = Dataset(folder, layer=layer)
+        dataset.is_salvaged = True
+        return dataset, []
+    manifest: Manifest | None = None
+    losses: list[Loss] = []
+    try:
+        manifest = load_manifest(folder / MANIFEST_NAME)
+        entries: dict[str, StreamEntry | None] = {one.sidecar: one for one in manifest.streams}
+    except VersionError:
+        raise
+    except FormatError as error:
+        problem = f"{error.problem}; the other files tell what the dataset holds"
+        losses.append(Loss(MANIFEST_NAME, None, None, problem, 0))
+        names = sorted(path.name for path in folder.glob("*.yaml"))
+        entries = {name: None for name in names if name != MANIFEST_NAME}
+    streams: list[Stream] = []
+    for name, entry in entries.items():
+        try:
+            streams.append(open_stream(folder / name, layer))
+        except VersionError:
+            raise
+        except FormatError as error:
+            losses += _lost_sidecar(name, entry, selected, error.problem)
+            continue
+        topics = tuple(streams[-1].topics)
+        try:
+            if manifest is not None and any(map(selected, topics)):
+                verify_file(folder / name, manifest.file(name))
+        except FormatError as error:
+            problem = f"{error.problem}: what has no digests, such as calibrations, may be altered"
+            losses.append(Loss(name, None, None, problem, 0, topics))
+    file, lost = _salvaged_messages(folder / MESSAGES_NAME, manifest)
+    losses += [one for one in lost if not one.topics or any(map(selected, one.topics))]
+    if not streams and file.path is None:
+        raise FormatError("file-missing", folder, "has no file that can be read")
+    dataset = Dataset.of(folder, manifest or _rebuilt(folder, streams, file), streams, file)
+    dataset.is_salvaged = True
+    return dataset, losses
+
+
+def _lost_sidecar(
+    name: str, entry: StreamEntry | None, selected: Callable[[str], bool], problem: str
+) -> list[Loss]:
+    """What is lost of selected topics by a sidecar that cannot be read."""
+    if entry is None:
+        return [Loss(name, None, None, problem)]
+    if selected(entry.topic):
+        return [Loss(name, None, None, problem, entry.frames, (entry.topic,))]
+    if any(map(selected, calibration_topics(entry.topic))):
+        return [Loss(name, None, None, f"{problem}; it may have had calibrations")]
+    return []
+
+
+def _salvaged_messages(path: Path, manifest: Manifest | None) -> tuple[MessagesFile, list[Loss]]:
+    """messages.mcap as far as it can be read, and what is lost of it."""
+    file = MessagesFile(path)
+    with suppress(FormatError):  # it is read below as far as possible
+        if manifest is not None:
+            file.verify(manifest)
+            return file, []
+    try:
+        file = MessagesFile(path, salvage=True)
+        _ = file.counts  # reads it once
+    except FormatError as error:
+        return MessagesFile(None), [Loss(MESSAGES_NAME, None, None, error.problem)]
+    losses = list(file.losses)
+    if not losses and manifest is not None:
+        problem = f"{_ALTERED}, although all its records can be read: some may be altered"
+        losses.append(Loss(MESSAGES_NAME, None, None, problem, 0))
+    return file, losses
+
+
+def _rebuilt(folder: Path, streams: Sequence[Stream], file: MessagesFile) -> Manifest:
+    """What the manifest said, as far as the other files tell."""
+    path = folder / MANIFEST_NAME
+    found = _FORMAT.search(path.read_bytes()) if path.is_file() else None
+    told: Any = found[1].decode() if found else recorded_format(file)
+    return Manifest(
+        mp4ds=FORMAT_VERSION,
+        kind="dataset",
+        profile=streams[0].sidecar.profile if streams else "lossless",
+        format=told,
+        recording_profile=file.profile,
+        sources=[],
+        messages=0,
+        streams=[StreamEntry.of(stream.path.name, stream.sidecar) for stream in streams],
+        verbatim=[
+            Verbatim(topic=item.topic, messages=number, first=0, reason="not known")
+            for item in file.channels
+            if is_camera(item) and (number := file.counts.get(item.id, 0))
+        ],
+        files=[],
+    )
+
+
+def examine(stream: Stream) -> list[Loss]:
+    """Find the frames of a stream that can be read; from then on it only reads these.
+
+    If the video matches its SHA-256, nothing is decoded.
+
+    Returns:
+        What is lost of the others.
+    """
+    count = len(stream)
+    try:
+        _ = stream.rebuilder
+    except FormatError as error:
+        stream.sound = np.zeros(count, np.bool_)
+        name, topics, ends = stream.video_path.name, (stream.topic,), (0, count - 1)
+        return [Loss(name, None, None, error.what, count, topics, *_span(stream), ends)]
+    is_hashed = all(video.sha256 for video in stream.sidecar.videos)
+    altered = [path for path, _ in stream.altered_videos()]
+    if is_hashed and not altered:
+        return []
+    name = (altered or [stream.video_path])[0].name
+    sound = np.ones(count, np.bool_)
+    losses, times = [], stream.log_times
+    for damage, first, last in stream.damages():
+        sound[first : last + 1] = False
+        span, ends = (int(times[first]), int(times[last])), (first, last)
+        lost, topics = last - first + 1, (stream.topic,)
+        losses.append(Loss(name, None, None, damage.what, lost, topics, *span, ends))
+    if stream.sidecar.digests is None and sound.any() and is_hashed:
+        problem = f"{_ALTERED}, and frames of a lossy video have no digests: some may be altered"
+        losses.append(Loss(name, None, None, problem, 0, (stream.topic,)))
+    stream.sound = sound
+    return losses
+
+
+def _span(stream: Stream) -> tuple[int | None, int | None]:
+    """Log times of the first and the last frame of a stream whose video is missing or too short.
+
+    The digests show that there were as many frames as the sidecar says: each takes its space there.
+    """
+    sidecar = stream.sidecar
+    try:
+        if sidecar.digests is None:
+            return None, None
+        sidecar.digests.decode(sidecar.frames)
+        times = sidecar.columns.log_time.decode(sidecar.frames)
+    except ValueError:
+        return None, None
+    return int(times[0]), int(times[-1])

@@ -11,6 +11,7 @@ from operator import index
 from pathlib import Path
 from typing import Any
 
+from mp4ds.dataset.redaction import Find, Redaction, parse_redaction
 from mp4ds.dataset.views import Reduction
 from mp4ds.errors import OptionError
 from mp4ds.messages.encodings import ENCODINGS
@@ -31,7 +32,6 @@ from mp4ds.options import (
     option,
     parse_time,
 )
-from mp4ds.packing.redaction import Find, Redaction, parse_redaction
 from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
 from mp4ds.video.codecs import (
     ARCHIVE,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -40,7 +40,6 @@ from mp4ds.files.sources import (
 )
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.manifest import ReductionEntry
-from mp4ds.format.models import StreamSidecar
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS
@@ -186,14 +185,18 @@ def pack(
 def _pack(
     paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
 ) -> PackSummary:
-    store = remote(target)
-    if store:
+    if store := remote(target):
         return _pack_to_store(paths, store, options, progress)
     if any(map(is_unfinished, paths)):
         return _recovered(paths, target, options)
-    if _is_copy(paths, options):
-        return _copied(paths, target, options, progress)
-    return _encoded(paths, target, options, progress)
+    if not _is_copy(paths, options):
+        return _encoded(paths, target, options, progress)
+    try:
+        return _copy(paths[0], target, options)
+    except Refused as reason:
+        again = _checked(options, paths, may_copy=False)
+        summary = _encoded(paths, target, again, progress)
+        return replace(summary, not_copied=str(reason))
 
 
 def _encoded(
@@ -216,20 +219,6 @@ def _recovered(paths: Sequence[Path], target: Path, options: PackOptions) -> Pac
         )
     about = load_about(options.about) if options.about is not None else None
     return recover(folder, target, pack, force=options.force, about=about)
-
-
-def _copied(
-    paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
-) -> PackSummary:
-    """Copy a dataset, or re-encode it if it cannot be copied."""
-    try:
-        return _copy(paths[0], target, options)
-    except Refused as reason:
-        quality = options.quality or parse_quality(_quality_of(paths))
-        transcode = options.transcode or any(one.body == "jpeg" for one in _sidecars(paths))
-        encoded = replace(options, quality=quality, transcode=transcode)
-        summary = _encoded(paths, target, _checked(encoded, paths, may_copy=False), progress)
-        return replace(summary, not_copied=str(reason))
 
 
 def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
@@ -280,22 +269,19 @@ def _pack_to_store(
     paths: Sequence[Path], store: RemotePath, options: PackOptions, progress: Report | None
 ) -> PackSummary:
     """Pack on this machine, then upload."""
-    shown = store
 
     def make(local: Path) -> PackSummary:
-        report = progress and (lambda state: progress(replace(state, dataset=shown)))
+        report = progress and (lambda state: progress(replace(state, dataset=store)))
         return _pack(paths, local, replace(options, force=True), report)
 
     def tell(name: str, done: int, total: int) -> None:
         if progress:
             share = done / total if total else None
-            progress(PackProgress(shown, "uploading", share, 0, total, done, {}, note=name))
+            progress(PackProgress(store, "uploading", share, 0, total, done, {}, note=name))
 
-    owned = dataset_files
-    summary = uploaded(
-        store, make, last=MANIFEST_NAME, force=options.force, owned=owned, report=tell
-    )
-    return replace(summary, dataset=shown)
+    force, owned = options.force, dataset_files
+    summary = uploaded(store, make, last=MANIFEST_NAME, force=force, owned=owned, report=tell)
+    return replace(summary, dataset=store)
 
 
 def pack_share(
@@ -326,8 +312,7 @@ def pack_share(
             "of rules, or pack as a whole."
         )
     target = _target(dataset, paths)
-    store = remote(target)
-    if store:
+    if store := remote(target):
         target = local_path(store)
     _pack_all([_planned(paths, target, chosen, progress, is_share=True)], chosen, share)
 
@@ -435,17 +420,19 @@ def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
 
 def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
     """Whether it is one dataset, and no option asks for encoding its videos."""
-    is_visual = options.quality is not None and options.quality.name == VISUAL
     is_divided = options.join or options.cluster is not None
     folder = dataset_at(paths[0]) if len(paths) == 1 and not is_divided else None
+    if folder is None:
+        return False
+    is_visual = options.quality is not None and options.quality.name == VISUAL
     kept = replace(options, quality=None, transcode=options.transcode and not is_visual)
-    if folder and options.view and not options.quality and _has_views(folder, options):
+    if options.view and not options.quality and _has_views(folder, options):
         kept = replace(kept, view=None)
     if kept.changing(ENCODING) != PackOptions().changing(ENCODING):
         return False
-    if folder is None or options.quality is None:
-        return folder is not None
-    streams = _streams_of(folder)
+    if options.quality is None:
+        return True
+    streams = Dataset(folder).streams
     encoded = [stream for stream in streams if _is_encoded(stream, options)]
     has_views = all(one.exact_path or one.sidecar.profile == VISUAL for one in encoded)
     return is_visual and has_views and any(stream.exact_path for stream in streams)
@@ -453,7 +440,7 @@ def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
 
 def _has_views(folder: Path, options: PackOptions) -> bool:
     """Whether the streams of a dataset have the views that are asked for already."""
-    chosen = [one.sidecar for one in _streams_of(folder) if options.selected(one.topic)]
+    chosen = [one.sidecar for one in Dataset(folder).streams if options.selected(one.topic)]
     if options.view == NO_VIEW:
         return all(one.view is None for one in chosen)
     return all(
@@ -461,12 +448,6 @@ def _has_views(folder: Path, options: PackOptions) -> bool:
         for one in chosen
         if one.profile == LOSSLESS
     ) and any(one.view for one in chosen)
-
-
-def _streams_of(folder: Path) -> list[Stream]:
-    """The streams of a dataset."""
-    entries = load_manifest(folder / MANIFEST_NAME).streams
-    return [Stream(folder / entry.sidecar) for entry in entries]
 
 
 def _is_encoded(stream: Stream, options: PackOptions) -> bool:
@@ -493,12 +474,24 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
         load_about(options.about)  # fails before anything is read
     if may_copy and _is_copy(paths, options):
         return options
+    datasets = [Dataset(folder) for folder in map(dataset_at, paths) if folder]
+    sidecars = [stream.sidecar for dataset in datasets for stream in dataset.streams]
+    profiles = {dataset.manifest.profile for dataset in datasets if dataset.manifest}
+    if len(datasets) < len(paths) or not paths:
+        profiles.add(LOSSLESS)  # as of a recording
     if options.asks_for_views:
-        _check_views(paths, options)
-    quality = options.quality or parse_quality(_quality_of(paths))
-    for folder in filter(None, map(dataset_at, paths)):
-        if quality.name != VISUAL:  # a score would be one of the views
-            Dataset(folder).require_exact(options.selected)
+        _check_views(options, profiles)
+    quality = options.quality
+    if quality is None:
+        if len(profiles) > 1 or parse_quality(*profiles).crf is not None:
+            raise OptionError(
+                "There is no default `quality` for what was packed as "
+                f"{', '.join(sorted(profiles))}. Give one."
+            )
+        quality = parse_quality(*profiles)
+    if quality.name != VISUAL:  # a score would be one of the views
+        for dataset in datasets:
+            dataset.require_exact(options.selected)
     if options.transcode and quality.lossless:
         raise OptionError(
             "`transcode` needs a lossy `quality`, such as visual: a JPEG file is smaller than "
@@ -513,12 +506,11 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
     )
     if quality.target and quality.target.metric == "vmaf" and not options.join:
         find_ffmpeg()  # fails before anything is read, saying how to get one
-    transcode = options.transcode or (
-        not quality.lossless and any(one.body == "jpeg" for one in _sidecars(paths))
-    )
-    view = options.view
-    if view is None and quality.lossless and not options.is_fast:
-        packets = (one.view for one in _sidecars(paths) if one.body == "packet")
+    transcode, view = options.transcode, options.view
+    if not quality.lossless:
+        transcode |= any(one.body == "jpeg" for one in sidecars)
+    elif view is None and not options.is_fast:
+        packets = (one.view for one in sidecars if one.body == "packet")
         view = next((one.codec for one in packets if one), None)
     chosen = replace(
         options, quality=quality, codec=codec, view=view, transcode=transcode, images=images
@@ -527,15 +519,19 @@ def _checked(options: PackOptions, paths: Sequence[Path], *, may_copy: bool = Tr
     return chosen
 
 
-def _check_views(paths: Sequence[Path], options: PackOptions) -> None:
+def _check_views(options: PackOptions, profiles: Collection[str]) -> None:
     """Refuse views where there are none.
+
+    Args:
+        options: As given by the user.
+        profiles: Of what is to be packed.
 
     Raises:
         OptionError: Says why.
     """
     told = {f"with `quality` {options.quality}": options.goal.lossless}
     if options.quality is None:
-        told = {f"of a dataset of {one}": one == LOSSLESS for one in _profiles(paths)}
+        told = {f"of a dataset of {one}": one == LOSSLESS for one in profiles}
     if lossy := [words for words, is_lossless in told.items() if not is_lossless]:
         raise OptionError(
             f"`view` is for lossless packing: {lossy[0]}, the videos are what a view would be."
@@ -545,37 +541,6 @@ def _check_views(paths: Sequence[Path], options: PackOptions) -> None:
             "`purpose` speed encodes nothing twice. Pack without `view`, and add views later: "
             "mp4ds pack DATASET -o NEW --view"
         )
-
-
-def _quality_of(paths: Sequence[Path]) -> str:
-    """The quality of the source datasets; lossless for recordings.
-
-    Raises:
-        OptionError: It does not determine the new quality.
-    """
-    found = _profiles(paths)
-    if not found:
-        return LOSSLESS
-    if len(found) == 1 and parse_quality(*found).crf is None:
-        return found.pop()
-    raise OptionError(
-        f"There is no default `quality` for what was packed as {', '.join(sorted(found))}. Give "
-        "one."
-    )
-
-
-def _profiles(paths: Sequence[Path]) -> set[str]:
-    """Those of the source datasets; lossless for recordings."""
-    folders = [dataset_at(path) for path in paths]
-    return {
-        load_manifest(folder / MANIFEST_NAME).profile if folder else LOSSLESS for folder in folders
-    }
-
-
-def _sidecars(paths: Sequence[Path]) -> Iterator[StreamSidecar]:
-    """The sidecars of the source datasets."""
-    for folder in filter(None, map(dataset_at, paths)):
-        yield from (stream.sidecar for stream in _streams_of(folder))
 
 
 def _planned(
@@ -614,7 +579,12 @@ def _pack_all(
     packs: Sequence[PartedPack], options: PackOptions, share: tuple[int, int] | None = None
 ) -> list[PackSummary]:
     """Pack recordings in parts, and make their datasets unless only a share is packed."""
-    results = pack_parts(packs, _executor(packs, options), options, share)
+    executor: AbstractContextManager[Executor]
+    if options.cluster:
+        executor = plugin("cluster:cluster_executor")(options.cluster)
+    else:
+        executor = ProcessExecutor(min(_processes_for(pack.plan) for pack in packs))
+    results = pack_parts(packs, executor, options, share)
     made = {summary.dataset: summary for summary in results}
     return [made[pack.target] for pack in packs if pack.target in made]
 
@@ -639,18 +609,6 @@ def _bytes_a_pixel(plan: TrackPlan) -> int:
     if plan.view is not None:  # its encoder and decoder, and some 45 images that wait for it
         own += 300 + (45 * plan.view.layout.encoding.pixel_bytes if plan.coding else 0)
     return own
-
-
-def _executor(
-    packs: Sequence[PartedPack], options: PackOptions
-) -> AbstractContextManager[Executor]:
-    """What packs the pieces."""
-    if options.cluster:
-        executor: AbstractContextManager[Executor] = plugin("cluster:cluster_executor")(
-            options.cluster
-        )
-        return executor
-    return ProcessExecutor(min(_processes_for(pack.plan) for pack in packs))
 
 
 def _paths(sources: Sequence[Path | str] | Path | str) -> list[Path]:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mp4ds.errors import EncoderRefusedError, Refused
 from mp4ds.format.fields import Quality as Measured
@@ -24,7 +23,7 @@ from mp4ds.format.models import Color
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, Prediction, native
 from mp4ds.messages.layouts import layout_for
 from mp4ds.packing.inspection import CameraMessage
-from mp4ds.packing.windows import WindowCoder, out_of_reach, window_frames
+from mp4ds.packing.windows import CrfControl, Scores, WindowCoder
 from mp4ds.video.codecs import (
     LOSSLESS,
     QualityTarget,
@@ -35,6 +34,7 @@ from mp4ds.video.codecs import (
 from mp4ds.video.decoder import PacketPictures
 from mp4ds.video.encoder import Coding, Predictor, VideoEncoder
 from mp4ds.video.packets import PacketWriter, join_segments
+from mp4ds.video.pixels import PlaneSpool
 
 _GREY = 128
 _VIEW_THREADS = 2
@@ -460,20 +460,19 @@ class _ScoredTrack(_PictureTrack):
         self._coder = coder
         self.coding, self.size = coder.coding, coder.coded_size
         self.options = {**coder.coding.recipe.options, "g": str(coder.coding.gop)}
-        self._most = window_frames(coder.coding.gop)
-        self._control = coder.control()
+        self._control = CrfControl(coder.coding, coder.target)
         self._folder = path.with_name(f".{path.stem}.windows")
         self._folder.mkdir()
-        self._spool = coder.spool(self._folder / "frames.yuv")
+        self._spool = PlaneSpool(self._folder / "frames.yuv", *coder.coded_size)
         self._ticks = array("q")
         self._segments: list[Path] = []
-        self._scores: list[NDArray[np.int64]] = []
+        self._scores: list[Scores] = []
         self._reencoded = self._limited = 0
 
     def write(self, seen: CameraMessage, tick: int) -> None:
         self._coder.keep(seen, self._spool)
         self._ticks.append(tick)
-        if len(self._spool) == self._most:
+        if len(self._spool) == self._coder.frames:
             self._finish_window()
 
     def _finish_window(self) -> None:
@@ -482,27 +481,26 @@ class _ScoredTrack(_PictureTrack):
         Raises:
             Refused: No crf is good enough.
         """
-        coder, control, target = self._coder, self._control, self._coder.target
-        spool, frames, number = self._spool, len(self._spool), len(self._segments)
-        place = partial(self._segment, number)
-        tries = coder.tries(control, spool, self._ticks[-frames:], place)
-        tried, due = tries.means, tries.due
-        kept = control.accepted(tried, due, frames)
+        coder, control, frames = self._coder, self._control, len(self._spool)
+        number = len(self._segments)
+
+        def place(crf: int) -> Path:
+            return self._folder / f"{number:06}-{crf}.mp4"
+
+        scores = coder.tries(control, self._spool, self._ticks[-frames:], place)
+        kept = control.accepted
         if kept is None:
-            first, least = len(self._ticks) - frames, min(tried)
-            made = f"crf {least} gives frames {first} to {first + frames - 1} of a part "
-            raise out_of_reach(target, due, f"{made}{tried[least]:.2f}")
-        control.keep(tried, kept, due, frames)
-        for crf in tried.keys() - {kept}:
+            first, last = len(self._ticks) - frames, len(self._ticks) - 1
+            made = f"crf {min(scores)} gives frames {first} to {last} of a part "
+            raise coder.out_of_reach(control, made)
+        control.keep(kept)
+        for crf in scores.keys() - {kept}:
             place(crf).unlink()
         self._segments.append(place(kept))
-        self._scores.append(tries.scores[kept])
-        self._reencoded += len(tried) > 1
-        self._limited += due < target.score
-        spool.clear()
-
-    def _segment(self, number: int, crf: int) -> Path:
-        return self._folder / f"{number:06}-{crf}.mp4"
+        self._scores.append(scores[kept])
+        self._reencoded += len(scores) > 1
+        self._limited += control.due < coder.target.score
+        self._spool.clear()
 
     def close(self) -> None:
         try:

@@ -7,9 +7,9 @@ until it is good enough.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
 from pathlib import Path
@@ -26,7 +26,10 @@ from mp4ds.video.encoder import Coding, VideoEncoder, coded_size
 from mp4ds.video.pixels import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
 from mp4ds.video.scores import SMALLEST, Ffmpeg, find_ffmpeg, scores_of
 
-FALLS = {"vmaf": 0.3, "psnr": 0.4, "ssim": 0.001}
+Scores = NDArray[np.int64]
+"""Of frames, in steps of the metric (`SCORE_STEPS`)."""
+
+_FALLS = {"vmaf": 0.3, "psnr": 0.4, "ssim": 0.001}
 """Metric -> about how much it drops per crf step, near typical targets."""
 
 _MOST_UP = 8  # maximum crf increase from one window to the next
@@ -47,96 +50,70 @@ class CrfControl:
     than required, if a second try with fewer bits can avoid it.
 
     Args:
-        start: The crf of the first window.
-        smallest: The smallest allowed.
-        largest: The largest allowed.
-        tolerance: How far below the target the mean of a window may be.
-        fall: About how much a score drops per crf step.
+        coding: How images are encoded, with the crf of the first window.
+        target: The score to reach.
         most_trims: How many tries there are at most where one with fewer bits may do.
+
+    Attributes:
+        crf: That of the next window.
+        due: The required score of the current one.
+        tried: Crf -> the mean score of its frames, in the order of the tries.
     """
 
     def __init__(
-        self,
-        start: int,
-        smallest: int,
-        largest: int,
-        tolerance: float,
-        fall: float,
-        most_trims: int = _MOST_TRIMS,
+        self, coding: Coding, target: QualityTarget, most_trims: int = _MOST_TRIMS
     ) -> None:
-        self._most_trims = most_trims
-        self.crf = start
-        self._smallest, self._largest = smallest, largest
-        self._tolerance = tolerance
-        self._assumed = self._fall = fall
+        codec = coding.recipe.codec
+        self.crf = coding.crf
+        self._smallest, self._largest = LEAST_CRF[codec], MAX_CRF[codec]
+        self._tolerance, self._most_trims = target.tolerance, most_trims
+        self._assumed = self._fall = _FALLS[target.metric]
         self._surplus = 0.0  # over all frames
 
-    def accepted(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        """The largest crf of those tried that is good enough; None if none is.
+    def begin(self, due: float, frames: int) -> None:
+        """Begin a window of so many frames."""
+        self.due, self._frames = due, frames
+        self.tried: dict[int, float] = {}
 
-        Args:
-            tried: Crf -> the mean score of the window's frames.
-            due: The required score.
-            frames: Number of its frames.
-        """
-        least = self._least(due, frames) - _NOISE
-        return max((crf for crf, mean in tried.items() if mean >= least), default=None)
+    @property
+    def accepted(self) -> int | None:
+        """The largest crf of those tried that is good enough; None if none is."""
+        least = self._least - _NOISE
+        return max((crf for crf, mean in self.tried.items() if mean >= least), default=None)
 
-    def next(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        """The crf to re-encode a window with; None if no further try is needed.
+    @property
+    def _least(self) -> float:
+        return self.due - min(self._tolerance, self._surplus / self._frames)
 
-        Args:
-            tried: Crf -> the mean score of the window, in the order they were tried.
-            due: The required score.
-            frames: Number of its frames.
-        """
-        self._learn(tried)
-        best = self.accepted(tried, due, frames)
-        if best is None:
-            return self._better(tried, due, frames)
-        is_lavish = tried[best] - due > _LAVISH * self._tolerance
-        return self._smaller(tried, best, due) if is_lavish else None
-
-    def keep(self, tried: Mapping[int, float], crf: int, due: float, frames: int) -> None:
-        """Accept a window as encoded with a crf, and choose the crf of the next one.
-
-        Args:
-            tried: Crf -> the mean score of the window.
-            crf: The one accepted.
-            due: The required score.
-            frames: Number of its frames.
-        """
-        mean = tried[crf]
-        self._surplus = max(0.0, self._surplus + (mean - due) * frames)
-        room = (due - self._least(due, frames)) / 2  # keep half in reserve
-        up = int((mean - due + room) / self._fall)
-        self.crf = min(crf + min(max(up, 0), _MOST_UP), self._largest)
-
-    def _least(self, due: float, frames: int) -> float:
-        return due - min(self._tolerance, self._surplus / frames)
-
-    def _better(self, tried: Mapping[int, float], due: float, frames: int) -> int | None:
-        crf, mean = min(tried.items())
-        if crf == self._smallest:
-            return None
-        short = self._least(due, frames) - mean
-        # doubled each time: a scene whose scores do not rise comes to an end soon; but a half
-        # at the most, as small crf differ more
-        step = max(ceil(short / self._fall), 1 << (len(tried) - 1))
-        return max(self._smallest, crf // 2, crf - step)
-
-    def _smaller(self, tried: Mapping[int, float], best: int, due: float) -> int | None:
-        if len(tried) > self._most_trims:
-            return None
-        refused = min((crf for crf in tried if crf > best), default=self._largest + 1)
-        crf = min(best + int((tried[best] - due) / self._fall), refused - 1)
-        return crf if crf > best else None
-
-    def _learn(self, tried: Mapping[int, float]) -> None:
+    def next(self) -> int | None:
+        """The crf to re-encode the window with; None if no further try is needed."""
+        tried = self.tried
         if len(tried) > 1:
             (crf, mean), (other, its_mean) = list(tried.items())[-2:]
             found = (its_mean - mean) / (crf - other)
             self._fall = min(max(found, self._assumed / _RANGE), self._assumed * _RANGE)
+        best = self.accepted
+        if best is None:
+            crf, mean = min(tried.items())
+            # doubled each time: a scene whose scores do not rise comes to an end soon; but a half
+            # at the most, as small crf differ more
+            step = max(ceil((self._least - mean) / self._fall), 1 << (len(tried) - 1))
+            better = max(self._smallest, crf // 2, crf - step)
+            return better if better < crf else None
+        surplus = tried[best] - self.due
+        if surplus <= _LAVISH * self._tolerance or len(tried) > self._most_trims:
+            return None
+        refused = min((crf for crf in tried if crf > best), default=self._largest + 1)
+        smaller = min(best + int(surplus / self._fall), refused - 1)
+        return smaller if smaller > best else None
+
+    def keep(self, crf: int) -> None:
+        """Accept the window as encoded with a crf, and choose the crf of the next one."""
+        surplus = self.tried[crf] - self.due
+        self._surplus = max(0.0, self._surplus + surplus * self._frames)
+        room = (self.due - self._least) / 2  # keep half in reserve
+        up = int((surplus + room) / self._fall)
+        self.crf = min(crf + min(max(up, 0), _MOST_UP), self._largest)
 
 
 # ---------------------------------------------------------------- windows
@@ -144,30 +121,6 @@ class CrfControl:
 _FRAMES = 60  # of a window, or one group of pictures if that is longer
 _MOST_FRAMES = 240
 _USUAL_RATE = 30.0
-
-
-def window_frames(gop: int) -> int:
-    """Frames of a window: whole groups of pictures, so that windows cost no more key frames.
-
-    Args:
-        gop: Maximum key frame interval, frames.
-    """
-    return min(max(1, _FRAMES // gop) * gop, _MOST_FRAMES)
-
-
-@dataclass
-class Tries:
-    """The encodings of a window.
-
-    Attributes:
-        due: The score required of it.
-        scores: Crf -> the scores of its frames, in steps of the metric.
-        means: Crf -> their mean, in the order of the tries.
-    """
-
-    due: float
-    scores: dict[int, NDArray[np.int64]] = field(default_factory=dict)
-    means: dict[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -188,52 +141,32 @@ class WindowCoder:
     threads: int
     rate: float | None
 
+    @property
+    def frames(self) -> int:
+        """Of a window: whole groups of pictures, so that windows cost no more key frames."""
+        gop = self.coding.gop
+        return min(max(1, _FRAMES // gop) * gop, _MOST_FRAMES)
+
     @cached_property
     def coded_size(self) -> tuple[int, int]:
         """Columns and rows of a coded picture."""
         return coded_size(self.coding.recipe, *self.coding.layout.picture_size(*self.size))
 
     @cached_property
-    def ffmpeg(self) -> Ffmpeg | None:
-        """The ffmpeg that computes VMAF, if that is the metric.
-
-        Raises:
-            ScoringError: There is none; says how to get one.
-        """
+    def _ffmpeg(self) -> Ffmpeg | None:
+        """The ffmpeg that computes VMAF, if that is the metric."""
         return find_ffmpeg() if self.target.metric == "vmaf" else None
 
     @cached_property
     def _maker(self) -> PlaneMaker:
         return PlaneMaker(self.coding.layout.pixel_format)
 
-    def spool(self, path: Path) -> PlaneSpool:
-        """Keeps planes in a file."""
-        return PlaneSpool(path, *self.coded_size)
-
     def keep(self, seen: CameraMessage, spool: PlaneSpool) -> None:
         """Add the planes of an image to a spool."""
         if seen.pixels is not None:
             spool.append(self._maker.make(self.coding.layout.to_picture(seen.pixels)))
 
-    def encode(
-        self, frames: PlaneSpool, ticks: Sequence[int], crf: int, path: Path
-    ) -> NDArray[np.int64]:
-        """Encode a window.
-
-        Args:
-            frames: The window's frames, at least one.
-            ticks: When each is shown, increasing.
-            crf: Constant rate factor.
-            path: The video to make.
-
-        Returns:
-            The scores of its frames, in steps of the metric (`SCORE_STEPS`).
-
-        Raises:
-            EncoderRefusedError: The encoder does not support such pictures.
-            ScoringError: libvmaf failed.
-            OSError: It cannot be written.
-        """
+    def _encode(self, frames: PlaneSpool, ticks: Sequence[int], crf: int, path: Path) -> Scores:
         width, height = self.coded_size
         with VideoEncoder(
             path,
@@ -254,34 +187,29 @@ class WindowCoder:
 
         Raises:
             Refused: No crf reaches it.
+            EncoderRefusedError: The encoder does not support such pictures.
+            ScoringError: A score cannot be computed.
         """
-        target, control = self.target, self.control(_MOST_TRIMS_OF_FIRST)
+        target, control = self.target, CrfControl(self.coding, self.target, _MOST_TRIMS_OF_FIRST)
         if min(self.coded_size) < SMALLEST:
             raise Refused(f"images with less than {SMALLEST} rows or columns have no {target}")
         step = round(TIMESCALE / (self.rate or _USUAL_RATE)) or 1
         with (
             tempfile.TemporaryDirectory(prefix="mp4ds-") as name,
-            closing(self.spool(Path(name, "frames.yuv"))) as spool,
+            closing(PlaneSpool(Path(name, "frames.yuv"), *self.coded_size)) as spool,
         ):
             for seen in samples:
                 self.keep(seen, spool)
             ticks = range(0, len(spool) * step, step)
-            tries = self.tries(control, spool, ticks, lambda _: Path(name, "sample.mp4"))
-        crf = control.accepted(tries.means, tries.due, len(samples))
+            self.tries(control, spool, ticks, lambda _: Path(name, "sample.mp4"))
+        crf = control.accepted
         if crf is None:
-            crf, mean = min(tries.means.items())
+            crf, mean = min(control.tried.items())
             # a few frames have less VMAF than many, compared with their originals too: where they
             # fall a little short, the first window tells
-            if mean < tries.due - target.tolerance:
-                raise out_of_reach(target, tries.due, f"crf {crf} gives {mean:.2f}")
+            if mean < control.due - target.tolerance:
+                raise self.out_of_reach(control, f"crf {crf} gives ")
         return crf
-
-    def control(self, most_trims: int = _MOST_TRIMS) -> CrfControl:
-        """What chooses the crf of windows."""
-        codec, target = self.coding.recipe.codec, self.target
-        bounds = LEAST_CRF[codec], MAX_CRF[codec]
-        fall = FALLS[target.metric]
-        return CrfControl(self.coding.crf, *bounds, target.tolerance, fall, most_trims)
 
     def tries(
         self,
@@ -289,55 +217,52 @@ class WindowCoder:
         frames: PlaneSpool,
         ticks: Sequence[int],
         place: Callable[[int], Path],
-    ) -> Tries:
+    ) -> dict[int, Scores]:
         """Encode a window until it is good enough, or no crf is.
 
         Args:
             control: Chooses each crf.
-            frames: As for `encode`.
-            ticks: As for `encode`.
+            frames: The window's frames, at least one.
+            ticks: When each is shown, increasing.
             place: The video to make with a crf.
-        """
-        tries = Tries(self.target.score)
-        crf: int | None = control.crf
-        while crf is not None:
-            scores = self.encode(frames, ticks, crf, place(crf))
-            tries.scores[crf], tries.means[crf] = scores, self.mean(scores)
-            is_first = len(tries.means) == 1
-            if is_first and control.accepted(tries.means, tries.due, len(frames)) is None:
-                tries.due = self.reachable(frames)
-            crf = control.next(tries.means, tries.due, len(frames))
-        return tries
 
-    def reachable(self, frames: PlaneSpool) -> float:
-        """The score required of a window: the target, or less if it is out of reach.
-
-        VMAF underrates still scenes, even compared with themselves.
+        Returns:
+            Crf -> the scores of the frames.
 
         Raises:
+            EncoderRefusedError: The encoder does not support such pictures.
             ScoringError: libvmaf failed.
+            OSError: It cannot be written.
         """
-        target = self.target
-        if target.metric != "vmaf":
-            return target.score
-        ceiling = self.mean(self._scores(frames, frames))
-        return min(target.score, ceiling - target.tolerance)
+        control.begin(self.target.score, len(frames))
+        scores: dict[int, Scores] = {}
+        crf: int | None = control.crf
+        while crf is not None:
+            scores[crf] = self._encode(frames, ticks, crf, place(crf))
+            control.tried[crf] = self.mean(scores[crf])
+            if len(scores) == 1 and control.accepted is None and self._ffmpeg is not None:
+                # VMAF underrates still scenes, even compared with themselves
+                ceiling = self.mean(self._scores(frames, frames))
+                control.due = min(control.due, ceiling - self.target.tolerance)
+            crf = control.next()
+        return scores
 
-    def mean(self, scores: NDArray[np.int64]) -> float:
+    def mean(self, scores: Scores) -> float:
         """The mean of scores given in steps."""
         return float(np.mean(scores)) / SCORE_STEPS[self.target.metric]
 
-    def _scores(self, frames: PlaneSpool, decoded: Iterable[Planes]) -> NDArray[np.int64]:
+    def _scores(self, frames: PlaneSpool, decoded: Iterable[Planes]) -> Scores:
         metric = "psnr_y" if self.target.metric == "psnr" else self.target.metric
         # motion in the first frame is measured with the second
-        before = frames.frame(1) if self.ffmpeg is not None and len(frames) > 1 else None
+        before = frames.frame(1) if self._ffmpeg is not None and len(frames) > 1 else None
         found = scores_of(
-            frames, decoded, [metric], ffmpeg=self.ffmpeg, threads=self.threads, before=before
+            frames, decoded, [metric], ffmpeg=self._ffmpeg, threads=self.threads, before=before
         )[metric]
         return np.rint(found * SCORE_STEPS[self.target.metric]).astype(np.int64)
 
-
-def out_of_reach(target: QualityTarget, due: float, made: str) -> Refused:
-    """Why a stream is lossless: the target, the required score, and the one reached."""
-    limit = f" of the {due:.2f} that the originals allow" if due < target.score else ""
-    return Refused(f"{target} is out of reach: {made}{limit}")
+    def out_of_reach(self, control: CrfControl, made: str) -> Refused:
+        """Why a stream is lossless: what was made of a window with the smallest crf tried."""
+        due = control.due
+        limit = f" of the {due:.2f} that the originals allow" if due < self.target.score else ""
+        mean = control.tried[min(control.tried)]
+        return Refused(f"{self.target} is out of reach: {made}{mean:.2f}{limit}")

@@ -22,7 +22,16 @@ import numpy as np
 from mp4ds.bags.latched import ends_of
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.images import Shown, shown_by
-from mp4ds.dataset.untouched import Rectangle, UntouchedBlocks, holds_pixels
+from mp4ds.dataset.redaction import (
+    Box,
+    Rectangle,
+    Redaction,
+    UntouchedBlocks,
+    check_change,
+    holds_pixels,
+    placed,
+    redact,
+)
 from mp4ds.dataset.views import View, view_of
 from mp4ds.errors import OptionError, Refused, SourceError
 from mp4ds.messages import depth, png
@@ -31,7 +40,6 @@ from mp4ds.messages.serializations import MessageSplitter, is_camera, plain_mess
 from mp4ds.messages.wire import CodedFields, Form, ImageFields, Parts, Slots
 from mp4ds.options import Selection
 from mp4ds.packing.options import PackOptions
-from mp4ds.packing.redaction import Box, Redaction, check_change, placed, redact
 from mp4ds.plugins.reducing import PACKETS, ChangedReader, ReducedReader
 from mp4ds.records import EVERYTHING, Channel, Excerpt, Message, Record
 from mp4ds.times import INT64_MAX

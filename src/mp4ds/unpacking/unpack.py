@@ -15,8 +15,14 @@ from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.protocols import WHOLE, BagReader, BagWriter, RecordingSlice
 from mp4ds.dataset.dataset import Dataset, Paths, datasets_in
 from mp4ds.dataset.messages import recorded_storage
-from mp4ds.dataset.recording import DatasetReader, slice_of, sliced
-from mp4ds.dataset.salvage import examine, open_damaged, open_selected
+from mp4ds.dataset.recording import (
+    DatasetReader,
+    examine,
+    open_damaged,
+    open_selected,
+    slice_of,
+    sliced,
+)
 from mp4ds.errors import (
     ConversionError,
     FormatError,

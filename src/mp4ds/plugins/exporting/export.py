@@ -12,8 +12,7 @@ from pathlib import Path
 
 from mp4ds._version import __version__
 from mp4ds.dataset.dataset import datasets_in
-from mp4ds.dataset.recording import slice_of, sliced
-from mp4ds.dataset.salvage import HOW_TO_SALVAGE, open_selected
+from mp4ds.dataset.recording import HOW_TO_SALVAGE, open_selected, slice_of, sliced
 from mp4ds.errors import OptionError, advising
 from mp4ds.files.outputs import listed_names, staged
 from mp4ds.files.urls import location, remote

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mp4ds.dataset.dataset import datasets_in
-from mp4ds.dataset.salvage import HOW_TO_SALVAGE, open_selected
+from mp4ds.dataset.recording import HOW_TO_SALVAGE, open_selected
 from mp4ds.errors import Refused, RemoteError, advising
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Pace, Ticks
