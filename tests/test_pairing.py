@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import mp4ds
 from mp4ds.errors import OptionError
-from mp4ds.packing.calibrations import (
+from mp4ds.packing.inspection import (
     choose_pairs,
     pair_camera_infos,
 )

@@ -112,50 +112,61 @@ def concat(
     for dataset in datasets:
         sources.append(_Source(dataset, part, selected, earlier))
         earlier.update(sources[-1].counts)
-    streams = _joined_streams(sources)
+    streams: list[_JoinedStream] = []
+    for segment in chain(*(source.segments for source in sources)):
+        if segment.images:
+            joined = next((stream for stream in streams if stream.takes(segment)), None)
+            if joined is None:
+                streams.append(_JoinedStream(segment))
+            else:
+                joined.add(segment)
     for source in sources:
         source.dataset.verify_sidecars(selected)
         if len(sources) > 1:
             source.dataset.verify_messages()
     made = _write_streams(streams, folder, report, is_one=len(sources) == 1)
-    sidecars = [sidecar for _, sidecar in made]
     report(MESSAGES_NAME)
-    transforms = _write_messages(sources, folder / MESSAGES_NAME, sidecars)
+    transforms = _write_messages(sources, folder / MESSAGES_NAME, list(made.values()))
     old = sources[0].manifest
     ranges = [source.range for source in sources if source.range]
     losses = [entry.to_record() for source in sources for entry in source.manifest.losses]
-    files = [
-        *(
-            (video.file, video.size or 0, video.sha256 or "")
-            for sidecar in sidecars
-            for video in sidecar.videos
-        ),
-        *((name, *digest_file(folder / name)) for name in (MESSAGES_NAME, *(n for n, _ in made))),
-    ]
-    manifest = old.model_copy(
-        update={
-            "mp4ds": FORMAT_VERSION,
-            "messages": earlier.total(),
-            "losses": list(map(LossEntry.from_record, bounded(losses))),
-            "topics_left_out": list(dict.fromkeys(chain(*(one.left_out for one in sources)))),
-            "time_range": TimeRange(
-                start=min(start for start, _ in ranges), end=max(end for _, end in ranges)
-            )
-            if ranges
-            else None,
-            "streams": [StreamEntry.of(name, sidecar) for name, sidecar in made],
-            "transforms": old.transforms
-            if len(sources) == 1
-            else static_transforms(sidecars, transforms),
-            "verbatim": _verbatim(sources),
-            "files": [
-                FileEntry(name=name, size=size, sha256=sha256)
-                for name, size, sha256 in sorted(files)
-            ],
-            **(changes or {}),
-        }
-    )
+    update = {
+        **contents(folder, made),
+        "messages": earlier.total(),
+        "losses": list(map(LossEntry.from_record, bounded(losses))),
+        "topics_left_out": list(dict.fromkeys(chain(*(one.left_out for one in sources)))),
+        "time_range": TimeRange(start=min(ranges)[0], end=max(end for _, end in ranges))
+        if ranges
+        else None,
+        "verbatim": _verbatim(sources),
+    }
+    if transforms is not None:
+        update["transforms"] = static_transforms(list(made.values()), transforms)
+    manifest = old.model_copy(update={**update, **(changes or {})})
     (folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
+
+
+def contents(folder: Path, sidecars: Mapping[str, StreamSidecar]) -> dict[str, Any]:
+    """The fields of a manifest that list the files of a folder.
+
+    Args:
+        folder: Holds all of them.
+        sidecars: By their names.
+    """
+    files = {
+        video.file: (video.size or 0, video.sha256 or "")
+        for sidecar in sidecars.values()
+        for video in sidecar.videos
+    }
+    files |= {name: digest_file(folder / name) for name in (MESSAGES_NAME, *sidecars)}
+    return {
+        "mp4ds": FORMAT_VERSION,
+        "streams": [StreamEntry.of(name, sidecar) for name, sidecar in sidecars.items()],
+        "files": [
+            FileEntry(name=name, size=size, sha256=sha256)
+            for name, (size, sha256) in sorted(files.items())
+        ],
+    }
 
 
 # ---------------------------------------------------------------- what is copied
@@ -207,11 +218,6 @@ class _Segment:
     def has_all(self) -> bool:
         """Whether the whole video is copied."""
         return len(self.images) == len(self.stream)
-
-    @property
-    def calibrations(self) -> list[Calibration]:
-        """Those of its camera."""
-        return self.infos.used_models if self.infos else []
 
 
 class _Source:
@@ -281,14 +287,8 @@ class _Source:
 
     def _rows(self, part: Part, models: Sequence[Any]) -> _Rows:
         """The messages in the span."""
-        start, end, times = self.span.start, self.span.end, part.columns.log_time
-        is_in = np.ones(len(times), np.bool_)
-        if start is not None:
-            is_in &= times >= start
-        if end is not None:
-            is_in &= times < end
-        offset = self._offsets[part.channel.identity]
-        return _Rows(part.columns, np.flatnonzero(is_in).astype(np.int64), models, offset)
+        numbers = np.fromiter(within(self.span)(part.columns), np.int64)
+        return _Rows(part.columns, numbers, models, self._offsets[part.channel.identity])
 
     def count(self, topic: str) -> int:
         """How many messages of a topic are copied."""
@@ -371,24 +371,12 @@ def _verbatim(sources: Sequence[_Source]) -> list[Verbatim]:
 # ---------------------------------------------------------------- videos
 
 
-def _joined_streams(sources: Sequence[_Source]) -> list[_JoinedStream]:
-    streams: list[_JoinedStream] = []
-    for segment in chain(*(source.segments for source in sources)):
-        if segment.images:
-            joined = next((stream for stream in streams if stream.takes(segment)), None)
-            if joined is None:
-                streams.append(_JoinedStream(segment))
-            else:
-                joined.add(segment)
-    return streams
-
-
 def _write_streams(
     streams: Sequence[_JoinedStream], folder: Path, report: Callable[[str], None], *, is_one: bool
-) -> list[tuple[str, StreamSidecar]]:
-    """Write videos and sidecars; each sidecar is returned with its name."""
+) -> dict[str, StreamSidecar]:
+    """Write videos and sidecars; the sidecars are returned by their names."""
     names = FileNames()
-    firsts = [stream.segments[0].stream for stream in streams]
+    firsts = [stream.first for stream in streams]
     stems = [first.path.stem if is_one else names.name_for(first.topic) for first in firsts]
 
     def write(stem: str, stream: _JoinedStream) -> tuple[str, StreamSidecar]:
@@ -399,7 +387,7 @@ def _write_streams(
 
     # copying and hashing run without Python's lock
     with ThreadPoolExecutor(_AT_ONCE) as threads:
-        return list(threads.map(write, stems, streams))
+        return dict(threads.map(write, stems, streams))
 
 
 class _JoinedStream:
@@ -450,7 +438,7 @@ class _JoinedStream:
         return (
             info.channel == self._info.channel
             and info.wire == self._info.wire
-            and _has_room(self._calibrations, segment.calibrations)
+            and _has_room(self._calibrations, segment.infos.used_models if segment.infos else ())
             and self._infos + len(segment.infos or ()) <= MAX_CAMERA_INFOS
         )
 
@@ -464,7 +452,7 @@ class _JoinedStream:
         if info is not None and (not info.messages or segment.infos):
             self._info = self._info or info
             self._infos += len(segment.infos or ())
-            for calibration in segment.calibrations:
+            for calibration in segment.infos.used_models if segment.infos else ():
                 self._calibrations.setdefault(repr(calibration), calibration)
 
     @cached_property
@@ -611,8 +599,8 @@ def _copy_file(path: Path, to: Path) -> None:
 
 def _write_messages(
     sources: Sequence[_Source], path: Path, sidecars: Sequence[StreamSidecar]
-) -> Iterable[Transform]:
-    """Write messages.mcap; returns the static transforms, unless it was merely copied."""
+) -> Sequence[Transform] | None:
+    """Write messages.mcap; returns the static transforms of several datasets."""
     first = sources[0]
     dataset = first.dataset
     if len(sources) == 1 and not first.is_slice and len(first.channels) == len(dataset.channels):
@@ -622,7 +610,7 @@ def _write_messages(
             first.manifest.file(MESSAGES_NAME),
             found=digest_file(path),
         )
-        return ()
+        return None
     in_videos: set[_Identity] = set()
     for sidecar in sidecars:
         in_videos.add(sidecar.channel.to_record(0).identity)
@@ -642,7 +630,7 @@ def _write_messages(
         for source in sources:
             for schema in source.dataset.messages_file.unused_schemas:
                 writer.add_schema(schema)
-    return collector.transforms
+    return collector.transforms if len(sources) > 1 else None
 
 
 def _channels(sources: Sequence[_Source]) -> list[dict[int, Channel]]:

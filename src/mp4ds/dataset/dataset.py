@@ -6,6 +6,7 @@ import glob
 import shlex
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from itertools import count, islice
@@ -94,8 +95,8 @@ class Dataset:
         if self.path.name == MANIFEST_NAME:
             self.path = self.path.parent
         self.manifest: Manifest | None = None
-        holds_one = (self.path / MANIFEST_NAME).exists()
-        if not holds_one and self.path.suffix not in (".yaml", ".yml", ".mp4"):
+        is_one = self.path.suffix in (".yaml", ".yml", ".mp4")
+        if not is_one and not (self.path / MANIFEST_NAME).exists():
             problem = "is not a dataset"
             remedy = "Give a folder made by `mp4ds pack`, or a sidecar next to its video."
             if video := video_at(self.path):
@@ -264,15 +265,14 @@ class Dataset:
         numbers: Iterable[int] = count()
         if group is not None:
             taken = group.places
-            count_of_all = len(taken) + group.recorded_count
-            numbers = np.setdiff1d(np.arange(count_of_all), taken).tolist()
+            everyone = np.arange(len(taken) + group.recorded_count)
+            numbers = np.setdiff1d(everyone, taken).tolist()
             if not group.is_in_time:
                 messages = group.recorded()
-        numbered = zip(numbers, messages, strict=False)
-        with_info = (item for item in self.streams if item.topic == channel.topic)
-        calibrated = next((item for item in with_info if item.calibrations), None)
+        own = (item for item in self.streams if item.topic == channel.topic and item.calibrations)
         path = self.messages_file.path or self.path
-        return verbatim_images(path, channel, numbered, recorded, calibrated)
+        numbered = zip(numbers, messages, strict=False)
+        return verbatim_images(path, channel, numbered, recorded, next(own, None))
 
     def __getitem__(self, topic: str) -> Topic:
         found = self._topic(topic)
@@ -394,22 +394,24 @@ class Dataset:
                 f"{self.path} has no topic {unknown[0]!r}; there are: {', '.join(known) or 'none'}"
             )
         wanted = None if topics is None else frozenset(topics)
-        return as_recorded(self._no_frames(wanted), self.messages_file.path or self.path)
-
-    def _no_frames(self, wanted: frozenset[str] | None) -> Iterator[Message]:
         ids = {channel.id for channel in self._verbatim_channels}
         calibrations = []
         for group in self._groups:
             if wanted is not None and group.channel.topic not in wanted:
                 continue
             if not group.streams:
-                own = self._group_messages(group, group.sources(), group.recorded())
-                calibrations.append(own)
+                calibrations.append(group.merged(group.sources(), group.recorded(), self._whole))
             elif wanted is not None:
                 ids |= group.recorded_ids
         found = self.messages_file.in_time(Excerpt(topics=wanted))
         recorded = (message for message in found if message.channel.id in ids)
-        return by_time(recorded, *calibrations)
+        messages = by_time(recorded, *calibrations)
+        return as_recorded(messages, self.messages_file.path or self.path)
+
+    @property
+    def _whole(self) -> str | None:
+        """The dataset, for errors, if it must have all messages; a pair on its own has its own."""
+        return str(self.path) if self.manifest is not None and not self.is_salvaged else None
 
     def sync(
         self,
@@ -485,12 +487,19 @@ class Dataset:
             if group.recorded_ids:  # else a thread would be begun for nothing
                 recorded = ahead(recorded)
             if not is_span:
-                return self._group_messages(group, own, recorded)
+                return group.merged(own, recorded, self._whole)
             return by_time(recorded, *((item for _, item in source) for source in own))
 
         groups = (item for item in self._groups if topics is None or item.channel.topic in topics)
         found = self.messages_file.in_time(span) if is_span else self.messages_file.in_file_order()
-        return by_time(ahead(self._verbatim_records(found, topics)), *map(messages, groups))
+        others = self._verbatim_channels
+        ids = {item.id for item in others if topics is None or item.topic in topics}
+        verbatim = (
+            record
+            for record in found
+            if not isinstance(record, Message) or record.channel.id in ids
+        )
+        return by_time(ahead(verbatim), *map(messages, groups))
 
     def times(self, topics: Collection[str] | None = None) -> dict[int, NDArray[np.int64]]:
         """Sorted log times of every message, nanoseconds, by channel id; decodes no frame.
@@ -552,32 +561,12 @@ class Dataset:
             if gap := group.gap:
                 yield group.channel.topic, gap
 
-    def _verbatim_records(
-        self, records: Iterator[Record], topics: Collection[str] | None
-    ) -> Iterator[Record]:
-        channels = self._verbatim_channels
-        wanted = {item.id for item in channels if topics is None or item.topic in topics}
-        for record in records:
-            if not isinstance(record, Message) or record.channel.id in wanted:
-                yield record
-
     def recorded_messages(self, excerpt: Excerpt) -> Iterator[Message]:
         """Messages in messages.mcap, by log time, on their channels."""
         owners = {key: group.channel for group in self._groups for key in group.recorded_ids}
         for message in self.messages_file.in_time(excerpt):
             owner = owners.get(message.channel.id)
             yield replace(message, channel=owner) if owner else message
-
-    def _group_messages(
-        self,
-        group: ChannelGroup,
-        own: Sequence[Iterator[tuple[int, Message]]],
-        recorded: Iterator[Message],
-    ) -> Iterator[Message]:
-        """One channel's messages from all its files, in the channel's order."""
-        # a pair on its own has only its own messages
-        is_whole = self.manifest is not None and not self.is_salvaged
-        return group.merged(own, recorded, str(self.path) if is_whole else None)
 
     def close(self) -> None:
         """Close all videos."""
@@ -652,10 +641,8 @@ def _datasets_at(path: Path) -> list[Path]:
         raise SourceNotFoundError(path)
     found: list[Path] = []
     for folder in folders:
-        try:
+        with suppress(SourceError):  # a pattern matches other folders, too
             found += _below(folder)
-        except SourceError:
-            continue  # a pattern matches other folders, too
     if not found:
         raise SourceError(path, "matches no dataset", "Give folders made by `mp4ds pack`.")
     return found
@@ -668,8 +655,9 @@ def _below(path: Path) -> list[Path]:
         return [path]
     refuse_unfinished(path)
     found = sorted(manifest.parent for manifest in path.rglob(MANIFEST_NAME))
-    # names that begin with a dot are being made
-    found = [one for one in found if not _is_hidden(one, path)]
+    if not isinstance(path, RemotePath):  # names that begin with a dot are being made
+        below = {one: one.relative_to(path).parts for one in found}
+        found = [one for one in found if not any(part.startswith(".") for part in below[one])]
     if not found:
         raise SourceError(
             path,
@@ -677,9 +665,3 @@ def _below(path: Path) -> list[Path]:
             "Give a folder made by `mp4ds pack`.",
         )
     return found
-
-
-def _is_hidden(dataset: Path, folder: Path) -> bool:
-    if isinstance(dataset, RemotePath):
-        return False
-    return any(part.startswith(".") for part in dataset.relative_to(folder).parts)

@@ -77,9 +77,9 @@ class PartedPack:
 
     def __post_init__(self) -> None:
         self.folder = PartsFolder(self.target)
-        self._done: dict[str, PartFacts] = {}
-        self._before = 0
-        self._written = 0
+        self._done: set[str] = set()
+        self._messages = Counter[str]()  # packed, by topic
+        self._before = self._read = self._written = 0
 
     def begin(self, *, anew: bool, alone: bool) -> None:
         """Take over the folder, which is locked.
@@ -123,7 +123,10 @@ class PartedPack:
         self.tell()
 
     def _note_part(self, piece: Piece, facts: PartFacts) -> None:
-        self._done[piece.name] = facts
+        self._done.add(piece.name)
+        for topic, (count, length) in facts.topics.items():
+            self._messages[topic] += count
+            self._read += length
         self._written += folder_size(self.folder.part(piece))
 
     def refuse_failures(self) -> None:
@@ -159,12 +162,7 @@ class PartedPack:
         """Report progress."""
         if self.report is None:
             return
-        messages, size = Counter[str](), 0
-        for facts in self._done.values():
-            for topic, (count, length) in facts.topics.items():
-                messages[topic] += count
-                size += length
-        frames = self.plan.frames
+        messages, frames = self._messages, self.plan.frames
         packed = sum(min(messages[topic], count or 0) for topic, count in frames.items())
         total = sum(count or 0 for count in frames.values())
         self.report(
@@ -172,7 +170,7 @@ class PartedPack:
                 dataset=self.target,
                 phase=phase,
                 done=packed / total if total else None,
-                bytes_read=size,
+                bytes_read=self._read,
                 bytes_total=sum(source.size for source in self.plan.sources),
                 bytes_written=self._written,
                 topics={topic: (messages[topic], count) for topic, count in frames.items()},
@@ -196,10 +194,19 @@ class PartedPack:
             SourceError: The recording is damaged, or has changed.
         """
         self.tell("joining")
+        places = [self.folder.part(piece) for piece in self.plan.pieces]
         try:
             with staged(self.target, force=self.force, owned=dataset_files) as made:
                 made.mkdir()
-                summary = self._join(made, digests)
+                summary = self._join(made, places, digests)
+        except FormatError as error:
+            for place in places:
+                if str(error.place).startswith(f"{place}{os.sep}"):
+                    (place / FACTS_NAME).unlink(missing_ok=True)  # so that it is made again
+                    problem = "was damaged after it was written; run the same command again to redo"
+                    problem += " this part"
+                    raise FormatError("checksum-mismatch", error.place, problem) from None
+            raise
         except OSError as error:
             if isinstance(error, (SourceError, TargetError)):
                 raise
@@ -210,72 +217,42 @@ class PartedPack:
         self.folder.remove()
         return summary
 
-    def _join(self, made: Path, digests: Mapping[str, Digest]) -> PackSummary:
+    def _join(
+        self, made: Path, places: Sequence[Path], digests: Mapping[str, Digest]
+    ) -> PackSummary:
         plan, whole = self.plan, PartRecord(made)
-        places = [self.folder.part(piece) for piece in plan.pieces]
+        for place in places:
+            facts = part_facts(place)
+            if facts is None:
+                raise FormatError("file-missing", place / MANIFEST_NAME, "or another file is gone")
+            whole.skipped |= facts.skipped
+            for name, (messages, size) in facts.topics.items():
+                topic = whole.topics.setdefault(name, TopicSummary(name, ""))
+                topic.messages += messages
+                topic.raw_bytes += size
+                notes = facts.notes.get(name, ())
+                topic.notes += [note for note in notes if note not in topic.notes]
         with ExitStack() as stack:
             reader = stack.enter_context(plan.open())
-            with _redone_if_damaged(places):
-                for place in places:
-                    _add_facts(whole, place)
-                parts = [stack.enter_context(Dataset(place, layer="exact")) for place in places]
-                for source in plan.sources:
-                    source.check()
-                for manifest in (part.manifest for part in parts):
-                    if manifest:
-                        whole.losses += [entry.to_record() for entry in manifest.losses]
-                        whole.left_out |= dict.fromkeys(manifest.topics_left_out)
-                        whole.redactions += manifest.redactions
-                concat(
-                    parts,
-                    made,
-                    changes=plan.origin(reader, whole, digests),
-                    report=lambda name: self.tell("joining", name),
-                )
-                # last, since damage of a part would be taken for that of the index
-                _check_index(reader, parts, plan.options.selected)
+            parts = [stack.enter_context(Dataset(place, layer="exact")) for place in places]
+            for source in plan.sources:
+                source.check()
+            for manifest in (part.manifest for part in parts):
+                if manifest:
+                    whole.losses += [entry.to_record() for entry in manifest.losses]
+                    whole.left_out |= dict.fromkeys(manifest.topics_left_out)
+                    whole.redactions += manifest.redactions
+            concat(
+                parts,
+                made,
+                changes=plan.origin(reader, whole, digests),
+                report=lambda name: self.tell("joining", name),
+            )
+            # last, since damage of a part would be taken for that of the index
+            _check_index(reader, parts, plan.options.selected)
             size = sum(source.size for source in plan.sources)
             source_bytes = None if plan.options.slice else size
             return summarize(whole, self.target, source_bytes, too_large=reader.slice.left_out)
-
-
-def _add_facts(whole: PartRecord, place: Path) -> None:
-    """Add what became of a part.
-
-    Raises:
-        FormatError: It is damaged, or gone.
-    """
-    facts = part_facts(place)
-    if facts is None:
-        raise FormatError("file-missing", place / MANIFEST_NAME, "or another file is gone")
-    whole.skipped |= facts.skipped
-    for name, (messages, size) in facts.topics.items():
-        topic = whole.topics.setdefault(name, TopicSummary(name, ""))
-        topic.messages += messages
-        topic.raw_bytes += size
-        topic.notes += [note for note in facts.notes.get(name, ()) if note not in topic.notes]
-
-
-@contextmanager
-def _redone_if_damaged(places: Sequence[Path]) -> Iterator[None]:
-    """Where parts cannot be joined, see to it that damaged ones are made again.
-
-    Raises:
-        FormatError: Names a damaged file.
-    """
-    try:
-        yield
-    except FormatError as error:
-        for place in places:
-            if str(error.place).startswith(f"{place}{os.sep}"):
-                (place / FACTS_NAME).unlink(missing_ok=True)
-                raise FormatError(
-                    "checksum-mismatch",
-                    error.place,
-                    "was damaged after it was written; run the same command again to redo this "
-                    "part",
-                ) from None
-        raise
 
 
 def _check_index(
@@ -296,19 +273,19 @@ def _check_index(
         # an image that cannot be reduced stays on its own channel
         return (channel.topic,) if reader.reduction else channel.identity
 
-    found = Counter[tuple[object, ...]]()  # by channel; equal ones of a recording are one in a part
+    # by channel; equal ones of a recording are one in a part
+    found, due = Counter[tuple[object, ...]](), Counter[tuple[object, ...]]()
     for part in parts:
         counts = part.counts()
         for channel in part.channels:
             found[key_of(channel)] += counts.get(channel.id, 0)
     stats = reader.stats()
-    due = Counter[tuple[object, ...]]()
-    for channel in reader.channels:
-        if selected(channel.topic) and channel.id in stats:
-            due[key_of(channel)] += stats[channel.id].count
-    for channel in reader.channels:
+    listed = [one for one in reader.channels if selected(one.topic) and one.id in stats]
+    for channel in listed:
+        due[key_of(channel)] += stats[channel.id].count
+    for channel in listed:
         key = key_of(channel)
-        if key in due and found[key] != due[key]:
+        if found[key] != due[key]:
             raise SourceError(
                 reader.path,
                 f"is damaged: its index lists {due[key]} messages on {channel.topic}, but "

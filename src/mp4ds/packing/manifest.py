@@ -9,22 +9,20 @@ from typing import Any
 
 from mp4ds._version import __version__
 from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.concat import contents
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import FormatError, SourceError, advising, counted, size_text
-from mp4ds.files.outputs import digest_file
 from mp4ds.files.sources import source_name, source_size
 from mp4ds.files.urls import spelled
-from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
+from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import (
     About,
     EarlierDataset,
-    FileEntry,
     LossEntry,
     Manifest,
     RedactionEntry,
     ReductionEntry,
     Source,
-    StreamEntry,
     TimeRange,
     Verbatim,
     static_transforms,
@@ -170,30 +168,18 @@ def write_manifest(part: PartRecord, origin: Mapping[str, Any], profile: str) ->
         origin: Where it came from; see `origin_of`.
         profile: The requested profile.
     """
-    videos = [video for sidecar in part.streams for video in sidecar.videos]
-    sidecars = [f"{Path(sidecar.seen.video.file).stem}.yaml" for sidecar in part.streams]
-    digests = {video.file: (video.size or 0, video.sha256 or "") for video in videos}
-    for name in (MESSAGES_NAME, *sidecars):
-        digests[name] = digest_file(part.folder / name)
+    sidecars = {f"{Path(one.seen.video.file).stem}.yaml": one for one in part.streams}
     manifest = Manifest(
-        mp4ds=FORMAT_VERSION,
+        **contents(part.folder, sidecars),
         kind="dataset",
         profile=profile,
         messages=sum(topic.messages for topic in part.topics.values()),
         time_range=TimeRange(start=part.span[0], end=part.span[1]) if part.span else None,
-        streams=[
-            StreamEntry.of(name, sidecar)
-            for name, sidecar in zip(sidecars, part.streams, strict=True)
-        ],
         transforms=static_transforms(part.streams, part.transforms),
         verbatim=[
             Verbatim(topic=topic.topic, messages=count, first=first, reason=reason)
             for topic in part.topics.values()
             for reason, (count, first) in topic.verbatim.items()
-        ],
-        files=[
-            FileEntry(name=name, size=size, sha256=sha256)
-            for name, (size, sha256) in sorted(digests.items())
         ],
         tools={**tools(), "zlib": zlib_build()},
         **origin,

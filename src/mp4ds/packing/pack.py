@@ -579,14 +579,21 @@ def _pack_all(
     packs: Sequence[PartedPack], options: PackOptions, share: tuple[int, int] | None = None
 ) -> list[PackSummary]:
     """Pack recordings in parts, and make their datasets unless only a share is packed."""
-    executor: AbstractContextManager[Executor]
-    if options.cluster:
-        executor = plugin("cluster:cluster_executor")(options.cluster)
-    else:
-        executor = ProcessExecutor(min(_processes_for(pack.plan) for pack in packs))
-    results = pack_parts(packs, executor, options, share)
+    results = pack_parts(packs, _executor(packs, options), options, share)
     made = {summary.dataset: summary for summary in results}
     return [made[pack.target] for pack in packs if pack.target in made]
+
+
+def _executor(
+    packs: Sequence[PartedPack], options: PackOptions
+) -> AbstractContextManager[Executor]:
+    """What packs the pieces."""
+    if options.cluster:
+        found: AbstractContextManager[Executor] = plugin("cluster:cluster_executor")(
+            options.cluster
+        )
+        return found
+    return ProcessExecutor(min(_processes_for(pack.plan) for pack in packs))
 
 
 def _processes_for(plan: Plan) -> int:

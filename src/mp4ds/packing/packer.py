@@ -34,9 +34,10 @@ from mp4ds.messages.png import zlib_fingerprint
 from mp4ds.messages.serializations import is_calibration, is_camera
 from mp4ds.messages.transforms import TransformCollector
 from mp4ds.messages.wire import CodedFields
-from mp4ds.packing.calibrations import Calibrations, Identity
 from mp4ds.packing.inspection import (
+    Calibrations,
     CameraMessage,
+    Identity,
     MessageInspector,
     MessageTable,
     StreamKey,

@@ -28,8 +28,14 @@ from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
 from mp4ds.messages.layouts import LAYOUTS, Layout, fit, layout_for
 from mp4ds.messages.serializations import is_camera
-from mp4ds.packing.calibrations import find_pairs
-from mp4ds.packing.inspection import CameraMessage, MessageInspector, StreamKey, depends_on_others
+from mp4ds.packing.inspection import (
+    CameraMessage,
+    MessageInspector,
+    StreamKey,
+    choose_pairs,
+    depends_on_others,
+    pair_camera_infos,
+)
 from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools
 from mp4ds.packing.options import NO_VIEW, ImportOptions, PackOptions, plugin
 from mp4ds.packing.tracks import TrackPlan
@@ -558,7 +564,7 @@ def divide(
     packed = [channel for channel in channels if is_camera(channel)]
     pairs = reader.pairs
     if pairs is None:
-        pairs = find_pairs(options.camera_info, channels)
+        pairs = pair_camera_infos(channels, chosen=choose_pairs(options.camera_info, channels))
     pieces = _pieces(reader, channels, pairs, options) if reader.is_indexed else []
     cores = max(1, available_cores() // recordings)
     stats = reader.stats()

@@ -39,8 +39,12 @@ from mp4ds.messages.wire import (
     WireError,
 )
 from mp4ds.options import Selection
-from mp4ds.packing.calibrations import find_pairs
-from mp4ds.packing.inspection import CameraMessage, MessageInspector
+from mp4ds.packing.inspection import (
+    CameraMessage,
+    MessageInspector,
+    choose_pairs,
+    pair_camera_infos,
+)
 from mp4ds.packing.options import PackOptions
 from mp4ds.records import EVERYTHING, Channel, ChannelStats, Excerpt, Message, Record
 from mp4ds.times import RateLimit, intervals, usual_interval
@@ -141,7 +145,8 @@ class ReducedReader(ChangedReader):
                 self._types[one.id] = types
                 self._given[one.id] = types.channel(one, one.id, one.topic)
         self.is_indexed = reader.is_indexed and options.max_rate is None and not self.videos
-        self.pairs = self._images = find_pairs(options.camera_info, chosen)
+        pairs = choose_pairs(options.camera_info, chosen)
+        self.pairs = self._images = pair_camera_infos(chosen, chosen=pairs)
         self._views: dict[tuple[str, _Kind], View] = {}
         self._originals: dict[int, _Kind] = {}
         images = []
