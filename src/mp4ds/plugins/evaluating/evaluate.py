@@ -9,13 +9,16 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Sequence
+from concurrent.futures import as_completed
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from mp4ds._version import __version__
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, counted
 from mp4ds.files.outputs import listed_names, staged, write_listing
 from mp4ds.files.urls import location
@@ -33,16 +36,15 @@ from mp4ds.plugins.evaluating.trials import (
     Evaluation,
     Setting,
     StorageRow,
-    Trial,
     chosen,
     make_clip,
     mean_score,
     open_cameras,
     reachable_score,
     recommend,
-    try_out,
-    versions_of,
+    try_setting,
 )
+from mp4ds.processes import ProcessExecutor, failure_of
 from mp4ds.video.codecs import (
     AV1,
     LOSSY_GOP,
@@ -53,6 +55,7 @@ from mp4ds.video.codecs import (
     codec_name,
     parse_quality,
 )
+from mp4ds.video.encoder import tool_versions
 from mp4ds.video.images import jpeg_bytes
 from mp4ds.video.pixels import rgb_of
 from mp4ds.video.scores import Ffmpeg, find_ffmpeg, scores_of, summary_of
@@ -227,19 +230,30 @@ def evaluate(
     """
     options = options or EvaluateOptions()
     goal, settings, place = options.target, settings_of(options), location(source)
-    ffmpeg = _ffmpeg(goal)
+    ffmpeg = None
+    try:
+        ffmpeg = find_ffmpeg()
+    except ScoringError as error:
+        if goal.metric == "vmaf":
+            raise ScoringError(
+                f"{error} Or choose another metric, such as `target` psnr=42."
+            ) from None
+    name = output or f"{place.name if place.is_dir() else place.stem}_evaluation"
+    target = Path(os.path.abspath(name))  # noqa: PTH100 - keeps links, unlike resolve()
     with ExitStack() as stack:
         found, left_out = stack.enter_context(open_cameras(place))
-        cameras = _selected(found, left_out, options)
+        options.selected.check([*(camera.topic for camera in found), *left_out])
+        wanted = (camera for camera in found if options.selected(camera.topic))
+        cameras = sorted(wanted, key=lambda camera: camera.topic)
         origin = min((int(camera.times[0]) for camera in found), default=0)
-        target = _target(place, output)
-        result = Evaluation(place, target, [], left_out, versions_of(ffmpeg))
+        vmaf = ffmpeg.version if ffmpeg else "none"
+        versions = {**tool_versions(), "mp4ds": __version__, "vmaf": vmaf}
+        result = Evaluation(place, target, [], left_out, versions)
         names = FileNames()
         made = stack.enter_context(
             staged(target, force=options.force, owned=listed_names, sources=[place])
         )
         (made / PICTURES).mkdir(parents=True)
-        run = _Run(options, settings, ffmpeg, result, made)
         for number, camera in enumerate(cameras):
 
             def tell(what: str, share: float, number: int = number) -> None:
@@ -247,10 +261,12 @@ def evaluate(
                     topic = cameras[number].topic
                     progress(f"{topic}: {what}", (number + share) / len(cameras))
 
-            name = names.name_for(camera.topic)
             try:
-                with TemporaryDirectory(dir=made.parent) as folder:
-                    result.cameras.append(run.evaluate(camera, name, origin, Path(folder), tell))
+                tell("reading", 0)
+                indices = chosen(camera.times, origin, options.frames, options.start)
+                name = names.name_for(camera.topic)
+                one = _evaluated(camera, indices, made, name, options, settings, ffmpeg, tell)
+                result.cameras.append(one)
             except Refused as reason:
                 left_out[camera.topic] = str(reason)
         if not result.cameras:
@@ -259,84 +275,73 @@ def evaluate(
             raise SourceError(place, f"has no camera to try settings on{why}")
         rated = [(camera.cells, camera.reachable) for camera in result.cameras]
         result.recommended = recommend(rated, goal)
+        result.tried = sum(len(camera.cells) for camera in result.cameras)
         write_files(result, made, asdict(options))
         write_listing(made)
     return result
 
 
-def _ffmpeg(goal: QualityTarget) -> Ffmpeg | None:
-    try:
-        return find_ffmpeg()
-    except ScoringError as error:
-        if goal.metric == "vmaf":
-            raise ScoringError(
-                f"{error} Or choose another metric, such as `target` psnr=42."
-            ) from None
-        return None
-
-
-def _selected(
-    cameras: Sequence[Camera], left_out: dict[str, str], options: EvaluateOptions
-) -> list[Camera]:
-    selection = options.selected
-    selection.check([*(camera.topic for camera in cameras), *left_out])
-    wanted = (camera for camera in cameras if selection(camera.topic))
-    return sorted(wanted, key=lambda camera: camera.topic)
-
-
-def _target(source: Path, output: Path | str | None) -> Path:
-    name = output or f"{source.name if source.is_dir() else source.stem}_evaluation"
-    return Path(os.path.abspath(name))  # noqa: PTH100 - keeps links, unlike resolve()
-
-
 # ---------------------------------------------------------------- one camera
 
 
-@dataclass(frozen=True)
-class _Run:
-    """What the evaluations of all cameras have in common."""
+def _evaluated(
+    camera: Camera,
+    indices: list[int],
+    made: Path,
+    name: str,
+    options: EvaluateOptions,
+    settings: Sequence[Setting],
+    ffmpeg: Ffmpeg | None,
+    tell: Callable[[str, float], None],
+) -> CameraEvaluation:
+    """Try all settings on a camera.
 
-    options: EvaluateOptions
-    settings: Sequence[Setting]
-    ffmpeg: Ffmpeg | None
-    result: Evaluation
-    made: Path
+    Args:
+        camera: The camera.
+        indices: Numbers of the images of the clip.
+        made: The folder of the evaluation.
+        name: For names of its files.
+        options: How.
+        settings: The grid.
+        ffmpeg: Computes VMAF; None for no VMAF.
+        tell: Called with what is done, and the share of it.
 
-    def evaluate(
-        self,
-        camera: Camera,
-        name: str,
-        origin: int,
-        folder: Path,
-        tell: Callable[[str, float], None],
-    ) -> CameraEvaluation:
-        """Try all settings on a camera.
-
-        Args:
-            camera: The camera.
-            name: For names of files.
-            origin: Log time at which the source begins, nanoseconds.
-            folder: For the files of its clip.
-            tell: Called with what is done, and the share of it.
-
-        Raises:
-            Refused: The camera's images are not usable.
-            ScoringError: No setting could be tried.
-        """
-        options, goal = self.options, self.options.target
-        tell("reading", 0)
-        clip = make_clip(
-            camera, chosen(camera.times, origin, options.frames, options.start), folder
-        )
-        truth = f"{PICTURES}/{name}-original.png"
+    Raises:
+        Refused: The camera's images are not usable.
+        ScoringError: No setting could be tried.
+    """
+    goal, threads, has_vmaf = options.target, options.encoder_threads, ffmpeg is not None
+    truth = f"{PICTURES}/{name}-original.png"
+    cells: list[Cell] = []
+    failures: dict[str, list[str]] = {}
+    with TemporaryDirectory(dir=made.parent) as work:
+        folder = Path(work)
+        clip = make_clip(camera, indices, folder)
         with closing(clip.open(folder)) as frames:
             picture = clip.picture(frames.frame(clip.detail_frame), clip.recipe)
-            (self.made / truth).write_bytes(picture)
+            (made / truth).write_bytes(picture)
             # without which the scores of settings say little
-            scores = scores_of(frames, frames, ffmpeg=self.ffmpeg, threads=options.encoder_threads)
-        ceiling = {name: summary_of(values) for name, values in scores.items()}
+            scores = scores_of(frames, frames, ffmpeg=ffmpeg, threads=threads)
+        ceiling = {metric: summary_of(values) for metric, values in scores.items()}
         reachable = reachable_score(goal, ceiling)
-        cells, notes = self._cells(camera.topic, name, clip, folder, tell)
+        attempt = partial(try_setting, clip, threads=threads, has_vmaf=has_vmaf)
+        with ProcessExecutor(options.jobs) as executor:
+            calls = {}
+            for setting in settings:
+                shown = made / PICTURES / f"{name}-{setting.name.replace(' ', '-')}.png"
+                calls[executor.submit(attempt, setting, folder, shown)] = setting
+            for done, _ in enumerate(as_completed(calls), 1):
+                tell(f"{done} of {len(calls)} settings", done / len(calls))
+        for call, setting in calls.items():
+            if error := call.exception():
+                failures.setdefault(str(failure_of(error)), []).append(setting.name)
+            else:
+                cells.append(call.result())
+        if not cells:
+            why = next(iter(failures))
+            raise ScoringError(f"{camera.topic}: no setting could be tried. {why}")
+        notes = [f"not tried: {', '.join(names)}: {why}" for why, names in failures.items()]
+        notes += _notes(clip, cells, goal, reachable, camera.lossy, options.jobs)
         found = CameraEvaluation(
             topic=camera.topic,
             name=name,
@@ -347,7 +352,7 @@ class _Run:
             cells=cells,
             recommended=recommend([(cells, reachable)], goal),
             ground_truth=truth,
-            notes=[*notes, *_notes(clip, cells, goal, reachable, camera.lossy, options.jobs)],
+            notes=notes,
         )
         if camera.rate is not None:
             streams, hours = options.streams or 1, options.hours or 1.0
@@ -357,37 +362,7 @@ class _Run:
                 f"at {camera.rate:.2f} Hz, {count:.0f} frames"
             )
             found.storage = _storage(found, folder, count)
-        return found
-
-    def _cells(
-        self,
-        topic: str,
-        name: str,
-        clip: Clip,
-        folder: Path,
-        tell: Callable[[str, float], None],
-    ) -> tuple[list[Cell], list[str]]:
-        """What was measured, and notes about what could not be."""
-        threads, has_vmaf = self.options.encoder_threads, self.ffmpeg is not None
-        trials = [
-            Trial(name, clip, setting, threads, has_vmaf, folder, self.made)
-            for setting in self.settings
-        ]
-        cells: list[Cell] = []
-        failures: dict[str, list[str]] = {}
-
-        def count(done: int) -> None:
-            tell(f"{done} of {len(trials)} settings", done / len(trials))
-
-        for trial, found in try_out(trials, self.options.jobs, count):
-            if isinstance(found, Cell):
-                cells.append(found)
-                self.result.tried += 1
-            else:
-                failures.setdefault(found, []).append(trial.setting.name)
-        if not cells:
-            raise ScoringError(f"{topic}: no setting could be tried. {next(iter(failures))}")
-        return cells, [f"not tried: {', '.join(names)}: {why}" for why, names in failures.items()]
+    return found
 
 
 def _storage(found: CameraEvaluation, folder: Path, count: float) -> list[StorageRow]:

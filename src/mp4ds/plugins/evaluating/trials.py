@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds._version import __version__
 from mp4ds.bags.formats import open_reader
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import open_dataset
@@ -23,17 +20,16 @@ from mp4ds.dataset.recording import DatasetReader
 from mp4ds.errors import Refused
 from mp4ds.format.sidecars import names_dataset
 from mp4ds.messages.encodings import ENCODINGS, Pixels
-from mp4ds.messages.layouts import LAYOUTS, Layout, layout_for
+from mp4ds.messages.layouts import LAYOUTS, layout_for
 from mp4ds.messages.serializations import is_camera, kind_of
 from mp4ds.messages.wire import CodedFields
 from mp4ds.packing.inspection import MessageInspector, depends_on_others
 from mp4ds.packing.options import ImportOptions
 from mp4ds.plugins.importing.images import open_images
-from mp4ds.processes import ProcessExecutor, failure_of
 from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import TIMESCALE, PresentationClock
 from mp4ds.video.codecs import LOSSLESS, LOSSY_GOP, QualityTarget, Recipe, recipe_for
-from mp4ds.video.encoder import VideoEncoder, tool_versions
+from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.images import png_file
 from mp4ds.video.packets import PacketReader
 from mp4ds.video.pixels import (
@@ -44,7 +40,7 @@ from mp4ds.video.pixels import (
     decoded_planes,
     rgb_of,
 )
-from mp4ds.video.scores import SMALLEST, Ffmpeg, ScoreSummary, find_ffmpeg, scores_of, summary_of
+from mp4ds.video.scores import SMALLEST, ScoreSummary, find_ffmpeg, scores_of, summary_of
 
 PICTURES = "pictures"
 """The folder of an evaluation for the details shown."""
@@ -167,78 +163,33 @@ class Cell:
     whole_seconds: float
 
 
-@dataclass(frozen=True)
-class Trial:
-    """A setting to try on a clip.
-
-    Attributes:
-        camera: Name of the camera, for names of files.
-        clip: The clip.
-        setting: How to encode.
-        threads: Of the encoder and of libvmaf.
-        has_vmaf: Whether VMAF is computed.
-        work: The folder with the files of the clip.
-        output: The folder of the evaluation.
-    """
-
-    camera: str
-    clip: Clip
-    setting: Setting
-    threads: int
-    has_vmaf: bool
-    work: Path
-    output: Path
-
-    @property
-    def picture(self) -> str:
-        """Name of the PNG file of the detail, in the folder of the evaluation."""
-        return f"{PICTURES}/{self.camera}-{self.setting.name.replace(' ', '-')}.png"
-
-
-def try_out(
-    trials: Sequence[Trial], jobs: int, on_done: Callable[[int], None] = lambda _: None
-) -> Iterator[tuple[Trial, Cell | str]]:
-    """Run trials.
-
-    Args:
-        trials: Different ones.
-        jobs: How many at a time.
-        on_done: Called with the number of trials done.
-
-    Yields:
-        Each in turn, and what was measured, or why that is not possible.
-    """
-    with ProcessExecutor(jobs) as executor:
-        calls = {executor.submit(run, trial): trial for trial in trials}
-        for number, _ in enumerate(as_completed(calls), 1):
-            on_done(number)
-    for call, trial in calls.items():
-        error = call.exception()
-        yield trial, call.result() if error is None else str(failure_of(error))
-
-
-def versions_of(ffmpeg: Ffmpeg | None) -> dict[str, str]:
-    """Versions of the software that makes videos and scores here.
-
-    Args:
-        ffmpeg: Computes VMAF; None for no VMAF.
-    """
-    vmaf = ffmpeg.version if ffmpeg else "none"
-    return {**tool_versions(), "mp4ds": __version__, "vmaf": vmaf}
-
-
 # ---------------------------------------------------------------- in a process
 
 
-def run(trial: Trial) -> Cell:
-    """Encode, decode, and score.
+def try_setting(
+    clip: Clip,
+    setting: Setting,
+    work: Path,
+    picture: Path,
+    *,
+    threads: int,
+    has_vmaf: bool,
+) -> Cell:
+    """Encode a clip as `mp4ds pack` does, decode it, and score it.
+
+    Args:
+        clip: The clip.
+        setting: How to encode.
+        work: The folder with the files of the clip.
+        picture: The PNG file of its detail to write, in the folder for these.
+        threads: Of the encoder and of libvmaf.
+        has_vmaf: Whether VMAF is computed.
 
     Raises:
         Mp4dsError: The encoder refuses, or libvmaf failed.
         OSError: A file cannot be written.
     """
-    clip, setting = trial.clip, trial.setting
-    ffmpeg = find_ffmpeg() if trial.has_vmaf else None
+    ffmpeg = find_ffmpeg() if has_vmaf else None
     recipe = recipe_for(
         clip.picture_format,
         lossless=False,
@@ -246,20 +197,53 @@ def run(trial: Trial) -> Cell:
         crf=setting.crf,
         preset=setting.preset,
     )
-    with closing(clip.open(trial.work)) as frames, TemporaryDirectory(dir=trial.work) as folder:
+    ticks = np.load(work / TICKS).tolist()
+    with closing(clip.open(work)) as frames, TemporaryDirectory(dir=work) as folder:
+        for _ in frames:
+            pass  # so that the encoder does not wait for a disk or network
         video = Path(folder, "video.mp4")
-        figures = _encoded(trial, frames, recipe, video)
+        wall, cpu = time.perf_counter(), time.process_time()
+        with VideoEncoder(
+            video,
+            recipe,
+            picture_format=PLANES_FORMAT,
+            width=frames.width,
+            height=frames.height,
+            gop=setting.gop,
+            threads=threads,
+            rate=clip.rate,
+        ) as encoder:
+            for planes, tick in zip(frames, ticks, strict=True):
+                encoder.write(planes, tick)
+        seconds, encoded = time.perf_counter() - wall, time.process_time()
+        for _ in decoded_planes(video):
+            pass
+        decode_seconds = time.process_time() - encoded
+        with PacketReader(video, codec=recipe.codec) as packets:
+            size = sum(packets.sizes)
+            frame_bytes = mean_size(packets.sizes, packets.keyframes, setting.gop)
 
         def watched(decoded: Iterable[Planes]) -> Iterator[Planes]:
             for number, planes in enumerate(decoded):
                 if number == clip.detail_frame:
-                    (trial.output / trial.picture).write_bytes(clip.picture(planes, recipe))
+                    picture.write_bytes(clip.picture(planes, recipe))
                 yield planes
 
-        decoded = watched(decoded_planes(video))
-        scores = scores_of(frames, decoded, ffmpeg=ffmpeg, threads=trial.threads)
-    summaries = {name: summary_of(values) for name, values in scores.items()}
-    return Cell(setting=setting, scores=summaries, picture=trial.picture, **figures)
+        scores = scores_of(frames, watched(decoded_planes(video)), ffmpeg=ffmpeg, threads=threads)
+    return Cell(
+        setting=setting,
+        encode_seconds=seconds,
+        encode_cpu_seconds=encoded - cpu,
+        decode_fps=clip.frames / max(1e-9, decode_seconds),
+        size=size,
+        frame_bytes=frame_bytes,
+        kbps=frame_bytes * clip.frames / clip.seconds * 8 / 1000,
+        encode_fps=clip.frames / max(1e-9, seconds),
+        scores={name: summary_of(values) for name, values in scores.items()},
+        picture=f"{PICTURES}/{picture.name}",
+        whole_bytes=frame_bytes * clip.source_frames,
+        whole_seconds=seconds / clip.frames * clip.source_frames,
+    )
 
 
 def mean_size(sizes: Sequence[int], keyframes: Sequence[int], gop: int) -> float:
@@ -274,44 +258,6 @@ def mean_size(sizes: Sequence[int], keyframes: Sequence[int], gop: int) -> float
     others = [size for size, is_key in zip(sizes, keyframes, strict=True) if not is_key]
     key = sum(keys) / max(1, len(keys))
     return (key + (gop - 1) * sum(others) / len(others)) / gop if others else key
-
-
-def _encoded(trial: Trial, frames: PlaneSpool, recipe: Recipe, video: Path) -> dict[str, Any]:
-    """Encode the clip as `mp4ds pack` does, and decode it; returns the figures of a `Cell`."""
-    clip, gop = trial.clip, trial.setting.gop
-    ticks = np.load(trial.work / TICKS).tolist()
-    for _ in frames:
-        pass  # so that the encoder does not wait for a disk or network
-    wall, cpu = time.perf_counter(), time.process_time()
-    with VideoEncoder(
-        video,
-        recipe,
-        picture_format=PLANES_FORMAT,
-        width=frames.width,
-        height=frames.height,
-        gop=gop,
-        threads=trial.threads,
-        rate=clip.rate,
-    ) as encoder:
-        for planes, tick in zip(frames, ticks, strict=True):
-            encoder.write(planes, tick)
-    seconds, encoded = time.perf_counter() - wall, time.process_time()
-    for _ in decoded_planes(video):
-        pass
-    decode_seconds = time.process_time() - encoded
-    with PacketReader(video, codec=recipe.codec) as packets:
-        size, frame_bytes = sum(packets.sizes), mean_size(packets.sizes, packets.keyframes, gop)
-    return {
-        "encode_seconds": seconds,
-        "encode_cpu_seconds": encoded - cpu,
-        "encode_fps": clip.frames / max(1e-9, seconds),
-        "decode_fps": clip.frames / max(1e-9, decode_seconds),
-        "size": size,
-        "frame_bytes": frame_bytes,
-        "kbps": frame_bytes * clip.frames / clip.seconds * 8 / 1000,
-        "whole_bytes": frame_bytes * clip.source_frames,
-        "whole_seconds": seconds / clip.frames * clip.source_frames,
-    }
 
 
 # ---------------------------------------------------------------- results
@@ -477,8 +423,7 @@ _SECOND = 1_000_000_000
 _DETAIL = (96, 128)  # rows and columns shown side by side
 
 
-_Kind = tuple[str, int, int]
-Shot = tuple[_Kind, Pixels, int, int]
+Shot = tuple[tuple[str, int, int], Pixels, int, int]
 """One image of a camera: its ROS encoding, width and height; pixels of the encoding; header stamp,
 and when it was recorded, nanoseconds."""
 
@@ -488,22 +433,44 @@ class Camera:
     """One camera of a source.
 
     Attributes:
-        topic: Its topic, or the name of a video.
+        reader: Of the source.
+        channel: Of its images.
         times: Log times of all its images, nanoseconds, sorted, at least one.
-        read: Yields images by increasing number, without messages that hold none.
         lossy: The lossy encoding they already went through; empty if none is known.
     """
 
-    topic: str
+    reader: BagReader
+    channel: Channel
     times: NDArray[np.int64]
-    read: Callable[[Sequence[int]], Iterator[Shot]]
     lossy: str = ""
+
+    @property
+    def topic(self) -> str:
+        """Its topic, or the name of a video."""
+        return self.channel.topic
 
     @property
     def rate(self) -> float | None:
         """Images per second; None below two, or without a time span."""
         span = int(self.times[-1] - self.times[0])
         return (len(self.times) - 1) * 1e9 / span if span > 0 else None
+
+    def shots(self, indices: Sequence[int]) -> Iterator[Shot]:
+        """Images by increasing number, without messages that hold none."""
+        first, last = (int(self.times[indices[place]]) for place in (0, -1))
+        number = int(np.searchsorted(self.times, first))
+        excerpt = Excerpt(first, last + 1, frozenset([self.topic]), others=False)
+        inspector, wanted = MessageInspector(self.channel, transcode=True), set(indices)
+        for record in self.reader.records(excerpt):
+            if not isinstance(record, Message) or record.channel.id != self.channel.id:
+                continue
+            if number in wanted:
+                with suppress(Refused):
+                    seen = inspector.inspect(record)
+                    if seen.pixels is not None:
+                        kind = seen.key.encoding, seen.key.width, seen.key.height
+                        yield kind, seen.pixels, seen.parts.stamp, record.log_time
+            number += 1
 
 
 @contextmanager
@@ -523,63 +490,28 @@ def open_cameras(place: Path) -> Iterator[tuple[list[Camera], dict[str, str]]]:
             reader = stack.enter_context(open_reader(place))
         elif (dataset := stack.enter_context(open_dataset(place))).channels:
             reader = DatasetReader(dataset)
-            lossy = next(
-                (
-                    one.profile
-                    for one in (stream.sidecar for stream in dataset.streams)
-                    if one.profile != LOSSLESS
-                ),
-                "",
-            )
+            profiles = (stream.sidecar.profile for stream in dataset.streams)
+            lossy = next((f"a dataset of {one}" for one in profiles if one != LOSSLESS), "")
         else:  # a video of any other program
             reader = stack.enter_context(open_images(place, ImportOptions(decode=True)))
-        yield _of_recording(reader, lossy and f"a dataset of {lossy}")
-
-
-def _of_recording(reader: BagReader, lossy: str = "") -> tuple[list[Camera], dict[str, str]]:
-    times = reader.times()
-    cameras: list[Camera] = []
-    left_out: dict[str, str] = {}
-    for channel in filter(is_camera, reader.channels):
-        own = times.get(channel.id, np.empty(0, np.int64))
-        first = reader.first(channel)
-        if first is None or not len(own):
-            left_out[channel.topic] = "has no images"
-        elif kind_of(channel) is CodedFields and depends_on_others(channel, first):
-            left_out[channel.topic] = "has video packets, which `mp4ds pack` copies"
-        else:
-            known = lossy or (_JPEG if _is_jpeg(first) else "")
-            cameras.append(_of_channel(reader, channel, own, known))
-    return cameras, left_out
+        times, cameras = reader.times(), list[Camera]()
+        left_out: dict[str, str] = {}
+        for channel in filter(is_camera, reader.channels):
+            own, first = times.get(channel.id, ()), reader.first(channel)
+            if first is None or not len(own):
+                left_out[channel.topic] = "has no images"
+            elif kind_of(channel) is CodedFields and depends_on_others(channel, first):
+                left_out[channel.topic] = "has video packets, which `mp4ds pack` copies"
+            else:
+                known = lossy or (_JPEG if _is_jpeg(first) else "")
+                cameras.append(Camera(reader, channel, np.asarray(own), known))
+        yield cameras, left_out
 
 
 def _is_jpeg(message: Message) -> bool:
     with suppress(Refused):
         return MessageInspector(message.channel).inspect(message).key.codec == "mjpeg"
     return False
-
-
-def _of_channel(
-    reader: BagReader, channel: Channel, times: NDArray[np.int64], lossy: str
-) -> Camera:
-    def read(indices: Sequence[int]) -> Iterator[Shot]:
-        wanted = set(indices)
-        first, last = int(times[indices[0]]), int(times[indices[-1]])
-        number = int(np.searchsorted(times, first))
-        excerpt = Excerpt(first, last + 1, frozenset([channel.topic]), others=False)
-        inspector = MessageInspector(channel, transcode=True)
-        for record in reader.records(excerpt):
-            if not isinstance(record, Message) or record.channel.id != channel.id:
-                continue
-            if number in wanted:
-                with suppress(Refused):
-                    seen = inspector.inspect(record)
-                    if seen.pixels is not None:
-                        kind = seen.key.encoding, seen.key.width, seen.key.height
-                        yield kind, seen.pixels, seen.parts.stamp, record.log_time
-            number += 1
-
-    return Camera(channel.topic, times, read, lossy)
 
 
 # ---------------------------------------------------------------- clips
@@ -620,13 +552,18 @@ def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
         SourceError: The source is damaged.
         OSError: It cannot be written.
     """
-    shots = camera.read(indices)
+    shots = camera.shots(indices)
     first = next(shots, None)
     if first is None:
         raise Refused("has no readable images in its clip")
-    layout = _layout_of(first[0])
-    maker, clock = PlaneMaker(layout.pixel_format), PresentationClock()
     encoding, width, height = first[0]
+    lossy = ENCODINGS[encoding].lossy
+    if lossy is None or LAYOUTS[lossy].parameters:
+        raise Refused(f"has {encoding} images; scores are of images of 8 bits without alpha")
+    if min(width, height) < SMALLEST:
+        raise Refused(f"has images of {width}x{height}, too small to score")
+    layout = layout_for(ENCODINGS[encoding], lossless=False)
+    maker, clock = PlaneMaker(layout.pixel_format), PresentationClock()
     size = width + width % 2, height + height % 2
     ticks: list[int] = []
     with closing(PlaneSpool(folder / FRAMES, *size)) as spool:
@@ -653,16 +590,6 @@ def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
         source_frames=len(camera.times),
         left_out=len(indices) - len(ticks),
     )
-
-
-def _layout_of(kind: _Kind) -> Layout:
-    name, width, height = kind
-    lossy = ENCODINGS[name].lossy
-    if lossy is None or LAYOUTS[lossy].parameters:
-        raise Refused(f"has {name} images; scores are of images of 8 bits without alpha")
-    if min(width, height) < SMALLEST:
-        raise Refused(f"has images of {width}x{height}, too small to score")
-    return layout_for(ENCODINGS[name], lossless=False)
 
 
 def _detail(luma: NDArray[np.uint8]) -> tuple[int, int, int, int]:
