@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +14,12 @@ from mp4ds.bags.formats import open_reader
 from mp4ds.bags.latched import take_slice
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.stream import Stream
 from mp4ds.errors import Refused, SourceError, counted
 from mp4ds.files.urls import location
+from mp4ds.format.models import Calibration
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, names_dataset
 from mp4ds.messages.serializations import MessageSplitter, kind_of
-from mp4ds.messages.wire import CodedFields, ImageFields
+from mp4ds.messages.wire import CalibrationFields, CodedFields, ImageFields
 from mp4ds.options import WHOLE, Slice, iso_text
 from mp4ds.packing.planning import open_recording
 from mp4ds.records import Channel, latched_text
@@ -93,40 +92,29 @@ def info(path: Path | str, asked: Slice = WHOLE) -> Info:
         FormatError: The dataset breaks a rule of the format.
         OptionError: The slice is empty.
     """
-    if asked:
-        with open_recording([location(path)]) as reader:
-            take_slice(reader, asked)
-            return _recording_info(reader)
-    with _open_any(path) as found:
-        return _dataset_info(found) if isinstance(found, Dataset) else _recording_info(found)
-
-
-def _open_any(path: Path | str) -> Dataset | BagReader:
-    """Open a recording, a dataset, or a video with its sidecar: a context manager."""
     place = location(path)
-    return Dataset(place) if names_dataset(place) else open_reader(place)
+    if not asked and names_dataset(place):
+        with Dataset(place) as dataset:
+            return _dataset_info(dataset)
+    with open_recording([place]) if asked else open_reader(place) as reader:
+        if asked:
+            take_slice(reader, asked)
+        size = sum(file.stat().st_size for file in reader.files)
+        times, channels = reader.times(), list(reader.channels)
+        topics = _topics(channels, times)
+        by_topic = {item.topic: item for item in topics}
+        for channel in channels:
+            item = by_topic[channel.topic]
+            if not item.content and kind_of(channel):
+                item.content = _content(reader, channel)
+        return Info(reader.path, reader.format, reader.profile, size, *_span(times), topics)
 
 
-def _recording_info(reader: BagReader) -> Info:
-    size = sum(file.stat().st_size for file in reader.files)
-    times, channels = reader.times(), list(reader.channels)
-    topics = _topics(channels, times)
-    by_topic = {item.topic: item for item in topics}
-    for channel in channels:
-        item = by_topic[channel.topic]
-        if not item.content and kind_of(channel):
-            item.content = _content(reader, channel)
-    return _spanned(Info(reader.path, reader.format, reader.profile, size), times, topics)
-
-
-def _spanned(result: Info, times: Mapping[int, NDArray[np.int64]], topics: list[TopicInfo]) -> Info:
-    """With its topics, and the time of its first and last message."""
-    result.topics = topics
+def _span(times: Mapping[int, NDArray[np.int64]]) -> tuple[int | None, int | None]:
+    """The time of the first and of the last message."""
     known = [found for found in times.values() if len(found)]
-    if known:
-        result.start = min(int(found[0]) for found in known)
-        result.end = max(int(found[-1]) for found in known)
-    return result
+    first = min((int(found[0]) for found in known), default=None)
+    return first, max((int(found[-1]) for found in known), default=None)
 
 
 def _topics(channels: Sequence[Channel], times: Mapping[int, NDArray[np.int64]]) -> list[TopicInfo]:
@@ -138,22 +126,17 @@ def _topics(channels: Sequence[Channel], times: Mapping[int, NDArray[np.int64]])
         found = [times[channel.id] for channel in own if channel.id in times]
         merged = np.sort(np.concatenate(found)) if found else np.empty(0, np.int64)
         types = dict.fromkeys(channel.type_name for channel in own)
-        topics.append(_timing(TopicInfo(topic, " | ".join(types)), merged))
+        item = TopicInfo(topic, " | ".join(types), len(merged))
+        if len(merged) > 1 and merged[-1] > merged[0]:
+            steps = intervals(merged)
+            item.rate_hz = (len(merged) - 1) * 1e9 / float(merged[-1] - merged[0])
+            item.jitter_ms = float(steps.std()) / 1e6
+            item.gaps = int((lost_frames(steps) > 0).sum())
+            item.longest_gap_s = float(steps.max()) / 1e9
         if len(own) > 1:
-            topics[-1].content = f"{len(own)} publishers"
+            item.content = f"{len(own)} publishers"
+        topics.append(item)
     return topics
-
-
-def _timing(item: TopicInfo, times: NDArray[np.int64]) -> TopicInfo:
-    item.messages = len(times)
-    if len(times) < 2 or times[-1] == times[0]:
-        return item
-    steps = intervals(times)
-    item.rate_hz = (len(times) - 1) * 1e9 / float(times[-1] - times[0])
-    item.jitter_ms = float(steps.std()) / 1e6
-    item.gaps = int((lost_frames(steps) > 0).sum())
-    item.longest_gap_s = float(steps.max()) / 1e9
-    return item
 
 
 def _content(reader: BagReader, channel: Channel) -> str:
@@ -168,14 +151,13 @@ def _content(reader: BagReader, channel: Channel) -> str:
         return f"{fields.encoding} {fields.width}x{fields.height}"
     if isinstance(fields, CodedFields):
         return fields.format
-    return intrinsics_text(fields.width, fields.height, fields.distortion_model, fields.k)
+    return _intrinsics_text(fields)
 
 
-def intrinsics_text(width: int, height: int, model: str, k: Any) -> str:
+def _intrinsics_text(of: CalibrationFields | Calibration) -> str:
     """A calibration in one line."""
-    return (
-        f"{width}x{height} {model or '-'} fx={k[0]:.1f} fy={k[4]:.1f} cx={k[2]:.1f} cy={k[5]:.1f}"
-    )
+    k, model = of.k, of.distortion_model or "-"
+    return f"{of.width}x{of.height} {model} fx={k[0]:.1f} fy={k[4]:.1f} cx={k[2]:.1f} cy={k[5]:.1f}"
 
 
 def _dataset_info(dataset: Dataset) -> Info:
@@ -185,16 +167,14 @@ def _dataset_info(dataset: Dataset) -> Info:
         if manifest
         else [path for stream in dataset.streams for path, _ in stream.videos]
     )
-    return _spanned(
-        Info(
-            dataset.path,
-            "dataset" if manifest else "stream",
-            dataset.profile,
-            sum(file.stat().st_size for file in files if file.is_file()),
-            notes=notes_of(dataset),
-        ),
-        dataset.times(),
+    return Info(
+        dataset.path,
+        "dataset" if manifest else "stream",
+        dataset.profile,
+        sum(file.stat().st_size for file in files if file.is_file()),
+        *_span(dataset.times()),
         topics_of(dataset),
+        notes_of(dataset),
     )
 
 
@@ -208,7 +188,20 @@ def topics_of(dataset: Dataset) -> list[TopicInfo]:
     topics = _topics(dataset.channels, dataset.times())
     by_topic = {item.topic: item for item in topics}
     for stream in dataset.streams:
-        _add_stream(by_topic, stream)
+        sidecar, item = stream.sidecar, by_topic[stream.topic]
+        image = f"{sidecar.image.encoding} {sidecar.image.width}x{sidecar.image.height}"
+        item.content = ", ".join(filter(None, (item.content, image)))
+        stored = f"{sidecar.video.codec} {sidecar.profile}: {sidecar.video.file}"
+        view = f"view: {sidecar.view.file}" if sidecar.view else ""
+        item.stored = ", ".join(filter(None, (item.stored, stored, view)))
+        sizes = [path.stat().st_size for path in stream.files if path.is_file()]
+        item.bytes = (item.bytes or 0) + sum(sizes)
+        info = sidecar.camera_info
+        if info and info.calibrations and (other := by_topic.get(info.channel.topic)):
+            more = len(info.calibrations) - 1
+            other.content = _intrinsics_text(info.calibrations[0])
+            other.content += f" (+{more} more)" if more else ""
+            other.stored = f"in {stream.path.name}"
     return topics
 
 
@@ -240,29 +233,6 @@ def notes_of(dataset: Dataset) -> list[str]:
     if any(sidecar.stamps == "record-float" for _, sidecar in sidecars):
         notes.append("times are record times stored as float seconds, so they are not exact")
     return notes
-
-
-def _add_stream(by_topic: dict[str, TopicInfo], stream: Stream) -> None:
-    sidecar = stream.sidecar
-    item = by_topic[stream.topic]
-    image = f"{sidecar.image.encoding} {sidecar.image.width}x{sidecar.image.height}"
-    item.content = ", ".join(filter(None, (item.content, image)))
-    stored = f"{sidecar.video.codec} {sidecar.profile}: {sidecar.video.file}"
-    view = f"view: {sidecar.view.file}" if sidecar.view else ""
-    item.stored = ", ".join(filter(None, (item.stored, stored, view)))
-    files = [path for path in stream.files if path.is_file()]
-    item.bytes = (item.bytes or 0) + sum(file.stat().st_size for file in files)
-    info_model = sidecar.camera_info
-    if info_model and info_model.calibrations:
-        calibration = info_model.calibrations[0]
-        text = intrinsics_text(
-            calibration.width, calibration.height, calibration.distortion_model, calibration.k
-        )
-        more = len(info_model.calibrations) - 1
-        other = by_topic.get(info_model.channel.topic)
-        if other is not None:
-            other.content = text + (f" (+{more} more)" if more else "")
-            other.stored = f"in {stream.path.name}"
 
 
 # ---------------------------------------------------------------- many datasets

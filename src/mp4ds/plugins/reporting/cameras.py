@@ -6,7 +6,6 @@ import base64
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,24 +40,19 @@ def why_not_played(stream: Stream) -> str:
     Raises:
         VideoError: The video cannot be read.
     """
-    reason = _why_not_in_browsers(stream.video_path)
-    if not reason and stream.sidecar.body != "packet" and not stream.sidecar.layout.is_shown:
+    with closing(Media(stream.video_path)) as media:
+        context = media.track.codec_context
+        name, pixel_format = context.codec.canonical_name, pixel_format_of(context)
+    reason, encoding = "", ENCODINGS[stream.encoding]
+    if name not in _PLAYED:
+        reason = f"{'few browsers play' if name in _FEW else 'no browser plays'} {name}"
+    elif pixel_format not in _PLAYED[name]:
+        reason = f"no browser plays {name} in the pixel format {pixel_format}"
+    elif stream.sidecar.body != "packet" and not stream.sidecar.layout.is_shown:
         reason = f"its video stores {stream.encoding} and does not look like the image"
-    encoding = ENCODINGS[stream.encoding]
     if reason and encoding.lossy and encoding.channels < 4:  # alpha has no view
         reason += "; `mp4ds pack DATASET -o NEW --view` adds a video that does"
     return reason
-
-
-def _why_not_in_browsers(path: Path) -> str:
-    with closing(Media(path)) as media:
-        context = media.track.codec_context
-        name, pixel_format = context.codec.canonical_name, pixel_format_of(context)
-    if name not in _PLAYED:
-        return f"{'few browsers play' if name in _FEW else 'no browser plays'} {name}"
-    if pixel_format not in _PLAYED[name]:
-        return f"no browser plays {name} in the pixel format {pixel_format}"
-    return ""
 
 
 def presentation_times(stream: Stream) -> NDArray[np.int64]:
@@ -127,15 +121,13 @@ def axis_of(cameras: Sequence[Mapping[str, Integers]]) -> str:
         steps = intervals(columns["stamp"])
         if 2 * int((steps > 0).sum()) < len(steps):
             return "log_time"
-    spans = {name: _span([columns[name] for columns in cameras]) for name in ("stamp", "log_time")}
-    is_one_clock = spans["stamp"] <= _WIDER * spans["log_time"] + _SLACK_NS
+    stamps, log_times = (
+        max((int(columns[name].max()) for columns in cameras), default=0)
+        - min((int(columns[name].min()) for columns in cameras), default=0)
+        for name in ("stamp", "log_time")
+    )
+    is_one_clock = stamps <= _WIDER * log_times + _SLACK_NS
     return "stamp" if is_one_clock else "log_time"
-
-
-def _span(columns: Sequence[Integers]) -> int:
-    if not columns:
-        return 0
-    return max(int(c.max()) for c in columns) - min(int(c.min()) for c in columns)
 
 
 # ---------------------------------------------------------------- packed columns
@@ -164,11 +156,6 @@ def pack_column(values: NDArray[np.int64]) -> dict[str, Any]:
         "size": size,
         "values": base64.b64encode(residuals.astype(f"<i{size}").tobytes()).decode(),
     }
-
-
-def pack_floats(values: NDArray[np.float32]) -> str:
-    """32-bit floats, little-endian, in base64; NaN if there is none."""
-    return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
 
 
 # ---------------------------------------------------------------- cameras
@@ -234,7 +221,8 @@ class ReportedCamera:
         if quality is None:
             return {}
         try:
-            return {quality.metric: pack_floats(quality.decode(len(self.stream)).astype("<f4"))}
+            scores = quality.decode(len(self.stream)).astype("<f4").tobytes()
+            return {quality.metric: base64.b64encode(scores).decode()}  # NaN if there is none
         except ValueError as error:
             place = f"{self.stream.path} at video.quality.scores"
             raise FormatError("scores-invalid", place, str(error)) from None
@@ -247,37 +235,29 @@ class ReportedCamera:
             untimed: Why its stamps are not compared with others; empty: they are.
         """
         sidecar, seq = self.stream.sidecar, self.stream.columns.seq
+        image, video = sidecar.image, sidecar.video
+        layers = dict.fromkeys((self.stream, self.recorded))  # the view first
+        # a video may be padded
+        shown = (image.width / video.width, image.height / video.height) if self.video else (1, 1)
         steps = np.empty(0, np.int64) if seq is None else np.diff(seq)
         return {
             "name": self.name,
             "columns": f"report/columns-{number}.js",
             "frames": len(self.stream),
-            "encoding": sidecar.image.encoding,
-            "width": sidecar.image.width,
-            "height": sidecar.image.height,
-            "stored": self._stored(),
-            "file": sidecar.video.file,
+            "encoding": image.encoding,
+            "width": image.width,
+            "height": image.height,
+            "stored": ", ".join(f"{o.sidecar.video.codec} {o.sidecar.profile}" for o in layers),
+            "file": video.file,
             "video": self.video,
             "stills": [{"frame": number, "file": url} for number, url in self.stills.items()],
             "note": self.note,
             "caption": self.caption,
-            "shown": self._shown(),
+            "shown": shown,
             "seq_missing": None if seq is None else sum((steps[steps > 1] - 1).tolist()),
             "untimed": untimed,
             **self._calibrations(),
         }
-
-    def _stored(self) -> str:
-        """Codec and profile, after those of the view if there is one."""
-        layers = dict.fromkeys((self.stream, self.recorded))
-        return ", ".join(f"{one.sidecar.video.codec} {one.sidecar.profile}" for one in layers)
-
-    def _shown(self) -> list[float]:
-        """The image's fraction of the played video's width and height: a video may be padded."""
-        image, video = self.stream.sidecar.image, self.stream.sidecar.video
-        if not self.video:
-            return [1.0, 1.0]
-        return [image.width / video.width, image.height / video.height]
 
     def _calibrations(self) -> dict[str, Any]:
         """Each calibration that differs from the previous one, and its first frame."""

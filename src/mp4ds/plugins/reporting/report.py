@@ -66,7 +66,6 @@ _PAGE = files("mp4ds.plugins.reporting") / "page"
 _INDEX = "index.html"
 _FOLDER = "report"
 
-_DATA_SIGN = b"/* made by mp4ds report */\n"
 _MOST_NOTES = 200
 _STILLS, _PICTURES = "stills", "pictures"
 _PICTURE_WIDTH = 240
@@ -157,7 +156,7 @@ def report(
             is_new = not folder.exists()
             folder.mkdir(exist_ok=True)
             try:
-                return _write(opened, folder, chosen, tell)
+                return _write(opened, folder, tell)
             except BaseException:
                 if is_new:
                     with suppress(OSError):
@@ -179,26 +178,36 @@ def _check_index(folder: Path, options: ReportOptions) -> None:
         raise TargetExistsError(index)
 
 
-def _write(
-    dataset: Dataset, folder: Path, options: ReportOptions, tell: Callable[[str], None]
-) -> ReportSummary:
-    target = folder / _FOLDER
+def _write(dataset: Dataset, folder: Path, tell: Callable[[str], None]) -> ReportSummary:
     problems: list[str] = []
-    with staged(target, force=True, owned=listed_names) as path:
+    with staged(folder / _FOLDER, force=True, owned=listed_names) as path:
         path.mkdir()
         cameras = []
-        for camera in _cameras(dataset, problems):
+        for number, camera in enumerate(_cameras(dataset, problems)):
             try:
                 _give_pictures(camera, folder, path, tell)
             except FormatError as error:
                 camera.note = str(error)
                 problems.append(str(error))
             cameras.append(camera)
+            columns = _call("columns", number, camera.columns())
+            (path / f"columns-{number}.js").write_bytes(columns)
         tell("topics")
-        _write_folder(path, dataset, cameras, problems)
+        for part in _PAGE.iterdir():
+            if part.name.endswith((".js", ".css")):
+                (path / part.name).write_bytes(part.read_bytes())
+        facts = _call("dataset", _data(dataset, cameras, problems))
+        (path / "data.js").write_bytes(b"/* made by mp4ds report */\n" + facts)
         write_listing(path)
-    write_synced(folder / _INDEX, (_PAGE / _INDEX).read_bytes())
-    return _summary(folder, cameras, problems)
+    index = folder / _INDEX
+    write_synced(index, (_PAGE / _INDEX).read_bytes())
+    written = [index, *(p for p in (folder / _FOLDER).rglob("*") if p.is_file())]
+    return ReportSummary(
+        index=index,
+        cameras=[CameraSummary(c.name, c.plays, c.note) for c in cameras],
+        bytes=sum(path.stat().st_size for path in written),
+        problems=problems,
+    )
 
 
 def _cameras(dataset: Dataset, problems: list[str]) -> Iterator[ReportedCamera]:
@@ -250,54 +259,16 @@ def _give_pictures(
         camera.caption = look.caption
 
 
-def _summary(folder: Path, cameras: list[ReportedCamera], problems: list[str]) -> ReportSummary:
-    files = [folder / _INDEX, *(p for p in (folder / _FOLDER).rglob("*") if p.is_file())]
-    return ReportSummary(
-        index=folder / _INDEX,
-        cameras=[CameraSummary(c.name, c.plays, c.note) for c in cameras],
-        bytes=sum(path.stat().st_size for path in files),
-        problems=problems,
-    )
-
-
 # ---------------------------------------------------------------- data of the page
 
 
-def _write_folder(
-    folder: Path, dataset: Dataset, cameras: list[ReportedCamera], problems: list[str]
-) -> None:
-    """Write all of the report except index.html and stills.
-
-    Args:
-        folder: Where to.
-        dataset: The dataset.
-        cameras: In the order of the page.
-        problems: What could not be shown of the dataset; gets what cannot be read now.
-
-    Raises:
-        OSError: It cannot be written.
-    """
-    for part in _PAGE.iterdir():
-        if part.name.endswith((".js", ".css")):
-            (folder / part.name).write_bytes(part.read_bytes())
-    for number, camera in enumerate(cameras):
-        columns = _call("columns", number, camera.columns())
-        (folder / f"columns-{number}.js").write_bytes(columns)
-    facts = _data(dataset, cameras, problems)
-    (folder / "data.js").write_bytes(_DATA_SIGN + _call("dataset", facts))
-
-
 def _call(name: str, *values: Any) -> bytes:
-    """A script that passes values to the page."""
-    return f"mp4dsReport.{name}({', '.join(map(as_script, values))});\n".encode()
-
-
-def as_script(value: Any) -> str:
-    """A value as JavaScript: ASCII, and safe inside an HTML element.
+    """A script that passes values to the page: ASCII, and safe inside an HTML element.
 
     Numbers that are not finite become null.
     """
-    return json.dumps(_finite(value), separators=(",", ":")).replace("<", "\\u003c")
+    texts = [json.dumps(_finite(value), separators=(",", ":")) for value in values]
+    return f"mp4dsReport.{name}({', '.join(texts)});\n".replace("<", "\\u003c").encode()
 
 
 def _finite(value: Any) -> Any:
@@ -318,7 +289,17 @@ def _data(dataset: Dataset, cameras: list[ReportedCamera], problems: list[str]) 
     base = min((int(columns[axis][0]) for columns in both), default=0)
     timed = [number for number, reason in enumerate(reasons) if not reason]
     try:
-        topics = _topic_rows(dataset)
+        topics = [
+            {
+                "topic": item.topic,
+                "type_name": item.type_name,
+                "messages": item.messages,
+                "rate_hz": item.rate_hz,
+                "stored": item.stored or MESSAGES_NAME,
+                "stored_bytes": item.bytes,
+            }
+            for item in topics_of(dataset)
+        ]
     except (FormatError, SourceError) as error:
         problems.append(str(error))
         topics = []
@@ -356,29 +337,6 @@ def _figures(dataset: Dataset, topics: list[dict[str, Any]]) -> dict[str, Any]:
         "source_bytes": sum(source.size for source in manifest.sources),
         "sources": [source.name for source in manifest.sources][:_MOST_NOTES],
     }
-
-
-# ---------------------------------------------------------------- topics
-
-
-def _topic_rows(dataset: Dataset) -> list[dict[str, Any]]:
-    """The topics by name.
-
-    Raises:
-        FormatError: The dataset is damaged.
-        SourceError: messages.mcap cannot be read.
-    """
-    return [
-        {
-            "topic": item.topic,
-            "type_name": item.type_name,
-            "messages": item.messages,
-            "rate_hz": item.rate_hz,
-            "stored": item.stored or MESSAGES_NAME,
-            "stored_bytes": item.bytes,
-        }
-        for item in topics_of(dataset)
-    ]
 
 
 # ---------------------------------------------------------------- many datasets
