@@ -19,11 +19,7 @@ from mp4ds.bags.protocols import BagReader, BagWriter, merged
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, read_bag_info
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.outputs import begins_with
-from mp4ds.files.sources import (
-    HOW_TO_OPEN,
-    refuse_unfinished,
-    video_at,
-)
+from mp4ds.files.sources import HOW_TO_OPEN, refuse_unfinished, video_at
 from mp4ds.files.urls import remote
 from mp4ds.records import (
     EVERYTHING,

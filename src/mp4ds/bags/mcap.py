@@ -19,11 +19,7 @@ from numpy.typing import NDArray
 
 from mp4ds._version import __version__
 from mp4ds.bags import protocols
-from mp4ds.bags.files import (
-    SALVAGE_REMEDY,
-    DamageError,
-    most_unpacked,
-)
+from mp4ds.bags.files import SALVAGE_REMEDY, DamageError, most_unpacked
 from mp4ds.bags.mcap_index import ChunkEntry, McapSummary, read_summary
 from mp4ds.bags.mcap_records import (
     MAX_RECORD_BYTES,

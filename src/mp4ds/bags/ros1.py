@@ -20,14 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.files import (
-    SALVAGE,
-    DamageError,
-    open_source,
-    other_begin,
-    unpack,
-    unreadable,
-)
+from mp4ds.bags.files import SALVAGE, DamageError, open_source, other_begin, unpack, unreadable
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import SourceError
 from mp4ds.files.ranges import expect

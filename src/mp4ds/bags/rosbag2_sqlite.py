@@ -18,18 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.files import (
-    SALVAGE,
-    SALVAGE_REMEDY,
-    OversizeError,
-    open_source,
-    unreadable,
-)
+from mp4ds.bags.files import SALVAGE, SALVAGE_REMEDY, OversizeError, open_source, unreadable
 from mp4ds.bags.protocols import BagReader, BagWriter
-from mp4ds.bags.rosbag2_metadata import (
-    MCAP_RECORD,
-    TopicMetadata,
-)
+from mp4ds.bags.rosbag2_metadata import MCAP_RECORD, TopicMetadata
 from mp4ds.errors import ConversionError, SourceError
 from mp4ds.records import (
     EVERYTHING,
@@ -245,10 +236,7 @@ class SqliteReader(BagReader):
         return "" if value is None else str(value)
 
     def _check_columns(self, tables: Tables) -> None:
-        topics, messages = (
-            self._columns(tables, "topics"),
-            self._columns(tables, "messages"),
-        )
+        topics, messages = (self._columns(tables, "topics"), self._columns(tables, "messages"))
         if not {*topics}.issuperset(_TOPIC_COLUMNS) or not {*messages} >= _MESSAGE_COLUMNS:
             raise SourceError(self.path, "is an sqlite3 database, but not of rosbag2")
         unknown = [name for name in messages if name not in _MESSAGE_COLUMNS]

@@ -246,12 +246,7 @@ FOXGLOVE_TYPES: Mapping[str, tuple[type[Fields], Mapping[str, Kind]]] = {
     "foxglove.CompressedVideo": (CodedFields, _CODED),
     "foxglove.CameraCalibration": (
         CalibrationFields,
-        {
-            **_STAMPED,
-            **_EXTENT,
-            "distortion_model": "text",
-            **dict.fromkeys("DKRP", "doubles"),
-        },
+        {**_STAMPED, **_EXTENT, "distortion_model": "text", **dict.fromkeys("DKRP", "doubles")},
     ),
 }
 """The fields of each type and what they hold (spec/registry.md, "Message types")."""

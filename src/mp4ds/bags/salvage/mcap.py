@@ -118,13 +118,7 @@ class _Scan(Scan):
         }
     )
 
-    def __init__(
-        self,
-        window: Window,
-        lose: Lose,
-        channels: Collection[int],
-        longest: int,
-    ) -> None:
+    def __init__(self, window: Window, lose: Lose, channels: Collection[int], longest: int) -> None:
         super().__init__(window, lose)
         self._channels = channels
         self._longest = longest

@@ -13,13 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.bags.files import (
-    ZSTD_MAGIC,
-    DamageError,
-    OversizeError,
-    decompress_file,
-    unzstd,
-)
+from mp4ds.bags.files import ZSTD_MAGIC, DamageError, OversizeError, decompress_file, unzstd
 from mp4ds.bags.protocols import BagReader
 from mp4ds.bags.rosbag2 import STORAGE_NAME, Rosbag2Reader, unlisted_storage
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, BagInfo, read_bag_info

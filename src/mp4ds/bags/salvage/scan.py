@@ -17,15 +17,7 @@ from mp4ds.bags.files import DECOMPRESSED, DamageError, OversizeError, open_sour
 from mp4ds.bags.protocols import BagReader, HoldBack
 from mp4ds.bags.ros1 import Fields
 from mp4ds.errors import SourceError
-from mp4ds.records import (
-    MAX_LOSSES,
-    MAX_LOST_TOPICS,
-    Excerpt,
-    Loss,
-    Message,
-    Record,
-    more_places,
-)
+from mp4ds.records import MAX_LOSSES, MAX_LOST_TOPICS, Excerpt, Loss, Message, Record, more_places
 
 BLOCK = 2**20
 _PIECE = 16 * 2**20
@@ -249,12 +241,7 @@ class Scan(ABC):
         return "a record has an impossible length"
 
     def resync(
-        self,
-        start: int,
-        problem: str,
-        *,
-        passed: int = 1,
-        kinds: Collection[int] | None = None,
+        self, start: int, problem: str, *, passed: int = 1, kinds: Collection[int] | None = None
     ) -> None:
         """Advance to the next certain record.
 
@@ -437,10 +424,7 @@ class Tally:
         self.losses: list[Draft] = []
 
     def open(
-        self,
-        expected: Mapping[int, int] | None,
-        end: int,
-        span: tuple[int, int] | None = None,
+        self, expected: Mapping[int, int] | None, end: int, span: tuple[int, int] | None = None
     ) -> None:
         """Begin a new section, once the previous one is settled.
 
