@@ -109,54 +109,43 @@ _MORE = {
 }
 _SOURCES = ("from_mosaic8", "from_yuv420", "from_yuv422")
 _METRES = ("metres16", "metres_fold", "table", "palette")
+_LOSSY = {"mono8": "gray8", "8UC1": "gray8", "8UC3": "bgr24"}
+_LOSSY.update(dict.fromkeys(("mono16", "rgb16", "bgr16"), "tone"))
+_KINDS = {"u": "U", "i": "S", "f": "F"}  # of numpy, and in the names of encodings
 
 
-def _of_samples(name: str, channels: int, dtype: str, lossy: str | None = None) -> Encoding:
+def _of_samples(name: str, channels: int, dtype: str) -> Encoding:
     """One to four channels, without a defined meaning in OpenCV's matrices."""
     general = {"1": _OF_BYTES, "2": _OF_WORDS}.get(dtype[1], {}).get(channels, "bytes")
     more = _METRES if name == "32FC1" else _MORE.get(general, ())
     if name == "8UC4":
         more = ("opaque",)
-    return Encoding(name, channels, dtype, general, (general, *more), lossy)
-
-
-def _bayer16(mosaic: str) -> Encoding:
-    exact = ("mosaic16", "mosaic_bits", "mosaic_fold")
-    return Encoding(f"bayer_{mosaic}16", 1, "u2", "mosaic16", exact, "tone", mosaic)
+    return Encoding(name, channels, dtype, general, (general, *more), _LOSSY.get(name))
 
 
 def _encodings() -> list[Encoding]:
     bayer = ("rggb", "bggr", "gbrg", "grbg")
-    sizes = {
-        "8U": "u1",
-        "8S": "i1",
-        "16U": "u2",
-        "16S": "i2",
-        "32S": "i4",
-        "32F": "f4",
-        "64F": "f8",
-    }
-    lossy = {"8UC1": "gray8", "8UC3": "bgr24"}
+    bayer16 = ("mosaic16", "mosaic_bits", "mosaic_fold")
     return [
-        _of_samples("mono8", 1, "u1", "gray8"),
-        _of_samples("mono16", 1, "u2", "tone"),
+        _of_samples("mono8", 1, "u1"),
+        _of_samples("mono16", 1, "u2"),
         Encoding("rgb8", 3, "u1", "rgb24", (*_SOURCES, "rgb24"), "rgb24"),
         Encoding("bgr8", 3, "u1", "bgr24", (*_SOURCES, "bgr24"), "bgr24"),
         Encoding("rgba8", 4, "u1", "rgba", ("rgba", "opaque"), "opaque"),
         Encoding("bgra8", 4, "u1", "bgra", ("bgra", "opaque"), "opaque"),
-        *(_of_samples(f"{order}16", 3, "u2", "tone") for order in ("rgb", "bgr")),
+        *(_of_samples(f"{order}16", 3, "u2") for order in ("rgb", "bgr")),
         *(_of_samples(f"{order}16", 4, "u2") for order in ("rgba", "bgra")),
         *(
             Encoding(f"bayer_{mosaic}8", 1, "u1", "mosaic8", ("mosaic8",), "demosaic8", mosaic)
             for mosaic in bayer
         ),
         *(
-            _bayer16(mosaic)
+            Encoding(f"bayer_{mosaic}16", 1, "u2", "mosaic16", bayer16, "tone", mosaic)
             for mosaic in bayer
         ),
         *(
-            _of_samples(f"{size}C{channels}", channels, dtype, lossy.get(f"{size}C{channels}"))
-            for size, dtype in sizes.items()
+            _of_samples(f"{8 * int(dtype[1])}{_KINDS[dtype[0]]}C{channels}", channels, dtype)
+            for dtype in ("u1", "i1", "u2", "i2", "i4", "f4", "f8")
             for channels in range(1, 5)
         ),
         *(
@@ -359,29 +348,40 @@ def native(pixels: Pixels) -> Samples:
 class Values(ABC):
     """A bijection between the samples of an image and those of its picture.
 
+    Args:
+        encoding: Of the images.
+        given: The parameters that it needs.
+
     Attributes:
-        parameters: Names of the parameters it needs.
+        parameters: Their names.
         bits: Bits per sample of the picture.
         is_identity: Whether the picture's samples have the bit patterns of the image's.
+
+    Raises:
+        ValueError: The parameters contradict themselves, or the encoding.
     """
 
     parameters: ClassVar[frozenset[str]] = frozenset()
-    bits: int
     is_identity = False
 
-    @classmethod
-    @abstractmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
-        """That with some parameters, which are those it needs.
-
-        Raises:
-            ValueError: They contradict themselves, or the encoding.
-        """
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        self.encoding, self.given = encoding, given
+        self.bits = 8 * encoding.bytes_per_sample
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """Parameters that suit samples of a stream, at least one; None if there are none."""
         return NO_PARAMETERS
+
+    @classmethod
+    def first_fitting(
+        cls, encoding: Encoding, samples: Sequence[Pixels], *candidates: LayoutParameters
+    ) -> LayoutParameters | None:
+        """The first of some parameters with which no sample is refused; None if there are none."""
+        for given in candidates:
+            if not any(map(cls(encoding, given).refuses, samples)):
+                return given
+        return None
 
     def shape(self, pixels: Pixels) -> tuple[int, ...]:
         """Shape of the samples of pixels."""
@@ -432,22 +432,18 @@ class Arrangement(ABC):
     def arrange(self, samples: Samples) -> Picture:
         """The picture; may be a view."""
 
-    @abstractmethod
     def restore(self, picture: Picture, samples: Samples) -> None:
-        """Write the samples of a picture of the right size."""
+        """Write the samples of a picture of the right size; here, where `arrange` gives views."""
+        for plane, target in zip(picture, self.arrange(samples), strict=True):
+            target[...] = plane
 
 
 class Whole(Values):
     """Samples as they are; signed integers have their top bit inverted, which keeps their order."""
 
-    def __init__(self, encoding: Encoding) -> None:
-        self.bits = 8 * encoding.bytes_per_sample
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        super().__init__(encoding, given)
         self.is_identity = not encoding.is_signed
-
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
-        """No parameters are needed."""
-        return cls(encoding)
 
     def encode(self, pixels: Pixels) -> Samples:
         """A view where possible."""
@@ -456,35 +452,38 @@ class Whole(Values):
 
     def decode(self, samples: Samples, out: Pixels) -> None:
         """Write the pixels."""
-        top = 0 if self.is_identity else 1 << (self.bits - 1)
-        patterns(out)[...] = samples ^ samples.dtype.type(top) if top else samples
+        patterns(out)[...] = samples ^ samples.dtype.type(1 << (self.bits - 1))
+
+
+def beyond(samples: Samples, bits: int, shift: int) -> str | None:
+    """That samples have other bits than so many above so many zero bits; None if they do not."""
+    used = int(np.bitwise_or.reduce(samples, axis=None))
+    if used & ~(((1 << bits) - 1) << shift):
+        below = f" above {shift} zero bits" if shift else ""
+        return f"a value does not fit into {bits} bits{below}"
+    return None
 
 
 class Narrow(Values):
     """The bits in use of 16-bit samples.
 
     Attributes:
-        bits: Bits per sample, one of `DEPTHS` or 16.
+        bits: Bits per sample, one of `depths`.
         shift: Zero bits below them.
-        signed: Whether half of the range is added first.
     """
 
     parameters = frozenset({"bits", "shift"})
     depths: ClassVar[tuple[int, ...]] = DEPTHS
 
-    def __init__(self, bits: int, shift: int, signed: bool) -> None:
-        self.bits, self.shift = bits, shift
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        super().__init__(encoding, given)
+        self.bits, self.shift = given.bits or 0, given.shift or 0
+        if self.bits not in self.depths or self.bits + self.shift > 16:
+            raise ValueError(f"no layout has {self.bits} bits above {self.shift} zero bits")
         # whether only the picture's format differs
-        self.is_identity = bits > 8 and not shift and not signed
-        self._half = 1 << (bits + shift - 1) if signed else 0
-
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Narrow:
-        """For so many bits above so many zero bits."""
-        bits, shift = parameters.bits or 0, parameters.shift or 0
-        if bits not in cls.depths or bits + shift > 16:
-            raise ValueError(f"no layout has {bits} bits above {shift} zero bits")
-        return cls(bits, shift, encoding.is_signed)
+        self.is_identity = self.bits > 8 and not self.shift and not encoding.is_signed
+        # half of the range is added to signed samples
+        self._half = 1 << (self.bits + self.shift - 1) if encoding.is_signed else 0
 
     def _shifted(self, pixels: Pixels) -> Samples:
         samples = native(pixels)
@@ -507,12 +506,7 @@ class Narrow(Values):
 
     def refuses(self, pixels: Pixels) -> str | None:
         """A bit outside the kept ones."""
-        used = int(np.bitwise_or.reduce(self._shifted(pixels), axis=None))
-        kept = ((1 << self.bits) - 1) << self.shift
-        if used & ~kept:
-            below = f" above {self.shift} zero bits" if self.shift else ""
-            return f"a value does not fit into {self.bits} bits{below}"
-        return None
+        return beyond(self._shifted(pixels), self.bits, self.shift)
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
@@ -531,13 +525,13 @@ class Narrow(Values):
         bits = (used >> zeros).bit_length()
         if not encoding.is_signed and bits in DEPTHS and most >> zeros == (1 << bits) - 1:
             return LayoutParameters(bits=bits, shift=zeros)
+        candidates = []
         # top bit of the values, and minimum zero bits below
         for top, least in ((16, 4), (12, 0), (16, 2)):
             bits = next((depth for depth in DEPTHS if depth >= top - zeros), 16)
-            narrow = cls(bits, top - bits, encoding.is_signed)
-            if zeros >= least and bits < 16 and not any(map(narrow.refuses, samples)):
-                return LayoutParameters(bits=bits, shift=top - bits)
-        return None
+            if zeros >= least and bits < 16:
+                candidates.append(LayoutParameters(bits=bits, shift=top - bits))
+        return Narrow.first_fitting(encoding, samples, *candidates)
 
 
 class NarrowPlanes(Narrow):
@@ -564,41 +558,24 @@ class NarrowFolded(Narrow):
     parameters = frozenset({"bits", "shift", "low"})
     depths = (*DEPTHS, 16)
 
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Narrow:
-        """For so many low bits of them, too."""
-        values, low = super().bind(encoding, parameters), parameters.low or 0
-        if not 1 <= values.bits - low <= _MOST_HIGH:
-            raise ValueError(f"no layout has {low} low bits of {values.bits}")
-        return values
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        super().__init__(encoding, given)
+        low = given.low or 0
+        if not 1 <= self.bits - low <= _MOST_HIGH:
+            raise ValueError(f"no layout has {low} low bits of {self.bits}")
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """All bits, or those in use if there are enough of them to separate noise from the rest."""
         found = Narrow.fit(encoding, samples) or LayoutParameters(bits=16, shift=0)
         low = _LOW_BITS.get(found.bits or 0)
-        return (
-            None if low is None else LayoutParameters(bits=found.bits, shift=found.shift, low=low)
-        )
+        return found.model_copy(update={"low": low}) if low else None
 
 
 class Opaque(Values):
-    """The colours of 8-bit pixels that all have the same alpha.
-
-    Attributes:
-        alpha: Of every pixel.
-    """
+    """The colours of 8-bit pixels that all have the same alpha."""
 
     parameters = frozenset({"alpha"})
-    bits = 8
-
-    def __init__(self, alpha: int) -> None:
-        self.alpha = alpha
-
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
-        """For that alpha."""
-        return cls(parameters.alpha or 0)
 
     def shape(self, pixels: Pixels) -> tuple[int, ...]:
         """Three channels."""
@@ -611,18 +588,16 @@ class Opaque(Values):
     def decode(self, samples: Samples, out: Pixels) -> None:
         """Write the pixels."""
         out[..., :3] = samples
-        out[..., 3] = self.alpha
+        out[..., 3] = self.given.alpha
 
     def refuses(self, pixels: Pixels) -> str | None:
         """A different alpha."""
-        if (pixels[..., 3] != self.alpha).any():
-            return f"an alpha that is not the stream's, {self.alpha}"
+        if (pixels[..., 3] != self.given.alpha).any():
+            return f"an alpha that is not the stream's, {self.given.alpha}"
         return None
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The alpha of the first pixel, if all have it."""
         alpha = int(samples[0][0, 0, 3])
-        if any(cls(alpha).refuses(pixels) for pixels in samples):
-            return None
-        return LayoutParameters(alpha=alpha)
+        return cls.first_fitting(encoding, samples, LayoutParameters(alpha=alpha))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 
@@ -59,10 +60,6 @@ class Packed(Arrangement):
         """A view."""
         return (samples,)
 
-    def restore(self, picture: Picture, samples: Samples) -> None:
-        """Copy."""
-        np.copyto(samples, picture[0])
-
 
 @dataclass(frozen=True, slots=True)
 class Mosaic(Arrangement):
@@ -78,58 +75,26 @@ class Mosaic(Arrangement):
 
     def arrange(self, samples: Samples) -> Picture:
         """A copy."""
-        height, width = samples.shape
-        half_height, half_width = (height + 1) // 2, (width + 1) // 2
-        picture = np.empty((2 * half_height, 2 * half_width), dtype=samples.dtype)
-        for row in (0, 1):
-            for column in (0, 1):
-                part = samples[row::2, column::2]
-                if not part.size:
-                    part = samples[:1, :1]
-                tile = picture[
-                    row * half_height : (row + 1) * half_height,
-                    column * half_width : (column + 1) * half_width,
-                ]
-                tile[: part.shape[0], : part.shape[1]] = part
-                tile[part.shape[0] :, : part.shape[1]] = part[-1:]
-                tile[:, part.shape[1] :] = tile[:, part.shape[1] - 1 : part.shape[1]]
+        width, height = self.picture_size(samples.shape[1], samples.shape[0])
+        picture = np.empty((height, width), samples.dtype)
+        for tile, part in self._tiles(picture, samples):
+            if not part.size:
+                part = samples[:1, :1]
+            missing = np.subtract(tile.shape, part.shape)
+            tile[...] = np.pad(part, [(0, n) for n in missing], "edge") if any(missing) else part
         return (picture,)
 
     def restore(self, picture: Picture, samples: Samples) -> None:
         """Copy."""
-        height, width = samples.shape
-        half_height, half_width = (height + 1) // 2, (width + 1) // 2
-        for row in (0, 1):
-            for column in (0, 1):
-                target = samples[row::2, column::2]
-                target[...] = picture[0][
-                    row * half_height : row * half_height + target.shape[0],
-                    column * half_width : column * half_width + target.shape[1],
-                ]
+        for tile, part in self._tiles(picture[0], samples):
+            part[...] = tile[: part.shape[0], : part.shape[1]]
 
-
-@dataclass(frozen=True, slots=True)
-class Stack(Arrangement):
-    """The channels of an image, stacked vertically.
-
-    Attributes:
-        channels: Number of channels.
-    """
-
-    channels: int
-
-    def picture_size(self, width: int, height: int) -> tuple[int, int]:
-        """Height times the number of channels."""
-        return width, self.channels * height
-
-    def arrange(self, samples: Samples) -> Picture:
-        """A copy."""
-        return (np.concatenate(np.moveaxis(samples, 2, 0)),)
-
-    def restore(self, picture: Picture, samples: Samples) -> None:
-        """Copy."""
-        for n, channel in enumerate(np.split(picture[0], self.channels)):
-            samples[..., n] = channel
+    def _tiles(self, picture: Samples, samples: Samples) -> Iterator[tuple[Samples, Samples]]:
+        """Views of each tile, and of the samples in it."""
+        height, width = picture.shape
+        tiles = picture.reshape(2, height // 2, 2, width // 2)
+        for row, column in product((0, 1), (0, 1)):
+            yield tiles[row, :, column], samples[row::2, column::2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,17 +111,10 @@ class PlanarRgb(Arrangement):
         """By alpha and depth."""
         return f"{'gbrap' if 'a' in self.order else 'gbrp'}{bits}le"
 
-    def _channels(self) -> Iterator[int]:
-        return (self.order.index(colour) for colour in "gbra"[: len(self.order)])
-
     def arrange(self, samples: Samples) -> Picture:
         """Views."""
-        return tuple(samples[..., channel] for channel in self._channels())
-
-    def restore(self, picture: Picture, samples: Samples) -> None:
-        """Copy."""
-        for channel, plane in zip(self._channels(), picture, strict=True):
-            samples[..., channel] = plane
+        channels = map(self.order.index, "gbra"[: len(self.order)])
+        return tuple(samples[..., channel] for channel in channels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,54 +173,62 @@ class Fold(Arrangement):
 
 
 @dataclass(frozen=True, slots=True)
-class Bytes(Arrangement):
-    """A picture for each byte of 32- or 64-bit samples, highest first: two or four side by side.
+class Stack(Arrangement):
+    """The channels of an image, stacked vertically; of large samples each byte, in two rows.
 
-    In two rows, with channels stacked. So each slice of the codec has bytes of one kind, and the
-    smooth high bytes do not share statistics with the low ones.
+    These have two or four pictures side by side, highest byte first. So each slice of the codec has
+    bytes of one kind, and the smooth high bytes do not share statistics with the low ones.
 
     Attributes:
-        size: Bytes of a sample, 4 or 8.
         channels: Of the image.
+        size: Bytes of a sample, 4 or 8; 1 for samples that stay whole.
     """
 
-    size: int
     channels: int
+    size: int = 1
+
+    @property
+    def _grid(self) -> tuple[int, int]:
+        """Rows and columns of pictures for each channel."""
+        return (1, 1) if self.size == 1 else (2, self.size // 2)
 
     def pixel_format(self, bits: int) -> str:
-        """Grey, 8 bits."""
-        return "gray"
+        """Grey, 8 bits for each byte."""
+        return Arrangement.pixel_format(self, bits if self.size == 1 else 8)
 
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
-        """Two rows of pictures for each channel."""
-        return self.size // 2 * width, 2 * self.channels * height
+        """Of all these pictures."""
+        down, across = self._grid
+        return across * width, self.channels * down * height
 
     def _tiles(self, picture: Samples, samples: Samples) -> Samples:
         """A picture as a view of shape (H, W, channels, rows of pictures, pictures in a row)."""
-        height, width = samples.shape[:2]
-        tiles = picture.reshape(self.channels, 2, height, self.size // 2, width)
-        return tiles.transpose(2, 4, 0, 1, 3)
+        (height, width), (down, across) = samples.shape[:2], self._grid
+        return picture.reshape(self.channels, down, height, across, width).transpose(2, 4, 0, 1, 3)
 
-    def _bytes(self, big: Samples) -> Samples:
-        """Contiguous big-endian samples as a view of the same shape."""
-        split = (*big.shape[:2], self.channels, 2, self.size // 2)
-        return big.view(np.uint8).reshape(split)
+    def _parts(self, samples: Samples) -> Samples:
+        """Samples, contiguous and big-endian where each byte is a part, as a view of that shape."""
+        parts = samples if self.size == 1 else samples.view(np.uint8)
+        return parts.reshape(*samples.shape[:2], self.channels, *self._grid)
 
     def arrange(self, samples: Samples) -> Picture:
         """A copy."""
         width, height = self.picture_size(samples.shape[1], samples.shape[0])
-        picture = np.empty((height, width), np.uint8)
-        big = np.ascontiguousarray(samples, f">u{self.size}")
-        self._tiles(picture, samples)[...] = self._bytes(big)
+        if self.size > 1:
+            samples = np.ascontiguousarray(samples, f">u{self.size}")
+        parts = self._parts(samples)
+        picture = np.empty((height, width), parts.dtype)
+        self._tiles(picture, samples)[...] = parts
         return (picture,)
 
     def restore(self, picture: Picture, samples: Samples) -> None:
         """Copy."""
-        big = np.empty(samples.shape, f">u{self.size}")
-        parts, tiles = self._bytes(big), self._tiles(picture[0], samples)
+        whole = samples if self.size == 1 else np.empty(samples.shape, f">u{self.size}")
+        parts, tiles = self._parts(whole), self._tiles(picture[0], samples)
         for part in np.ndindex(parts.shape[2:]):  # a fifth of the time of all at once
             parts[(..., *part)] = tiles[(..., *part)]
-        samples[...] = big
+        if whole is not samples:
+            samples[...] = whole
 
 
 # ---------------------------------------------------------------- chroma
@@ -285,19 +251,10 @@ class Packed422(Arrangement):
         """Chroma of half the width."""
         return "yuv422p"
 
-    def luma_rows(self, samples: Samples) -> int:
-        """Rows of the image."""
-        return int(samples.shape[0])
-
     def arrange(self, samples: Samples) -> Picture:
         """Views."""
         chroma = samples[..., 1 - self.luma]
         return samples[..., self.luma], chroma[:, 0::2], chroma[:, 1::2]
-
-    def restore(self, picture: Picture, samples: Samples) -> None:
-        """Copy."""
-        for plane, target in zip(picture, self.arrange(samples), strict=True):
-            target[...] = plane
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,21 +275,21 @@ class SemiPlanar(Arrangement):
 
     def arrange(self, samples: Samples) -> Picture:
         """Views if rows are contiguous."""
-        height = self.luma_rows(samples)
+        height = self._luma_rows(samples)
         both = samples[height:].reshape(height >> self.halved, -1, 2)
         u = 0 if self.first == "u" else 1
         return samples[:height], both[..., u], both[..., 1 - u]
 
     def restore(self, picture: Picture, samples: Samples) -> None:
         """Copy."""
-        height = self.luma_rows(samples)
+        height = self._luma_rows(samples)
         u = 0 if self.first == "u" else 1
         both = np.empty((*picture[1].shape, 2), samples.dtype)
         both[..., u], both[..., 1 - u] = picture[1], picture[2]
         samples[:height] = picture[0]
         samples[height:] = both.reshape(-1, samples.shape[1])
 
-    def luma_rows(self, samples: Samples) -> int:
+    def _luma_rows(self, samples: Samples) -> int:
         """Rows of the image."""
         return int(samples.shape[0] * 2 // 3 if self.halved else samples.shape[0] // 3)
 
@@ -374,7 +331,7 @@ class Halved(Arrangement):
 
     def restore(self, picture: Picture, samples: Samples) -> None:
         """Copy; chroma samples are repeated."""
-        height, width = self.full.luma_rows(samples), samples.shape[1]
+        height, width = self.full.arrange(samples)[0].shape
         across, down = self._shifts
         planes = [picture[0][:height, :width]]
         for plane in picture[1:]:
@@ -502,7 +459,7 @@ LAYOUTS: dict[str, LayoutKind] = {
         ),
         LayoutKind("metres16", Metres, lambda e, p: Packed()),
         LayoutKind("metres_fold", Metres, lambda e, p: _fold(p)),
-        LayoutKind("bytes", Whole, lambda e, p: Bytes(e.bytes_per_sample, e.channels)),
+        LayoutKind("bytes", Whole, lambda e, p: Stack(e.channels, e.bytes_per_sample)),
     )
 }
 
@@ -618,7 +575,7 @@ def bind(name: str, encoding: Encoding, parameters: LayoutParameters = NO_PARAME
         needed = ", ".join(sorted(kind.parameters)) or "none"
         given = ", ".join(sorted(parameters.values)) or "none"
         raise ValueError(f"layout {name} needs the parameters {needed} and was given {given}")
-    values = kind.values.bind(encoding, parameters)
+    values = kind.values(encoding, parameters)
     arrangement = kind.arrangement(encoding, parameters)
     pixel_format = arrangement.pixel_format(values.bits)
     return Layout(

@@ -10,6 +10,7 @@ import numpy as np
 
 from mp4ds.messages.encodings import (
     MAX_TABLE,
+    NO_PARAMETERS,
     Arrangement,
     Encoding,
     LayoutParameters,
@@ -19,30 +20,13 @@ from mp4ds.messages.encodings import (
     Samples,
     Values,
     Whole,
+    beyond,
     native,
     patterns,
 )
 
 SCALES = ("product", "quotient")
 """How metres were made from millimetres: ``k * 0.001f`` or ``k / 1000``."""
-
-
-def table_of(encoding: Encoding, parameters: LayoutParameters) -> Samples:
-    """The table of a layout, as patterns of an encoding's samples.
-
-    Raises:
-        ValueError: It is empty or too long, does not increase, or has other values.
-    """
-    table = parameters.table or ()
-    if not table:
-        raise ValueError("a table of 0 values")
-    top = 256**encoding.bytes_per_sample - 1
-    if max(table) > top:
-        raise ValueError(f"a table with values beyond 0 to {top}")
-    array = np.array(table, f"u{encoding.bytes_per_sample}")
-    if (array[1:] <= array[:-1]).any():
-        raise ValueError("a table that does not increase")
-    return array
 
 
 class PatternTable(Values):
@@ -54,14 +38,17 @@ class PatternTable(Values):
 
     parameters = frozenset({"table"})
 
-    def __init__(self, table: Samples) -> None:
-        self.table = table
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        super().__init__(encoding, given)
+        table, top = given.table or (), 2**self.bits - 1
+        if not table:
+            raise ValueError("a table of 0 values")
+        if max(table) > top:
+            raise ValueError(f"a table with values beyond 0 to {top}")
+        self.table = np.array(table, f"u{encoding.bytes_per_sample}")
+        if (self.table[1:] <= self.table[:-1]).any():
+            raise ValueError("a table that does not increase")
         self.bits = 8 if len(table) <= 256 else 16
-
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
-        """For that table."""
-        return cls(table_of(encoding, parameters))
 
     def _numbers(self, samples: Samples) -> Samples:
         """For each sample the index of the last pattern that is not greater, or 0."""
@@ -86,12 +73,13 @@ class PatternTable(Values):
 
     def refuses(self, pixels: Pixels) -> str | None:
         """A pattern that is not in the table."""
-        samples = native(pixels)
-        unknown = self.table[self.encode(pixels)] != samples
+        unknown = self.table[self.encode(pixels)] != native(pixels)
         if unknown.any():
-            value = np.ascontiguousarray(pixels[unknown][:1]).item()
-            return f"value {value} is not one of the {len(self.table)} in the stream's table"
+            return f"value {np.ascontiguousarray(pixels[unknown][:1]).item()} is {self._unknown()}"
         return None
+
+    def _unknown(self) -> str:
+        return f"not one of the {len(self.table)} in the stream's table"
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
@@ -126,24 +114,17 @@ class Tone(PatternTable):
 
     parameters = frozenset({"bits", "shift", "table"})
 
-    def __init__(self, table: Samples, used: Narrow) -> None:
-        super().__init__(table)
-        self._used = used
-        wide = table.astype(np.uint32)
-        self._between = (wide[:-1] + wide[1:] + 1) // 2
-
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
-        """For so many bits above so many zero bits, and that table."""
-        bits, shift = parameters.bits or 0, parameters.shift or 0
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        super().__init__(encoding, given)
+        self._used = bits, shift = given.bits or 0, given.shift or 0
         if bits < 8 or bits + shift > 16:
             raise ValueError(f"no layout shows {bits} bits above {shift} zero bits")
-        table, used = table_of(encoding, parameters), Narrow(bits, shift, signed=False)
-        if len(table) != 256:
-            raise ValueError(f"a table of {len(table)} values, not of 256")
-        if reason := used.refuses(table):
+        if len(self.table) != 256:
+            raise ValueError(f"a table of {len(self.table)} values, not of 256")
+        if reason := beyond(self.table, bits, shift):
             raise ValueError(f"a table in which {reason}")
-        return cls(table, used)
+        wide = self.table.astype(np.uint32)
+        self._between = (wide[:-1] + wide[1:] + 1) // 2
 
     def _numbers(self, samples: Samples) -> Samples:
         found: Samples = np.searchsorted(self._between, samples, side="right").astype(np.uint8)
@@ -151,7 +132,7 @@ class Tone(PatternTable):
 
     def refuses(self, pixels: Pixels) -> str | None:
         """A bit outside the kept ones."""
-        return self._used.refuses(pixels)
+        return beyond(native(pixels), *self._used)
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
@@ -193,32 +174,18 @@ def _metres(scale: str) -> Samples:
     return found
 
 
-class Metres(Values):
-    """Whole millimetres, from floats in metres; 0 is the hole.
-
-    Attributes:
-        hole: Bit pattern of a float32: 0, a NaN or an infinity.
-        scale: One of `SCALES`.
-    """
+class Metres(PatternTable):
+    """Whole millimetres, from floats in metres; 0 is the hole: 0, a NaN or an infinity."""
 
     parameters = frozenset({"hole", "scale"})
-    bits = 16
 
-    def __init__(self, hole: int, scale: str) -> None:
-        self.hole, self.scale = hole, scale
-
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
-        """For that hole and scale."""
-        hole, scale = parameters.hole, parameters.scale
-        if scale not in SCALES:
-            raise ValueError(f"scale {scale!r} is not one of {', '.join(SCALES)}")
-        return cls(hole or 0, scale)
-
-    def _table(self) -> Samples:
-        table: Samples = _metres(self.scale).copy()
-        table[0] = self.hole
-        return table
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        Values.__init__(self, encoding, given)
+        if given.scale not in SCALES:
+            raise ValueError(f"scale {given.scale!r} is not one of {', '.join(SCALES)}")
+        self.bits = 16
+        self.table = _metres(given.scale).copy()
+        self.table[0] = given.hole or 0
 
     def encode(self, pixels: Pixels) -> Samples:
         """New samples."""
@@ -229,17 +196,8 @@ class Metres(Values):
         found: Samples = counts.astype(np.uint16)
         return found
 
-    def decode(self, samples: Samples, out: Pixels) -> None:
-        """Write the pixels."""
-        patterns(out)[...] = self._table()[samples]
-
-    def refuses(self, pixels: Pixels) -> str | None:
-        """A float that is neither the hole nor a whole number of millimetres."""
-        other = self._table()[self.encode(pixels)] != native(pixels)
-        if other.any():
-            value = np.ascontiguousarray(pixels[other][:1]).item()
-            return f"value {value} is neither whole millimetres nor the stream's mark of a hole"
-        return None
+    def _unknown(self) -> str:
+        return "neither whole millimetres nor the stream's mark of a hole"
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
@@ -251,13 +209,9 @@ class Metres(Values):
             if holes.size:
                 hole = int(holes[0])
                 break
-        for scale in SCALES:
-            metres = cls(hole, scale)
-            if not any(metres.refuses(pixels[::16, ::16]) for pixels in samples) and not any(
-                metres.refuses(pixels) for pixels in samples
-            ):
-                return LayoutParameters(hole=hole, scale=scale)
-        return None
+        candidates = [LayoutParameters(hole=hole, scale=scale) for scale in SCALES]
+        likely = cls.first_fitting(encoding, [one[::16, ::16] for one in samples], *candidates)
+        return cls.first_fitting(encoding, samples, *candidates) if likely else None
 
 
 # ---------------------------------------------------------------- few values in an image
@@ -269,33 +223,24 @@ _ROOM = 3 / 2  # entries per value of a sample image
 
 
 class Few(Whole):
-    """Samples of a limited number of different values in each image.
-
-    Attributes:
-        entries: That number.
-    """
+    """Samples of a limited number of different values in each image."""
 
     parameters = frozenset({"entries"})
 
-    def __init__(self, encoding: Encoding, entries: int) -> None:
-        super().__init__(encoding)
-        self.entries = entries
-
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
-        """For a list of so many entries."""
-        entries = parameters.entries or 0
-        if entries < FEWEST_ENTRIES or entries & (entries - 1):
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        super().__init__(encoding, given)
+        self._entries = given.entries or 0
+        if self._entries < FEWEST_ENTRIES or self._entries & (self._entries - 1):
             raise ValueError(
-                f"a list of {entries} values, which is no power of two from {FEWEST_ENTRIES} on"
+                f"a list of {self._entries} values, which is no power of two from "
+                f"{FEWEST_ENTRIES} on"
             )
-        return cls(encoding, entries)
 
     def refuses(self, pixels: Pixels) -> str | None:
         """Too many values."""
         count = len(distinct(native(pixels)))
-        if count > self.entries:
-            return f"{count} different values, more than the {self.entries} of the stream's list"
+        if count > self._entries:
+            return f"{count} different values, more than the {self._entries} of the stream's list"
         return None
 
     @classmethod
@@ -305,7 +250,7 @@ class Few(Whole):
         for pixels in samples:
             if len(distinct(native(pixels)[::8, ::8])) > MOST_ENTRIES / _ROOM:
                 return None
-            values = distinct(Whole(encoding).encode(pixels))
+            values = distinct(Whole(encoding, NO_PARAMETERS).encode(pixels))
             if not encoding.is_float and int(values[-1]) - int(values[0]) + 1 < 2 * len(values):
                 return None  # a plain picture hardly has more
             most = max(most, len(values))

@@ -173,25 +173,15 @@ def _beside(options: int, least: int) -> int:
 
 
 class Demosaiced(Source):
-    """The mosaic of colours that were made of it by bilinear interpolation.
-
-    Attributes:
-        mosaic: One of `MOSAICS`.
-    """
+    """The mosaic of colours that were made of it by bilinear interpolation."""
 
     parameters = frozenset({"mosaic"})
 
-    def __init__(self, encoding: Encoding, mosaic: str) -> None:
-        self._encoding = encoding
-        self.mosaic = mosaic
-        self.bits = 8 * encoding.bytes_per_sample
-
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
-        """For that mosaic."""
-        if parameters.mosaic not in MOSAICS:
-            raise ValueError(f"mosaic {parameters.mosaic!r} is not one of {', '.join(MOSAICS)}")
-        return cls(encoding, parameters.mosaic)
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        super().__init__(encoding, given)
+        if given.mosaic not in MOSAICS:
+            raise ValueError(f"mosaic {given.mosaic!r} is not one of {', '.join(MOSAICS)}")
+        self._mosaic = given.mosaic
 
     def shape(self, pixels: Pixels) -> tuple[int, ...]:
         """One sample a pixel."""
@@ -199,15 +189,15 @@ class Demosaiced(Source):
 
     def encode(self, pixels: Pixels) -> Samples:
         """New samples."""
-        return _mosaic(_colours(native(pixels), self._encoding), self.mosaic)
+        return _mosaic(_colours(native(pixels), self.encoding), self._mosaic)
 
     def predicted(self, prediction: Pixels) -> Samples:
         """The color that the mosaic has at each pixel."""
-        return _sampled(_colours(prediction, self._encoding), self.mosaic)
+        return _sampled(_colours(prediction, self.encoding), self._mosaic)
 
     def decode(self, samples: Samples, out: Pixels) -> None:
         """Write the pixels."""
-        _demosaic(samples, self.mosaic, _colours(patterns(out), self._encoding))
+        _demosaic(samples, self._mosaic, _colours(patterns(out), self.encoding))
 
     def prove(self, pixels: Pixels) -> Samples:
         """The mosaic, if interpolation gives every colour."""
@@ -215,22 +205,21 @@ class Demosaiced(Source):
         samples = self.encode(pixels)
         self.decode(samples, made)
         if not np.array_equal(made, native(pixels)):
-            raise Refused(f"it was not made of a mosaic ({self.mosaic})")
+            raise Refused(f"it was not made of a mosaic ({self._mosaic})")
         return samples
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The only mosaic that explains the inside of a few places, if it explains all images."""
-        found = [name for name in MOSAICS if cls(encoding, name)._may_have_made(samples[0])]
-        if len(found) != 1 or any(map(cls(encoding, found[0]).refuses, samples)):
-            return None
-        return LayoutParameters(mosaic=found[0])
+        candidates = [LayoutParameters(mosaic=mosaic) for mosaic in MOSAICS]
+        found = [given for given in candidates if cls(encoding, given)._may_have_made(samples[0])]
+        return cls.first_fitting(encoding, samples, *found) if len(found) == 1 else None
 
     def _may_have_made(self, pixels: Pixels) -> bool:
         for rows in _band_rows(len(pixels)):
-            rgb = _colours(native(pixels[rows]), self._encoding)
+            rgb = _colours(native(pixels[rows]), self.encoding)
             made = np.empty(rgb.shape, rgb.dtype)
-            _demosaic(_mosaic(rgb, self.mosaic), self.mosaic, made)
+            _demosaic(_mosaic(rgb, self._mosaic), self._mosaic, made)
             if not np.array_equal(made[2:-2, 2:-2], rgb[2:-2, 2:-2]):
                 return False
         return True
@@ -486,26 +475,16 @@ def _estimate(colours: Samples) -> Samples:
 
 
 class Converted(Source):
-    """The YUV, chroma halved, of colours that were made of it.
-
-    Attributes:
-        rule: One of `CONVERSIONS`.
-    """
+    """The YUV, chroma halved, of colours that were made of it."""
 
     parameters = frozenset({"rule"})
-    bits = 8
     is_tall = False  # whether chroma is halved in height, too
 
-    def __init__(self, encoding: Encoding, rule: str) -> None:
-        self._encoding = encoding
-        self.rule = rule
-
-    @classmethod
-    def bind(cls, encoding: Encoding, parameters: LayoutParameters) -> Values:
-        """For that rule."""
-        if parameters.rule not in CONVERSIONS:
-            raise ValueError(f"rule {parameters.rule!r} is not one of {', '.join(CONVERSIONS)}")
-        return cls(encoding, parameters.rule)
+    def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
+        super().__init__(encoding, given)
+        if given.rule not in CONVERSIONS:
+            raise ValueError(f"rule {given.rule!r} is not one of {', '.join(CONVERSIONS)}")
+        self._conversion = CONVERSIONS[given.rule]
 
     def shape(self, pixels: Pixels) -> tuple[int, ...]:
         """As YUYV or NV12 have it."""
@@ -515,12 +494,12 @@ class Converted(Source):
     def _solved(self, pixels: Pixels) -> _Solution:
         height, width = pixels.shape[:2]
         down = 1 + self.is_tall
-        rgb = _colours(pixels, self._encoding)
+        rgb = _colours(pixels, self.encoding)
         colours = np.empty((3, down, 2, height // down, width // 2), np.int32)
         for color, y, x in product(range(3), range(down), (0, 1)):
             colours[color, y, x] = rgb[y::down, x::2, color]
         colours = colours.reshape(3, 2 * down, -1)
-        return _Solution.of(CONVERSIONS[self.rule], colours)
+        return _Solution.of(self._conversion, colours)
 
     def _planes(self, samples: Samples) -> tuple[Samples, Samples, Samples]:
         """Views of Y, U and V."""
@@ -548,7 +527,7 @@ class Converted(Source):
     def predicted(self, prediction: Pixels) -> Samples:
         """About the YUV of these colours: one rule for all."""
         samples = np.empty(self.shape(prediction), np.uint8)
-        rgb = _colours(prediction, self._encoding)
+        rgb = _colours(prediction, self.encoding)
         luma, u, v = self._planes(samples)
         halvings = 1 + self.is_tall
         middle = 0x8080 << halvings
@@ -573,8 +552,8 @@ class Converted(Source):
         down = 1 + self.is_tall
         blocks = luma.reshape(len(u), down, -1, 2)
         chroma = (256 * u.astype(np.int32) + v)[:, None, :, None]
-        target = _colours(out, self._encoding)
-        for color, made in enumerate(CONVERSIONS[self.rule].colours(blocks, chroma)):
+        target = _colours(out, self.encoding)
+        for color, made in enumerate(self._conversion.colours(blocks, chroma)):
             target[..., color] = np.clip(made, 0, 255).reshape(luma.shape)
 
     def prove(self, pixels: Pixels) -> Samples:
@@ -585,7 +564,7 @@ class Converted(Source):
         if not solution.is_refuted:
             solution.complete()
         if solution.is_open.any():
-            raise Refused(f"it was not made of YUV ({self.rule})")
+            raise Refused(f"it was not made of YUV ({self.given.rule})")
         return self._placed(solution, pixels)
 
     @classmethod
@@ -595,14 +574,13 @@ class Converted(Source):
         if width % 2 or (cls.is_tall and height % 2):
             return None
         places = np.concatenate([samples[0][rows] for rows in _band_rows(height)])
-        for name in CONVERSIONS:
-            tried = cls(encoding, name)
-            solution = tried._solved(places)
-            if solution.is_refuted or len(np.unique(solution.chroma)) < _FEWEST_CHROMAS:
-                continue
-            if not any(map(tried.refuses, samples)):
-                return LayoutParameters(rule=name)
-        return None
+        candidates = [LayoutParameters(rule=rule) for rule in CONVERSIONS]
+        likely = []
+        for given in candidates:
+            solution = cls(encoding, given)._solved(places)
+            if not solution.is_refuted and len(np.unique(solution.chroma)) >= _FEWEST_CHROMAS:
+                likely.append(given)
+        return cls.first_fitting(encoding, samples, *likely)
 
 
 class ConvertedTall(Converted):
