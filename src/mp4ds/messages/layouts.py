@@ -388,14 +388,12 @@ class LayoutKind:
     """A layout of the registry.
 
     Attributes:
-        name: Its name there.
         values: The step on values, which knows its parameters.
         arrangement: Makes their placement.
         is_exact: Whether the pixels are restored if the picture is.
         is_shown: Whether the picture looks like the image, so that its colours are tagged.
     """
 
-    name: str
     values: type[Values]
     arrangement: Callable[[Encoding, LayoutParameters], Arrangement]
     is_exact: bool = True
@@ -408,59 +406,54 @@ class LayoutKind:
 
 
 def _shown(
-    name: str,
     arrangement: Callable[[Encoding, LayoutParameters], Arrangement],
     values: type[Values] = Whole,
     *,
     exact: bool = True,
 ) -> LayoutKind:
-    return LayoutKind(name, values, arrangement, is_exact=exact, is_shown=True)
+    return LayoutKind(values, arrangement, is_exact=exact, is_shown=True)
 
 
 _COLOURS = {"rgba": "rgb24", "bgra": "bgr24"}  # without their alpha
 
 LAYOUTS: dict[str, LayoutKind] = {
-    kind.name: kind
-    for kind in (
-        _shown("gray8", lambda e, p: Packed()),
-        LayoutKind("gray16", Whole, lambda e, p: Packed()),
-        LayoutKind("gray_bits", Narrow, lambda e, p: Packed()),
-        LayoutKind("fold", NarrowFolded, lambda e, p: _fold(p)),
-        _shown("rgb24", lambda e, p: Packed("rgb24")),
-        _shown("bgr24", lambda e, p: Packed("bgr24")),
-        _shown("rgba", lambda e, p: Packed("rgba")),
-        _shown("bgra", lambda e, p: Packed("bgra")),
-        _shown("opaque", lambda e, p: Packed(_COLOURS[_rgb_order(e)]), Opaque),
-        _shown("gbr16", lambda e, p: PlanarRgb(_rgb_order(e))),
-        _shown("gbr_bits", lambda e, p: PlanarRgb(_rgb_order(e)), NarrowPlanes),
-        _shown("gbra16", lambda e, p: PlanarRgb(_rgb_order(e))),
-        _shown("gbra_bits", lambda e, p: PlanarRgb(_rgb_order(e)), NarrowPlanes),
-        LayoutKind("mosaic8", Whole, lambda e, p: Mosaic()),
-        LayoutKind("mosaic16", Whole, lambda e, p: Mosaic()),
-        LayoutKind("mosaic_bits", Narrow, lambda e, p: Mosaic()),
-        LayoutKind("mosaic_fold", NarrowFolded, lambda e, p: _fold(p, Mosaic())),
-        LayoutKind("from_mosaic8", Demosaiced, lambda e, p: Mosaic()),
-        _shown("from_yuv420", lambda e, p: SemiPlanar(halved=True, first="u"), ConvertedTall),
-        _shown("from_yuv422", lambda e, p: Packed422(0), Converted),
-        # demosaicing is done by the video's converter; resampling restores the mosaic
-        _shown("demosaic8", lambda e, p: Packed(f"bayer_{e.mosaic}8"), exact=False),
-        _shown("tone", lambda e, p: _toned(e), Tone, exact=False),
-        _shown("planar422", lambda e, p: _yuv(e)),
-        _shown("planar420", lambda e, p: _yuv(e)),
-        _shown("planar444", lambda e, p: _yuv(e)),
-        _shown("halved420", lambda e, p: Halved(_yuv(e)), exact=False),
-        LayoutKind("stack8", Whole, lambda e, p: Stack(e.channels)),
-        LayoutKind("stack16", Whole, lambda e, p: Stack(e.channels)),
-        LayoutKind("table", PatternTable, lambda e, p: _numbers(len(p.table or ()))),
-        LayoutKind(
-            "palette",
-            Few,
-            lambda e, p: Palette(p.entries or 0, e.bytes_per_sample, _numbers(p.entries or 0)),
-        ),
-        LayoutKind("metres16", Metres, lambda e, p: Packed()),
-        LayoutKind("metres_fold", Metres, lambda e, p: _fold(p)),
-        LayoutKind("bytes", Whole, lambda e, p: Stack(e.channels, e.bytes_per_sample)),
-    )
+    "gray8": _shown(lambda e, p: Packed()),
+    "gray16": LayoutKind(Whole, lambda e, p: Packed()),
+    "gray_bits": LayoutKind(Narrow, lambda e, p: Packed()),
+    "fold": LayoutKind(NarrowFolded, lambda e, p: _fold(p)),
+    "rgb24": _shown(lambda e, p: Packed("rgb24")),
+    "bgr24": _shown(lambda e, p: Packed("bgr24")),
+    "rgba": _shown(lambda e, p: Packed("rgba")),
+    "bgra": _shown(lambda e, p: Packed("bgra")),
+    "opaque": _shown(lambda e, p: Packed(_COLOURS[_rgb_order(e)]), Opaque),
+    "gbr16": _shown(lambda e, p: PlanarRgb(_rgb_order(e))),
+    "gbr_bits": _shown(lambda e, p: PlanarRgb(_rgb_order(e)), NarrowPlanes),
+    "gbra16": _shown(lambda e, p: PlanarRgb(_rgb_order(e))),
+    "gbra_bits": _shown(lambda e, p: PlanarRgb(_rgb_order(e)), NarrowPlanes),
+    "mosaic8": LayoutKind(Whole, lambda e, p: Mosaic()),
+    "mosaic16": LayoutKind(Whole, lambda e, p: Mosaic()),
+    "mosaic_bits": LayoutKind(Narrow, lambda e, p: Mosaic()),
+    "mosaic_fold": LayoutKind(NarrowFolded, lambda e, p: _fold(p, Mosaic())),
+    "from_mosaic8": LayoutKind(Demosaiced, lambda e, p: Mosaic()),
+    "from_yuv420": _shown(lambda e, p: SemiPlanar(halved=True, first="u"), ConvertedTall),
+    "from_yuv422": _shown(lambda e, p: Packed422(0), Converted),
+    # demosaicing is done by the video's converter; resampling restores the mosaic
+    "demosaic8": _shown(lambda e, p: Packed(f"bayer_{e.mosaic}8"), exact=False),
+    "tone": _shown(lambda e, p: _toned(e), Tone, exact=False),
+    "planar422": _shown(lambda e, p: _yuv(e)),
+    "planar420": _shown(lambda e, p: _yuv(e)),
+    "planar444": _shown(lambda e, p: _yuv(e)),
+    "halved420": _shown(lambda e, p: Halved(_yuv(e)), exact=False),
+    "stack8": LayoutKind(Whole, lambda e, p: Stack(e.channels)),
+    "stack16": LayoutKind(Whole, lambda e, p: Stack(e.channels)),
+    "table": LayoutKind(PatternTable, lambda e, p: _numbers(len(p.table or ()))),
+    "palette": LayoutKind(
+        Few,
+        lambda e, p: Palette(p.entries or 0, e.bytes_per_sample, _numbers(p.entries or 0)),
+    ),
+    "metres16": LayoutKind(Metres, lambda e, p: Packed()),
+    "metres_fold": LayoutKind(Metres, lambda e, p: _fold(p)),
+    "bytes": LayoutKind(Whole, lambda e, p: Stack(e.channels, e.bytes_per_sample)),
 }
 
 

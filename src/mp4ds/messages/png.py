@@ -411,29 +411,19 @@ def decode(data: bytes | memoryview, hint: PngRecipe | None = None) -> tuple[Pix
     rows = _inflate(deflated, info)
     pixel_rows = unfilter(rows, info.pixel_bytes)
     pixels = _to_pixels(pixel_rows, info)
+    header = deflated[:2].hex()
     before, after = (base64.b64encode(part).decode() for part in (first, last))
-    if hint is not None:
+    # what need not be computed comes first
+    if hint and hint.zlib_header == header and chunk_bytes in (0, hint.chunk_bytes):
         recipe = replace(hint, before=before, after=after)
-        # what need not be computed comes first
-        is_alike = recipe.zlib_header == deflated[:2].hex() and (
-            not chunk_bytes or recipe.chunk_bytes == chunk_bytes
-        )
-        if is_alike and rebuild(pixels, recipe) == data:
+        if rebuild(pixels, recipe) == data:
             return pixels, recipe
     rule = find_rule(rows[:, 0], pixel_rows, info.pixel_bytes)
     if rule is None:
         raise Refused(f"{_NO_REBUILD}: its filters follow no known rule")
     for level, strategy, memory_level, window_bits in _codings(deflated, rows):
         recipe = PngRecipe(
-            filters=rule,
-            level=level,
-            strategy=strategy,
-            memory_level=memory_level,
-            window_bits=window_bits,
-            zlib_header=deflated[:2].hex(),
-            chunk_bytes=chunk_bytes,
-            before=before,
-            after=after,
+            rule, level, strategy, memory_level, window_bits, header, chunk_bytes, before, after
         )
         if rebuild(pixels, recipe) == data:
             return pixels, recipe

@@ -51,15 +51,16 @@ WIRES = (*_ROS_WIRES, _PROTOBUF)
 # ---------------------------------------------------------------- ROS
 
 # (name, code): struct codes, s for a string, d* for a length-prefixed array of doubles
-_HEADER = (("header", ""),)
-_TIME = (("time", ""), ("frame_id", "s"))
-_BODY = ("body", "")
+_TIME = (("sec", "I"), ("nanosec", "I"), ("frame_id", "s"))
+_HEADER = (("seq", "I"), *_TIME)  # ROS 2 has neither a sequence number nor unsigned seconds
+_BODY = ("body", "I")  # its length
 _SIZE = (("width", "I"), ("height", "I"))
 _MATRICES = (("distortion_model", "s"), ("d", "d*"), ("k", "9d"), ("r", "9d"), ("p", "12d"))
 _BINNING = (("binning_x", "I"), ("binning_y", "I"))
 _ROI = (("roi", "4I"), ("roi_do_rectify", "B"))  # x_offset, y_offset, height, width
 
 _Layout = tuple[tuple[str, str], ...]
+_SLOT_FIELDS = {"seq": ("seq", 4), "sec": ("stamp", 8), "pts": ("pts", 8)}  # and bytes of the slots
 _PACKET = "ffmpeg_image_transport_msgs/FFMPEGPacket"
 
 ROS_TYPES: Mapping[str, tuple[type[Fields], _Layout]] = {
@@ -111,8 +112,12 @@ class RosForm(Form):
         self._prefix, self._order = _ROS_WIRES[wire]
         self._ros2 = wire != "ros1"  # CDR: aligned, NUL-terminated, without seq
         self._kind, known = ROS_TYPES[type_name]
-        self._layout = layout or known
         self._sec_code = "i" if self._ros2 else "I"
+        self._layout = [
+            (name, self._sec_code if name == "sec" else code)
+            for name, code in layout or known
+            if not (self._ros2 and name == "seq")
+        ]
         names = [name for name, _ in self._layout]
         has_tail = "body" in names and names[-1] != "body"
         if self._ros2 and has_tail:
@@ -128,26 +133,17 @@ class RosForm(Form):
         spans: dict[str, Span] = {}
         body = len(data), len(data)
         for name, code in self._layout:
-            if name in ("header", "time"):
-                if name == "header" and not self._ros2:
-                    values["seq"] = reader.integer("I")
-                    spans["seq"] = reader.offset - 4, reader.offset
-                start = reader.align(4)
-                spans["stamp"] = start, start + 8
-                values["stamp"] = reader.integer(self._sec_code), reader.integer("I")
-                if name == "header":
-                    values["frame_id"] = reader.string()
-            elif name == "body":
-                size = reader.integer("I")
-                body = reader.offset, reader.offset + size
+            values[name] = _take(reader, code)
+            if name == "body":
+                body = reader.offset, reader.offset + values["body"]
                 spans["body"] = reader.offset - 4, body[1]
-                reader.raw(size)
-            else:
-                values[name] = _take(reader, code)
-                if name == "pts":
-                    spans["pts"] = reader.offset - 8, reader.offset
+                reader.raw(values["body"])
+            elif name in _SLOT_FIELDS:
+                slot, size = _SLOT_FIELDS[name]
+                start = reader.offset - struct.calcsize(code)
+                spans[slot] = start, start + size
         parts = {
-            "stamp": join_stamp(*values["stamp"]),
+            "stamp": join_stamp(values["sec"], values["nanosec"]),
             "seq": values.get("seq"),
             "pts": values.get("pts"),
             "frame_id": values["frame_id"],
@@ -157,13 +153,13 @@ class RosForm(Form):
 
     def slot(self, name: str, slots: Slots, body_size: int) -> bytes:
         """The bytes of a slot."""
+        code, numbers = "I", [body_size if name == "body" else slots.seq or 0]
+        if name == "stamp":
+            code, numbers = f"{self._sec_code}I", [*divmod(slots.stamp, NS)]
+        elif name == "pts":
+            code, numbers = "Q", [slots.pts or 0]
         try:
-            if name == "stamp":
-                return struct.pack(f"{self._order}{self._sec_code}I", *divmod(slots.stamp, NS))
-            if name == "pts":
-                return struct.pack(f"{self._order}Q", slots.pts or 0)
-            value = body_size if name == "body" else slots.seq
-            return struct.pack(f"{self._order}I", value or 0)
+            return struct.pack(self._order + code, *numbers)
         except struct.error:
             raise WireError("a time or number is beyond what its message has bits for") from None
 
@@ -180,21 +176,9 @@ class RosForm(Form):
             flags: Of a packet.
         """
         writer = PrimitiveWriter(self._prefix, self._order, is_cdr=self._ros2)
+        known = {"frame_id": frame_id, "flags": flags}
         for name, code in self._layout:
-            if name in ("header", "time"):
-                if name == "header" and not self._ros2:
-                    writer.put("I", 0)
-                writer.put("I", 0, 0)
-                if name == "header":
-                    writer.string(frame_id)
-            elif name == "body":
-                writer.put("I", 0)
-            elif name in ("pts", "flags") or (name, self._kind) == ("is_bigendian", CodedFields):
-                writer.put(code, flags if name == "flags" else 0)
-            elif name == "frame_id":
-                writer.string(frame_id)
-            else:
-                _put(writer, code, getattr(fields, name))
+            _put(writer, code, known[name] if name in known else getattr(fields, name, 0))
         return writer.getvalue()
 
 
@@ -223,7 +207,8 @@ def _put(writer: PrimitiveWriter, code: str, value: Any) -> None:
         writer.put(code, value)
 
 
-def _ros_type(name: str) -> str:
+def ros_type(name: str) -> str:
+    """A type's name as ROS 1 spells it."""
     return name.replace("/msg/", "/")
 
 
@@ -319,10 +304,11 @@ class ProtobufForm(Form):
                 raise WireError(f"its field {name} is not of the declared type")
             if slot:
                 spans[slot] = at, end
+            value = None if kind == "data" else _value(kind, wire_type, data[start:end])
             if kind == "doubles":
-                values[name] += _doubles(data[start:end])
-            elif kind != "data":
-                values[name] = _value(kind, wire_type, data[start:end])
+                values[name] += value
+            else:
+                values[name] = value
         for name, kind in self._kinds.items():
             if kind in _SLOTS and _SLOTS[kind] not in spans:
                 raise WireError(f"it has no {name}")
@@ -442,18 +428,15 @@ def _varint_bytes(value: int) -> bytes:
     return bytes(out)
 
 
-def _value(kind: Kind, wire_type: int, raw: memoryview) -> int | str:
-    """The value of a time, a text or a number."""
+def _value(kind: Kind, wire_type: int, raw: memoryview) -> Any:
+    """The value of a time, a text, a number or numbers."""
     if kind == "time":
         return _stamp(raw)
     if kind == "text":
         return text(raw)
-    if wire_type == _VARINT:
-        return _varint(raw, 0)[0] & 0xFFFFFFFF
-    return int(struct.unpack("<I", raw)[0])
-
-
-def _doubles(raw: memoryview) -> tuple[float, ...]:
+    if kind == "u32":
+        number = _varint(raw, 0)[0] if wire_type == _VARINT else int.from_bytes(raw, "little")
+        return number & 0xFFFFFFFF
     if len(raw) % 8:
         raise WireError("a list of numbers in it is cut short")
     return struct.unpack(f"<{len(raw) // 8}d", raw)
@@ -527,7 +510,7 @@ def kind_of(channel: Channel) -> type[Fields] | None:
     """
     is_ros = channel.message_encoding in ("ros1", "cdr")
     types = ROS_TYPES if is_ros else FOXGLOVE_TYPES
-    entry = types.get(_ros_type(channel.type_name) if is_ros else channel.type_name)
+    entry = types.get(ros_type(channel.type_name) if is_ros else channel.type_name)
     return entry[0] if entry else None
 
 
@@ -600,7 +583,7 @@ def form_of(wire: str, type_name: str, schema: bytes) -> Form:
     """
     if wire == _PROTOBUF:
         return ProtobufForm(type_name, schema)
-    name = _ros_type(type_name)
+    name = ros_type(type_name)
     if wire not in _ROS_WIRES or name not in ROS_TYPES:
         raise WireError(f"type {type_name!r} is not modelled")
     return RosForm(wire, name)
@@ -630,7 +613,7 @@ def plain_message(
     Raises:
         WireError: The type cannot represent a value.
     """
-    name = _ros_type(type_name)
+    name = ros_type(type_name)
     form = RosForm(wire, name, _ROS1_PACKET if (wire, name) == ("ros1", _PACKET) else None)
     template = form.template(form.blank(frame_id, fields, flags=flags))
     head, tail = template.around(slots, len(body))

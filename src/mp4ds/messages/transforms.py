@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mp4ds.messages.serializations import decoder_of_schema, wire_of
+from mp4ds.messages.serializations import decoder_of_schema, ros_type, wire_of
 from mp4ds.messages.wire import PrimitiveReader, WireError
 from mp4ds.records import Channel, Schema
 
@@ -29,14 +29,14 @@ _MAX_IN_MESSAGE = 10 * MAX_TRANSFORMS
 _MAX_SCHEMA = 1 << 20
 _TOLERANCE = 0.01  # of a rotation's squared norm, as in tf2
 _TOPIC = "tf_static"
+# whether a message has several, and whether each has a header
 _ROS_TYPES = {
-    "tf2_msgs/TFMessage": ("list", "stamped"),
-    "tf/tfMessage": ("list", "stamped"),
-    "foxglove_msgs/FrameTransforms": ("list", "foxglove"),
-    "foxglove_msgs/FrameTransform": ("one", "foxglove"),
+    "tf2_msgs/TFMessage": (True, True),
+    "tf/tfMessage": (True, True),
+    "foxglove_msgs/FrameTransforms": (True, False),
+    "foxglove_msgs/FrameTransform": (False, False),
 }
 _FOXGLOVE_TYPES = frozenset({"foxglove.FrameTransform", "foxglove.FrameTransforms"})
-_CDR_ORDERS = {"cdr-le": "<", "cdr-be": ">"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ def transform_parser(channel: Channel) -> Parser | None:
     Returns:
         None if the type is not one of transforms, or its descriptor does not parse.
     """
-    encoding, name, schema = channel.message_encoding, _ros_name(channel), channel.schema
+    encoding, name, schema = channel.message_encoding, ros_type(channel.type_name), channel.schema
     many = channel.type_name.endswith("s")
     read: Parser
     if encoding in ("ros1", "cdr") and name in _ROS_TYPES:
@@ -108,10 +108,6 @@ def transform_parser(channel: Channel) -> Parser | None:
     return parse
 
 
-def _ros_name(channel: Channel) -> str:
-    return channel.type_name.replace("/msg/", "/")
-
-
 def _name(frame_id: str) -> str:
     """A frame's name as tf2 compares it."""
     return frame_id.removeprefix("/")
@@ -123,22 +119,20 @@ def _name(frame_id: str) -> str:
 def _parse_ros(encoding: str, name: str, data: memoryview) -> list[Transform]:
     wire = wire_of(encoding, data)
     cdr = wire != "ros1"
-    reader = PrimitiveReader(data, 4 if cdr else 0, _CDR_ORDERS.get(wire, "<"), is_cdr=cdr)
-    amount, layout = _ROS_TYPES[name]
-    count = reader.integer("I") if amount == "list" else 1
+    order = ">" if wire == "cdr-be" else "<"
+    reader = PrimitiveReader(data, 4 if cdr else 0, order, is_cdr=cdr)
+    is_list, has_header = _ROS_TYPES[name]
+    found = []
     # a message that declares more than it holds gives an error
-    return [_read_ros(reader, layout, cdr=cdr) for _ in range(count)]
-
-
-def _read_ros(reader: PrimitiveReader, layout: str, *, cdr: bool) -> Transform:
-    if layout == "stamped" and not cdr:
-        reader.take("I")  # seq
-    reader.take("I", 2)  # stamp
-    parent = reader.string()
-    child = reader.string()
-    x, y, z = reader.take("d", 3)
-    qx, qy, qz, qw = reader.take("d", 4)
-    return Transform(parent, child, (x, y, z), (qx, qy, qz, qw))
+    for _ in range(reader.integer("I") if is_list else 1):
+        if has_header and not cdr:
+            reader.take("I")  # seq
+        reader.take("I", 2)  # stamp
+        parent, child = reader.string(), reader.string()
+        x, y, z = reader.take("d", 3)
+        qx, qy, qz, qw = reader.take("d", 4)
+        found.append(Transform(parent, child, (x, y, z), (qx, qy, qz, qw)))
+    return found
 
 
 # ---------------------------------------------------------------- Foxglove
@@ -243,7 +237,8 @@ class TransformCollector:
     @staticmethod
     def takes(channel: Channel) -> bool:
         """Whether a channel has static transforms, that is, its topic's last part is tf_static."""
-        is_transform = channel.type_name in _FOXGLOVE_TYPES or _ros_name(channel) in _ROS_TYPES
+        name = channel.type_name
+        is_transform = name in _FOXGLOVE_TYPES or ros_type(name) in _ROS_TYPES
         return is_transform and channel.topic.strip("/").rpartition("/")[2] == _TOPIC
 
     def add(self, channel: Channel, data: bytes | memoryview) -> None:

@@ -314,24 +314,14 @@ class PrimitiveReader:
         self._order = order
         self._is_cdr = is_cdr
 
-    def align(self, size: int) -> int:
-        """Advance to the next primitive of that size; returns the offset."""
-        if self._is_cdr:
-            self.offset += -(self.offset - self._start) % size
-        return self.offset
-
     def take(self, code: str, count: int = 1) -> tuple[float, ...]:
         """Read `count` primitives of a struct code."""
         if count == 0:
             return ()
         size = struct.calcsize(code)
-        self.align(size)
-        end = self.offset + size * count
-        if end > len(self._data):
-            raise WireError(f"it ends at byte {len(self._data)}, in the middle of its fields")
-        values = struct.unpack_from(f"{self._order}{count}{code}", self._data, self.offset)
-        self.offset = end
-        return values
+        if self._is_cdr:
+            self.offset += -(self.offset - self._start) % size
+        return struct.unpack(f"{self._order}{count}{code}", self.raw(size * count))
 
     def integer(self, code: str) -> int:
         """Read one integer."""
