@@ -128,19 +128,11 @@ def _decode_residuals(text: str, count: int) -> NDArray[np.int64]:
 def _decode_runs(text: str, count: int) -> NDArray[np.int64]:
     if not _TOKENS.fullmatch(text):
         raise ValueError("holds something other than integers and runs")
-    values: list[int] = []
-    lengths: list[int] = []
-    total = 0
-    for token in text.split():
-        value, _, length = token.partition("*")
-        values.append(int(value))
-        lengths.append(int(length or 1))
-        if not lengths[-1]:
-            raise ValueError("holds a run of no values")
-        total += lengths[-1]
-        if total > count:
-            break
-    if total != count:
+    tokens = [token.partition("*") for token in text.split()]
+    values, lengths = [int(value) for value, _, _ in tokens], [int(n or 1) for _, _, n in tokens]
+    if 0 in lengths:
+        raise ValueError("holds a run of no values")
+    if sum(lengths) != count:
         raise ValueError(f"does not hold {count + 1} values")
     if any(not INT64_MIN <= value <= INT64_MAX for value in values):
         raise ValueError("holds an integer beyond 64 bits")
@@ -351,6 +343,13 @@ def nanoseconds(value: int, what: str, example: str = "half a second is 500_000_
         raise TypeError(f"{what} is an integer, in nanoseconds, not {value!r}: {example}") from None
 
 
+def _tolerance(value: int) -> int:
+    tolerance = nanoseconds(value, "tolerance_ns")
+    if tolerance < 0:
+        raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
+    return tolerance
+
+
 def synchronize(
     stamps: Mapping[str, Integers], *, tolerance_ns: int, reference: str | None = None
 ) -> Sync:
@@ -364,9 +363,7 @@ def synchronize(
     Raises:
         OptionError: There is no topic, no such reference, or the tolerance is negative.
     """
-    tolerance = nanoseconds(tolerance_ns, "tolerance_ns")
-    if tolerance < 0:
-        raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
+    tolerance = _tolerance(tolerance_ns)
     if not stamps:
         raise OptionError("there are no topics to match")
     if reference is None:
@@ -508,21 +505,25 @@ class StampIndex:
         if mode not in _WANTED:
             raise OptionError(f"mode {mode!r} is not known: use {', '.join(_WANTED)}")
         stamp = self._time(stamp_ns)
-        tolerance = None if tolerance_ns is None else nanoseconds(tolerance_ns, "tolerance_ns")
-        if tolerance is not None and tolerance < 0:
-            raise OptionError(f"tolerance is {tolerance} ns: use 0 or more")
-        earlier, later = self._around(stamp)
-        near = [place for place in (earlier, later) if place is not None]
-        nearest = min(near, key=lambda place: abs(self._stamp(place) - stamp))
-        place = {"before": earlier, "after": later}.get(mode, nearest)
-        if place is not None:
-            distance = abs(self._stamp(place) - stamp)
-            most = 0 if mode == "exact" else tolerance
-            if most is None or distance <= most:
+        tolerance = None if tolerance_ns is None else _tolerance(tolerance_ns)
+        most = 0 if mode == "exact" else tolerance
+        # the first at or after the time, and the last at or before it
+        after = self._place(stamp)
+        later = [after] if after < len(self._sorted) else []
+        earlier = [self._place(self._stamp(after - 1))] if after else []
+        if later and self._stamp(after) == stamp:
+            earlier = later
+
+        def distance(place: int) -> int:
+            return abs(self._stamp(place) - stamp)
+
+        nearest = min((*earlier, *later), key=distance)
+        for place in {"before": earlier, "after": later}.get(mode, [nearest]):
+            if most is None or distance(place) <= most:
                 return int(self._order[place])
         within = "" if tolerance is None else f"within {tolerance} ns "
-        wanted = _WANTED[mode] if not within else f"{within}{_WANTED[mode]}"
-        raise FrameNotFoundError(self._topic, stamp, wanted, self._stamp(nearest))
+        near = self._stamp(nearest)
+        raise FrameNotFoundError(self._topic, stamp, f"{within}{_WANTED[mode]}", near)
 
     def between(self, start_ns: int, end_ns: int) -> NDArray[np.int64]:
         """Numbers of the frames with start_ns <= stamp < end_ns, by stamp."""
@@ -539,15 +540,6 @@ class StampIndex:
             return len(self._sorted)
         value = np.int64(max(stamp, INT64_MIN))
         return int(np.searchsorted(self._sorted, value, side="left"))
-
-    def _around(self, stamp: int) -> tuple[int | None, int | None]:
-        """Indices of the last stamp at or before a time, and of the first at or after it."""
-        place = self._place(stamp)
-        later = place if place < len(self._sorted) else None
-        if later is not None and self._stamp(later) == stamp:
-            return later, later
-        earlier = self._place(self._stamp(place - 1)) if place else None
-        return earlier, later
 
     def _stamp(self, place: int) -> int:
         return int(self._sorted[place])
@@ -577,14 +569,8 @@ def cut_times(times: Sequence[NDArray[np.int64]], frames: int) -> list[int]:
             if end - start > (2 * frames if cuts else frames):
                 new.extend(column[start + frames : end : frames].tolist())
         cuts = sorted({*cuts, *(time for time in new if time > int(column[0]))})
-    return _without_short_end(cuts, times, frames)
-
-
-def _without_short_end(
-    cuts: list[int], times: Sequence[NDArray[np.int64]], frames: int
-) -> list[int]:
-    """Drop a last cut that leaves little after it."""
-    if not cuts:
-        return cuts
-    rest = max((len(column) - np.searchsorted(column, cuts[-1]) for column in times), default=0)
-    return cuts[:-1] if rest < frames // 2 else cuts
+    if cuts:
+        # a last cut that leaves little after it is dropped
+        rest = max((len(column) - np.searchsorted(column, cuts[-1]) for column in times), default=0)
+        return cuts[:-1] if rest < frames // 2 else cuts
+    return cuts
