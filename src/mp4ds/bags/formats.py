@@ -146,23 +146,16 @@ def open_sources(
     return opener(paths[0]) if is_alone else MultiReader([partial(opener, path) for path in paths])
 
 
-def limits_of(
-    target: str, storage: str
-) -> tuple[Callable[[Channel], None], Callable[[Message], None]]:
-    """The writer's checks that a format can hold a channel, and a message.
+def writer_of(target: str, storage: str) -> type[BagWriter]:
+    """The class that knows whether a format can hold a channel, and a message.
 
     Args:
         target: ``bag``, ``rosbag2`` or ``mcap``.
         storage: ``sqlite3`` or ``mcap``, for ``rosbag2``.
     """
-    is_sqlite = target == "rosbag2" and storage == "sqlite3"
-    name = (
-        "rosbag2_sqlite:SqliteWriter"
-        if is_sqlite
-        else _CLASSES["bag" if target == "bag" else "mcap"][_WRITER]
-    )
-    writer: type[BagWriter] = _class(name)
-    return writer.check_channel, writer.check_message
+    if target == "rosbag2" and storage == "sqlite3":
+        return _class("rosbag2_sqlite:SqliteWriter")  # type: ignore[no-any-return]
+    return _class(_CLASSES["bag" if target == "bag" else "mcap"][_WRITER])  # type: ignore[no-any-return]
 
 
 def open_writer(

@@ -127,26 +127,20 @@ class LatchedMessages:
 
     def add(self, message: Message) -> None:
         """Keep one more."""
-        kept = [one for one in self._kept if one[0].data != message.data]
-        kept.append((message, self._children(message.data) if self._children else None))
+        rows = [one for one in self._kept if one[0].data != message.data]
+        rows.append((message, self._children(message.data) if self._children else None))
+        most = self._depth
         if self._children:
-            kept = _uncovered(kept)
-        self._kept = kept[-(MOST if self._children else self._depth) :]
+            # only messages with a child frame that is in no later message
+            later: set[str] = set()
+            kept = []
+            for row in reversed(rows):
+                if row[1] is None or not row[1] <= later:
+                    kept.append(row)
+                later |= row[1] or set()
+            rows, most = kept[::-1], MOST
+        self._kept = rows[-most:]
         self.size = sum(len(one.data) for one in self)
-
-
-_Row = tuple[Message, frozenset[str] | None]
-
-
-def _uncovered(rows: list[_Row]) -> list[_Row]:
-    """The messages with a child frame that is in no later message."""
-    later: set[str] = set()
-    found = []
-    for message, frames in reversed(rows):
-        if frames is None or not frames <= later:
-            found.append((message, frames))
-        later |= frames or set()
-    return found[::-1]
 
 
 def _parser(channel: Channel) -> Callable[[bytes | memoryview], frozenset[str] | None] | None:
@@ -184,11 +178,10 @@ def take_slice(
     """
     first, last = ends_of(reader)
     span = Excerpt(*asked.times(first, last, reader.path))
+    latched: tuple[Sequence[Message], Sequence[str]] = ((), ())
     if asked.latched and span.start is not None:
         latched = latched_before(reader, Excerpt(end=span.start), selected)
-        reader.slice = RecordingSlice(span, *latched)
-    else:
-        reader.slice = RecordingSlice(span)
+    reader.slice = RecordingSlice(span, *latched)
 
 
 def ends_of(reader: BagReader) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
@@ -20,14 +21,18 @@ from numpy.typing import NDArray
 from mp4ds._version import __version__
 from mp4ds.bags import protocols
 from mp4ds.bags.files import SALVAGE_REMEDY, DamageError, most_unpacked
-from mp4ds.bags.mcap_index import ChunkEntry, McapSummary, read_summary
 from mp4ds.bags.mcap_records import (
+    FRAME,
+    MAGIC,
     MAX_RECORD_BYTES,
     PRIVATE_OPCODE,
+    ChunkEntry,
     Declared,
+    McapSummary,
     RecordStream,
     chunk_records,
     parse,
+    read_summary,
     unpack_chunk,
 )
 from mp4ds.bags.protocols import BagReader, BagWriter, HoldBack, sorted_times
@@ -38,6 +43,7 @@ from mp4ds.records import (
     Channel,
     ChannelStats,
     Excerpt,
+    Loss,
     Message,
     MetadataRecord,
     Record,
@@ -74,20 +80,16 @@ class McapReader(BagReader):
         self._summary: McapSummary | None = None
         with closing(self._start_pass()) as stream:
             try:
-                self._read_ends(stream)
+                opcode, body = stream.next()
+                if opcode != Opcode.HEADER:
+                    raise DamageError("it is in the place of the header")
+                header = parse(mcap_records.Header, body)
+                self.profile, self.library = header.profile, header.library
+                self._summary = read_summary(stream)
+                if self._summary:
+                    declared.add_summary(self._summary)
             except DamageError as error:
                 raise stream.damaged(error) from None
-
-    def _read_ends(self, stream: RecordStream) -> None:
-        opcode, body = stream.next()
-        if opcode != Opcode.HEADER:
-            raise DamageError("it is in the place of the header")
-        header = parse(mcap_records.Header, body)
-        self.profile: str = header.profile
-        self.library: str = header.library
-        self._summary = read_summary(stream)
-        if self._summary:
-            self._declared.add_summary(self._summary.schemas, self._summary.channels)
 
     def _start_pass(self) -> RecordStream:
         stream = RecordStream(self.path, self._most)
@@ -113,7 +115,7 @@ class McapReader(BagReader):
         """Whether the summary is complete and consistent, and chunks can be read by their times."""
         return (
             self._summary is not None
-            and self._summary.chunks.held_in_time_order() <= protocols.HOLD_BYTES
+            and self._summary.chunks.most_held(by_start=True) <= protocols.HOLD_BYTES
             and self.has_whole_index
         )
 
@@ -146,16 +148,13 @@ class McapReader(BagReader):
 
     def _read(self, stream: RecordStream, excerpt: Excerpt) -> Iterator[Record]:
         summary = self._summary
-        # The whole is read in file order, unless that is too far from log-time order.
-        if (
-            summary
-            and self.is_indexed
-            and (
-                excerpt != EVERYTHING or summary.chunks.held_in_file_order() > protocols.HOLD_BYTES
-            )
-        ):
-            yield from self._read_chunks(stream, excerpt, summary)
-            return
+        if summary and self.is_indexed:
+            # the whole in file order, which no index that lies can spoil, unless that is too far
+            # from log-time order
+            held_most = summary.chunks.most_held(by_start=False)
+            if excerpt != EVERYTHING or held_most > protocols.HOLD_BYTES:
+                yield from self._read_chunks(stream, excerpt, summary)
+                return
         # a buffer that sorts messages, if the file states its chunks' times
         held = HoldBack() if summary and summary.chunks.has_messages else None
         yield from filter(excerpt.has, self._read_through(stream, held))
@@ -204,11 +203,8 @@ class McapReader(BagReader):
         for place in others:
             yield self._other_at(stream, place)
         if excerpt == EVERYTHING and not summary.covers(count):
-            raise SourceError(
-                self.path,
-                f"is damaged: its chunks hold {count} messages, which its statistics contradict",
-                SALVAGE_REMEDY,
-            )
+            problem = f"its chunks hold {count} messages, which its statistics contradict"
+            raise SourceError(self.path, f"is damaged: {problem}", SALVAGE_REMEDY)
 
     def _other_at(self, stream: RecordStream, place: int) -> Attachment | MetadataRecord:
         stream.seek(place)
@@ -460,3 +456,53 @@ def compressed_size(payloads: Iterable[bytes | memoryview]) -> int:
         payloads: Of the messages, each as large as a chunk or nearly so.
     """
     return sum(len(zstandard.compress(bytes(payload))) for payload in payloads)
+
+
+# ---------------------------------------------------------------- copies
+
+_OUTSIDE = {*(Opcode.HEADER, Opcode.METADATA, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.DATA_END)}
+"""What a recorder writes outside of chunks, before the summary."""
+
+
+def copy_verified(piece: Path, copy: Path) -> list[Loss]:
+    """Copy what a recorder wrote, as far as it is certainly that: a power cut may leave zeros.
+
+    Salvage keeps what it can of a chunk that does not match its checksum. Of a recorder's own
+    chunks, half a second each, none is worth an image that is not the camera's.
+
+    Args:
+        piece: A file of `McapWriter`, perhaps incomplete.
+        copy: The file to make.
+
+    Returns:
+        What was left out.
+    """
+    losses: list[Loss] = []
+    end = piece.stat().st_size
+    with piece.open("rb") as source, copy.open("wb") as target:
+        target.write(source.read(len(MAGIC)))
+        while head := source.read(FRAME.size):
+            offset = source.tell() - len(head)
+            kind, size = FRAME.unpack(head.ljust(FRAME.size, b"\0"))
+            is_whole = kind in _OUTSIDE and size <= min(MAX_RECORD_BYTES, end - source.tell())
+            body = source.read(size) if is_whole else b""
+            if not is_whole:
+                losses.append(Loss(piece.name, offset, end - offset, "it ends within a record"))
+                break
+            try:
+                if kind == Opcode.CHUNK:
+                    unpack_chunk(memoryview(body))
+            except DamageError:
+                problem = "a chunk does not match its checksum"
+                losses.append(Loss(piece.name, offset, len(head) + size, problem))
+                continue
+            target.write(head + body)
+            if kind == Opcode.DATA_END:
+                place, summary = source.tell(), source.read(MAX_RECORD_BYTES)
+                checksum = int.from_bytes(summary[-len(MAGIC) - 4 : -len(MAGIC)], "little")
+                if zlib.crc32(summary[: -len(MAGIC) - 4]) == checksum:
+                    target.write(summary)
+                else:
+                    losses.append(Loss(piece.name, place, end - place, "its summary is damaged"))
+                break
+    return losses

@@ -248,17 +248,17 @@ _LATEST = 2**63 - 1  # more than any time of a bag
 _CHUNK_HEAD, _INDEX_HEAD = 96, 64  # maximum bytes of the records as usually written
 
 
-_Index = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.uint32]]
-"""One connection's messages by log time, ties in source order: times, chunk numbers, offsets."""
+_PLACE = np.dtype([("time", np.int64), ("chunk", np.int32), ("offset", np.uint32)])
+"""Of a message: its log time, and its place."""
 
 
 class _Chunk(NamedTuple):
-    """A chunk, from the bag's index and its own header.
+    """A chunk.
 
     Attributes:
         start: Byte where its record begins.
-        counts: Its messages by connection.
-        compression: Its name.
+        counts: Its messages by connection, from the bag's index.
+        compression: The name of that, from its own header as all that follows.
         size: Bytes of its content.
         place: Byte where its data begin.
         packed: Bytes of these.
@@ -266,10 +266,10 @@ class _Chunk(NamedTuple):
 
     start: int
     counts: Mapping[int, int]
-    compression: str = ""
-    size: int = 0
-    place: int = 0
-    packed: int = 0
+    compression: str
+    size: int
+    place: int
+    packed: int
 
 
 class Ros1Reader(BagReader):
@@ -379,15 +379,25 @@ class Ros1Reader(BagReader):
             raise SourceError(path, f"{problem}{self._size} bytes", _COPY_AGAIN)
         return header
 
-    def _read_index(self, header: Fields) -> dict[int, _Index]:
+    def _read_index(self, header: Fields) -> dict[int, NDArray[Any]]:
         """The messages of each connection, from the index at the end and those of the chunks."""
         first = self._length() + self._stream.tell()
         index = header.number(b"index_pos", 8)
         self._seek(index)
         for _ in range(header.number(b"conn_count")):
-            self._read_connection()
+            record = self._header()
+            if record.get(b"op") != bytes([Op.CONNECTION]):
+                raise DamageError("a connection record is missing")
+            channel = connection_of(record, self._take(self._length()))
+            self._channels.setdefault(channel.id, channel)  # the first counts, as in ROS
         start = self._stream.tell()
-        listed = [self._read_chunk_info() for _ in range(header.number(b"chunk_count"))]
+        listed = []
+        for _ in range(header.number(b"chunk_count")):
+            info = self._header(Op.CHUNK_INFO)
+            _check_version(info)
+            self._length()
+            counts = self._take(8 * info.number(b"count"))
+            listed.append((info.number(b"chunk_pos", 8), dict(CHUNK_COUNT.iter_unpack(counts))))
         if self._goes_on():
             raise DamageError("its header declares fewer chunks than its index lists")
         expect(self._stream, _index_ranges(listed, start))
@@ -395,13 +405,13 @@ class Ros1Reader(BagReader):
         entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         runs: defaultdict[int, array[int]] = defaultdict(partial(array, "I"))
         ends = {}
-        for number, chunk in enumerate(listed):
-            self._chunks.append(self._read_chunk(chunk))
-            for _ in chunk.counts:
-                connection, found = self._read_entries(chunk)
+        for number, (place, counted) in enumerate(listed):
+            self._chunks.append(self._read_chunk(place, counted))
+            for _ in counted:
+                connection, found = self._read_entries(self._chunks[-1])
                 entries[connection] += found
                 runs[connection].extend((number, len(found) // INDEX_ENTRY.itemsize))
-            ends[chunk.start] = self._stream.tell()
+            ends[place] = self._stream.tell()
         if len(ends) < len(listed):
             raise DamageError("its index lists a chunk twice")
         # messages that the index does not list would be lost silently
@@ -421,28 +431,14 @@ class Ros1Reader(BagReader):
         except _DAMAGE:
             return False
 
-    def _read_connection(self) -> None:
-        record = self._header()
-        if record.get(b"op") != bytes([Op.CONNECTION]):
-            raise DamageError("a connection record is missing")
-        channel = connection_of(record, self._take(self._length()))
-        self._channels.setdefault(channel.id, channel)  # the first counts, as in ROS
-
-    def _read_chunk_info(self) -> _Chunk:
-        header = self._header(Op.CHUNK_INFO)
-        _check_version(header)
-        self._length()
-        counts = self._take(8 * header.number(b"count"))
-        return _Chunk(header.number(b"chunk_pos", 8), dict(CHUNK_COUNT.iter_unpack(counts)))
-
-    def _read_chunk(self, chunk: _Chunk) -> _Chunk:
-        """A chunk with its header's fields; it will be decompressed to that size."""
-        self._seek(chunk.start)
+    def _read_chunk(self, start: int, counts: Mapping[int, int]) -> _Chunk:
+        """The chunk whose record begins at a byte; it will be decompressed to its header's size."""
+        self._seek(start)
         header = self._header(Op.CHUNK)
         compression = header.get(b"compression", b"").decode(errors="replace")
         packed, place = self._length(), self._stream.tell()
         self._seek(place + packed)
-        return _Chunk(chunk.start, chunk.counts, compression, header.number(b"size"), place, packed)
+        return _Chunk(start, counts, compression, header.number(b"size"), place, packed)
 
     def _read_entries(self, chunk: _Chunk) -> tuple[int, bytes]:
         """A connection, and its messages in a chunk, of which the next index is."""
@@ -486,17 +482,17 @@ class Ros1Reader(BagReader):
         parts = [_within(self._index[channel.id], excerpt) for channel in channels]
         if not parts:
             return
-        times, chunks, offsets = (np.concatenate(column) for column in zip(*parts, strict=True))
-        owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part[0]) for part in parts])
-        order = np.lexsort((offsets, chunks, times))
-        first_seen = np.sort(np.unique(chunks[order], return_index=True)[1])
-        needed = (self._chunks[number] for number in chunks[order][first_seen].tolist())
+        index = np.concatenate(parts)
+        owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
+        order = np.lexsort((index["offset"], index["chunk"], index["time"]))
+        visited = index["chunk"][order]
+        first_seen = np.sort(np.unique(visited, return_index=True)[1])
+        needed = (self._chunks[number] for number in visited[first_seen].tolist())
         expect(self._stream, ((one.place, one.place + one.packed) for one in needed))
         for start in range(0, len(order), 4096):
             rows = order[start : start + 4096]
-            columns = (column[rows].tolist() for column in (owners, times, chunks, offsets))
-            for owner, time, chunk, offset in zip(*columns, strict=True):
-                yield channels[owner], time, chunk, offset
+            for owner, place in zip(owners[rows].tolist(), index[rows].tolist(), strict=True):
+                yield channels[owner], *place
 
     def _message(self, channel: Channel, time: int, chunk: int, offset: int) -> Message:
         try:
@@ -536,7 +532,7 @@ class Ros1Reader(BagReader):
 
     def _times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times from the index."""
-        return {key: times for key, (times, _, _) in self._index.items()}
+        return {key: index["time"].copy() for key, index in self._index.items()}
 
     def close(self) -> None:
         """Close the file."""
@@ -544,41 +540,42 @@ class Ros1Reader(BagReader):
         self._stream.close()
 
 
-def _index_ranges(chunks: Sequence[_Chunk], end: int) -> Iterator[tuple[int, int]]:
+def _index_ranges(
+    chunks: Sequence[tuple[int, Mapping[int, int]]], end: int
+) -> Iterator[tuple[int, int]]:
     """The byte ranges of the index: between the data of the chunks."""
-    ends = [chunk.start for chunk in chunks[1:]] + [end]
-    for chunk, next_start in zip(chunks, ends, strict=True):
-        head = chunk.start + _CHUNK_HEAD
-        yield chunk.start, head
-        entries = (_INDEX_HEAD + INDEX_ENTRY.itemsize * n for n in chunk.counts.values())
+    ends = [start for start, _ in chunks[1:]] + [end]
+    for (start, counts), next_start in zip(chunks, ends, strict=True):
+        head = start + _CHUNK_HEAD
+        yield start, head
+        entries = (_INDEX_HEAD + INDEX_ENTRY.itemsize * n for n in counts.values())
         if head < next_start:
             yield max(head, next_start - sum(entries)), next_start
 
 
-def _sorted_index(raw: bytes | bytearray, chunk_runs: Sequence[int]) -> _Index:
+def _sorted_index(raw: bytes | bytearray, chunk_runs: Sequence[int]) -> NDArray[Any]:
+    """One connection's messages by log time, ties in source order, as `_PLACE`."""
     entries = np.frombuffer(raw, INDEX_ENTRY)
     runs = np.array(chunk_runs, np.int64).reshape(-1, 2)
-    chunks = np.repeat(runs[:, 0].astype(np.int32), runs[:, 1])
-    times = times_in(entries)
-    if times.max(initial=0) >= MAX_TIME:
-        raise DamageError(
-            "it has a message with a time past 2^32 seconds, which ROS cannot represent"
-        )
-    places = chunks.astype(np.int64) << 32 | entries["offset"]
+    index = np.empty(len(entries), _PLACE)
+    index["time"], index["offset"] = times_in(entries), entries["offset"]
+    index["chunk"] = np.repeat(runs[:, 0], runs[:, 1])
+    if index["time"].max(initial=0) >= MAX_TIME:
+        problem = "it has a message with a time past 2^32 seconds, which ROS cannot represent"
+        raise DamageError(problem)
+    places = index["chunk"].astype(np.int64) << 32 | index["offset"]
     if len(np.unique(places)) < len(places):
         raise DamageError("its index lists a message twice")
-    order = np.lexsort((entries["offset"], chunks, times))
-    return times[order], chunks[order], entries["offset"][order]
+    return index[np.lexsort((index["offset"], index["chunk"], index["time"]))]
 
 
-def _within(index: _Index, excerpt: Excerpt) -> _Index:
+def _within(index: NDArray[Any], excerpt: Excerpt) -> NDArray[Any]:
     """The messages of an excerpt's span."""
-    times, chunks, offsets = index
     start, end = (
-        None if time is None else int(np.searchsorted(times, min(max(time, 0), _LATEST)))
+        None if time is None else int(np.searchsorted(index["time"], min(max(time, 0), _LATEST)))
         for time in (excerpt.start, excerpt.end)
     )
-    return times[start:end], chunks[start:end], offsets[start:end]
+    return index[start:end]
 
 
 def _check_version(header: Fields) -> None:

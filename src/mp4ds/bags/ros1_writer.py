@@ -51,11 +51,11 @@ class Ros1Writer(BagWriter):
         header = _header(
             Op.BAG,
             (b"index_pos", index_pos.to_bytes(8, "little")),
-            (b"conn_count", _uint32(len(self._connections))),
-            (b"chunk_count", _uint32(len(self._chunk_infos))),
+            (b"conn_count", UINT32.pack(len(self._connections))),
+            (b"chunk_count", UINT32.pack(len(self._chunk_infos))),
         )
         padding = _BAG_HEADER_BYTES - 4 - len(header)
-        self._file.write(header + _uint32(padding) + b" " * padding)
+        self._file.write(header + UINT32.pack(padding) + b" " * padding)
 
     @staticmethod
     def check_channel(channel: Channel) -> None:
@@ -91,12 +91,12 @@ class Ros1Writer(BagWriter):
 
     def add_channel(self, channel: Channel) -> None:
         """Declare a channel, which gets a connection."""
-        self.check_channel(channel)
         if channel.id in self._numbers:
             return
+        self.check_channel(channel)
         number = self._numbers[channel.id] = len(self._connections)
         topic, header = _make_header(channel)
-        record = _header(Op.CONNECTION, (b"conn", _uint32(number)), (b"topic", topic))
+        record = _header(Op.CONNECTION, (b"conn", UINT32.pack(number)), (b"topic", topic))
         self._connections.append(record + _join_header(header))
         self._chunk.write(self._connections[-1])
 
@@ -122,25 +122,25 @@ class Ros1Writer(BagWriter):
         if not content:
             return
         place = self._file.tell()
-        size = _uint32(len(content))
+        size = UINT32.pack(len(content))
         self._file.write(_header(Op.CHUNK, (b"compression", b"none"), (b"size", size)) + size)
         self._file.write(content)
         for number, entries in index.items():
             data = b"".join(_ENTRY.pack(*divmod(time, 10**9), offset) for time, offset in entries)
-            counted = ((b"conn", _uint32(number)), (b"count", _uint32(len(entries))))
-            self._file.write(_header(Op.INDEX, (b"ver", _uint32(1)), *counted))
-            self._file.write(_uint32(len(data)) + data)
+            counted = ((b"conn", UINT32.pack(number)), (b"count", UINT32.pack(len(entries))))
+            self._file.write(_header(Op.INDEX, (b"ver", UINT32.pack(1)), *counted))
+            self._file.write(UINT32.pack(len(data)) + data)
         times = [time for entries in index.values() for time, _ in entries] or [0]
         header = _header(
             Op.CHUNK_INFO,
-            (b"ver", _uint32(1)),
+            (b"ver", UINT32.pack(1)),
             (b"chunk_pos", place.to_bytes(8, "little")),
             (b"start_time", _PAIR.pack(*divmod(min(times), 10**9))),
             (b"end_time", _PAIR.pack(*divmod(max(times), 10**9))),
-            (b"count", _uint32(len(index))),
+            (b"count", UINT32.pack(len(index))),
         )
         counts = b"".join(_PAIR.pack(number, len(entries)) for number, entries in index.items())
-        self._chunk_infos.append(header + _uint32(len(counts)) + counts)
+        self._chunk_infos.append(header + UINT32.pack(len(counts)) + counts)
 
     def finish(self) -> None:
         """Write the last chunk and the index, and close the file."""
@@ -160,10 +160,6 @@ class Ros1Writer(BagWriter):
 
 def _header(op: Op, *fields: tuple[bytes, bytes]) -> bytes:
     return _join_header([(b"op", bytes([op])), *fields])
-
-
-def _uint32(number: int) -> bytes:
-    return number.to_bytes(4, "little")
 
 
 def _join_header(fields: Iterable[tuple[bytes, bytes]]) -> bytes:

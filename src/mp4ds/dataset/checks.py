@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import ValidationError
 
-from mp4ds.bags.formats import limits_of
+from mp4ds.bags.formats import writer_of
 from mp4ds.dataset.dataset import Dataset, datasets_in
 from mp4ds.dataset.images import shown_by
 from mp4ds.dataset.messages import MessagesFile, Part, recorded_storage
@@ -442,7 +442,7 @@ def _check_limits(
     storage = ""
     if manifest.format == "rosbag2":
         storage = recorded_storage(dataset.messages_file.in_file_order())
-    check_channel, check_message = limits_of(manifest.format, storage)
+    writer = writer_of(manifest.format, storage)
 
     def refusal(
         check: Callable[[_Checked], None], item: _Checked, place: Path | str
@@ -454,14 +454,14 @@ def _check_limits(
         return []
 
     for channel in dataset.channels:
-        yield from refusal(check_channel, channel, channel.topic)
+        yield from refusal(writer.check_channel, channel, channel.topic)
     for stream in dataset.streams:
         for message in _extremes(stream):
-            yield from refusal(check_message, message, stream.path)
+            yield from refusal(writer.check_message, message, stream.path)
     refused: list[FormatError] = []
     for record in records:  # to the end: they are counted
         if isinstance(record, Message) and not refused:
-            refused = refusal(check_message, record, dataset.path / MESSAGES_NAME)
+            refused = refusal(writer.check_message, record, dataset.path / MESSAGES_NAME)
     yield from refused
 
 

@@ -15,8 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import IO, Literal
 
-from mp4ds.bags.mcap import McapWriter
-from mp4ds.bags.mcap_records import copy_verified
+from mp4ds.bags.mcap import McapWriter, copy_verified
 from mp4ds.bags.protocols import Format
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.dataset.checks import validate

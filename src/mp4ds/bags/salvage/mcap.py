@@ -15,7 +15,6 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mp4ds.bags.files import DamageError, recover
-from mp4ds.bags.mcap_index import McapSummary, read_summary, summary_place
 from mp4ds.bags.mcap_records import (
     FOOTER_BYTES,
     FRAME,
@@ -24,9 +23,12 @@ from mp4ds.bags.mcap_records import (
     MESSAGE_HEAD,
     PRIVATE_OPCODE,
     Declared,
+    McapSummary,
     RecordStream,
     chunk_records,
     parse,
+    read_summary,
+    summary_place,
     unpack_chunk,
 )
 from mp4ds.bags.salvage.scan import BLOCK, FileSalvage, Lose, RecordFrame, Scan, Window
@@ -332,7 +334,7 @@ class McapSalvage(FileSalvage):
         self._is_timed = self._summary.chunks.has_messages
         self._longest = most
         self._read_profile()
-        self._declared.add_summary(self._summary.schemas, self._summary.channels)
+        declared.add_summary(self._summary)
 
     def _scan_of(self, window: Window, lose: Lose) -> Scan:
         return _Scan(window, lose, self._declared.channels, self._longest)
