@@ -160,12 +160,9 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
     try:
         version = int(info["version"])
         if version > NEWEST_VERSION:
-            raise SourceError(
-                path,
-                f"has rosbag2 metadata version {version}; this mp4ds reads versions up to "
-                f"{NEWEST_VERSION}",
-                "Install a newer mp4ds.",
-            )
+            reads = f"this mp4ds reads versions up to {NEWEST_VERSION}"
+            problem = f"has rosbag2 metadata version {version}; {reads}"
+            raise SourceError(path, problem, "Install a newer mp4ds.")
         names = tuple(_base_name(name, path) for name in info.get("relative_file_paths") or [])
         topics = tuple(_topic(item) for item in info.get("topics_with_message_count") or [])
         return BagInfo(
@@ -181,9 +178,9 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
             topics=topics,
             counts=_counts(info, names, topics),
         )
+    except SourceError:
+        raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        if isinstance(error, SourceError):
-            raise
         problem = f"is not rosbag2 metadata as expected: {error!r}"
         raise SourceError(path, problem, SALVAGE_REMEDY) from None
 
@@ -229,9 +226,8 @@ def _storage(identifier: str, names: tuple[str, ...], path: Path) -> str:
     suffixes = {_STORAGES.get(name.removesuffix(".zstd").rpartition(".")[2], "") for name in names}
     if identifier == "" and len(suffixes) <= 1 and "" not in suffixes:
         return suffixes.pop() if suffixes else ""
-    raise SourceError(
-        path, f"names the storage {identifier!r}; only sqlite3 and mcap are supported"
-    )
+    problem = f"names the storage {identifier!r}; only sqlite3 and mcap are supported"
+    raise SourceError(path, problem)
 
 
 def _compression(info: Mapping[str, Any], path: Path) -> str:
@@ -240,20 +236,15 @@ def _compression(info: Mapping[str, Any], path: Path) -> str:
         return ""
     scheme = _text(info.get("compression_format"))
     if mode not in ("file", "message") or scheme != "zstd":
-        raise SourceError(
-            path,
-            f"names the compression {scheme!r} of mode {mode!r}; only zstd of files or messages "
-            "is supported",
-        )
+        known = "only zstd of files or messages is supported"
+        raise SourceError(path, f"names the compression {scheme!r} of mode {mode!r}; {known}")
     return mode
 
 
 def _topic(item: Mapping[str, Any]) -> TopicMetadata:
     topic = item["topic_metadata"]
     qos = topic.get("offered_qos_profiles")
-    qos_text = _text(qos)
-    if isinstance(qos, list):
-        qos_text = dump_yaml(qos) if qos else ""
+    qos_text = (dump_yaml(qos) if qos else "") if isinstance(qos, list) else _text(qos)
     has_qos, has_hash = "offered_qos_profiles" in topic, "type_description_hash" in topic
     return TopicMetadata(
         name=_text(topic["name"]),
@@ -267,14 +258,7 @@ def _topic(item: Mapping[str, Any]) -> TopicMetadata:
 
 def dump_yaml(value: Any) -> str:
     """Write YAML as rosbag2 does, without a line break at the end."""
-    text: str = yaml.dump(
-        value,
-        Dumper=_Dumper,
-        sort_keys=False,
-        default_flow_style=False,
-        allow_unicode=True,
-        width=2**31,
-    )
+    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**31)
     return text.rstrip("\n")
 
 
@@ -283,54 +267,40 @@ def dump_bag_info(info: Mapping[str, Any]) -> str:
     return dump_yaml({_TOP_KEY: info}) + "\n"
 
 
-_HISTORY = ("system_default", "keep_last", "keep_all", "unknown")
-_RELIABILITY = ("system_default", "reliable", "best_effort", "unknown", "best_available")
-_DURABILITY = ("system_default", "transient_local", "volatile", "unknown", "best_available")
-_LIVELINESS = (
-    "system_default",
-    "automatic",
-    "manual_by_node",
-    "manual_by_topic",
-    "unknown",
-    "best_available",
-)
+# the names of policies, by their numbers before `NATIVE_QOS_VERSION`
 _POLICIES = {
-    "history": _HISTORY,
-    "reliability": _RELIABILITY,
-    "durability": _DURABILITY,
-    "liveliness": _LIVELINESS,
+    "history": "system_default keep_last keep_all unknown",
+    "reliability": "system_default reliable best_effort unknown best_available",
+    "durability": "system_default transient_local volatile unknown best_available",
+    "liveliness": "system_default automatic manual_by_node manual_by_topic unknown best_available",
 }
 
 
-def parse_qos(text: str) -> list[dict[str, Any]] | None:
-    """The QoS profiles of a topic as YAML values, None if the text is not a list of them."""
+def parse_qos(text: str) -> list[dict[str, Any]]:
+    """The QoS profiles of a topic as YAML values; none if the text is not a list of them."""
     try:
-        profiles = yamlio.build(text, _scalar) if text.strip() else None
+        profiles = yamlio.build(text, _scalar) if text.strip() else []
     except ValueError:
-        return None
-    if profiles is None:
         return []
     if isinstance(profiles, list) and all(isinstance(profile, dict) for profile in profiles):
         return profiles
-    return None
+    return []
 
 
 def has_numeric_qos(text: str) -> bool:
     """Whether QoS policies are numbers, as before metadata version 9."""
-    profiles = parse_qos(text) or []
-    return any(isinstance(profile.get("reliability"), int) for profile in profiles)
+    return any(isinstance(profile.get("reliability"), int) for profile in parse_qos(text))
 
 
 def native_qos(text: str) -> list[dict[str, Any]]:
     """QoS profiles as metadata version 9 lists them: the policies by name."""
     return [
-        {key: _policy(key, value) for key, value in profile.items()}
-        for profile in parse_qos(text) or []
+        {key: _policy(key, value) for key, value in profile.items()} for profile in parse_qos(text)
     ]
 
 
 def _policy(key: str, value: Any) -> Any:
-    names = _POLICIES.get(key)
-    if names is None or not isinstance(value, int) or isinstance(value, bool):
+    names = _POLICIES.get(key, "").split()
+    if not names or not isinstance(value, int) or isinstance(value, bool):
         return value
     return names[value] if 0 <= value < len(names) else "unknown"

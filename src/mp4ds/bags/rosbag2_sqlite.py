@@ -83,13 +83,8 @@ class Tables:
                     f"Drop it with the sqlite3 tool, or {SALVAGE}",
                 )
 
-    def columns(self, table: str) -> list[tuple[Any, bool]]:
-        """Name of each column of a table, and whether its values are computed."""
-        found = self._connection.execute(f"PRAGMA table_xinfo({table})")
-        return [(row[1], row[6] != 0) for row in found]
-
     def select(self, query: str, values: Any = ()) -> sqlite3.Cursor:
-        """Rows of numbers."""
+        """Rows of numbers, or of the schema, which the file's size bounds."""
         return self._connection.execute(query, values)
 
     def rows(self, query: str, values: Any = ()) -> Iterator[tuple[Any, ...]]:
@@ -219,33 +214,29 @@ class SqliteReader(BagReader):
         return open_tables(self.path, damaged=self._damaged)
 
     def _columns(self, tables: Tables, table: str) -> list[str]:
-        columns = tables.columns(table)
-        if any(is_computed for _, is_computed in columns):
+        """The columns of a table; none if it is not there."""
+        columns = tables.select(f"PRAGMA table_xinfo({table})").fetchall()
+        if any(hidden for *_, hidden in columns):
             problem = f"has a computed column in its table {table}, which recordings never have"
             raise SourceError(self.path, problem, SALVAGE_REMEDY)
-        return [self._text(name, table) for name, _ in columns]
+        return [self._text(column[1], table) for column in columns]
 
     def _text(self, value: Any, table: str) -> str:
-        if isinstance(value, bytes):
-            try:
-                return value.decode()
-            except UnicodeDecodeError:
-                raise SourceError(
-                    self.path, f"has text in its table {table} that is not UTF-8"
-                ) from None
-        return "" if value is None else str(value)
+        if not isinstance(value, bytes):
+            return "" if value is None else str(value)
+        try:
+            return value.decode()
+        except UnicodeDecodeError:
+            problem = f"has text in its table {table} that is not UTF-8"
+            raise SourceError(self.path, problem) from None
 
     def _check_columns(self, tables: Tables) -> None:
-        topics, messages = (self._columns(tables, "topics"), self._columns(tables, "messages"))
+        topics, messages = self._columns(tables, "topics"), self._columns(tables, "messages")
         if not {*topics}.issuperset(_TOPIC_COLUMNS) or not {*messages} >= _MESSAGE_COLUMNS:
             raise SourceError(self.path, "is an sqlite3 database, but not of rosbag2")
-        unknown = [name for name in messages if name not in _MESSAGE_COLUMNS]
-        if unknown:
-            raise SourceError(
-                self.path,
-                f"has an unknown column {unknown[0]!r} in its table of messages",
-                "Install a newer mp4ds.",
-            )
+        if unknown := [name for name in messages if name not in _MESSAGE_COLUMNS]:
+            problem = f"has an unknown column {unknown[0]!r} in its table of messages"
+            raise SourceError(self.path, problem, "Install a newer mp4ds.")
 
     def _read_definitions(self, tables: Tables) -> Iterator[tuple[Schema, str]]:
         if not self._columns(tables, "message_definitions"):
@@ -261,25 +252,19 @@ class SqliteReader(BagReader):
 
     def _read_topics(self, tables: Tables) -> Iterator[Channel]:
         columns = self._columns(tables, "topics")
-        extra = [name for name in columns if name not in _TOPIC_COLUMNS]
         for row in tables.rows("SELECT * FROM topics ORDER BY id"):
             fields = dict(zip(columns, row, strict=True))
-            name, type_name, encoding = (
-                self._text(fields[column], "topics") for column in _TOPIC_COLUMNS[1:]
-            )
-            metadata = {
-                _METADATA_KEYS.get(column, column): self._text(fields[column], "topics")
-                for column in extra
-            }
+            number = fields.pop("id")
+            texts = {column: self._text(value, "topics") for column, value in fields.items()}
+            name, type_name, encoding = (texts.pop(column) for column in _TOPIC_COLUMNS[1:])
+            metadata = {_METADATA_KEYS.get(column, column): text for column, text in texts.items()}
             schema = self._definition(type_name, metadata.get(HASH_KEY, ""))
-            yield Channel(fields["id"], name, encoding, schema, metadata)
+            yield Channel(number, name, encoding, schema, metadata)
 
     def _definition(self, type_name: str, type_hash: str) -> Schema:
         found = [item for item in self._definitions if item[0].name == type_name]
-        exact = [schema for schema, its_hash in found if its_hash == type_hash]
-        if exact or found:
-            return exact[0] if exact else found[0][0]
-        return Schema(type_name, "", b"")
+        unknown = Schema(type_name, "", b""), type_hash
+        return min(found, key=lambda item: item[1] != type_hash, default=unknown)[0]
 
     def _read_tables(self, tables: Tables) -> Iterator[tuple[str, str]]:
         prefix = f"db3:{self.path.name}"
@@ -329,8 +314,7 @@ class SqliteReader(BagReader):
             # Ids first: without an index, sorting whole rows would copy the recording.
             query = "SELECT id, timestamp FROM messages ORDER BY timestamp, id"
             before = None
-            for row in tables.select(query):
-                read += 1
+            for read, row in enumerate(tables.select(query), 1):
                 message = self._message(tables, row[0], f"message {read}")
                 if row == before or row[1] != message.log_time:  # one twice, another not at all
                     raise self._bad_index()
@@ -371,21 +355,20 @@ class SqliteReader(BagReader):
         topic_id, timestamp, data, kind, size = row
         channel = self._channels.get(topic_id)
         if channel is None:
-            raise SourceError(
-                self.path,
-                f"{place} has topic id {topic_id}, which is not in its table of topics",
-                f"`ros2 bag convert` leaves such messages out, or {SALVAGE}",
-            )
+            problem = f"{place} has topic id {topic_id}, which is not in its table of topics"
+            remedy = f"`ros2 bag convert` leaves such messages out, or {SALVAGE}"
+            raise SourceError(self.path, problem, remedy)
         place = f"{place}, topic {channel.topic}"
+        problem = ""
         if not isinstance(timestamp, int) or timestamp < 0:
-            problem = f"{place}: {timestamp!r} is not a valid time"
-            raise SourceError(self.path, problem, SALVAGE_REMEDY)
-        if kind != b"blob":
-            problem = f"{place}: the payload is {kind.decode()}, not a blob"
-            raise SourceError(self.path, problem, SALVAGE_REMEDY)
-        if data is None:
+            problem = f"{timestamp!r} is not a valid time"
+        elif kind != b"blob":
+            problem = f"the payload is {kind.decode()}, not a blob"
+        elif data is None:
             error = OversizeError(f"it has {size} bytes", self._most)
             raise unreadable(self.path, f": {place}", error, SALVAGE_REMEDY)
+        if problem:
+            raise SourceError(self.path, f"{place}: {problem}", SALVAGE_REMEDY)
         return Message(channel, timestamp, timestamp, 0, data)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
@@ -418,19 +401,16 @@ def _conditions(excerpt: Excerpt) -> Iterator[tuple[str, list[int]]]:
     so spans open at the start or the end find and refuse them.
     """
     first, last = _INT64
-    start, end = excerpt.start, excerpt.end
-    if (start is not None and start > last) or (end is not None and end <= first):
+    start = first if excerpt.start is None else excerpt.start
+    end = last + 1 if excerpt.end is None else excerpt.end
+    if start > last or end <= first:
         return
-    if start is not None and start <= first:
-        start = None
-    if end is not None and end > last:
-        end = None
-    terms = {"timestamp >= ?": start, "timestamp < ?": end}
-    known = {term: time for term, time in terms.items() if time is not None}
-    if start is None and end is not None:
-        yield "WHERE timestamp IS NULL", []
-    condition = f"WHERE {' AND '.join(known)}" if known else ""
-    yield condition, list(known.values())
+    known = {"timestamp >= ?": start} if start > first else {}
+    if end <= last:
+        known["timestamp < ?"] = end
+        if start <= first:
+            yield "WHERE timestamp IS NULL", []
+    yield f"WHERE {' AND '.join(known)}" if known else "", list(known.values())
 
 
 # ---------------------------------------------------------------- the writer
