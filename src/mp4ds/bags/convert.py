@@ -8,7 +8,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -110,15 +110,6 @@ class Converter:
         self._plans: dict[Schema, _Plan] = {}
         self._omitted: Counter[str] = Counter()
 
-    # standard types take a while to load, and most recordings are in their target already
-    @cached_property
-    def _ros1(self) -> Typesdict:
-        return ros1_types()
-
-    @cached_property
-    def _ros2(self) -> Typesdict:
-        return ros2_types()
-
     @property
     def omitted(self) -> Mapping[str, int]:
         """What was left out because the target cannot hold it: a phrase -> how many."""
@@ -161,7 +152,7 @@ class Converter:
         if schema is None or not schema.name or "md5sum" in channel.metadata:
             return channel
         try:
-            store = make_store(types_of(schema, self._ros1), self._ros1)
+            store = make_store(types_of(schema, ros1_types()), ros1_types())
             name = normalize_msgtype(schema.name)
             problem = incomprehensible(schema.name)
             definition, digest = by_library(problem, store.generate_msgdef, name, 1)
@@ -191,7 +182,7 @@ class Converter:
 
     def _make_plan(self, schema: Schema) -> _Plan:
         to_ros2 = self._to == "ros2"
-        source, target = (self._ros1, self._ros2) if to_ros2 else (self._ros2, self._ros1)
+        source, target = (ros1_types(), ros2_types()) if to_ros2 else (ros2_types(), ros1_types())
         problem = incomprehensible(schema.name)
         types = types_of(schema, source)
         name = normalize_msgtype(schema.name)
@@ -203,7 +194,7 @@ class Converter:
         else:
             definition, digest = by_library(problem, made.generate_msgdef, new_name, 1)
             new_name = by_library(problem, denormalize_msgtype, new_name)
-        store = make_store(types, self._ros2)
+        store = make_store(types, ros2_types())
         store.get_msgdef(name)  # compiled now, to fail before any message
         encoding = SCHEMA_ENCODINGS["cdr" if to_ros2 else "ros1"]
         made_schema = Schema(new_name, encoding, definition.encode())
@@ -225,7 +216,11 @@ class Converter:
             converted = by_library(problem, convert, raw, name)
         except Refused:
             # ROS itself ignores bytes after a message, which bags of RealSense cameras have.
-            end = _end(plan, raw, to_ros1=to_ros1)
+            definition = store.get_msgdef(name)
+            start, size = 0, definition.getsize_ros1_to_cdr
+            if to_ros1:
+                start, size = 4, definition.getsize_cdr_to_ros1
+            end = start + by_library(problem, size, raw[start:], 0, None, 0, store)[0]
             if not (0 < len(raw) - end <= MAX_TAIL and fields_of(plan.types, name)):
                 raise
             raw = raw[:end]
@@ -243,24 +238,18 @@ class Converter:
 
     def _remembered(self, channel: Channel, plan: _Plan) -> Channel | None:
         """The ROS 1 channel that this one was made from, if recorded and still valid."""
-        known = {
-            key[len(_ROS1) :]: value
-            for key, value in channel.metadata.items()
-            if key.startswith(_ROS1)
-        }
+        prefixed = (item for item in channel.metadata.items() if item[0].startswith(_ROS1))
+        known = {key.removeprefix(_ROS1): value for key, value in prefixed}
         name, definition = known.pop("type", ""), known.pop("message_definition", None)
         encoded = known.pop("message_definition;base64", None)
         encoding = "" if definition is None and encoded is None else SCHEMA_ENCODINGS["ros1"]
         try:
             data = base64.b64decode(encoded) if encoded else (definition or "").encode()
-        except ValueError:
-            return None
-        try:
             schema = Schema(name, encoding, data)
-            types = types_of(schema, self._ros1)
+            types = types_of(schema, ros1_types())
             if not same_wire(plan.types, plan.name, types, normalize_msgtype(name)):
                 return None
-        except Refused:
+        except (ValueError, Refused):
             return None
         return replace(channel, message_encoding="ros1", schema=schema, metadata=known)
 
@@ -288,20 +277,6 @@ def _ros2_channel(channel: Channel, plan: _Plan) -> Channel:
             encoded = base64.b64encode(channel.schema.data).decode()
             metadata[_ROS1 + "message_definition;base64"] = encoded
     return replace(channel, message_encoding="cdr", schema=plan.schema, metadata=metadata)
-
-
-def _end(plan: _Plan, raw: memoryview, *, to_ros1: bool) -> int:
-    """Where the message in `raw` ends.
-
-    Raises:
-        Refused: It is none.
-    """
-    definition = plan.store.get_msgdef(plan.name)
-    start, size = 0, definition.getsize_ros1_to_cdr
-    if to_ros1:
-        start, size = 4, definition.getsize_cdr_to_ros1
-    end, _ = by_library(plan.no_message, size, raw[start:], 0, None, 0, plan.store)
-    return start + int(end)
 
 
 def _time_beyond(plan: _Plan, data: bytes | memoryview) -> int | None:
@@ -380,10 +355,8 @@ def decoder_of(channel: Channel) -> Decoder:
     """
     make = _DECODERS.get(channel.message_encoding)
     if make is None:
-        known = ", ".join(_DECODERS)
-        raise _undecodable(
-            channel, f"their encoding is {channel.message_encoding or 'unknown'}, not {known}"
-        )
+        encoding = channel.message_encoding or "unknown"
+        raise _undecodable(channel, f"their encoding is {encoding}, not {', '.join(_DECODERS)}")
     return make(channel)
 
 
@@ -409,31 +382,28 @@ def _ros(channel: Channel) -> Decoder:
 
     def decode(payload: memoryview) -> Any:
         start, read = 0, definition.deserialize_ros1
+        problem = f"it is not a {schema.name}"
         if not is_ros1:
             if len(payload) < 4 or payload[0] != 0 or payload[1] > 1:
-                raise WireError(f"it is not a {schema.name}")
+                raise WireError(problem)
             start = 4
             read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
         try:
-            args = (payload[start:], 0, definition.cls, store)
-            message, end = by_library(f"it is not a {schema.name}", read, *args)
-        except Refused as reason:
-            raise WireError(str(reason)) from None
+            message, end = by_library(problem, read, payload[start:], 0, definition.cls, store)
+        except Refused:
+            raise WireError(problem) from None
         if len(payload) - start - end > MAX_TAIL:
-            raise WireError(f"it is not a {schema.name}")
+            raise WireError(problem)
         return message
 
     return decode
 
 
-def _json(channel: Channel) -> Decoder:
-    def decode(payload: memoryview) -> Any:
-        try:
-            return json.loads(bytes(payload))
-        except (ValueError, RecursionError):
-            raise WireError("it is not JSON") from None
-
-    return decode
+def _from_json(payload: memoryview) -> Any:
+    try:
+        return json.loads(bytes(payload))
+    except (ValueError, RecursionError):
+        raise WireError("it is not JSON") from None
 
 
 def _protobuf(channel: Channel) -> Decoder:
@@ -449,6 +419,6 @@ def _protobuf(channel: Channel) -> Decoder:
 _DECODERS: Mapping[str, Callable[[Channel], Decoder]] = {
     "ros1": _ros,
     "cdr": _ros,
-    "json": _json,
+    "json": lambda channel: _from_json,
     "protobuf": _protobuf,
 }

@@ -177,11 +177,10 @@ class Rosbag2Reader(CombinedReader):
         Databases of early versions have no column for it.
         """
         if self._info and self._storage == "sqlite3" and QOS_KEY not in channel.metadata:
-            for topic in self._info.topics:
-                name = topic.name, topic.type_name
-                if topic.qos and name == (channel.topic, channel.type_name):
-                    metadata = {**channel.metadata, QOS_KEY: topic.qos}
-                    return super()._share(number, replace(channel, metadata=metadata))
+            name = channel.topic, channel.type_name
+            topics = (topic for topic in self._info.topics if (topic.name, topic.type_name) == name)
+            if qos := next((topic.qos for topic in topics if topic.qos), None):
+                channel = replace(channel, metadata={**channel.metadata, QOS_KEY: qos})
         return super()._share(number, channel)
 
     def _declare_listed(self) -> None:
@@ -284,28 +283,19 @@ def _start(file: Path) -> bytes:
 
 def _folder_info(path: Path) -> BagInfo:
     if not (path / METADATA_FILE).exists():
-        raise SourceError(
-            path,
-            f"has no {METADATA_FILE}",
-            "If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or "
-            f"{SALVAGE} If it is a folder of images, use `mp4ds import images`.",
-        )
+        remedy = f"If it is a rosbag2 recording, run `ros2 bag reindex` on it first, or {SALVAGE}"
+        remedy += " If it is a folder of images, use `mp4ds import images`."
+        raise SourceError(path, f"has no {METADATA_FILE}", remedy)
     info = read_bag_info(path / METADATA_FILE)
-    missing = [name for name in info.file_names if not (path / name).exists()]
-    if missing:
+    if missing := [name for name in info.file_names if not (path / name).exists()]:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise SourceError(
-            path,
-            f"is incomplete: {missing[0]}{more}, listed in its {METADATA_FILE}, is missing",
-            f"Add the missing file, run `ros2 bag reindex` to do without it, or {SALVAGE}",
-        )
-    unlisted = [] if remote(path) else unlisted_storage(path, info.file_names)
-    if unlisted:
-        raise SourceError(
-            path,
-            f"has {unlisted[0]}, which its {METADATA_FILE} does not list",
-            f"Move it away, run `ros2 bag reindex` to add it, or {SALVAGE}",
-        )
+        problem = f"is incomplete: {missing[0]}{more}, listed in its {METADATA_FILE}, is missing"
+        remedy = f"Add the missing file, run `ros2 bag reindex` to do without it, or {SALVAGE}"
+        raise SourceError(path, problem, remedy)
+    if unlisted := [] if remote(path) else unlisted_storage(path, info.file_names):
+        problem = f"has {unlisted[0]}, which its {METADATA_FILE} does not list"
+        remedy = f"Move it away, run `ros2 bag reindex` to add it, or {SALVAGE}"
+        raise SourceError(path, problem, remedy)
     return info
 
 
@@ -430,44 +420,36 @@ class Rosbag2Writer(BagWriter):
 
     def add_metadata(self, record: MetadataRecord) -> None:
         """Take over the metadata of the source recording, or append a metadata record."""
-        if record.name == RECORD:
-            self._take_source(record.metadata)
-        elif record.name == TABLES_RECORD:
-            self._take_distro(record.metadata)
-        else:
-            if record.name == MCAP_RECORD and not self._source_is_whole:
-                text = record.metadata.get("serialized_metadata", "")
-                self._source = _parsed(text) or self._source
-            self._source_has_record |= record.name == MCAP_RECORD
-            self._writer.add_metadata(record)
-
-    def _take_source(self, content: Mapping[str, str]) -> None:
-        self._take_distro(content)
-        texts = [text for key, text in content.items() if ":metadata:" in key]
-        self._source = _parsed(content.get(METADATA_FILE, texts[-1] if texts else ""))
-        self._source_is_whole = self._source is not None
-
-    def _take_distro(self, content: Mapping[str, str]) -> None:
-        distros = [text for key, text in content.items() if key.endswith(":ros_distro") and text]
-        self._source_distro = self._source_distro or (distros[0] if distros else "")
+        content = record.metadata
+        if record.name in (RECORD, TABLES_RECORD):
+            distros = (text for key, text in content.items() if key.endswith(":ros_distro"))
+            self._source_distro = next(filter(None, (self._source_distro, *distros)), "")
+            if record.name == RECORD:
+                texts = [text for key, text in content.items() if ":metadata:" in key]
+                self._source = _parsed(content.get(METADATA_FILE, texts[-1] if texts else ""))
+                self._source_is_whole = self._source is not None
+            return
+        if record.name == MCAP_RECORD:
+            if not self._source_is_whole:
+                self._source = _parsed(content.get("serialized_metadata", "")) or self._source
+            self._source_has_record = True
+        self._writer.add_metadata(record)
 
     @property
     def _ros_distro(self) -> str:
         return (self._source.ros_distro if self._source else "") or self._source_distro
 
-    def _version(self) -> int:
-        if self._source:
-            return self._source.version
-        old_style = any(has_numeric_qos(topic.qos or "") for topic in self._counts)
-        return NATIVE_QOS_VERSION - 1 if old_style else NEWEST_VERSION
-
     def _info(self) -> dict[str, Any]:
         """The content of metadata.yaml in the layout of its version."""
-        version = self._version()
-        count = sum(self._counts.values())
+        old_style = any(has_numeric_qos(topic.qos or "") for topic in self._counts)
+        version = NATIVE_QOS_VERSION - 1 if old_style else NEWEST_VERSION
+        if self._source:
+            version = self._source.version
+        prefix = "" if version >= 4 else f"{self._name}/"
         duration = {"nanoseconds": max(0, self._end - self._start)}
         start = {"nanoseconds_since_epoch": self._start}
-        prefix = "" if version >= 4 else f"{self._name}/"
+        count = sum(self._counts.values())
+        part = {"starting_time": start, "duration": duration, "message_count": count}
         info = {
             "version": version,
             "storage_identifier": self._storage,
@@ -481,14 +463,7 @@ class Rosbag2Writer(BagWriter):
             "compression_format": "",
             "compression_mode": "",
             "relative_file_paths": [prefix + self._file_name],
-            "files": [
-                {
-                    "path": self._file_name,
-                    "starting_time": start,
-                    "duration": duration,
-                    "message_count": count,
-                }
-            ],
+            "files": [{"path": self._file_name, **part}],
             "custom_data": (dict(self._source.custom_data) if self._source else {}) or None,
             "ros_distro": self._ros_distro,
         }
@@ -496,18 +471,16 @@ class Rosbag2Writer(BagWriter):
 
     def _as_listed(self, topic: TopicMetadata) -> TopicMetadata:
         """The topic as listed in the source's metadata.yaml, which may differ from its files."""
-        found = [
-            listed
-            for listed in (self._source.topics if self._source else ())
-            if (listed.name, listed.type_name) == (topic.name, topic.type_name)
-        ]
+        listed, name = self._source.topics if self._source else (), (topic.name, topic.type_name)
+        found = [one for one in listed if (one.name, one.type_name) == name]
         if len(found) != 1:
             return topic
+        (one,) = found
         return replace(
             topic,
-            serialization_format=found[0].serialization_format,
-            qos=topic.qos if found[0].qos is None else found[0].qos,
-            type_hash=topic.type_hash if found[0].type_hash is None else found[0].type_hash,
+            serialization_format=one.serialization_format,
+            qos=topic.qos if one.qos is None else one.qos,
+            type_hash=topic.type_hash if one.type_hash is None else one.type_hash,
         )
 
     def finish(self) -> None:

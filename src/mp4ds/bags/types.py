@@ -6,7 +6,7 @@ import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rosbags.interfaces import Msgdef, Nodetype
@@ -268,6 +268,7 @@ SCHEMA_ENCODINGS = {"ros1": "ros1msg", "cdr": "ros2msg"}
 """Encoding of messages -> that of the definitions generated for them."""
 
 
+@cache  # they take a while to load
 def ros1_types() -> Typesdict:
     """The standard types of ROS 1 Noetic; rosbags has all except tf2's."""
     tf2 = "tf2_msgs/msg/TFMessage"
@@ -275,6 +276,7 @@ def ros1_types() -> Typesdict:
     return {**standard, **get_typestore(Stores.ROS1_NOETIC).fielddefs}
 
 
+@cache
 def ros2_types(distribution: str = "humble") -> Typesdict:
     """The standard types of a distribution of ROS 2, for definitions that were not recorded."""
     # including later types: a recording without definitions may have them

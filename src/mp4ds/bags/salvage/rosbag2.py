@@ -102,13 +102,12 @@ class SqliteSalvage(SqliteReader):
 
     def _salvaged(self, tables: Tables, key: int, log: LossLog) -> Message | None:
         """A message; None if it is lost, which is recorded."""
-        topics: list[str] = []
+        channel = None
         try:
             topic_id, time = _first(tables, "topic_id, timestamp", key)
             channel = self._channels.get(topic_id) if isinstance(topic_id, int) else None
             if channel is None:
                 raise Refused(f"messages of topic id {topic_id}, which has no row")
-            topics.append(channel.topic)
             if not isinstance(time, int) or time < 0:
                 raise Refused(f"messages of {channel.topic} with a time before 1970")
             (size,) = _first(tables, "length(data)", key)
@@ -123,8 +122,9 @@ class SqliteSalvage(SqliteReader):
             problem = str(lost)
         except (sqlite3.Error, SourceError):
             _raise_if_interrupted(tables)
-            of = f" of {topics[0]}" if topics else ""
+            of = f" of {channel.topic}" if channel else ""
             problem = f"messages{of} with damaged or missing pages"
+        topics = [channel.topic] if channel else []
         log.lost_of_kind(problem, None, problem).add(1, topics)
         return None
 
@@ -223,11 +223,9 @@ class Rosbag2Salvage(Rosbag2Reader):
         info = self._read_info(path)
         names = self._names(info)
         if not names and not info:
-            raise SourceError(
-                path,
-                f"has no {METADATA_FILE} and no storage file",
-                "Give a rosbag2 folder, a ROS 1 .bag or an .mcap file.",
-            )
+            problem = f"has no {METADATA_FILE} and no storage file"
+            remedy = "Give a rosbag2 folder, a ROS 1 .bag or an .mcap file."
+            raise SourceError(path, problem, remedy)
         return info, [path / name for name in names]
 
     def _read_info(self, folder: Path) -> BagInfo | None:
