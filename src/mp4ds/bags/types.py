@@ -102,12 +102,6 @@ class FieldShape:
         """Whether it is an array or a sequence."""
         return self.length is not None or self.bound is not None
 
-    @property
-    def on_wire(self) -> tuple[object, ...]:
-        """What determines its bytes, except for the message type; bounds do not."""
-        base = _BYTES.get(self.base, self.base)
-        return base, bool(self.message), self.length, self.bound is None
-
 
 def field_shape(desc: FieldDesc) -> FieldShape:
     """The shape of a field of `fields_of`."""
@@ -366,8 +360,14 @@ def same_wire(left: Typesdict, left_name: str, right: Typesdict, right_name: str
     left_shapes, right_shapes = shapes_of(left, left_name), shapes_of(right, right_name)
     if len(left_shapes) != len(right_shapes):
         return False
+
+    def bytes_of(shape: FieldShape) -> tuple[object, ...]:
+        """What determines its bytes, except for the message type; bounds do not."""
+        base = _BYTES.get(shape.base, shape.base)
+        return base, bool(shape.message), shape.length, shape.bound is None
+
     return all(
-        one.on_wire == other.on_wire
+        bytes_of(one) == bytes_of(other)
         and (not one.message or same_wire(left, one.message, right, other.message))
         for one, other in zip(left_shapes, right_shapes, strict=True)
     )

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -109,15 +108,9 @@ class _Scan(Scan):
     """
 
     lookahead = 2**16
-    outer: Collection[int] = frozenset(
-        {
-            Opcode.CHUNK,
-            Opcode.MESSAGE_INDEX,
-            Opcode.ATTACHMENT,
-            Opcode.METADATA,
-            Opcode.DATA_END,
-            Opcode.FOOTER,
-        }
+    outer = (
+        *(Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT),
+        *(Opcode.METADATA, Opcode.DATA_END, Opcode.FOOTER),
     )
 
     def __init__(self, window: Window, lose: Lose, channels: Collection[int], longest: int) -> None:
@@ -209,11 +202,8 @@ def _read_summary(path: Path) -> tuple[McapSummary, McapSummary]:
     Raises:
         SourceError: The file cannot be read.
     """
-    place, read = 0, McapSummary()
-    with (
-        closing(RecordStream(path, MAX_RECORD_BYTES)) as stream,
-        suppress(SourceError, DamageError),
-    ):
+    place, read, stream = 0, McapSummary(), RecordStream(path, MAX_RECORD_BYTES)
+    with closing(stream), suppress(SourceError, DamageError):
         found, checksum = summary_place(stream)
         if len(MAGIC) < found < stream.size - FOOTER_BYTES:
             place = found
@@ -241,59 +231,22 @@ _MARGIN = 600 * 10**9  # ns; a damaged chunk may seem to end where the next one 
 _Found = Message | Attachment | MetadataRecord | None
 
 
-@dataclass(frozen=True, slots=True)
-class _Chunk:
-    """The content recovered from a chunk.
+def _recovered(
+    compression: str, data: memoryview, size: int, crc: int
+) -> tuple[bytes, int, str, bool]:
+    """What can be recovered from the records of a chunk, of which the checksum is `crc` or 0.
 
-    Attributes:
-        content: Records.
-        is_plain: Whether it is not compressed.
-        head: Bytes of the chunk's body before its records.
-        used: Bytes of the chunk's body that were used, as far as known.
-        problem: What is wrong with it, a phrase; empty if nothing is.
-        is_doubtful: Whether the content may differ from what was recorded.
-        span: Earliest and latest log time that its messages can have, ns.
-        records: Opcodes and bodies, if verified by its checksum; otherwise empty.
+    Returns:
+        The records; bytes of the data that were used, as far as known; what is wrong, a phrase,
+        empty if nothing is; and whether the records may differ from what was recorded.
     """
-
-    content: bytes | memoryview
-    is_plain: bool
-    head: int
-    used: int
-    problem: str
-    is_doubtful: bool
-    span: tuple[int, int]
-    records: Sequence[tuple[int, memoryview]] = ()
-
-    @classmethod
-    def unpacked(cls, body: memoryview) -> _Chunk:
-        """Decompress the body of a chunk, which may be cut short."""
-        if len(body) < _CHUNK_HEAD.size + 8:
-            return cls(b"", False, 0, 0, "a chunk is cut short", False, (0, 0))
-        start, end, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
-        compression = bytes(body[_CHUNK_HEAD.size :][:name_length]).decode(errors="replace")
-        records = _CHUNK_HEAD.size + name_length
-        length = int.from_bytes(body[records : records + 8], "little")
-        is_plain = not compression
-        if is_plain:
-            start, end = start - _MARGIN, end + _MARGIN
-        if crc:
-            with suppress(DamageError):
-                content = unpack_chunk(body)
-                found = list(chunk_records(content))
-                used = records + 8 + length
-                span = (start, end)
-                return cls(content, is_plain, records + 8, used, "", False, span, found)
-        data, most = body[records + 8 :][:length], min(size, MAX_RECORD_BYTES)
-        content, used, damage, is_sound = recover(compression, data, most)
-        problem = damage
-        if crc and zlib.crc32(content) == crc:
-            problem = ""
-        elif crc and not problem:
-            problem = "a chunk does not match its checksum: what could be read of it may be altered"
-        used = records + 8 + used if used else 0
-        is_doubtful = bool(problem) and (not is_sound or not damage)
-        return cls(content, is_plain, records + 8, used, problem, is_doubtful, (start, end))
+    content, used, damage, is_sound = recover(compression, data, min(size, MAX_RECORD_BYTES))
+    problem = damage
+    if crc and zlib.crc32(content) == crc:
+        problem = ""
+    elif crc and not problem:
+        problem = "a chunk does not match its checksum: what could be read of it may be altered"
+    return content, used, problem, bool(problem) and (not is_sound or not damage)
 
 
 def _message_count(statistics: mcap_records.Statistics | None) -> int | None:
@@ -333,20 +286,16 @@ class McapSalvage(FileSalvage):
         self._index_offset = self._summary.offset or None
         self._is_timed = self._summary.chunks.has_messages
         self._longest = most
-        self._read_profile()
         declared.add_summary(self._summary)
-
-    def _scan_of(self, window: Window, lose: Lose) -> Scan:
-        return _Scan(window, lose, self._declared.channels, self._longest)
-
-    def _read_profile(self) -> None:
-        stream = RecordStream(self.path, BLOCK)
-        with closing(stream), suppress(SourceError, DamageError):
+        with closing(RecordStream(path, BLOCK)) as stream, suppress(SourceError, DamageError):
             stream.seek(len(MAGIC))
             opcode, body = stream.next()
             if opcode == Opcode.HEADER:
                 header = parse(mcap_records.Header, body)
                 self.profile, self.library = header.profile, header.library
+
+    def _scan_of(self, window: Window, lose: Lose) -> Scan:
+        return _Scan(window, lose, self._declared.channels, self._longest)
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -496,18 +445,38 @@ class McapSalvage(FileSalvage):
         """The messages of a chunk, as far as it can be decompressed."""
         offset = self._window.offset
         have, proven = self._peek_chunk(frame)
-        chunk = _Chunk.unpacked(have[frame.head :])
-        self._tally.open(None, offset + frame.size, chunk.span)
-        if chunk.is_plain and chunk.problem:
+        body = have[frame.head :]  # with all fields before its records, or it would be no frame
+        start, end, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
+        head = _CHUNK_HEAD.size + name_length + 8
+        compression = bytes(body[_CHUNK_HEAD.size : head - 8]).decode()
+        used = int.from_bytes(body[head - 8 : head], "little")
+        content, records, problem, is_doubtful = b"", None, "", False
+        if crc:
+            with suppress(DamageError):
+                records = list(chunk_records(unpack_chunk(body)))
+        if records is None:
+            found = _recovered(compression, body[head:][:used], size, crc)
+            content, used, problem, is_doubtful = found
+        margin = 0 if compression else _MARGIN
+        self._tally.open(None, offset + frame.size, (start - margin, end + margin))
+        if problem and not compression:
             # Its records are in the file like any other: damage to one does not hide the others.
-            if chunk.is_doubtful:
-                self._plain = offset, offset + frame.size, chunk.problem
-            self._window.skip(frame.head + chunk.head)
+            if is_doubtful:
+                self._plain = offset, offset + frame.size, problem
+            self._window.skip(frame.head + head)
             return
-        problems = [chunk.problem] if chunk.problem else []
-        yield from self._content(chunk, offset, problems)
-        used = frame.head + chunk.used
-        self._leave_chunk(frame, used, problems, proven=proven, whole=not chunk.problem)
+        problems = [problem] if problem else []
+        scanned = ((part.kind, data) for part, data in self._inside(content, problems))
+        for kind, data in scanned if records is None else records:
+            try:
+                if kind != Opcode.MESSAGE:
+                    self._other(kind, data)
+                else:
+                    yield from self._take(data, offset, is_doubtful=is_doubtful)
+            except DamageError as error:
+                problems.append(f"in a chunk, {error}")
+        used = frame.head + head + used if used or records is not None else frame.head
+        self._leave_chunk(frame, used, problems, proven=proven, whole=not problem)
 
     def _leave_plain(self, kind: int) -> None:
         """At the end of a damaged uncompressed chunk, record the damage if nothing else did."""
@@ -520,18 +489,6 @@ class McapSalvage(FileSalvage):
         self._plain = None
         if not self._tally.losses:
             self._lose(start, min(offset, end) - start, problem)
-
-    def _content(self, chunk: _Chunk, offset: int, problems: list[str]) -> Iterator[_Found]:
-        """The records of a chunk."""
-        scanned = ((frame.kind, body) for frame, body in self._inside(chunk.content, problems))
-        for kind, body in chunk.records or scanned:
-            try:
-                if kind != Opcode.MESSAGE:
-                    self._other(kind, body)
-                else:
-                    yield from self._take(body, offset, is_doubtful=chunk.is_doubtful)
-            except DamageError as error:
-                problems.append(f"in a chunk, {error}")
 
     def _listed(self, body: bytes, offset: int) -> None:
         """Process a message index: what it lists was read, or is lost."""

@@ -57,18 +57,6 @@ class Window:
         stream.seek(offset)
         return cls(stream, path, size=path.stat().st_size, offset=offset)
 
-    @classmethod
-    def of_content(cls, content: bytes) -> Window:
-        """A window over the decompressed content of a chunk."""
-        window = cls(io.BytesIO(), Path(), size=len(content))
-        window._data, window._ended = content, True
-        return window
-
-    @property
-    def left(self) -> int:
-        """Bytes ahead of the reader."""
-        return max(0, self.size - self.offset)
-
     def peek(self, length: int) -> memoryview:
         """The next bytes; fewer at the end only. Memory is bounded by the file, not by `length`.
 
@@ -219,15 +207,10 @@ class Scan(ABC):
         self._window.skip(frame.size)
         return bytes(whole[frame.head : frame.size])
 
-    def is_cut(self, frame: RecordFrame) -> bool:
-        """Whether the file ends before the record does."""
-        return self._window.left < frame.size
-
     def is_proven(self, frame: RecordFrame) -> bool:
         """Whether a record is complete and, if it is large, followed by another one."""
-        if self.is_cut(frame):
-            return False
-        return frame.size <= MAX_UNPROVEN or self.is_followed(frame.size)
+        is_cut = frame.size > self._window.size - self._window.offset
+        return not is_cut and (frame.size <= MAX_UNPROVEN or self.is_followed(frame.size))
 
     def is_followed(self, size: int) -> bool:
         """Whether a record, or the end, follows after that many bytes."""
@@ -236,7 +219,7 @@ class Scan(ABC):
 
     def cut_or_damaged(self, frame: RecordFrame) -> str:
         """What is wrong with an unproven record, in words."""
-        if self.is_cut(frame):
+        if frame.size > self._window.size - self._window.offset:
             return "the file ends within a record"
         return "a record has an impossible length"
 
@@ -630,7 +613,7 @@ class FileSalvage(BagReader):
     ) -> Iterator[tuple[RecordFrame, bytes]]:
         """The records of a decompressed chunk; what is wrong with it is added to `problems`."""
         scan = self._scan_of(
-            Window.of_content(bytes(content)),
+            Window(io.BytesIO(content), Path(), size=len(content)),
             lambda _offset, _size, problem: problems.append(f"in a chunk, {problem}"),
         )
         while frame := scan.next():
