@@ -18,7 +18,7 @@ import mp4ds
 from foxglove_scenes import FOXGLOVE_SOURCES, foxglove_scene
 from foxglove_wire import SERIALIZATIONS
 from mp4ds.bags.convert import decoder_of
-from mp4ds.messages.wire import WireError
+from mp4ds.errors import Refused
 from mp4ds.records import Channel, Schema
 from round_trips import packed
 from scenes import image_ros1, raw_scene
@@ -205,7 +205,7 @@ def test_a_type_declared_inside_another_in_a_file_that_comes_before_its_imports(
 
 @pytest.mark.parametrize("encoding", ["ros1", "cdr", "json", "protobuf"])
 def test_any_bytes(encoding: str) -> None:
-    """An object or a WireError, whatever the bytes are."""
+    """An object or a Refused, whatever the bytes are."""
     if encoding == "protobuf":
         name, schema = SERIALIZATIONS["protobuf"].schema("foxglove_msgs/msg/Log")
         odd = channel("protobuf", name, schema, "protobuf")
@@ -222,7 +222,7 @@ def test_any_bytes(encoding: str) -> None:
             data = b"\0\1\0\0" + data
         try:
             decode(memoryview(data))
-        except WireError:
+        except Refused:
             refused += 1
     assert refused > 100
 
@@ -230,7 +230,7 @@ def test_any_bytes(encoding: str) -> None:
 def test_deep_json() -> None:
     decode = decoder_of(channel("json"))
     assert decode(memoryview(b'{"a": [1, 2.5]}')) == {"a": [1, 2.5]}
-    with pytest.raises(WireError):
+    with pytest.raises(Refused):
         decode(memoryview(b"[" * (10 * sys.getrecursionlimit())))
 
 
@@ -239,7 +239,7 @@ def test_bytes_after_a_message() -> None:
     image = image_ros1(width=2, height=1, encoding="mono8", data=b"ab", tail=b"four")
     decode = decoder_of(channel("ros1", "sensor_msgs/Image"))
     assert decode(memoryview(image)).data.tolist() == [97, 98]
-    with pytest.raises(WireError, match="it is not a sensor_msgs/Image"):
+    with pytest.raises(Refused, match="it is not a sensor_msgs/Image"):
         decode(memoryview(image + bytes(9)))
 
 
@@ -265,5 +265,5 @@ def test_big_endian_cdr() -> None:
     decode = decoder_of(channel("cdr", "std_msgs/msg/Int32", b"int32 data", "ros2msg"))
     assert decode(memoryview(b"\0\0\0\0\0\0\0\7")).data == 7
     assert decode(memoryview(b"\0\1\0\0\7\0\0\0")).data == 7
-    with pytest.raises(WireError):
+    with pytest.raises(Refused):
         decode(memoryview(b"\0\2\0\0\7\0\0\0"))

@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from foxglove_wire import fill
+from mp4ds.errors import Refused
 from mp4ds.messages.transforms import (
     Transform,
     TransformCollector,
     transform_parser,
 )
-from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel, Schema
 from scenes import build, typestore
 
@@ -201,13 +201,13 @@ def test_descriptors_that_are_not_whole() -> None:
     ],
 )  # fmt: skip
 def test_json_of_another_shape(text: str) -> None:
-    with pytest.raises(WireError):
+    with pytest.raises(Refused):
         parse_transforms(channel("json", MANY), text.encode("utf-8", "surrogatepass"))
 
 
 def test_a_message_beyond_all_measure() -> None:
     for own, write in MANY_KINDS.values():
-        with pytest.raises(WireError, match="bytes"):
+        with pytest.raises(Refused, match="bytes"):
             parse_transforms(own, write(TREE) + bytes(1 << 20))
 
 
@@ -222,7 +222,7 @@ def test_damaged_messages_end_in_a_wire_error(data: st.DataObject) -> None:
     for damaged in (bytes(payload), bytes(payload[:cut])):
         try:
             found = parse_transforms(own, damaged)
-        except WireError:
+        except Refused:
             continue
         assert all(isinstance(item, Transform) for item in found)
 

@@ -39,7 +39,6 @@ from mp4ds.bags.types import (
 )
 from mp4ds.errors import ConversionError, OptionError, Refused
 from mp4ds.messages.serializations import decoder_of_schema
-from mp4ds.messages.wire import WireError
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 if TYPE_CHECKING:
@@ -338,7 +337,7 @@ Decoder = Callable[[memoryview], Any]
 """Makes an object from a payload.
 
 Raises:
-    WireError: The payload is not of its channel's type.
+    Refused: The payload is not of its channel's type.
 """
 
 _ADVICE = "use its raw bytes instead, `RecordedMessage.raw`"
@@ -385,15 +384,12 @@ def _ros(channel: Channel) -> Decoder:
         problem = f"it is not a {schema.name}"
         if not is_ros1:
             if len(payload) < 4 or payload[0] != 0 or payload[1] > 1:
-                raise WireError(problem)
+                raise Refused(problem)
             start = 4
             read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
-        try:
-            message, end = by_library(problem, read, payload[start:], 0, definition.cls, store)
-        except Refused:
-            raise WireError(problem) from None
+        message, end = by_library(problem, read, payload[start:], 0, definition.cls, store)
         if len(payload) - start - end > MAX_TAIL:
-            raise WireError(problem)
+            raise Refused(problem)
         return message
 
     return decode
@@ -403,7 +399,7 @@ def _from_json(payload: memoryview) -> Any:
     try:
         return json.loads(bytes(payload))
     except (ValueError, RecursionError):
-        raise WireError("it is not JSON") from None
+        raise Refused("it is not JSON") from None
 
 
 def _protobuf(channel: Channel) -> Decoder:
@@ -412,7 +408,7 @@ def _protobuf(channel: Channel) -> Decoder:
         raise _undecodable(channel, "they are protobuf, and their definition is unknown")
     try:
         return decoder_of_schema(schema.name, schema.data)
-    except WireError as error:
+    except Refused as error:
         raise _undecodable(channel, str(error)) from None
 
 

@@ -17,10 +17,9 @@ from mp4ds.bags.protocols import (
     with_own_payload,
 )
 from mp4ds.bags.rosbag2_metadata import native_qos
-from mp4ds.errors import SourceError
+from mp4ds.errors import Refused, SourceError
 from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.transforms import transform_parser
-from mp4ds.messages.wire import WireError
 from mp4ds.options import Slice
 from mp4ds.records import QOS_KEY, Channel, Excerpt, Message
 
@@ -152,7 +151,7 @@ def _parser(channel: Channel) -> Callable[[bytes | memoryview], frozenset[str] |
     def children(payload: bytes | memoryview) -> frozenset[str] | None:
         try:
             return frozenset(one.child for one in parse(memoryview(payload)))
-        except WireError:
+        except Refused:
             return None  # kept in any case
 
     return children

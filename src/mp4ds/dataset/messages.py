@@ -19,11 +19,10 @@ from mp4ds.bags.rosbag2_metadata import RECORD
 from mp4ds.bags.salvage.mcap import McapSalvage
 from mp4ds.dataset.rebuild import CalibrationMessages
 from mp4ds.dataset.stream import Stream
-from mp4ds.errors import FormatError, SourceError
+from mp4ds.errors import FormatError, Refused, SourceError
 from mp4ds.format.fields import Choice, everything
 from mp4ds.format.manifest import Manifest
 from mp4ds.format.sidecars import verify_file
-from mp4ds.messages.wire import WireError
 from mp4ds.records import (
     EVERYTHING,
     Channel,
@@ -251,7 +250,7 @@ def _decoder(channel: Channel, path: Path) -> Callable[[memoryview], Any]:
     def decode(raw: memoryview) -> Any:
         try:
             return made()(raw)
-        except WireError as error:
+        except Refused as error:
             problem = f"a message of {channel.topic} cannot be decoded: {error}"
             raise SourceError(path, problem) from None
 

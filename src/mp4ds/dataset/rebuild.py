@@ -23,7 +23,6 @@ from mp4ds.messages.wire import (
     ImageFields,
     Slots,
     Template,
-    WireError,
 )
 from mp4ds.records import Channel, Message
 from mp4ds.video.codecs import CODECS
@@ -45,7 +44,7 @@ def check_slots(columns: DecodedColumns, templates: list[Template], place: str) 
             slots = Slots(**{"stamp": 0, "seq": 0, "pts": 0, name: value})
             try:
                 templates[0].around(slots, 0)
-            except WireError as error:
+            except Refused as error:
                 raise FormatError(
                     "column-invalid", f"{place} at columns.{name}", f"holds {value}: {error}"
                 ) from None
@@ -59,7 +58,7 @@ def form_for(channel: Channel, wire: str, place: str) -> Form:
     """
     try:
         return form_of(wire, channel.type_name, channel.schema.data if channel.schema else b"")
-    except WireError as error:
+    except Refused as error:
         raise FormatError("header-mismatch", f"{place} at channel", str(error)) from None
 
 
@@ -81,13 +80,13 @@ def template_of(
     try:
         blank = form.plain(frame_id, fields) if encoded is None else decode_base64(encoded)
         if blank is None:
-            raise WireError("a message of this type needs a template")
+            raise Refused("a message of this type needs a template")
         parts = form.split(memoryview(blank))
         found = parts.fields
         if isinstance(found, CodedFields):
             found = CodedFields(found.format)
         if (parts.frame_id, found) != (frame_id, fields):
-            raise WireError("contradicts the fields beside it")
+            raise Refused("contradicts the fields beside it")
         return form.template(blank)
     except ValueError as error:
         raise FormatError("header-mismatch", place, str(error)) from None

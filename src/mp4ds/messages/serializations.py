@@ -28,7 +28,6 @@ from mp4ds.messages.wire import (
     Reading,
     Slots,
     Span,
-    WireError,
     join_stamp,
     make_fields,
     text,
@@ -127,7 +126,7 @@ class RosForm(Form):
     def read(self, data: memoryview) -> Reading:
         """Read a message."""
         if bytes(data[: len(self._prefix)]) != self._prefix:
-            raise WireError("it does not begin like a plain serialization of its kind")
+            raise Refused("it does not begin like a plain serialization of its kind")
         reader = PrimitiveReader(data, len(self._prefix), self._order, is_cdr=self._ros2)
         values: dict[str, Any] = {}
         spans: dict[str, Span] = {}
@@ -161,7 +160,7 @@ class RosForm(Form):
         try:
             return struct.pack(self._order + code, *numbers)
         except struct.error:
-            raise WireError("a time or number is beyond what its message has bits for") from None
+            raise Refused("a time or number is beyond what its message has bits for") from None
 
     def plain(self, frame_id: str, fields: Fields) -> bytes | None:
         """The blank as ROS writes it; None for types whose other fields are not modelled."""
@@ -188,7 +187,7 @@ def _take(reader: PrimitiveReader, code: str) -> Any:
     if code == "d*":
         count = reader.integer("I")
         if count > MAX_DISTORTION:
-            raise WireError(f"it has {count} distortion parameters")
+            raise Refused(f"it has {count} distortion parameters")
         return reader.take("d", count)
     if len(code) > 1:
         return reader.take(code[-1], int(code[:-1]))
@@ -269,14 +268,14 @@ class ProtobufForm(Form):
         schema: A serialized FileDescriptorSet that declares it.
 
     Raises:
-        WireError: The type differs, or the schema does not declare it with its fields.
+        Refused: The type differs, or the schema does not declare it with its fields.
     """
 
     wire = "protobuf"
 
     def __init__(self, type_name: str, schema: bytes) -> None:
         if type_name not in FOXGLOVE_TYPES:
-            raise WireError(f"type {type_name!r} is not modelled")
+            raise Refused(f"type {type_name!r} is not modelled")
         self._kind, self._kinds = FOXGLOVE_TYPES[type_name]
         self._declared = _declared(type_name, schema, self._kinds)
 
@@ -292,16 +291,16 @@ class ProtobufForm(Form):
             name, kind, wire_types = self._declared.get(number, _OTHER)
             slot = _SLOTS.get(kind)
             if slot in spans:
-                raise WireError(f"it has its {name} twice")
+                raise Refused(f"it has its {name} twice")
             if slot == "body":
                 body = start, end
             if (around := end - (body[1] - body[0])) > MAX_BLANK:
                 # before all were read: this bounds the number of fields
-                raise WireError(f"it has {around} bytes besides its data")
+                raise Refused(f"it has {around} bytes besides its data")
             if kind == "other":
                 continue
             if wire_type not in wire_types:
-                raise WireError(f"its field {name} is not of the declared type")
+                raise Refused(f"its field {name} is not of the declared type")
             if slot:
                 spans[slot] = at, end
             value = None if kind == "data" else _value(kind, wire_type, data[start:end])
@@ -311,7 +310,7 @@ class ProtobufForm(Form):
                 values[name] = value
         for name, kind in self._kinds.items():
             if kind in _SLOTS and _SLOTS[kind] not in spans:
-                raise WireError(f"it has no {name}")
+                raise Refused(f"it has no {name}")
         parts = {
             "stamp": values["timestamp"],
             "seq": None,
@@ -333,9 +332,9 @@ def _checked(values: dict[str, Any]) -> dict[str, Any]:
     """Values by their names in ROS, where lists have the right lengths."""
     for name, size in _LENGTHS.items():
         if name in values and len(values[name]) != size:
-            raise WireError(f"it has {len(values[name])} values in {name}, not {size}")
+            raise Refused(f"it has {len(values[name])} values in {name}, not {size}")
     if len(values.get("D", ())) > MAX_DISTORTION:
-        raise WireError(f"it has {len(values['D'])} distortion parameters")
+        raise Refused(f"it has {len(values['D'])} distortion parameters")
     lists = {name.lower(): tuple(values[name]) for name in "DKRP" if name in values}
     return values | lists
 
@@ -349,12 +348,12 @@ def _declared(type_name: str, schema: bytes, kinds: Mapping[str, Kind]) -> Mappi
         if field is None:
             if name == "frame_id":  # older image schemas have none
                 continue
-            raise WireError(f"its schema has no field {name!r}")
+            raise Refused(f"its schema has no field {name!r}")
         is_repeated = field.label == _REPEATED
         if field.type not in _TYPES[kind] or is_repeated != (kind == "doubles"):
-            raise WireError(f"field {name!r} of its schema is not of Foxglove's type")
+            raise Refused(f"field {name!r} of its schema is not of Foxglove's type")
         if kind == "time" and field.type_name not in _TIMESTAMPS:
-            raise WireError(f"field {name!r} of its schema is not a google.protobuf.Timestamp")
+            raise Refused(f"field {name!r} of its schema is not a google.protobuf.Timestamp")
         by_number[field.number] = name, kind, _TYPES[kind][field.type]
     return by_number
 
@@ -368,7 +367,7 @@ def _declaration(type_name: str, schema: bytes) -> Any:
     try:
         files = FileDescriptorSet.FromString(schema).file
     except (DecodeError, ValueError):  # the latter by protobuf's pure Python
-        raise WireError("its schema is not a FileDescriptorSet") from None
+        raise Refused("its schema is not a FileDescriptorSet") from None
     name = tuple(type_name.rsplit(".", 1))
     # compared one by one: names that are not UTF-8 come as bytes
     found = [
@@ -378,7 +377,7 @@ def _declaration(type_name: str, schema: bytes) -> Any:
         if (file.package, message.name) == name
     ]
     if len(found) != 1:
-        raise WireError(f"its schema declares {type_name} {len(found)} times")
+        raise Refused(f"its schema declares {type_name} {len(found)} times")
     return found[0]
 
 
@@ -389,7 +388,7 @@ def _fields(data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
         tag, at = _varint(data, at)
         number, wire_type = tag >> 3, tag & 7
         if number == 0 or tag >> 32:
-            raise WireError("it has an invalid tag")
+            raise Refused("it has an invalid tag")
         start = at
         if wire_type == _VARINT:
             end = _varint(data, at)[1]
@@ -399,9 +398,9 @@ def _fields(data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
         elif wire_type in (_I64, _I32):
             end = at + (8 if wire_type == _I64 else 4)
         else:
-            raise WireError(f"it has a field of wire type {wire_type}")
+            raise Refused(f"it has a field of wire type {wire_type}")
         if end > len(data):
-            raise WireError(f"it ends at byte {len(data)}, but a field extends to byte {end}")
+            raise Refused(f"it ends at byte {len(data)}, but a field extends to byte {end}")
         yield number, wire_type, at, start, end
         at = end
 
@@ -415,7 +414,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
             if value > _UINT64:
                 break
             return value, at + index + 1
-    raise WireError("a number in it is cut short")
+    raise Refused("a number in it is cut short")
 
 
 def _varint_bytes(value: int) -> bytes:
@@ -438,7 +437,7 @@ def _value(kind: Kind, wire_type: int, raw: memoryview) -> Any:
         number = _varint(raw, 0)[0] if wire_type == _VARINT else int.from_bytes(raw, "little")
         return number & 0xFFFFFFFF
     if len(raw) % 8:
-        raise WireError("a list of numbers in it is cut short")
+        raise Refused("a list of numbers in it is cut short")
     return struct.unpack(f"<{len(raw) // 8}d", raw)
 
 
@@ -448,12 +447,12 @@ def _stamp(raw: memoryview) -> int:
     for number, wire_type, _, start, _ in _fields(raw):
         if number in values:
             if wire_type != _VARINT:
-                raise WireError("its timestamp is not of the declared type")
+                raise Refused("its timestamp is not of the declared type")
             value = _varint(raw, start)[0]
             values[number] = value - (value >> 63 << 64)
     stamp = join_stamp(values[1], values[2])
     if not -_INT64 <= stamp < _INT64:  # what a column holds
-        raise WireError("its stamp is beyond 64-bit nanoseconds")
+        raise Refused("its stamp is beyond 64-bit nanoseconds")
     return stamp
 
 
@@ -461,20 +460,20 @@ def _timestamp(stamp: int) -> bytes:
     """A google.protobuf.Timestamp as serializers write it."""
     sec, nanos = divmod(stamp, NS)
     if not -(1 << 63) <= sec < 1 << 63:
-        raise WireError("a time is beyond what its message has bits for")
+        raise Refused("a time is beyond what its message has bits for")
     out = b"\x08" + _varint_bytes(sec & _UINT64) if sec else b""
     return out + (b"\x10" + _varint_bytes(nanos) if nanos else b"")
 
 
 def decoder_of_schema(type_name: str, schema: bytes) -> Callable[[memoryview], Any]:
-    """A decoder of messages of any type; it raises WireError for invalid ones.
+    """A decoder of messages of any type; it raises Refused for invalid ones.
 
     Args:
         type_name: Full name of the messages' type.
         schema: A serialized FileDescriptorSet that declares it and everything it refers to.
 
     Raises:
-        WireError: It does not.
+        Refused: It does not.
     """
     # only recordings with protobuf need it
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -488,13 +487,13 @@ def decoder_of_schema(type_name: str, schema: bytes) -> Callable[[memoryview], A
         # by name, as a type may be declared inside another one
         message_class = GetMessageClass(pool.FindMessageTypeByName(type_name))
     except (DecodeError, LookupError, ValueError, TypeError, RecursionError):
-        raise WireError(f"its schema does not declare {type_name}") from None
+        raise Refused(f"its schema does not declare {type_name}") from None
 
     def decode(data: memoryview) -> Any:
         try:
             return message_class.FromString(bytes(data))
         except (DecodeError, ValueError):  # the latter by protobuf's pure Python
-            raise WireError(f"it is not a {type_name}") from None
+            raise Refused(f"it is not a {type_name}") from None
 
     return decode
 
@@ -551,7 +550,7 @@ def wire_of(message_encoding: str, data: memoryview) -> str:
         data: The payload; CDR has its byte order in its first bytes.
 
     Raises:
-        WireError: No wire has this serialization.
+        Refused: No wire has this serialization.
     """
     if message_encoding in ("ros1", _PROTOBUF):
         return message_encoding
@@ -560,14 +559,14 @@ def wire_of(message_encoding: str, data: memoryview) -> str:
             if prefix and data[:4] == prefix:
                 return name
         if data[:4] == _ZSTD:
-            raise WireError(
+            raise Refused(
                 "it is compressed by zstd, as rosbag2 does in its compression mode MESSAGE: pack "
                 "the folder with its metadata.yaml"
             )
         if len(data) < 4:
-            raise WireError("it is too short for a CDR encapsulation")
-        raise WireError(f"its CDR encapsulation is {bytes(data[:4]).hex()}, which is not plain CDR")
-    raise WireError(f"serialization {message_encoding!r} is not modelled")
+            raise Refused("it is too short for a CDR encapsulation")
+        raise Refused(f"its CDR encapsulation is {bytes(data[:4]).hex()}, which is not plain CDR")
+    raise Refused(f"serialization {message_encoding!r} is not modelled")
 
 
 def form_of(wire: str, type_name: str, schema: bytes) -> Form:
@@ -579,13 +578,13 @@ def form_of(wire: str, type_name: str, schema: bytes) -> Form:
         schema: The recorded definition.
 
     Raises:
-        WireError: The type is not modelled in that serialization.
+        Refused: The type is not modelled in that serialization.
     """
     if wire == _PROTOBUF:
         return ProtobufForm(type_name, schema)
     name = ros_type(type_name)
     if wire not in _ROS_WIRES or name not in ROS_TYPES:
-        raise WireError(f"type {type_name!r} is not modelled")
+        raise Refused(f"type {type_name!r} is not modelled")
     return RosForm(wire, name)
 
 
@@ -611,7 +610,7 @@ def plain_message(
         flags: Of a packet: 1 if decoding can begin with it.
 
     Raises:
-        WireError: The type cannot represent a value.
+        Refused: The type cannot represent a value.
     """
     name = ros_type(type_name)
     form = RosForm(wire, name, _ROS1_PACKET if (wire, name) == ("ros1", _PACKET) else None)
@@ -643,5 +642,5 @@ class MessageSplitter:
                 self._forms[wire] = form_of(wire, self._channel.type_name, definition)
             form = self._forms[wire]
             return form, form.split(data)
-        except WireError as error:
+        except Refused as error:
             raise Refused(f"it does not parse: {error}") from None

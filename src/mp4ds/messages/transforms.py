@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.errors import Refused
 from mp4ds.messages.serializations import decoder_of_schema, ros_type, wire_of
-from mp4ds.messages.wire import PrimitiveReader, WireError
+from mp4ds.messages.wire import PrimitiveReader
 from mp4ds.records import Channel, Schema
 
 MAX_TRANSFORMS = 1000
@@ -77,7 +78,7 @@ def transform_parser(channel: Channel) -> Parser | None:
     and JSON. In the latter two, an absent translation is zero and an absent rotation is the
     identity.
 
-    It raises `WireError` for a message that does not parse, or is unreasonably large (more than
+    It raises `Refused` for a message that does not parse, or is unreasonably large (more than
     1 MiB).
 
     Returns:
@@ -95,14 +96,14 @@ def transform_parser(channel: Channel) -> Parser | None:
     elif encoding == "protobuf" and len(schema.data) <= _MAX_SCHEMA:
         try:
             read = partial(_read_nodes, decoder_of_schema(schema.name, schema.data), many)
-        except WireError:
+        except Refused:
             return None
     else:
         return None
 
     def parse(data: memoryview) -> list[Transform]:
         if len(data) > _MAX_MESSAGE:
-            raise WireError(f"it has {len(data)} bytes")
+            raise Refused(f"it has {len(data)} bytes")
         return read(data)
 
     return parse
@@ -142,7 +143,7 @@ def _parse_json(data: memoryview) -> Any:
     try:
         return json.loads(bytes(data))
     except (ValueError, RecursionError) as error:
-        raise WireError(f"it is not JSON: {error}") from None
+        raise Refused(f"it is not JSON: {error}") from None
 
 
 def _read_nodes(
@@ -156,7 +157,7 @@ def _read_nodes(
             raise ValueError(f"it has {len(nodes)} transforms")
         return [_read_node(node) for node in nodes]
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise WireError(f"its fields are not those of a transform: {error}") from None
+        raise Refused(f"its fields are not those of a transform: {error}") from None
 
 
 def _read_node(node: Any) -> Transform:
@@ -249,7 +250,7 @@ class TransformCollector:
         if key not in self._parsers:
             self._parsers[key] = transform_parser(channel)
         parse = self._parsers[key]
-        with suppress(WireError):
+        with suppress(Refused):
             self._take(parse(memoryview(data)) if parse else [])
 
     def _take(self, transforms: Iterable[Transform]) -> None:

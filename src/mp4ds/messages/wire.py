@@ -13,13 +13,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from mp4ds.errors import Refused
+
 NS = 10**9
 MAX_BLANK = 1 << 16
 """Maximum size of a blank, bytes: what a message may hold besides its body."""
-
-
-class WireError(ValueError):
-    """A payload that does not parse as its type; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +148,7 @@ class Form(ABC):
         """Read a message.
 
         Raises:
-            WireError: The payload does not parse, or cannot be modelled; says why.
+            Refused: The payload does not parse, or cannot be modelled; says why.
         """
 
     @abstractmethod
@@ -158,7 +156,7 @@ class Form(ABC):
         """The bytes of a slot; of ``body``, its length.
 
         Raises:
-            WireError: This serialization cannot represent a value.
+            Refused: This serialization cannot represent a value.
         """
 
     def plain(self, frame_id: str, fields: Fields) -> bytes | None:
@@ -169,11 +167,11 @@ class Form(ABC):
         """Split a message.
 
         Raises:
-            WireError: The payload does not parse, or cannot be modelled; says why.
+            Refused: The payload does not parse, or cannot be modelled; says why.
         """
         values, spans, (start, end) = self.read(data)
         if (around := len(data) - (end - start)) > MAX_BLANK:
-            raise WireError(f"it has {around} bytes besides its data")
+            raise Refused(f"it has {around} bytes besides its data")
         # a blank keeps the body's length as far as what follows depends on it
         kept = (end - start) % self.body_alignment
         head, tail = Template(self, data, spans, kept).around(_BLANK, kept)
@@ -183,14 +181,14 @@ class Form(ABC):
         """The template of a blank.
 
         Raises:
-            WireError: It is not a blank message of this form.
+            Refused: It is not a blank message of this form.
         """
         _, spans, (start, end) = self.read(memoryview(blank))
         kept = end - start
         for name, (first, last) in spans.items():
             size = last - first - (kept if name == "body" else 0)
             if kept >= self.body_alignment or size != len(self.slot(name, _BLANK, kept)):
-                raise WireError("a blank message has times or data")
+                raise Refused("a blank message has times or data")
         return Template(self, memoryview(blank), spans, kept)
 
 
@@ -226,7 +224,7 @@ class Template:
             body_size: Bytes of the body.
 
         Raises:
-            WireError: This serialization cannot represent a value.
+            Refused: This serialization cannot represent a value.
         """
         head = b""
         parts: list[bytes] = []
@@ -262,10 +260,10 @@ def make_fields(kind: type[Fields], values: Mapping[str, Any]) -> Fields:
         values: By name; those that a type does not have may be absent.
 
     Raises:
-        WireError: A value of a calibration is infinite or not a number, which YAML cannot hold.
+        Refused: A value of a calibration is infinite or not a number, which YAML cannot hold.
     """
     if any(value - value != 0 for name in "dkrp" for value in values.get(name, ())):
-        raise WireError("a calibration value is not finite")
+        raise Refused("a calibration value is not finite")
     return kind(
         **{field.name: values[field.name] for field in fields(kind) if field.name in values}
     )
@@ -275,10 +273,10 @@ def join_stamp(sec: int, nanosec: int) -> int:
     """Nanoseconds.
 
     Raises:
-        WireError: The stamp cannot be restored from them.
+        Refused: The stamp cannot be restored from them.
     """
     if not 0 <= nanosec < NS:
-        raise WireError("its stamp has a second or more in nanoseconds")
+        raise Refused("its stamp has a second or more in nanoseconds")
     return sec * NS + nanosec
 
 
@@ -286,12 +284,12 @@ def text(raw: memoryview) -> str:
     """Decode a string of a message.
 
     Raises:
-        WireError: It is not UTF-8.
+        Refused: It is not UTF-8.
     """
     try:
         return str(raw, "utf-8")
     except UnicodeDecodeError:
-        raise WireError("a string is not UTF-8") from None
+        raise Refused("a string is not UTF-8") from None
 
 
 # ---------------------------------------------------------------- primitive types
@@ -331,7 +329,7 @@ class PrimitiveReader:
         """Read bytes as a view."""
         end = self.offset + size
         if end > len(self._data):
-            raise WireError(f"it ends at byte {len(self._data)}, but a field extends to byte {end}")
+            raise Refused(f"it ends at byte {len(self._data)}, but a field extends to byte {end}")
         view = self._data[self.offset : end]
         self.offset = end
         return view
@@ -341,7 +339,7 @@ class PrimitiveReader:
         raw = self.raw(self.integer("I"))
         if self._is_cdr:
             if not len(raw) or raw[-1] != 0:
-                raise WireError("a string does not end in NUL")
+                raise Refused("a string does not end in NUL")
             raw = raw[:-1]
         return text(raw)
 

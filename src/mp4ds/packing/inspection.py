@@ -36,7 +36,6 @@ from mp4ds.messages.wire import (
     ImageFields,
     Parts,
     Template,
-    WireError,
     prove,
 )
 from mp4ds.packing.options import TopicSummary
@@ -364,7 +363,7 @@ class MessageTable(Generic[_ModelT]):
         try:
             template = self._templates.get(blank) or self.form.template(blank)
             exact = prove(template, parts, memoryview(message.data))
-        except WireError as error:
+        except Refused as error:
             raise Refused(f"its header does not rebuild: {error}") from None
         if not exact:
             raise Refused("its header does not rebuild")

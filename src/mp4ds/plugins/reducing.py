@@ -36,7 +36,6 @@ from mp4ds.messages.wire import (
     Form,
     Parts,
     Slots,
-    WireError,
 )
 from mp4ds.options import Selection
 from mp4ds.packing.inspection import (
@@ -303,7 +302,7 @@ class ReducedReader(ChangedReader):
                 data = types.message(slots, frame_id, fields, body)
             else:
                 data = plain_message(form.wire, channel.type_name, frame_id, fields, slots, body)
-        except WireError as error:
+        except Refused as error:
             problem = f"the message logged at {message.log_time} ns: {error}"
             raise ConversionError(channel.topic, problem) from None
         return replace(message, channel=self._given.get(channel.id, channel), data=data)

@@ -16,7 +16,7 @@ from mp4ds.dataset.stream import Stream
 from mp4ds.errors import ConversionError, FormatError, Refused
 from mp4ds.format.fields import Choice, everything
 from mp4ds.messages.serializations import TRANSPORTS, is_camera, plain_message
-from mp4ds.messages.wire import NS, Fields, Slots, WireError
+from mp4ds.messages.wire import NS, Fields, Slots
 from mp4ds.records import HASH_KEY, Channel, Message, Schema
 from mp4ds.unpacking.pictures import (
     FAMILIES,
@@ -279,7 +279,7 @@ class Republisher:
                 payload = types.message(
                     slots, frame_id, frame.fields, frame.body, is_key=frame.is_key
                 )
-            except WireError as error:
+            except Refused as error:
                 raise ConversionError(recorded.topic, f"message {index}: {error}") from None
             yield ordinal, message_at(columns, index, made or recorded, payload)
         due = stream.count()
@@ -393,7 +393,7 @@ class Types:
             is_key: For a packet, whether decoding can begin with it.
 
         Raises:
-            WireError: The serialization cannot represent the stamp or a number.
+            Refused: The serialization cannot represent the stamp or a number.
         """
         self._without_seq += slots.seq is not None and not self._has_seq
         stamp = _wrapped(slots.stamp, signed=self.encoding == "cdr")

@@ -11,7 +11,6 @@ from typing import Any
 from mp4ds.bags.convert import decoder_of
 from mp4ds.bags.types import FieldShape, field_shape, fields_of, name_of, standard_of, types_of
 from mp4ds.errors import OptionError, Refused
-from mp4ds.messages.wire import WireError
 from mp4ds.records import Channel
 
 _STEP = r"[A-Za-z_]\w*(?:\[\d+\])?"
@@ -85,7 +84,7 @@ class Trigger:
                     found = getattr(found, name)
                     found = found if index is None else found[index]
                 self._is_met = bool(compare(found, value))
-            except (IndexError, WireError):
+            except (IndexError, Refused):
                 self._is_met = False
             return self._is_met and not was_met
 
