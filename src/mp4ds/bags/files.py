@@ -6,8 +6,8 @@ import io
 import os
 import shutil
 from bz2 import BZ2Decompressor
-from collections.abc import Iterator
 from contextlib import closing, suppress
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -145,8 +145,8 @@ _MACHINES: dict[str, Any] = {
 _DAMAGE = (OSError, RuntimeError, EOFError, ValueError, zstandard.ZstdError)
 
 
-def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
-    """The content of a compressed chunk.
+def unpack(compression: str, data: bytes | memoryview, size: int) -> tuple[bytes, int]:
+    """The content of a compressed chunk, and how many bytes of the data it took.
 
     Args:
         compression: ``bz2``, ``lz4`` or ``zstd``.
@@ -156,11 +156,6 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
     Raises:
         DamageError: The data is damaged or of another size, or the compression is not known.
     """
-    return _unpacked(compression, data, size)[0]
-
-
-def _unpacked(compression: str, data: bytes | memoryview, size: int) -> tuple[bytes, int]:
-    """The content of a compressed chunk, and how many bytes of the data it took."""
     if compression not in _MACHINES:
         raise DamageError(f"it is compressed with {compression!r}, which is not supported")
     if size > (most := most_held(len(data))):
@@ -276,13 +271,15 @@ def recover(compression: str, data: memoryview, size: int) -> tuple[bytes, int, 
         problem = f"a chunk is compressed with {compression!r}, which is not supported"
         return b"", 0, problem, True
     with suppress(DamageError):
-        return (*_unpacked(found, data, size), "", True)
+        return (*unpack(found, data, size), "", True)
     machine = _MACHINES[found]()
     gathered = io.BytesIO()  # pieces in a list would need the memory twice
     is_verified = found == "bz2"  # it has a checksum for each block
     used, problem, is_sound = 0, f"the {found} data of a chunk is cut short", True
     try:
-        for begin, end in _small_pieces(len(data)):
+        body = max(0, len(data) - _CLOSE)
+        places = chain(range(0, body, _SMALL_PIECE), range(body, len(data) + 1))
+        for begin, end in pairwise(places):
             made = [machine.decompress(data[begin:end])]
             while made[-1] and not machine.eof:  # bz2 compares a checksum with the last of a block
                 made.append(machine.decompress(b""))
@@ -303,14 +300,6 @@ def recover(compression: str, data: memoryview, size: int) -> tuple[bytes, int, 
     return gathered.getvalue(), used, problem, is_sound
 
 
-def _small_pieces(length: int) -> Iterator[tuple[int, int]]:
-    body = max(0, length - _CLOSE)
-    for start in range(0, body, _SMALL_PIECE):
-        yield start, min(start + _SMALL_PIECE, body)
-    for start in range(body, length):
-        yield start, start + 1
-
-
 # ---------------------------------------------------------------- files compressed as a whole
 
 
@@ -322,16 +311,15 @@ def copy_file(path: Path, target: Path) -> None:
         RemoteError: It cannot be read.
         OSError: The target cannot be written.
     """
-    sides = [path, *(path.with_name(path.name + ending) for ending in ("-wal", "-journal"))]
-    found = [side for side in sides if side is path or side.exists()]
+    sides = (path.with_name(path.name + ending) for ending in ("-wal", "-journal"))
+    found = [path, *(side for side in sides if side.exists())]
     size = sum(side.stat().st_size for side in found)
     if size > shutil.disk_usage(target.parent).free:
-        raise SourceError(
-            path,
+        problem = (
             f"is an sqlite3 database of {size} bytes, which must be copied to {target.parent} to "
-            "be read, and there is not enough space",
-            "Set TMPDIR to another folder.",
+            "be read, and there is not enough space"
         )
+        raise SourceError(path, problem, "Set TMPDIR to another folder.")
     for side in found:
         ending = side.name.removeprefix(path.name)
         with closing(side.open("rb")) as stream, Path(f"{target}{ending}").open("wb") as output:

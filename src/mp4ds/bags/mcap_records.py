@@ -213,7 +213,7 @@ def unpack_chunk(body: bytes | memoryview) -> bytes | memoryview:
     data = view[_CHUNK_HEAD.size + length + 8 :][:data_length]
     if len(data) != data_length:
         raise DamageError("a chunk is shorter than its fields")
-    content = unpack(compression, data, size) if compression else data
+    content = unpack(compression, data, size)[0] if compression else data
     if len(content) != size:
         raise DamageError(f"a chunk holds {len(content)} bytes instead of {size}")
     if crc and crc != zlib.crc32(content):

@@ -520,7 +520,7 @@ class Ros1Reader(BagReader):
         self._seek(chunk.place)
         data = self._take(chunk.packed)
         if chunk.compression != "none":
-            data = unpack(chunk.compression, data, chunk.size)
+            data, _ = unpack(chunk.compression, data, chunk.size)
         elif len(data) != chunk.size:
             raise DamageError(f"it holds {len(data)} bytes instead of {chunk.size}")
         content = memoryview(data)

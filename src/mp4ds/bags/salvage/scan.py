@@ -392,17 +392,18 @@ class Tally:
         self._log = log
         self._topic_of = topic_of
         self.held: list[tuple[int, Message]] = []
-        self._begin(None)
+        self._begin(None, None, None)
 
-    def _begin(self, expected: Mapping[int, int] | None) -> None:
+    def _begin(
+        self, expected: Mapping[int, int] | None, end: int | None, span: tuple[int, int] | None
+    ) -> None:
         self._expected = None if expected is None else Counter(expected)
+        self._end, self._span = end, span
         self._read: Counter[int] = Counter()
         self._strays: Counter[int] = Counter()
         self._index_is_whole = False
         self._listed: Counter[int] = Counter()
         self._listed_times: Counter[tuple[int, int]] = Counter()  # only while messages are held
-        self._end: int | None = None
-        self._span: tuple[int, int] | None = None
         self.is_verified = False
         self.losses: list[Draft] = []
 
@@ -417,8 +418,7 @@ class Tally:
             span: Earliest and latest possible log time of its messages, ns, if known.
         """
         self.close()
-        self._begin(expected)
-        self._end, self._span = end, span
+        self._begin(expected, end, span)
 
     def extend(self, expected: Mapping[int, int] | None) -> None:
         """Another section begins within what is lost, and cannot be separated from this one."""
