@@ -75,10 +75,6 @@ class Server:
                 found.append((span[0], span[1] + 1))
         return found
 
-    def put(self) -> list[str]:
-        """Names of the files that were uploaded, in their order."""
-        return [path.rpartition("/")[2] for method, path, _ in self.requests if method == "PUT"]
-
     def forget(self) -> None:
         """Begin anew."""
         self.requests.clear()

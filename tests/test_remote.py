@@ -297,6 +297,22 @@ def test_what_is_not_there_or_refused(
         refused(call(*command, url), 2, f"{url}: cannot be read: access denied: ", "403")
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["pack", "pack --shard 1/2", "pack several/", "unpack --to bag several/", "export tum"],
+)
+def test_outputs_are_local(words: str, packed_bag: Path, tmp_path: Path) -> None:
+    command, *rest = words.split()
+    url = "s3://bucket/" + (rest.pop() if words.endswith("/") else "out")
+    source = packed_bag
+    if command == "pack":
+        source = tmp_path / "drive.bag"
+        write_bag(source, scene("mono8"))
+    result = call(command, *rest, source, "-o", url)
+    refused(result, 2, "mp4ds: s3://bucket/", "is a URL, and outputs are written to local folders")
+    assert [path.name for path in tmp_path.iterdir()] in ([], ["drive.bag"])
+
+
 def test_a_connection_that_is_closed_early(web: Server, tmp_path: Path) -> None:
     write_bag(tmp_path / "web" / "early.bag", scene("mono8"))
     web.breaks_off = True

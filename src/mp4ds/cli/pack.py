@@ -487,9 +487,9 @@ def demo_command(output: Path, seconds: float, force: bool) -> None:
     nargs=-1,
     required=True,
 )
-@output_option("OUT", "Folder to create.", required=True, type=click.Path(path_type=Path))
+@output_option("OUT", "Folder to create.", required=True)
 @takes(ExportOptions)
-def export_command(to: str, datasets: Sequence[str], output: Path, options: ExportOptions) -> None:
+def export_command(to: str, datasets: Sequence[str], output: str, options: ExportOptions) -> None:
     """Export a dataset to another tool's format, keeping what that format supports.
 
     Folders of images get the exact pixels, or with --quality visual those of the views of lossless

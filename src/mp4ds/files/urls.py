@@ -11,14 +11,14 @@ import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache, cached_property, partial
 from pathlib import Path, PurePosixPath
 from reprlib import repr as shortened
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 from urllib.parse import quote, unquote, urlsplit
 
-from mp4ds.errors import Mp4dsError, OptionError, Refused, RemoteError, SourceError, TargetError
+from mp4ds.errors import Mp4dsError, OptionError, Refused, RemoteError, SourceError
 from mp4ds.files.ranges import Blocks, Range, RemoteFile
 
 _HTTP = ("http", "https")
@@ -27,8 +27,6 @@ _HUB = "hf"  # of Hugging Face, whose files would read ahead, and fetch one rang
 _INSTALL = "Run: pip install 'mp4ds[remote]'"
 # Many small ranges are requested at once, on that many connections; botocore's default is 10.
 _AT_ONCE, _HUB_AT_ONCE = 32, 8
-# By default s3fs keeps ten parts of 50 MiB in memory.
-_S3_UPLOAD = {"chunksize": 2**24, "max_concurrency": 4}
 _TAGS = ("ETag", "etag", "blob_id", "md5Hash", "Content-MD5")
 _TIMES = ("LastModified", "Last-Modified", "mtime")
 _GONE = "could not be read: it no longer exists"
@@ -313,7 +311,7 @@ class RemotePath(_Path):
         """
         starts, ends = [start for start, _ in ranges], [end for _, end in ranges]
         try:
-            with _sentences(self, "fetched"):
+            with _sentences(self, fetches=True):
                 if self.scheme == _HUB:
                     ask = partial(self._files.cat_file, self._key, cache_type="none")
                     with ThreadPoolExecutor(_HUB_AT_ONCE) as pool:
@@ -338,39 +336,6 @@ class RemotePath(_Path):
         """All of it."""
         with self.open() as stream:
             return stream.read()
-
-    # ---------------------------------------------------------------- writing
-
-    @property
-    def is_writable(self) -> bool:
-        """Whether its kind of store accepts uploads."""
-        return not self._on_web
-
-    def upload(self, local: Path) -> None:
-        """Upload a file here, replacing what is there.
-
-        Raises:
-            TargetError: The store denies access.
-            RemoteError: It does not respond, or has stored less.
-        """
-        with _sentences(self, "uploaded"):
-            options = _S3_UPLOAD if self.scheme in _S3 else {}
-            self._files.put_file(str(local), self._key, **options)
-        now = self._at(self._rest)
-        sizes = now.stat().st_size if now.exists() else 0, local.stat().st_size
-        if sizes[0] != sizes[1]:
-            problem = f"could not be uploaded: only {sizes[0]} of {sizes[1]} bytes arrived"
-            raise RemoteError(self, problem)
-
-    def remove(self) -> None:
-        """Remove the file here, if there is one.
-
-        Raises:
-            TargetError: The store denies access.
-            RemoteError: It does not answer.
-        """
-        with suppress(FileNotFoundError), _sentences(self, "removed"):
-            self._files.rm_file(self._key)
 
 
 @cache
@@ -465,12 +430,12 @@ _MAX_TEXT, _MAX_CAUSES = 300, 8
 
 
 @contextmanager
-def _sentences(path: RemotePath, done: str = "read") -> Iterator[None]:
+def _sentences(path: RemotePath, *, fetches: bool = False) -> Iterator[None]:
     """Translate fsspec's errors; a missing file becomes a FileNotFoundError.
 
     Args:
         path: What is being accessed.
-        done: The operation, as a participle.
+        fetches: Whether the file was opened before, which was allowed.
     """
     try:
         yield
@@ -481,14 +446,12 @@ def _sentences(path: RemotePath, done: str = "read") -> Iterator[None]:
         raise SourceError(path, problem, "Download it first.") from None
     except Exception as error:
         verdict, reason = _explained(error)
-        if verdict == "missing" and done != "uploaded":
+        if verdict == "missing":
             raise FileNotFoundError(str(path)) from None
         what = "access denied: " if verdict == "refused" else ""
-        if verdict == "failed" or done == "fetched":  # the latter was allowed before
-            done = "read" if done == "fetched" else done
-            raise RemoteError(path, f"could not be {done}: {what}{reason}", _NETWORK) from None
-        kind = SourceError if done == "read" else TargetError
-        raise kind(path, f"cannot be {done}: {what}{reason}", _ACCESS) from None
+        if verdict == "failed" or fetches:
+            raise RemoteError(path, f"could not be read: {what}{reason}", _NETWORK) from None
+        raise SourceError(path, f"cannot be read: {what}{reason}", _ACCESS) from None
 
 
 def _explained(error: BaseException) -> tuple[str, str]:

@@ -322,7 +322,7 @@ class PackProgress:
 
     Attributes:
         dataset: The dataset being made.
-        phase: ``planning``, ``packing``, ``joining`` or, for a URL, ``uploading``.
+        phase: ``planning``, ``packing`` or ``joining``.
         done: Share of the work of this phase that is done, 0 to 1; None if unknown.
         bytes_read: Payload bytes of the messages packed so far.
         bytes_total: Bytes of the source files.

@@ -30,7 +30,7 @@ from mp4ds.errors import (
     advising,
     path_text,
 )
-from mp4ds.files.outputs import check_target, digest_file, local_path, staged, uploaded
+from mp4ds.files.outputs import check_target, digest_file, local_target, staged
 from mp4ds.files.sources import (
     SourceHasher,
     is_unfinished,
@@ -185,8 +185,6 @@ def pack(
 def _pack(
     paths: Sequence[Path], target: Path, options: PackOptions, progress: Report | None
 ) -> PackSummary:
-    if store := remote(target):
-        return _pack_to_store(paths, store, options, progress)
     if any(map(is_unfinished, paths)):
         return _recovered(paths, target, options)
     if not _is_copy(paths, options):
@@ -265,25 +263,6 @@ def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
         return replace(summary, source_bytes=folder_size(dataset.path))
 
 
-def _pack_to_store(
-    paths: Sequence[Path], store: RemotePath, options: PackOptions, progress: Report | None
-) -> PackSummary:
-    """Pack on this machine, then upload."""
-
-    def make(local: Path) -> PackSummary:
-        report = progress and (lambda state: progress(replace(state, dataset=store)))
-        return _pack(paths, local, replace(options, force=True), report)
-
-    def tell(name: str, done: int, total: int) -> None:
-        if progress:
-            share = done / total if total else None
-            progress(PackProgress(store, "uploading", share, 0, total, done, {}, note=name))
-
-    force, owned = options.force, dataset_files
-    summary = uploaded(store, make, last=MANIFEST_NAME, force=force, owned=owned, report=tell)
-    return replace(summary, dataset=store)
-
-
 def pack_share(
     sources: Sequence[Path | str] | Path | str,
     dataset: Path | str | None,
@@ -312,8 +291,6 @@ def pack_share(
             "of rules, or pack as a whole."
         )
     target = _target(dataset, paths)
-    if store := remote(target):
-        target = local_path(store)
     _pack_all([_planned(paths, target, chosen, progress, is_share=True)], chosen, share)
 
 
@@ -328,7 +305,7 @@ def pack_each(
 
     Args:
         sources: Each a bag, rosbag2 folder or MCAP file, or its URL.
-        folder: Folder or URL in which to make the datasets; each is named after its recording.
+        folder: Folder in which to make the datasets; each is named after its recording.
         options: How.
         progress: Called several times a second.
 
@@ -343,7 +320,7 @@ def pack_each(
     asked = options or PackOptions()
     copied = [path for path in paths if _is_copy([path], asked)]
     chosen = _checked(asked, [path for path in paths if path not in copied], may_copy=False)
-    parent = _absolute(folder)
+    parent = local_target(folder)
     targets: dict[Path, Path] = {}
     for source in paths:
         target = parent / _name_of(source)
@@ -353,8 +330,7 @@ def pack_each(
                 "elsewhere."
             )
         targets[target] = source
-    if not remote(parent):
-        parent.mkdir(exist_ok=True)
+    parent.mkdir(exist_ok=True)
     missing = {
         target: source
         for target, source in targets.items()
@@ -363,8 +339,7 @@ def pack_each(
     made: dict[Path, PackSummary] = {}
     parted = []
     for target, source in missing.items():
-        # copies, and uploads to URLs, are made one after another
-        if source in copied or remote(parent):
+        if source in copied:  # one after another
             own = _checked(asked, [source])
             made[target] = _pack([source], target, own, progress)
         else:
@@ -385,7 +360,7 @@ def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
     Raises:
         TargetExistsError: Something else is there.
     """
-    if not (target / MANIFEST_NAME).exists() if remote(target) else not os.path.lexists(target):
+    if not os.path.lexists(target):
         return False
     try:
         manifest = load_manifest(target / MANIFEST_NAME)
@@ -630,13 +605,13 @@ def _target(dataset: Path | str | None, paths: Sequence[Path]) -> Path:
         OptionError: It is not named, and has to be.
     """
     if dataset is not None:
-        return _absolute(dataset)
+        return local_target(dataset)
     if len(paths) != 1 or dataset_at(paths[0]):
         raise OptionError(
             "Give `output`, the dataset to make: only that of one recording is named by itself."
         )
-    source = _absolute(paths[0])
-    target = Path(os.path.abspath(_name_of(source)))  # noqa: PTH100 - keeps links
+    source = paths[0] if remote(paths[0]) else local_target(paths[0])
+    target = local_target(_name_of(source))
     if target == source:
         raise OptionError(
             f"Give `output`, the dataset to make: {path_text(target)} is the recording itself."
@@ -647,10 +622,3 @@ def _target(dataset: Path | str | None, paths: Sequence[Path]) -> Path:
 def _name_of(source: Path) -> str:
     """The name of a dataset after that of its recording."""
     return source.name if source.is_dir() else source.stem
-
-
-def _absolute(path: Path | str) -> Path:
-    found = location(path)
-    if remote(found):
-        return found
-    return Path(os.path.abspath(found))  # noqa: PTH100 - keeps links, unlike resolve()

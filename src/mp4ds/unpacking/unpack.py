@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath
@@ -31,8 +30,8 @@ from mp4ds.errors import (
     advising,
     interrupted,
 )
-from mp4ds.files.outputs import Owned, staged, uploaded
-from mp4ds.files.urls import RemotePath, location, remote
+from mp4ds.files.outputs import Owned, local_target, staged
+from mp4ds.files.urls import remote
 from mp4ds.format.sidecars import MANIFEST_NAME, FileNames
 from mp4ds.options import WHAT, Selection, SliceOptions, force, jpeg_quality, latched, option
 from mp4ds.processes import each
@@ -144,8 +143,8 @@ def unpack(
         to: ``bag``, ``rosbag2``, ``mcap`` or ``images``; None for what the suffix of the output
             says (``.bag`` or ``.mcap``), else the recording's own format, or ``mcap`` for a single
             video.
-        output: The file or folder to make, or its URL; None for the dataset's name, next to it, or
-            in the current folder if the dataset is at a URL.
+        output: The file or folder to make; None for the dataset's name, next to it, or in the
+            current folder if the dataset is at a URL.
         options: How.
         progress: Called after every few messages.
 
@@ -160,27 +159,16 @@ def unpack(
         RemoteError: A store or web server fails.
     """
     chosen = options or UnpackOptions()
-    with nullcontext() if chosen.salvage else advising("`salvage` restores what can be read."):
+    with ExitStack() as stack:
+        if not chosen.salvage:
+            stack.enter_context(advising("`salvage` restores what can be read."))
         if to is None:
             to = _format_of(output) or _own_format(dataset, chosen)
         _check(to, chosen)
-        if output and (store := remote(location(output))):
-            return _unpack_to_store(dataset, to, store, chosen, progress)
-        return _unpack_here(dataset, to, output, chosen, progress)
-
-
-def _unpack_here(
-    dataset: Path | str,
-    to: str,
-    output: Path | str | None,
-    chosen: UnpackOptions,
-    progress: Callable[[UnpackProgress], None] | None,
-) -> UnpackSummary:
-    with ExitStack() as stack:
+        given = local_target(output) if output else None
         whole, losses = _opened(dataset, chosen, verify=to != "images" and not chosen.slice)
         stack.enter_context(whole)
-        given = location(output) if output else default_output(whole.path, to)
-        target = Path(os.path.abspath(given))  # noqa: PTH100
+        target = given or local_target(default_output(whole.path, to))
         path = stack.enter_context(
             staged(target, force=chosen.force, owned=_owned(to), sources=[whole.path])
         )
@@ -311,13 +299,13 @@ def unpack_each(
     for dataset in datasets_in(datasets):
         kind = to or _own_format(dataset, options or UnpackOptions())
         stem = dataset.name if dataset.is_dir() else dataset.stem
-        outputs[dataset] = location(folder) / f"{stem}{SUFFIXES[kind]}" if folder else None
+        outputs[dataset] = local_target(folder) / f"{stem}{SUFFIXES[kind]}" if folder else None
     named = [output for output in outputs.values() if output is not None]
     twice = [output for output, count in Counter(named).items() if count > 1]
     if twice:
         raise OptionError(f"Two datasets would become {twice[0]}. Unpack one of them elsewhere.")
-    if folder is not None and not remote(location(folder)):
-        location(folder).mkdir(exist_ok=True)
+    if folder is not None:
+        local_target(folder).mkdir(exist_ok=True)
     work = partial(_unpack_one, to=to, options=options)
     summaries: list[UnpackSummary] = []
     try:
@@ -375,29 +363,6 @@ def default_output(dataset: Path, to: str) -> Path:
         return Path(f"{stem}_unpacked{SUFFIXES[to]}")
     stem = dataset.resolve().name if dataset.is_dir() else dataset.stem
     return dataset.resolve().parent / f"{stem}_unpacked{SUFFIXES[to]}"
-
-
-def _unpack_to_store(
-    dataset: Path | str,
-    to: str,
-    target: RemotePath,
-    options: UnpackOptions,
-    progress: Callable[[UnpackProgress], None] | None,
-) -> UnpackSummary:
-    """Unpack on this machine, then upload."""
-
-    def make(local: Path) -> UnpackSummary:
-        return _unpack_here(dataset, to, local, replace(options, force=True), progress)
-
-    summary = uploaded(
-        target,
-        make,
-        is_folder=to in ("rosbag2", "images"),
-        last="metadata.yaml" if to == "rosbag2" else "",
-        force=options.force,
-        owned=_owned(to),
-    )
-    return replace(summary, output=target)
 
 
 def _owned(to: str) -> Owned:

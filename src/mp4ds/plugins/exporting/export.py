@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -14,8 +13,7 @@ from mp4ds._version import __version__
 from mp4ds.dataset.dataset import datasets_in
 from mp4ds.dataset.recording import HOW_TO_SALVAGE, open_selected, slice_of, sliced
 from mp4ds.errors import OptionError, advising
-from mp4ds.files.outputs import listed_names, staged
-from mp4ds.files.urls import location, remote
+from mp4ds.files.outputs import listed_names, local_target, staged
 from mp4ds.format.fields import document_of
 from mp4ds.packing.options import plugin
 from mp4ds.plugins.exporting.folders import write_colmap, write_euroc, write_tum
@@ -71,9 +69,7 @@ def export(
         raise OptionError("there is no dataset to export")
     paths = datasets_in(datasets)
     _check(to, paths, chosen)
-    if remote(location(output)):
-        raise OptionError(f"{output} is a URL: export to a local folder, then upload it.")
-    target = Path(os.path.abspath(output))  # noqa: PTH100
+    target = local_target(output)
     name, write = _FORMATS[to]
     with ExitStack() as stack, advising(HOW_TO_SALVAGE):
         opened = [
