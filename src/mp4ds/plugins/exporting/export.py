@@ -23,15 +23,11 @@ NOTE_NAME = "mp4ds_export.json"
 """File in an exported folder that lists what it holds and leaves out."""
 
 
-def _write_lerobot(*jobs: ExportJob) -> None:
-    plugin("exporting.lerobot:write")(*jobs)
-
-
 _FORMATS: dict[str, tuple[str, Callable[..., None]]] = {
     "euroc": ("EuRoC", write_euroc),
     "tum": ("TUM", write_tum),
     "colmap": ("COLMAP", write_colmap),
-    "lerobot": ("LeRobot", _write_lerobot),
+    "lerobot": ("LeRobot", lambda *jobs: plugin("exporting.lerobot:write")(*jobs)),
 }
 """Name of a format -> as its users write it, and what writes it."""
 
@@ -68,88 +64,57 @@ def export(
     if not isinstance(datasets, (str, Path)) and not [*datasets]:
         raise OptionError("there is no dataset to export")
     paths = datasets_in(datasets)
-    _check(to, paths, chosen)
-    target = local_target(output)
+    if to not in _FORMATS:
+        raise OptionError(f"format {to!r} is not known. Use {', '.join(_FORMATS)}.")
     name, write = _FORMATS[to]
+    in_colour = to == "lerobot"  # its videos are
+    if len(paths) > 1 and to != "lerobot":
+        raise OptionError(
+            f"{name} holds a single dataset, but {len(paths)} were given: export them one by one."
+        )
+    chosen.check_for(to)
+    target = local_target(output)
     with ExitStack() as stack, advising(HOW_TO_SALVAGE):
+        layer, check_all = "view" if in_colour else chosen.layer, not chosen.slice
         opened = [
             stack.enter_context(
-                open_selected(
-                    path,
-                    chosen.uses,
-                    layer="view" if to == "lerobot" else chosen.layer,
-                    verify_messages=not chosen.slice,
-                )
+                open_selected(path, chosen.uses, layer=layer, verify_messages=check_all)
             )
             for path in paths
         ]
-        if to != "lerobot" and chosen.layer is None:
+        if layer is None:
             for one in opened:
                 one.require_exact(chosen.uses)
-        path = stack.enter_context(
-            staged(
-                target,
-                force=chosen.force,
-                owned=partial(listed_names, listing=NOTE_NAME),
-                sources=[dataset.path for dataset in opened],
-            )
-        )
-        views = [[part.topic for part in one.streams if part.layer == "view"] for one in opened]
-        opened = [
-            stack.enter_context(
-                sliced(
-                    one,
-                    slice_of(one, chosen.slice, chosen.uses),
-                    path.parent / str(number),
-                    chosen.uses,
-                )
-            )
-            for number, one in enumerate(opened)
-        ]
-        summary = ExportSummary(target, to)
-        jobs = [
-            ExportJob(
-                one,
+        owned, sources = partial(listed_names, listing=NOTE_NAME), [one.path for one in opened]
+        path = stack.enter_context(staged(target, force=chosen.force, owned=owned, sources=sources))
+        summary, jobs = ExportSummary(target, to), list[ExportJob]()
+        for number, one in enumerate(opened):
+            span, place = slice_of(one, chosen.slice, chosen.uses), path.parent / str(number)
+            job = ExportJob(
+                stack.enter_context(sliced(one, span, place, chosen.uses)),
                 path,
                 chosen,
                 summary,
                 progress or (lambda *_: None),
                 where=f"{one.path.name}: " if len(opened) > 1 else "",
-                in_colour=to == "lerobot",  # its videos are
-                views=shown,
+                in_colour=in_colour,
+                views=[part.topic for part in one.streams if part.layer == "view"],
             )
-            for one, shown in zip(opened, views, strict=True)
-        ]
+            jobs.append(job)
         write(*jobs)
         for job in jobs:
             job.leave_out_rest(name)
         if not summary.messages:
             why = [f"{topic}: {next(iter(found))}" for topic, found in summary.left_out.items()]
             raise OptionError(
-                f"{name} cannot hold any topic of {opened[0].path}: "
+                f"{name} cannot hold any topic of {jobs[0].dataset.path}: "
                 f"{why[0] if why else 'it has no messages'}."
             )
         files = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
         note: dict[str, object] = {"mp4ds": __version__, **asdict(summary)}
         note |= {"output": target.name, "files": files}
-        abouts = [one.manifest.about for one in opened if one.manifest and one.manifest.about]
-        if abouts:
-            note["about"] = [document_of(about) for about in abouts]
+        manifests = [job.dataset.manifest for job in jobs]
+        if abouts := [one.about for one in manifests if one and one.about]:
+            note["about"] = list(map(document_of, abouts))
         (path / NOTE_NAME).write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
         return summary
-
-
-def _check(to: str, paths: Sequence[Path], options: ExportOptions) -> None:
-    """Refuse options that are unknown or contradict each other.
-
-    Raises:
-        OptionError: Says which, and lists the valid ones.
-    """
-    if to not in _FORMATS:
-        raise OptionError(f"format {to!r} is not known. Use {', '.join(_FORMATS)}.")
-    if len(paths) > 1 and to != "lerobot":
-        raise OptionError(
-            f"{_FORMATS[to][0]} holds a single dataset, but {len(paths)} were given: export them "
-            "one by one."
-        )
-    options.check_for(to)

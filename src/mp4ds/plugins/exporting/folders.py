@@ -16,7 +16,7 @@ from mp4ds.format.models import Calibration
 from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.transforms import TransformCollector, quaternion_of
 from mp4ds.options import seconds_text
-from mp4ds.plugins.exporting.job import IMU, ExportedCamera, ExportJob, Measures, Row
+from mp4ds.plugins.exporting.job import IMU, ExportedCamera, ExportJob, Measures, Row, ros_type
 from mp4ds.records import Message
 from mp4ds.times import INT64_MIN
 from mp4ds.video.images import encoding_as
@@ -94,7 +94,9 @@ def _poses(job: ExportJob) -> Measures | None:
 
 
 def _imus(job: ExportJob) -> list[Measures]:
-    return [Measures(job.dataset, topic, "imu") for topic in job.topics_of(IMU)]
+    topics = filter(job.options.chosen, dict.fromkeys(one.topic for one in job.dataset.channels))
+    own = (topic for topic in topics if ros_type(job.dataset, topic) == IMU)
+    return [Measures(job.dataset, topic, "imu") for topic in own]
 
 
 # ---------------------------------------------------------------- euroc

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.stream import Stream
@@ -22,7 +21,7 @@ from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import WHAT, Parsed, SliceOptions, force, option
-from mp4ds.times import at_most, intervals, sound_times, synchronize, usual_interval
+from mp4ds.times import Integers, at_most, intervals, sound_times, synchronize, usual_interval
 from mp4ds.unpacking.pictures import FrameOptions, is_inverse_depth
 from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
@@ -143,8 +142,6 @@ class ExportSummary:
 
 _THINNED = "left out on request (--every, --max-rate)"
 _INVERSE = "quantised inverse depths; `mp4ds unpack --images raw` converts them to depths"
-
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -336,9 +333,7 @@ def in_order(rows: Iterable[Row], window: int = _WINDOW) -> Iterator[Row]:
         if len(waiting) > window:
             time, _, values = heapq.heappop(waiting)
             yield time, values
-    while waiting:
-        time, _, values = heapq.heappop(waiting)
-        yield time, values
+    yield from ((time, values) for time, _, values in sorted(waiting))
 
 
 # ---------------------------------------------------------------- job
@@ -438,15 +433,6 @@ class ExportJob:
         for topic in self._views:
             if topic in self._summary.messages:
                 self.note(f"{topic}: its pixels are those of its view")
-
-    def topics_of(self, type_name: str) -> list[str]:
-        """The selected topics with a ROS type, such as ``sensor_msgs/Imu``."""
-        topics = dict.fromkeys(channel.topic for channel in self.dataset.channels)
-        return [
-            topic
-            for topic in topics
-            if self.options.chosen(topic) and ros_type(self.dataset, topic) == type_name
-        ]
 
     # ------------------------------------------------ cameras
 

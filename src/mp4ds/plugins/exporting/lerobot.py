@@ -22,7 +22,6 @@ from mp4ds.dataset.vectors import (
     SAMPLES,
     STATE,
     Statistics,
-    Vectors,
     fields_of,
     image_features,
     merged,
@@ -34,8 +33,8 @@ from mp4ds.dataset.vectors import (
 )
 from mp4ds.errors import OptionError
 from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, DepthCodes
-from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, Integers, ros_type
-from mp4ds.times import TIMESCALE, constant_rate, nearest
+from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, ros_type
+from mp4ds.times import TIMESCALE, Integers, constant_rate, nearest
 from mp4ds.video.codecs import CODECS, recipe_for
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.packets import PacketReader
@@ -155,25 +154,33 @@ def _is_depth(camera: ExportedCamera) -> bool:
 
 
 def _add_videos(
-    job: ExportJob,
-    cameras: Sequence[ExportedCamera],
-    episode: Episode,
-    fps: int,
+    job: ExportJob, cameras: Sequence[ExportedCamera], episode: Episode, fps: int
 ) -> None:
     features = image_features([camera.topic for camera in cameras])
     for feature, camera in zip(features, cameras, strict=True):
         path = job.path / episode.path(f"videos/{feature}", "mp4")
         path.parent.mkdir(parents=True, exist_ok=True)
         used, repeats = np.unique(nearest(camera.times, episode.times), return_counts=True)
-        _count(job, camera, used, episode.times, fps)
+        job.keep(camera.topic, len(used))
+        is_unused = np.ones(len(camera), np.bool_)
+        is_unused[used] = False
+        is_within = (camera.times >= episode.times[0]) & (camera.times <= episode.times[-1])
+        for reason, which in (
+            (f"another frame is nearer at {fps} frames per second", is_within),
+            ("before the first or after the last frame of all cameras", ~is_within),
+        ):
+            job.leave_out(camera.topic, reason, int((is_unused & which).sum()))
+        if repeated := len(episode.times) - len(used):
+            job.note(
+                f"{camera.topic}: {repeated} of {len(episode.times)} frames repeat the previous "
+                f"one, to reach {fps} per second"
+            )
         depths = DepthCodes(camera.view.encoding.name) if _is_depth(camera) else None
         size = _encode(job, camera.at(used), repeats.tolist(), path, fps, depths)
         codec = "h265" if depths else job.options.codec
         with PacketReader(path, codec=codec) as packets:
-            pixel_format = packets.pixel_format
-        info = {"video.codec": CODECS[codec].ffmpeg, "video.pix_fmt": pixel_format}
-        told = depths.info if depths else None
-        episode.features[feature] = video_feature(size, fps, info, told)
+            info = {"video.codec": CODECS[codec].ffmpeg, "video.pix_fmt": packets.pixel_format}
+        episode.features[feature] = video_feature(size, fps, info, depths.info if depths else None)
         if depths:
             job.note(f"{camera.topic}: {depths}")
         view = {
@@ -185,25 +192,6 @@ def _add_videos(
             episode.statistics[feature] = sampled_statistics(topic, numbers, SAMPLES, **view)
         episode.videos.append(feature)
         job.places[f"videos/{feature}"] = camera.topic
-
-
-def _count(
-    job: ExportJob, camera: ExportedCamera, used: Integers, times: Integers, fps: int
-) -> None:
-    job.keep(camera.topic, len(used))
-    is_within = (camera.times >= times[0]) & (camera.times <= times[-1])
-    is_unused = np.ones(len(camera), np.bool_)
-    is_unused[used] = False
-    for reason, which in (
-        (f"another frame is nearer at {fps} frames per second", is_within),
-        ("before the first or after the last frame of all cameras", ~is_within),
-    ):
-        job.leave_out(camera.topic, reason, int((is_unused & which).sum()))
-    if len(times) > len(used):
-        job.note(
-            f"{camera.topic}: {len(times) - len(used)} of {len(times)} frames repeat the previous "
-            f"one, to reach {fps} per second"
-        )
 
 
 def _encode(
@@ -253,26 +241,20 @@ def _add_vectors(job: ExportJob, episode: Episode, fps: int) -> None:
             continue
         ((topic, paths),) = fields_of(given, f"`{option}`").items()
         found = read_vectors(job.dataset, topic, paths)
-        episode.vectors[feature] = _at(job, found, episode.times, fps, topic in counted)
+        places = found.nearest(episode.times)
+        if topic not in counted:
+            used = len(np.unique(places))
+            job.keep(topic, used)
+            reason = f"another message is nearer at {fps} frames per second"
+            job.leave_out(topic, reason, len(found.times) - used)
+            away = int(np.abs(found.times[places] - episode.times).max()) / _NS
+            job.note(f"{topic}: each frame gets the nearest message, at most {away:.3f} s away")
+        values = found.values[places]
+        episode.vectors[feature] = values
         episode.features[feature] = vector_feature(found.names)
-        episode.statistics[feature] = statistics_of(episode.vectors[feature])
+        episode.statistics[feature] = statistics_of(values)
         job.places[feature] = topic
         counted.add(topic)
-
-
-def _at(
-    job: ExportJob, found: Vectors, times: Integers, fps: int, is_counted: bool
-) -> NDArray[np.float32]:
-    """The message nearest to each time."""
-    places = found.nearest(times)
-    if not is_counted:
-        used = len(np.unique(places))
-        job.keep(found.topic, used)
-        reason = f"another message is nearer at {fps} frames per second"
-        job.leave_out(found.topic, reason, len(found.times) - used)
-        away = int(np.abs(found.times[places] - times).max()) / _NS
-        job.note(f"{found.topic}: each frame gets the nearest message, at most {away:.3f} s away")
-    return found.values[places]
 
 
 # ---------------------------------------------------------------- tables
