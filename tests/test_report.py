@@ -120,7 +120,7 @@ def test_topics_and_their_sizes(copy: Path) -> None:
         (FRAMES - 1) * 1e9 / (times["/tf"][-1] - times["/tf"][0])
     )
     stored = sum((copy / f"front_image_raw.{end}").stat().st_size for end in ("mp4", "yaml"))
-    assert rows[COLOUR]["stored_bytes"] == stored
+    assert rows[COLOUR]["bytes"] == stored
     assert rows["/front/camera_info"]["stored"] == "in front_image_raw.yaml"
 
 

@@ -225,7 +225,13 @@ def plot(camera: CameraEvaluation, kind: str) -> str:
         legend += 20
     shapes.append(_line([(_LEGEND - 7, legend), (_LEGEND + 7, legend)], _FRONT, 6))
     shapes.append(_text((_LEGEND + 12, legend), "Pareto front"))
-    return _svg(shapes)
+    width, height = SIZE
+    parts = "\n".join(shapes)  # later ones cover earlier ones
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
+        f'viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="12">\n'
+        f'<rect width="{width}" height="{height}" fill="#ffffff"/>\n{parts}\n</svg>\n'
+    )
 
 
 def pareto(costs: Sequence[float], scores: Sequence[float]) -> list[int]:
@@ -291,17 +297,6 @@ def _text(place: tuple[float, float], words: str, anchor: str = "start", color: 
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" '
         f'dominant-baseline="central" fill="{color}">{escape(words)}</text>'
-    )
-
-
-def _svg(shapes: Sequence[str]) -> str:
-    """The drawing; later shapes cover earlier ones."""
-    width, height = SIZE
-    parts = "\n".join(shapes)
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
-        f'viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="12">\n'
-        f'<rect width="{width}" height="{height}" fill="#ffffff"/>\n{parts}\n</svg>\n'
     )
 
 

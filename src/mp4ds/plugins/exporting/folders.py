@@ -170,8 +170,12 @@ def _described(job: ExportJob, camera: ExportedCamera) -> list[str]:
     if calibration is None:
         job.note(f"{camera.topic}: not calibrated")
         return lines
-    model, coefficients = euroc_distortion(calibration)
-    if model not in ("radial-tangential", "equidistant"):
+    model, d = lens_of(calibration)
+    if model == "none":
+        model, d = "radial-tangential", [0.0] * 4
+    elif model == "plumb_bob" and not d[4]:
+        model, d = "radial-tangential", d[:4]
+    elif model != "equidistant":
         job.note(f"{camera.topic}: EuRoC has no distortion {model}; it is given by its name")
     k = calibration.k
     return [
@@ -179,18 +183,8 @@ def _described(job: ExportJob, camera: ExportedCamera) -> list[str]:
         "camera_model: pinhole",
         f"intrinsics: {[k[0], k[4], k[2], k[5]]} # fu, fv, cu, cv",
         f"distortion_model: {json.dumps(model)}",
-        f"distortion_coefficients: {coefficients}",
+        f"distortion_coefficients: {d}",
     ]
-
-
-def euroc_distortion(calibration: Calibration) -> tuple[str, list[float]]:
-    """Name and coefficients of a distortion, in EuRoC's terms if it has them."""
-    model, d = lens_of(calibration)
-    if model == "none":
-        return "radial-tangential", [0.0] * 4
-    if model == "plumb_bob" and not d[4]:
-        return "radial-tangential", d[:4]
-    return model, d
 
 
 # ---------------------------------------------------------------- tum

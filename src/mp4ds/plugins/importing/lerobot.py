@@ -33,6 +33,7 @@ _PATHS = {
     "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
     "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
 }
+_PICTURES = ("video", "image")  # types of features
 _MAX_BYTES, _MAX_NUMBERS, _MAX_NAME = 2**24, 2**20, 200
 _NS = 10**9
 
@@ -84,10 +85,6 @@ class _Folder:
             raise SourceError(self.path / name, "does not exist, but an episode is in it")
         return self.path / name
 
-    def is_row(self, name: str) -> bool:
-        """Whether a column has the numbers or texts of a feature."""
-        return name in self.features and self.features[name]["dtype"] not in ("video", "image")
-
     def episodes(self, number: int | None = None) -> list[tuple[Path, dict[str, Any]]]:
         """The rows of all episodes, or of one, without statistics, and their files."""
         found: list[tuple[Path, dict[str, Any]]] = []
@@ -110,7 +107,7 @@ def _check_feature(name: str, feature: Any) -> None:
         raise ValueError(f"the shape of {name} is not positive numbers")
     if not isinstance(feature.get("info") or {}, dict):
         raise ValueError(f"the info of {name} is no mapping")
-    if math.prod(shape) > _MAX_NUMBERS and feature["dtype"] not in ("video", "image"):
+    if math.prod(shape) > _MAX_NUMBERS and feature["dtype"] not in _PICTURES:
         raise ValueError(f"{name} has more than {_MAX_NUMBERS} numbers")
 
 
@@ -170,7 +167,8 @@ def open_episode(folder: Path, options: ImportOptions) -> ImagesReader:
     reader.add_file(data)
     with _reading(data):
         held = pq.read_schema(data).names
-        wanted = [name for name in held if name in COLUMNS or known.is_row(name)]
+        rows = {name for name, one in known.features.items() if one["dtype"] not in _PICTURES}
+        wanted = [name for name in held if name in COLUMNS or name in rows]
         table = pq.read_table(data, columns=wanted, filters=[("episode_index", "==", number)])
         if table.num_rows != length or not length:
             raise ValueError(f"it has {table.num_rows} rows of episode {number}, not {length}")

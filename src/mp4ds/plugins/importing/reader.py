@@ -255,7 +255,8 @@ class ImagesReader(BagReader):
 
         def make(number: int) -> bytes:
             writer = PrimitiveWriter(_PREFIX, "<", is_cdr=True)
-            _put_header(writer, int(stamps[number]), "")
+            writer.put("I", *divmod(int(stamps[number]), NS))
+            writer.string("")
             writer.put("I", len(names))
             for name in names:
                 writer.string(name)
@@ -416,8 +417,3 @@ def _camera_message(
     type_name: str, frame_id: str, fields: Fields, stamp: int, body: bytes = b""
 ) -> bytes:
     return plain_message(_WIRE, type_name, frame_id, fields, Slots(stamp), body)
-
-
-def _put_header(writer: PrimitiveWriter, stamp: int, frame_id: str) -> None:
-    writer.put("I", *divmod(stamp, NS))
-    writer.string(frame_id)

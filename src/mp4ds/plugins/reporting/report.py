@@ -13,7 +13,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -46,9 +46,8 @@ from mp4ds.files.outputs import (
     write_synced,
 )
 from mp4ds.files.urls import remote
-from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.options import WHERE, Options, force, option
-from mp4ds.plugins.info import Brief, brief, notes_of, topics_of
+from mp4ds.plugins.info import Brief, TopicInfo, brief, notes_of, topics_of
 from mp4ds.plugins.reporting.cameras import (
     ReportedCamera,
     axis_of,
@@ -289,17 +288,7 @@ def _data(dataset: Dataset, cameras: list[ReportedCamera], problems: list[str]) 
     base = min((int(columns[axis][0]) for columns in both), default=0)
     timed = [number for number, reason in enumerate(reasons) if not reason]
     try:
-        topics = [
-            {
-                "topic": item.topic,
-                "type_name": item.type_name,
-                "messages": item.messages,
-                "rate_hz": item.rate_hz,
-                "stored": item.stored or MESSAGES_NAME,
-                "stored_bytes": item.bytes,
-            }
-            for item in topics_of(dataset)
-        ]
+        topics = topics_of(dataset)
     except (FormatError, SourceError) as error:
         problems.append(str(error))
         topics = []
@@ -313,17 +302,17 @@ def _data(dataset: Dataset, cameras: list[ReportedCamera], problems: list[str]) 
         "summary": _figures(dataset, topics),
         "reference": timed[0] if len(timed) > 1 else None,
         "cameras": [camera.facts(number, reasons[number]) for number, camera in enumerate(cameras)],
-        "topics": topics,
+        "topics": [asdict(item) for item in topics],
         "transforms": [item.model_dump() for item in manifest.transforms] if manifest else [],
         "notes": [*notes[:_MOST_NOTES], *more],
     }
 
 
-def _figures(dataset: Dataset, topics: list[dict[str, Any]]) -> dict[str, Any]:
+def _figures(dataset: Dataset, topics: list[TopicInfo]) -> dict[str, Any]:
     """Figures of the whole dataset: bytes, and nanoseconds as text, as BigInt reads them."""
     manifest = dataset.manifest
     summary: dict[str, Any] = {
-        "messages": sum(row["messages"] for row in topics),
+        "messages": sum(item.messages for item in topics),
         "topics": len(topics),
     }
     if manifest is None:

@@ -42,7 +42,10 @@ _LOW, _HIGH = 1.0, 99.0  # percentiles mapped to the ends of the colour scale
 _WHITE = 99.9  # percentile shown as white
 _SIDE = 256  # maximum side of a sampled frame, pixels
 # from near to far: violet, blue, green, yellow; missing values are black
-_COLOURS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+_STOPS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+_COLOURS = np.rint(  # of 256 values
+    [np.interp(range(256), np.linspace(0, 255, len(_STOPS)), one) for one in np.transpose(_STOPS)]
+).T.astype(np.uint8)
 
 
 class Look:
@@ -92,7 +95,7 @@ class Look:
             return seen if seen.dtype == np.uint8 else self._scaled(seen).astype(np.uint8)
         numbers = _first(seen)
         places = self._scaled(numbers).astype(np.uint8)
-        picture: Bytes = _colour_table()[places]
+        picture: Bytes = _COLOURS[places]
         picture[~_is_value(numbers)] = 0
         return picture
 
@@ -106,9 +109,8 @@ class Look:
 
 def _sampled(topic: Topic) -> list[Pixels]:
     """Pixels of a few frames, subsampled."""
-    numbers = sorted(set(np.linspace(0, len(topic) - 1, _SAMPLES).astype(int).tolist()))
     found = []
-    for number in numbers:
+    for number in spread(len(topic), _SAMPLES):
         try:
             frame = topic.get([number])[0].data
         except VideoError:
@@ -135,15 +137,6 @@ def _range(samples: list[Pixels], low: float, high: float) -> tuple[float, float
         return 0.0, 1.0
     least, most = (float(value) for value in np.percentile(known, [low, high]))
     return (least, most) if most - least > 1e-12 * abs(most) else (least - 0.5, least + 0.5)
-
-
-def _colour_table() -> Bytes:
-    places = np.linspace(0, 255, len(_COLOURS))
-    channels = [
-        np.interp(np.arange(256), places, channel) for channel in zip(*_COLOURS, strict=True)
-    ]
-    table: Bytes = np.rint(np.stack(channels, axis=1)).astype(np.uint8)
-    return table
 
 
 # ---------------------------------------------------------------- frames
@@ -234,11 +227,7 @@ def frames(dataset: Path | str, output: Path | str, options: StillOptions) -> St
         with closing(Topic([part])) as alone:  # which has one size and encoding
             pixels, encoding = _still(alone, number, options)
         data = ImageFile(encoding, kind, quality=_QUALITY).encode(pixels)
-        with staged(
-            target.absolute(),
-            force=options.force,
-            owned=_image_names,
-        ) as path:
+        with staged(target.absolute(), force=options.force, owned=_image_names) as path:
             path.write_bytes(data)
         return StillSummary(
             output=target,

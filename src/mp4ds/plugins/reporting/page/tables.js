@@ -98,7 +98,7 @@ var mp4dsTables = (() => {
     const head = [["Topic", {long: true}], ["Type", {long: true}], ["Messages", NUMBER], ["Rate, Hz", NUMBER], ["Stored", NUMBER],
       ["In", {long: true}]];
     table(place, head, data.topics.map(row => [row.topic, row.type_name, grouped(row.messages), optional(row.rate_hz, 2),
-      bytesText(row.stored_bytes), row.stored]));
+      bytesText(row.bytes), row.stored || "messages.mcap"]));
   }
 
   function calibrations(place, data) {
