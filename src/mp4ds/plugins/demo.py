@@ -6,7 +6,6 @@ Bayer and an RGB camera, their calibrations, IMU and transforms. The same on eve
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from mp4ds.bags.convert import Converter, ros2_channel
 from mp4ds.bags.formats import open_reader, open_writer, recording_names
 from mp4ds.bags.latched import DEFAULT_QOS, LATCHED_QOS
 from mp4ds.errors import OptionError
-from mp4ds.files.outputs import staged
+from mp4ds.files.outputs import local_target, staged
 from mp4ds.records import Channel, Message
 
 START_NS = 1_712_647_128_027_473_200
@@ -76,7 +75,7 @@ def demo(output: Path | str = "demo.mcap", *, seconds: float = 3.0, force: bool 
     """
     if not 0.1 <= seconds <= 3600:  # not a number, too: older typers let it pass
         raise OptionError(f"A demo lasts from 0.1 to 3600 seconds, not {seconds:g}.")
-    target = Path(os.path.abspath(output))  # noqa: PTH100 - keeps links, unlike resolve()
+    target = local_target(output)
     if target.suffix not in _KINDS:
         raise OptionError(
             f"The demo cannot be a {target.suffix} file. Name it .mcap, .bag (ROS 1), or "

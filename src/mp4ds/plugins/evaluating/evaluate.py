@@ -20,7 +20,7 @@ import numpy as np
 
 from mp4ds._version import __version__
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, counted
-from mp4ds.files.outputs import listed_names, staged, write_listing
+from mp4ds.files.outputs import listed_names, local_target, staged, write_listing
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.encodings import ENCODINGS
@@ -239,7 +239,7 @@ def evaluate(
                 f"{error} Or choose another metric, such as `target` psnr=42."
             ) from None
     name = output or f"{place.name if place.is_dir() else place.stem}_evaluation"
-    target = Path(os.path.abspath(name))  # noqa: PTH100 - keeps links, unlike resolve()
+    target = local_target(name)
     with ExitStack() as stack:
         found, left_out = stack.enter_context(open_cameras(place))
         options.selected.check([*(camera.topic for camera in found), *left_out])

@@ -5,7 +5,6 @@ Nothing is re-encoded: the video's packets get the times of the YAML, which the 
 
 from __future__ import annotations
 
-import os
 from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +16,7 @@ from mp4ds import yamlio
 from mp4ds.bags.convert import Converter
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.errors import FormatError, OptionError, SourceError, SourceNotFoundError
-from mp4ds.files.outputs import digest_file, staged
+from mp4ds.files.outputs import digest_file, local_target, staged
 from mp4ds.files.sources import SourceState, unchanged
 from mp4ds.files.urls import location, remote
 from mp4ds.format.fields import FORMAT_VERSION, Model, columns_model
@@ -51,19 +50,16 @@ def import_ros_mp4(
     Raises:
         SourceError: A file is missing or cannot be read, or the YAML is not of that tool.
         FormatError: The YAML is not valid, or does not match the video.
-        OptionError: A path is a URL.
+        OptionError: A source is a URL.
         TargetError: The dataset cannot be written there.
         WriteError: The dataset could not be written; nothing is left behind.
     """
     source, described = _local(video), _local(sidecar)
     for path in (source, described):
         if not path.is_file():
-            raise (
-                SourceNotFoundError(path)
-                if not path.exists()
-                else SourceError(path, "is not a file")
-            )
-    target = Path(os.path.abspath(_local(dataset)))  # noqa: PTH100 - keeps links, unlike resolve()
+            missing = SourceNotFoundError(path)
+            raise SourceError(path, "is not a file") if path.exists() else missing
+    target = local_target(dataset)
     states = [SourceState.of(source), SourceState.of(described)]
     stream = read_pair(described)
     with (

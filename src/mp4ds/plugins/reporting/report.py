@@ -41,6 +41,7 @@ from mp4ds.files.outputs import (
     check_target,
     is_page,
     listed_names,
+    local_target,
     staged,
     write_listing,
     write_synced,
@@ -145,7 +146,7 @@ def report(
         _check_local(opened.path)
         if opened.manifest is None and chosen.output is None:
             raise OptionError("A single video has no folder for a report: give `output`.")
-        folder = Path(os.path.abspath(chosen.output or opened.path))  # noqa: PTH100 - as named
+        folder = local_target(chosen.output or opened.path)
         if folder.exists():
             _check_index(folder, chosen)
             check_target(folder / _FOLDER, force=True, owned=listed_names)
@@ -375,7 +376,7 @@ def reports(
     found = datasets_in(datasets)
     for path in found:
         _check_local(path)
-    place = Path(os.path.abspath(folder))  # noqa: PTH100 - as named
+    place = local_target(folder)
     _check_index(place, chosen)
     tell = progress or (lambda *_: None)
     rows, problems = [], []
