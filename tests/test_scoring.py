@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from mp4ds.errors import ScoringError
 from mp4ds.video.scores import (
     VMAF_MODEL,
-    Ffmpeg,
     YuvFrame,
     find_ffmpeg,
     scores_of,
@@ -106,7 +105,7 @@ def test_vmaf_is_that_of_files(size: tuple[int, int], bits: int, tmp_path: Path)
     scores = scores_of(original, made, ffmpeg=ours)["vmaf"]
     files = raw(tmp_path / "made", made), raw(tmp_path / "original", original)
     graph = f"libvmaf=model=version={VMAF_MODEL}:log_fmt=json:log_path=log.json"
-    filtered(ours.path, tmp_path, *files, size, bits, graph)
+    filtered(ours, tmp_path, *files, size, bits, graph)
     frames = json.loads((tmp_path / "log.json").read_text())["frames"]
     theirs = np.array([frame["metrics"]["vmaf"] for frame in frames])
     assert 0 < scores.min() <= scores.max() < 100  # of neither bound
@@ -122,7 +121,7 @@ def test_psnr_and_ssim_are_those_of_ffmpeg(
     original, made = clip(size, bits=bits), clip(size, bits=bits, noise=0.03)
     scores = scores_of(original, made)
     filtered(
-        find_ffmpeg().path, tmp_path,
+        find_ffmpeg(), tmp_path,
         raw(tmp_path / "made", made), raw(tmp_path / "original", original), size, bits,
         "[0][1]psnr=stats_file=psnr.log[m];[m][1]ssim=stats_file=ssim.log",
     )  # fmt: skip
@@ -189,7 +188,7 @@ def program(folder: Path, script: str) -> str:
 )
 def test_a_process_that_fails(script: str, said: str, tmp_path: Path) -> None:
     frames = clip((322, 242))  # more than a pipe holds
-    ffmpeg = Ffmpeg(program(tmp_path, script) if script else str(tmp_path / "none"))
+    ffmpeg = program(tmp_path, script) if script else str(tmp_path / "none")
     with pytest.raises(ScoringError, match=said):
         scores_of(frames, frames, ffmpeg=ffmpeg)
 

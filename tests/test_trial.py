@@ -17,7 +17,7 @@ from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.layouts import fit
 from mp4ds.packing.options import PackOptions
 from mp4ds.video.codecs import lossless_codecs
-from mp4ds.video.encoder import Coding, VideoEncoder, choose, encode_on_trial
+from mp4ds.video.encoder import Coding, VideoEncoder, bytes_per_frame, choose, encode_on_trial
 from pictures import picture
 from pixel_kinds import rounded
 from round_trips import unpacked
@@ -106,7 +106,7 @@ def test_large_images_are_tried_in_part(encoding: str) -> None:
         picture_format=layout.pixel_format,
         threads=1,
     )
-    assert choice.bytes_per_frame == pytest.approx(whole.bytes_per_frame(60), rel=0.1)
+    assert choice.bytes_per_frame == pytest.approx(bytes_per_frame(whole, 60), rel=0.1)
 
 
 @pytest.mark.parametrize("codec", [None, "ffv1"])

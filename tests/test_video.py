@@ -25,7 +25,7 @@ from mp4ds.video.codecs import Recipe, recipe_for
 from mp4ds.video.decoder import VideoDecoder, jpeg_pixels
 from mp4ds.video.encoder import VideoEncoder
 from mp4ds.video.images import ImageFile
-from mp4ds.video.pixels import PictureMaker, PlaneMaker
+from mp4ds.video.pixels import PictureConverter, PictureMaker, to_planes
 from pictures import picture
 from pixel_kinds import rounded
 from republished import psnr
@@ -208,7 +208,7 @@ def test_colours_are_rounded_to_the_nearest() -> None:
     red, green, blue = colours.astype(float).T
     y = 0.2126 * red + 0.7152 * green + 0.0722 * blue
     exact = (y, 128 + (blue - y) / 1.8556, 128 + (red - y) / 1.5748)
-    for found, due in zip(PlaneMaker("rgb24").make((picture,)), exact, strict=True):
+    for found, due in zip(to_planes((picture,), "rgb24", PictureConverter()), exact, strict=True):
         side = found.shape[0] // 20
         errors = found[side // 2 :: side, side // 2 :: side].ravel() - np.minimum(due, 255)
         assert np.abs(errors).max() < 0.6

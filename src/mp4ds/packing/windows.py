@@ -23,8 +23,15 @@ from mp4ds.packing.inspection import CameraMessage
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import LEAST_CRF, MAX_CRF, QualityTarget
 from mp4ds.video.encoder import Coding, VideoEncoder, coded_size
-from mp4ds.video.pixels import PLANES_FORMAT, PlaneMaker, Planes, PlaneSpool, decoded_planes
-from mp4ds.video.scores import SMALLEST, Ffmpeg, find_ffmpeg, scores_of
+from mp4ds.video.pixels import (
+    PLANES_FORMAT,
+    PictureConverter,
+    Planes,
+    PlaneSpool,
+    decoded_planes,
+    to_planes,
+)
+from mp4ds.video.scores import SMALLEST, find_ffmpeg, scores_of
 
 Scores = NDArray[np.int64]
 """Of frames, in steps of the metric (`SCORE_STEPS`)."""
@@ -153,18 +160,20 @@ class WindowCoder:
         return coded_size(self.coding.recipe, *self.coding.layout.picture_size(*self.size))
 
     @cached_property
-    def _ffmpeg(self) -> Ffmpeg | None:
+    def _ffmpeg(self) -> str | None:
         """The ffmpeg that computes VMAF, if that is the metric."""
         return find_ffmpeg() if self.target.metric == "vmaf" else None
 
     @cached_property
-    def _maker(self) -> PlaneMaker:
-        return PlaneMaker(self.coding.layout.pixel_format)
+    def _converter(self) -> PictureConverter:
+        return PictureConverter()
 
     def keep(self, seen: CameraMessage, spool: PlaneSpool) -> None:
         """Add the planes of an image to a spool."""
         if seen.pixels is not None:
-            spool.append(self._maker.make(self.coding.layout.to_picture(seen.pixels)))
+            layout = self.coding.layout
+            picture = layout.to_picture(seen.pixels)
+            spool.append(to_planes(picture, layout.pixel_format, self._converter))
 
     def _encode(self, frames: PlaneSpool, ticks: Sequence[int], crf: int, path: Path) -> Scores:
         width, height = self.coded_size

@@ -167,19 +167,12 @@ _TUNING = "ref=3:mixed-refs=1:subme=5:me=dia:weightp=0:scenecut=0"
 _OF_NOISE = {"preset": "ultrafast", "x264-params": "cabac=1:8x8dct=1:partitions=i8x8"}
 
 
-def _x264_lossless(pixel_format: str) -> _Coding:
-    given = {**_X264, "qp": "0"}
-    return _Coding("libx264", pixel_format, given, "veryfast", _TUNING)
+def _x264_lossless(pixel_format: str, encoder: str = "libx264", tuning: str = _TUNING) -> _Coding:
+    return _Coding(encoder, pixel_format, {**_X264, "qp": "0"}, "veryfast", tuning)
 
 
 def _ffv1_8bit(pixel_format: str) -> _Coding:
     return _Coding("ffv1", pixel_format, _FFV1_8BIT)
-
-
-def _x264_rgb(pixel_format: str) -> _Coding:
-    tuning = f"{_TUNING}:8x8dct=0:partitions=p8x8"
-    given = {**_X264, "qp": "0"}
-    return _Coding("libx264rgb", pixel_format, given, "veryfast", tuning)
 
 
 def _x265_lossless(pixel_format: str) -> _Coding:
@@ -210,7 +203,7 @@ _LOSSLESS: dict[str, dict[str, _Coding]] = {
     **{
         packed: {
             "ffv1": _ffv1_8bit("bgr0"),
-            "h264": _x264_rgb(packed),
+            "h264": _x264_lossless(packed, "libx264rgb", f"{_TUNING}:8x8dct=0:partitions=p8x8"),
         }
         for packed in ("rgb24", "bgr24")
     },
@@ -399,7 +392,11 @@ def recipe_for(
         options = dict(coding.options)
     else:
         name = codec or DEFAULT_LOSSY
-        coding, options = _lossy(name, crf)
+        if name not in _LOSSY:
+            known = ", ".join(_LOSSY)
+            raise OptionError(f"codec {name} is lossless only; use one of {known}")
+        coding = _LOSSY[name]
+        options = {**coding.options, "crf": str(crf)}
         if pixel_format in _YUV:
             options = _sited_left(options)
         if varied and name == "h264":
@@ -421,15 +418,6 @@ def recipe_for(
         matrix="smpte170m" if is_yuv else "gbr" if is_rgb else "bt709",
         full_range=not is_yuv,
     )
-
-
-def _lossy(name: str, crf: int | None) -> tuple[_Coding, dict[str, str]]:
-    """How pictures are coded at a crf, and all options but the preset."""
-    if name not in _LOSSY:
-        known = ", ".join(_LOSSY)
-        raise OptionError(f"codec {name} is lossless only; use one of {known}")
-    coding = _LOSSY[name]
-    return coding, {**coding.options, "crf": str(crf)}
 
 
 def _sited_left(options: Mapping[str, str]) -> dict[str, str]:

@@ -353,23 +353,15 @@ class Coding:
         return f"{layout.name} {values} {recipe.encoder} {options} gop {self.gop}"
 
 
-@dataclass(frozen=True, slots=True)
-class Coded:
-    """The cost of a few consecutive pictures, the first of which is a key frame.
+def bytes_per_frame(sizes: Sequence[int], gop: int) -> float:
+    """Mean bytes per frame of a long video with a key frame every `gop` frames.
 
-    The others are assumed to represent all others of a group of pictures.
-
-    Attributes:
-        key: Bytes of the key frame.
-        other: Mean bytes of the others.
+    Args:
+        sizes: Bytes of consecutive frames, of which only the first is a key frame: the others
+            represent all others of a group of pictures.
+        gop: The distance of key frames.
     """
-
-    key: float
-    other: float
-
-    def bytes_per_frame(self, gop: int) -> float:
-        """Mean bytes per frame of a long video with a key frame every `gop` frames."""
-        return (self.key + (gop - 1) * self.other) / gop
+    return (sizes[0] + (gop - 1) * float(np.mean(sizes[1:] or sizes))) / gop
 
 
 class Predictor:
@@ -410,8 +402,8 @@ _UNFILTERED = "enable-tf=0"  # SVT-AV1's option against temporal filtering
 
 def predict_on_trial(
     samples: Sequence[Pixels], coding: Coding, threads: int
-) -> tuple[Coded, list[Pixels]]:
-    """The cost of a view, and what it shows.
+) -> tuple[list[int], list[Pixels]]:
+    """Bytes of each frame of a view, and what it shows.
 
     Args:
         samples: Pixels of consecutive images, at least one.
@@ -434,13 +426,13 @@ def predict_on_trial(
     predictor = Predictor(coding, size, bytes(context.extradata or b""))
     data = [*map(bytes, packets), None]
     shown = [pixels for packet in data for pixels in predictor.images(packet)]
-    return _cost(packets, len(samples)), shown
+    return _sizes(packets, len(samples)), shown
 
 
 def encode_on_trial(
     pictures: Sequence[Picture], recipe: Recipe, *, picture_format: str, threads: int
-) -> Coded:
-    """Measure the cost of pictures.
+) -> list[int]:
+    """Bytes of each of some pictures, encoded as one group of pictures.
 
     Args:
         pictures: Consecutive ones, at least one, all of one size.
@@ -452,14 +444,14 @@ def encode_on_trial(
         EncoderRefusedError: The codec does not take such pictures.
     """
     _, packets = _encoded(pictures, recipe, picture_format, threads)
-    return _cost(packets, len(pictures))
+    return _sizes(packets, len(pictures))
 
 
-def _cost(packets: Sequence[Any], frames: int) -> Coded:
+def _sizes(packets: Sequence[Any], frames: int) -> list[int]:
     sizes = [0] * frames
     for packet in packets:
         sizes[packet.pts] += packet.size
-    return Coded(float(sizes[0]), float(np.mean(sizes[1:] or sizes)))
+    return sizes
 
 
 def _encoded(
@@ -527,7 +519,7 @@ def choose(
     """
     crops, share = _crops(samples, encoding)
     is_noise = bool(differences)
-    tried: list[tuple[Coding, Coded]] = []
+    tried: list[tuple[Coding, list[int]]] = []
     refusals: list[Exception] = []
     candidates = differences or (
         (layout, list(map(layout.to_picture, crops))) for layout in _candidates(samples, encoding)
@@ -539,22 +531,22 @@ def choose(
                 recipe = recipe_for(
                     picture_format, lossless=True, codec=name, preset=preset, is_noise=is_noise
                 )
-                coded = encode_on_trial(
+                sizes = encode_on_trial(
                     pictures, recipe, picture_format=picture_format, threads=threads
                 )
             except (OptionError, EncoderRefusedError) as error:
                 refusals.append(error)
             else:
                 most = (h264_gop if name == "h264" else None) or gop
-                size = coded.bytes_per_frame(most) / share
-                tried.append((Coding(layout, recipe, most, size), coded))
+                size = bytes_per_frame(sizes, most) / share
+                tried.append((Coding(layout, recipe, most, size), sizes))
     if not tried:
         # that an encoder refuses the size says more than that another has no such format
         raise next((e for e in refusals if isinstance(e, EncoderRefusedError)), refusals[0])
     smallest = min(choice.bytes_per_frame for choice, _ in tried)
     for distance in _DISTANCES if purpose == TRAINING else ():
-        sizes = [(coded.bytes_per_frame(distance) / share, choice) for choice, coded in tried]
-        size, best = min(sizes, key=itemgetter(0))
+        costs = [(bytes_per_frame(sizes, distance) / share, choice) for choice, sizes in tried]
+        size, best = min(costs, key=itemgetter(0))
         if size <= _FASTER * smallest and distance < gop:
             return replace(best, gop=distance, bytes_per_frame=size)
     near = 1.0 if purpose == ARCHIVE else NEAR
@@ -610,13 +602,13 @@ def choose_predicted(
     """
     encoding = view.layout.encoding
     crops, share = _crops(samples, encoding)
-    coded, shown = predict_on_trial(crops, view, options["threads"])
+    sizes, shown = predict_on_trial(crops, view, options["threads"])
     predictions = [(pixels, view.layout.used_bits) for pixels in shown]
     differences = [
         (layout, [layout.to_picture(*pair) for pair in zip(crops, predictions, strict=True)])
         for layout in layouts
     ]
-    of_view = coded.bytes_per_frame(view.gop)
+    of_view = bytes_per_frame(sizes, view.gop)
 
     def tried(**changes: Any) -> Coding:
         asked = {**options, **changes}
@@ -646,18 +638,14 @@ def _candidates(samples: Sequence[Pixels], encoding: Encoding) -> list[Layout]:
     found = []
     for name in encoding.exact:
         layout = fit(name, encoding, samples)
-        if layout is None or not _is_in_bounds(layout, samples[0]):
+        rows, columns = samples[0].shape[:2]
+        size = columns, int(rows / encoding.rows)
+        if layout is None or max(layout.picture_size(*size)) > MAX_SIDE:
             continue
         if layout.is_source:
             return [layout]
         found.append(layout)
     return [layout for layout in found if layout.name != "bytes"] or found
-
-
-def _is_in_bounds(layout: Layout, pixels: Pixels) -> bool:
-    encoding = layout.encoding
-    width, height = pixels.shape[1], int(pixels.shape[0] / encoding.rows)
-    return max(layout.picture_size(width, height)) <= MAX_SIDE
 
 
 def _crops(samples: Sequence[Pixels], encoding: Encoding) -> tuple[Sequence[Pixels], float]:

@@ -317,7 +317,7 @@ def picture_to_frame(
         frame = picture_to_frame(picture, picture_format, "yuv420p", converter)
         return with_bits(frame, TEN_BITS, full_range=full_range)
     if pixel_format == "yuv420p" and picture_format == "gray":
-        return _gray_to_yuv(picture[0], pixel_format)
+        return plain_frame(_grey_planes(picture[0]), pixel_format)
     if pixel_format in ("yuv420p", TEN_BITS) and picture_format not in CHROMA_SHIFTS:
         picture = (_pad_to_even(picture[0]),)
     frame = plain_frame(picture, picture_format)
@@ -350,14 +350,11 @@ def _pad_to_even(picture: NDArray[Any]) -> NDArray[Any]:
     return np.pad(picture, pad, mode="edge")
 
 
-def _gray_to_yuv(picture: NDArray[Any], pixel_format: str) -> av.VideoFrame:
-    picture = _pad_to_even(picture)
-    height, width = picture.shape
-    frame = av.VideoFrame(width, height, pixel_format)
-    samples(frame)[...] = picture
-    for index in (1, 2):
-        samples(frame, index)[...] = 128
-    return frame
+def _grey_planes(picture: NDArray[Any]) -> Picture:
+    """With neutral chroma."""
+    luma = _pad_to_even(picture)
+    chroma = np.full_like(luma[::2, ::2], 128)
+    return luma, chroma, chroma
 
 
 # ---------------------------------------------------------------- pictures
@@ -425,21 +422,18 @@ class PictureMaker:
         if scale is not None:
             return (self._converter.scale(frame, scale, out),)
         is_mosaic = self._picture_format.startswith("bayer_")
-        if is_mosaic or self._picture_format in _PACKED:
-            self._check_colours(frame.format)
+        is_coloured, found = is_mosaic or self._picture_format in _PACKED, frame.format
+        if is_coloured and not (self._is_tagged or found.is_rgb or found.name in colour.BITS):
+            # colours that the format does not define depend on libswscale's version
+            problem = f"decodes to {found.name}, not {PLANES_FORMAT} or {TEN_BITS}"
+            raise VideoError("codec-mismatch", self._path, problem)
         if is_mosaic:
             return (self._mosaic(samples(self._converter.convert(frame, "rgb24"))),)
-        if self._picture_format in _PACKED:
+        if is_coloured:
             width, height = self._picture_size
             colours = samples(self._converter.convert(frame, self._picture_format))
             return (colours[:height, :width],)
         return self._planes(frame)
-
-    def _check_colours(self, found: av.VideoFormat) -> None:
-        """Refuse what the format does not define: libswscale's colours depend on its version."""
-        if not (self._is_tagged or found.is_rgb or found.name in colour.BITS):
-            problem = f"decodes to {found.name}, not {PLANES_FORMAT} or {TEN_BITS}"
-            raise VideoError("codec-mismatch", self._path, problem)
 
     def _planes(self, frame: av.VideoFrame) -> Picture:
         wanted, (width, height) = self._picture_format, self._picture_size
@@ -474,44 +468,23 @@ Planes = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]
 """Luma, and chroma of half the width and height."""
 
 
-class PlaneMaker:
-    """Converts pictures to a lossy encoder's input; not thread-safe.
+def to_planes(picture: Picture, picture_format: str, converter: PictureConverter) -> Planes:
+    """The planes of a picture for a lossy encoder, in new memory; odd sides are padded.
 
     Args:
-        picture_format: Pixel format of the pictures.
+        picture: As a layout gives it.
+        picture_format: Its pixel format.
+        converter: See `picture_to_frame`.
     """
-
-    def __init__(self, picture_format: str) -> None:
-        self._picture_format = picture_format
-        self._converter = PictureConverter()
-
-    def make(self, picture: Picture) -> Planes:
-        """The planes of a picture, in new memory; odd sides are padded."""
-        frame = picture_to_frame(picture, self._picture_format, PLANES_FORMAT, self._converter)
-        y, u, v = (plane.copy() for plane in planes_of(frame))
-        return _pad_to_even(y), u, v
+    frame = picture_to_frame(picture, picture_format, PLANES_FORMAT, converter)
+    y, u, v = (plane.copy() for plane in planes_of(frame))
+    return _pad_to_even(y), u, v
 
 
 def planes_of(frame: av.VideoFrame) -> Planes:
     """The planes of a frame of `PLANES_FORMAT`, as views of it."""
     y, u, v = (samples(frame, index) for index in range(3))
     return y, u, v
-
-
-def planes_in(frame: NDArray[np.uint8], width: int, height: int) -> Planes:
-    """The planes of a frame, stored one after another, as views.
-
-    Args:
-        frame: uint8, shape (width * height * 3 / 2,).
-        width: Columns, even.
-        height: Rows, even.
-    """
-    luma = width * height
-    return (
-        frame[:luma].reshape(height, width),
-        frame[luma : luma * 5 // 4].reshape(height // 2, width // 2),
-        frame[luma * 5 // 4 :].reshape(height // 2, width // 2),
-    )
 
 
 def decoded_planes(path: Path) -> Iterator[Planes]:
@@ -603,7 +576,9 @@ class PlaneSpool:
         data = np.frombuffer(self._file.read(self._size), np.uint8)
         if len(data) != self._size:
             raise OSError("frames kept on disk were truncated")
-        return planes_in(data, self.width, self.height)
+        luma, half = data[: self.width * self.height], (self.height // 2, self.width // 2)
+        u, v = data[len(luma) :].reshape(2, *half)
+        return luma.reshape(self.height, self.width), u, v
 
     def clear(self) -> None:
         """Drop all frames."""

@@ -11,10 +11,9 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -139,49 +138,33 @@ _MISSING = (
 )
 
 
-@dataclass(frozen=True)
-class Ffmpeg:
-    """An ffmpeg that has libvmaf.
-
-    Attributes:
-        path: The program.
-    """
-
-    path: str
-
-    @cached_property
-    def version(self) -> str:
-        """Its version, as it reports it."""
-        first = _ask(self.path, "-version").partition("\n")[0]
-        found = re.match(r"ffmpeg version (\S+)", first)
-        return found[1] if found else first
-
-
-def find_ffmpeg() -> Ffmpeg:
+def find_ffmpeg() -> str:
     """Find an ffmpeg with libvmaf: the one of the package imageio-ffmpeg, or one on the PATH.
 
     Raises:
         ScoringError: There is none; says how to get one.
     """
     for path in (_packaged(), shutil.which("ffmpeg")):
-        if path and _can_score(path):
-            return Ffmpeg(path)
+        # options of libvmaf 2 and later; older ones need the models as files
+        if path and re.search(r"(?m)^ +model +<string>", _ask(path, "-h", "filter=libvmaf")):
+            return path
     raise ScoringError(f"{_MISSING}.")
 
 
+def ffmpeg_version(path: str) -> str:
+    """The version of an ffmpeg, as it reports it."""
+    first = _ask(path, "-version").partition("\n")[0]
+    found = re.match(r"ffmpeg version (\S+)", first)
+    return found[1] if found else first
+
+
 def _packaged() -> str | None:
-    try:
+    # it may not be installed, or have no program for this machine
+    with suppress(ImportError, RuntimeError):
         import imageio_ffmpeg
-    except ImportError:
-        return None
-    with suppress(RuntimeError):  # it has no program for this machine
+
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     return None
-
-
-def _can_score(path: str) -> bool:
-    # options of libvmaf 2 and later; older ones need the models as files
-    return bool(re.search(r"^ +model +<string>", _ask(path, "-h", "filter=libvmaf"), re.MULTILINE))
 
 
 def _ask(path: str, *arguments: str) -> str:
@@ -197,14 +180,11 @@ def _ask(path: str, *arguments: str) -> str:
     return ""
 
 
-@contextmanager
-def scoring_process(
-    ffmpeg: Ffmpeg, *, width: int, height: int, pixel_format: str, threads: int
-) -> Iterator[VmafProcess]:
-    """An ffmpeg that scores the frames written to it; it ends with the block.
+class VmafProcess:
+    """An ffmpeg that scores the frames written to it. A context manager, which ends it.
 
     Args:
-        ffmpeg: The program.
+        path: The program.
         width: Columns of a frame, even.
         height: Rows of a frame, even.
         pixel_format: ``yuv420p`` or ``yuv420p10le``.
@@ -213,62 +193,38 @@ def scoring_process(
     Raises:
         ScoringError: It cannot be started.
     """
-    with tempfile.TemporaryDirectory(prefix="mp4ds-") as name:
-        folder = Path(name)
-        with (folder / "stderr").open("wb") as stderr:
-            command = _command(ffmpeg.path, width, height, pixel_format, threads)
+
+    def __init__(
+        self, path: str, *, width: int, height: int, pixel_format: str, threads: int
+    ) -> None:
+        # one picture with the decoded frame over its original: one pipe, and no frame goes astray
+        graph = (
+            f"[0:v]split[above][below];[above]crop={width}:{height}:0:0:exact=1[decoded];"
+            f"[below]crop={width}:{height}:0:{height}:exact=1[reference];"
+            f"[decoded][reference]libvmaf=model=version={VMAF_MODEL}:n_threads={threads}"
+            f":log_fmt=json:log_path={_LOG}"
+        )
+        size = f"{width}x{2 * height}"
+        command = [
+            *(path, "-hide_banner", "-loglevel", "error"),
+            *("-f", "rawvideo", "-pix_fmt", pixel_format, "-video_size", size),
+            *("-framerate", "25", "-i", "pipe:0", "-filter_complex", graph, "-f", "null", "-"),
+        ]
+        self._temporary = tempfile.TemporaryDirectory(prefix="mp4ds-")
+        self._folder = Path(self._temporary.name)
+        with (self._folder / "stderr").open("wb") as stderr:
             try:
-                process: Any = subprocess.Popen(
+                self._process: Any = subprocess.Popen(
                     command,
-                    cwd=folder,  # a name without a path needs no escapes in a filter
+                    cwd=self._folder,  # a name without a path needs no escapes in a filter
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=stderr,
                     start_new_session=True,  # Ctrl-C is for the one that ends it
                 )
             except OSError as error:
-                raise ScoringError(f"{ffmpeg.path} cannot be run: {error.strerror}.") from None
-            try:
-                yield VmafProcess(process, folder)
-            finally:
-                _end(process)
-
-
-def _command(path: str, width: int, height: int, pixel_format: str, threads: int) -> list[str]:
-    # one picture with the decoded frame over its original: one pipe, and no frame goes astray
-    graph = (
-        f"[0:v]split[above][below];[above]crop={width}:{height}:0:0:exact=1[decoded];"
-        f"[below]crop={width}:{height}:0:{height}:exact=1[reference];"
-        f"[decoded][reference]libvmaf=model=version={VMAF_MODEL}:n_threads={threads}"
-        f":log_fmt=json:log_path={_LOG}"
-    )
-    given = ["-f", "rawvideo", "-pix_fmt", pixel_format, "-video_size", f"{width}x{2 * height}"]
-    return [
-        *(path, "-hide_banner", "-loglevel", "error"),
-        *given,
-        *("-framerate", "25", "-i", "pipe:0", "-filter_complex", graph, "-f", "null", "-"),
-    ]
-
-
-def _end(process: Any) -> None:
-    """End it if it is still running."""
-    with suppress(OSError):
-        process.stdin.close()
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(_END_SECONDS)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-class VmafProcess:
-    """A running ffmpeg, of `scoring_process`."""
-
-    def __init__(self, process: Any, folder: Path) -> None:
-        self._process = process
-        self._folder = folder
+                self._temporary.cleanup()
+                raise ScoringError(f"{path} cannot be run: {error.strerror}.") from None
 
     def write(self, reference: tuple[NDArray[Any], ...], decoded: tuple[NDArray[Any], ...]) -> None:
         """Write the next frame and its original.
@@ -281,7 +237,6 @@ class VmafProcess:
                 for plane in (above, below):
                     self._process.stdin.write(np.ascontiguousarray(plane).data)
         except OSError:
-            self._process.wait()
             raise self._failure() from None
 
     def finish(self) -> NDArray[np.float64]:
@@ -292,21 +247,33 @@ class VmafProcess:
         """
         try:
             self._process.stdin.close()
-        except OSError:
-            self._process.wait()
-            raise self._failure() from None
-        if self._process.wait():
-            raise self._failure()
-        try:
-            log = json.loads((self._folder / _LOG).read_bytes())
-            return np.array([frame["metrics"]["vmaf"] for frame in log["frames"]], np.float64)
+            if not self._process.wait():
+                log = json.loads((self._folder / _LOG).read_bytes())
+                return np.array([frame["metrics"]["vmaf"] for frame in log["frames"]], np.float64)
         except (OSError, ValueError, KeyError, TypeError):
-            raise self._failure() from None
+            pass
+        raise self._failure()
 
     def _failure(self) -> ScoringError:
+        code = self._process.wait()
         lines = (self._folder / "stderr").read_text(errors="replace").strip().splitlines()
         said = f": {lines[-1].strip()}" if lines else ""
-        return ScoringError(f"libvmaf failed (code {self._process.returncode}){said}.")
+        return ScoringError(f"libvmaf failed (code {code}){said}.")
+
+    def __enter__(self) -> VmafProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):
+            self._process.stdin.close()
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(_END_SECONDS)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        self._temporary.cleanup()
 
 
 # ---------------------------------------------------------------- scoring
@@ -333,7 +300,7 @@ def scores_of(
     decoded: Iterable[YuvFrame],
     metrics: Sequence[str] = METRICS,
     *,
-    ffmpeg: Ffmpeg | None = None,
+    ffmpeg: str | None = None,
     threads: int = 1,
     before: YuvFrame | None = None,
 ) -> dict[str, NDArray[np.float64]]:
@@ -366,7 +333,7 @@ def scores_of(
     with ExitStack() as stack:
         process = None
         if ffmpeg is not None and "vmaf" in metrics:
-            opened = scoring_process(
+            opened = VmafProcess(
                 ffmpeg, width=width, height=height, pixel_format=pixel_format, threads=threads
             )
             process = stack.enter_context(opened)

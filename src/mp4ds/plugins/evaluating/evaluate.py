@@ -58,7 +58,7 @@ from mp4ds.video.codecs import (
 from mp4ds.video.encoder import tool_versions
 from mp4ds.video.images import jpeg_bytes
 from mp4ds.video.pixels import rgb_of
-from mp4ds.video.scores import Ffmpeg, find_ffmpeg, scores_of, summary_of
+from mp4ds.video.scores import ffmpeg_version, find_ffmpeg, scores_of, summary_of
 
 _DEFAULT_PRESETS = {
     **dict.fromkeys(AV1, ("6", "8")),
@@ -246,7 +246,7 @@ def evaluate(
         wanted = (camera for camera in found if options.selected(camera.topic))
         cameras = sorted(wanted, key=lambda camera: camera.topic)
         origin = min((int(camera.times[0]) for camera in found), default=0)
-        vmaf = ffmpeg.version if ffmpeg else "none"
+        vmaf = ffmpeg_version(ffmpeg) if ffmpeg else "none"
         versions = {**tool_versions(), "mp4ds": __version__, "vmaf": vmaf}
         result = Evaluation(place, target, [], left_out, versions)
         names = FileNames()
@@ -291,7 +291,7 @@ def _evaluated(
     name: str,
     options: EvaluateOptions,
     settings: Sequence[Setting],
-    ffmpeg: Ffmpeg | None,
+    ffmpeg: str | None,
     tell: Callable[[str, float], None],
 ) -> CameraEvaluation:
     """Try all settings on a camera.

@@ -34,13 +34,20 @@ from mp4ds.video.images import png_file
 from mp4ds.video.packets import PacketReader
 from mp4ds.video.pixels import (
     PLANES_FORMAT,
-    PlaneMaker,
+    PictureConverter,
     Planes,
     PlaneSpool,
     decoded_planes,
     rgb_of,
+    to_planes,
 )
-from mp4ds.video.scores import SMALLEST, ScoreSummary, find_ffmpeg, scores_of, summary_of
+from mp4ds.video.scores import (
+    SMALLEST,
+    ScoreSummary,
+    find_ffmpeg,
+    scores_of,
+    summary_of,
+)
 
 PICTURES = "pictures"
 """The folder of an evaluation for the details shown."""
@@ -563,14 +570,14 @@ def make_clip(camera: Camera, indices: list[int], folder: Path) -> Clip:
     if min(width, height) < SMALLEST:
         raise Refused(f"has images of {width}x{height}, too small to score")
     layout = layout_for(ENCODINGS[encoding], lossless=False)
-    maker, clock = PlaneMaker(layout.pixel_format), PresentationClock()
+    converter, clock = PictureConverter(), PresentationClock()
     size = width + width % 2, height + height % 2
     ticks: list[int] = []
     with closing(PlaneSpool(folder / FRAMES, *size)) as spool:
         for kind, pixels, stamp, log_time in chain([first], shots):
             if kind != first[0]:
                 continue
-            spool.append(maker.make(layout.to_picture(pixels)))
+            spool.append(to_planes(layout.to_picture(pixels), layout.pixel_format, converter))
             ticks.append(clock.tick(stamp, log_time))
         middle = (len(ticks) - 1) // 2
         detail = _detail(spool.frame(middle)[0])
