@@ -20,15 +20,15 @@ from mp4ds.dataset.topic import Topic
 from mp4ds.errors import FormatError, VideoError
 from mp4ds.format.models import References, video_facts
 from mp4ds.format.sidecars import load_stream
-from mp4ds.video.access import Chains
-from mp4ds.video.codecs import CODECS
-from mp4ds.video.mp4 import SampleTable, sample_table_of
-from mp4ds.video.references import (
+from mp4ds.video.access import (
+    Chains,
     Structures,
     digest_video,
     packets_of_groups,
     read_structure,
 )
+from mp4ds.video.codecs import CODECS
+from mp4ds.video.mp4 import SampleTable, sample_table_of
 from sources import SOURCES, scene
 from test_access import written
 from test_references import FRAMES, RECIPES

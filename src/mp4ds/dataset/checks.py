@@ -49,8 +49,8 @@ from mp4ds.format.sidecars import (
 from mp4ds.messages.encodings import ENCODINGS, Encoding, Pixels
 from mp4ds.messages.serializations import MessageSplitter, is_camera
 from mp4ds.records import Message, Record
+from mp4ds.video.access import Structures, digest_video, packets_of_groups
 from mp4ds.video.mp4 import sample_table_of
-from mp4ds.video.references import Structures, digest_video, packets_of_groups
 
 _Report = Callable[[str, float | None], None]
 _TELL_EVERY = 16  # frames

@@ -39,6 +39,14 @@ from mp4ds.messages.serializations import WIRES
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
+from mp4ds.video.access import (
+    MAX_CHARS,
+    MAX_STRUCTURE_CHARS,
+    MAX_STRUCTURES,
+    STRUCTURE_PATTERN,
+    Structures,
+    digest_video,
+)
 from mp4ds.video.codecs import (
     CODECS,
     LEAST_CRF,
@@ -48,14 +56,6 @@ from mp4ds.video.codecs import (
 )
 from mp4ds.video.colour import MATRICES
 from mp4ds.video.pixels import shows_colours
-from mp4ds.video.references import (
-    MAX_CHARS,
-    MAX_STRUCTURE_CHARS,
-    MAX_STRUCTURES,
-    STRUCTURE_PATTERN,
-    Structures,
-    digest_video,
-)
 
 # ---------------------------------------------------------------- references
 

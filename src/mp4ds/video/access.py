@@ -1,7 +1,9 @@
-"""Frames of a video by number, decoding only what they depend on."""
+"""What the frames of a video refer to, and frames by number, decoding only what they depend on."""
 
 from __future__ import annotations
 
+import hashlib
+from array import array
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,20 +18,238 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from mp4ds.errors import FormatError, Refused, VideoError, reason_of
+from mp4ds.files.outputs import digest_file
 from mp4ds.files.ranges import expect
 from mp4ds.messages.encodings import Picture, Pixels
 from mp4ds.video.codecs import CODECS
 from mp4ds.video.coded import StreamParser, UnknownStructure
 from mp4ds.video.decoder import JpegDecoder, VideoDecoder, VideoFile, open_packet_decoder
 from mp4ds.video.media import raise_if_scarce
-from mp4ds.video.mp4 import SampleTable, read_sample_table
+from mp4ds.video.mp4 import SampleTable, read_sample_table, sample_table_of
 from mp4ds.video.pixels import PictureMaker, Scale
-from mp4ds.video.references import (
-    StructureError,
-    Structures,
-    packets_of_groups,
-    read_structure,
-)
+
+# ---------------------------------------------------------------- structures
+
+MAX_STRUCTURES = 256
+"""Maximum number of distinct ones in a video; one that has more is not described."""
+
+MAX_STRUCTURE_CHARS = 2**16
+MAX_CHARS = 2**20
+"""Maximum total length of all structures of a video."""
+
+_FRAME = r"(k|[1-9][0-9]{0,5}(,[1-9][0-9]{0,5})*)"
+_PACKET = rf"{_FRAME}(\+{_FRAME})*"
+STRUCTURE_PATTERN = rf"^k(\+{_FRAME})*( {_PACKET})*$"
+
+_BLOCK = 2**20
+_KEY = "k"
+
+Needs = tuple[int, ...]
+"""Numbers of the coded frames that a frame refers to, counted from its key frame."""
+
+
+class StructureError(ValueError):
+    """A structure contradicts itself; the text says how."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structures:
+    """The structures of a video's groups of pictures.
+
+    Attributes:
+        texts: The distinct structures.
+        groups: Number of each group's structure, int64, shape (groups,).
+    """
+
+    texts: Sequence[str]
+    groups: NDArray[np.int64]
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether every frame needs the one before it, so that none can be skipped."""
+        return all(
+            frame.startswith("1,") or frame == "1"
+            for text in self.texts
+            for frame in text.replace("+", " ").split(" ")[1:]
+        )
+
+    def check(self) -> None:
+        """Refuse a structure that contradicts itself.
+
+        Raises:
+            StructureError: One does; see `read_structure`.
+        """
+        for text in self.texts:
+            read_structure(text)
+
+    def mismatch(self, packets: NDArray[np.int64]) -> str:
+        """Why these cannot be the structures of a video, in words; empty if they can.
+
+        Args:
+            packets: Of each group, shape (groups,).
+        """
+        if len(self.groups) != len(packets):
+            return (
+                f"they are of {len(self.groups)} groups of pictures, of which it has {len(packets)}"
+            )
+        if len(self.groups) and not 0 <= self.groups.min() <= self.groups.max() < len(self.texts):
+            return "they name a structure that is not there"
+        due = np.array([text.count(" ") + 1 for text in self.texts], np.int64)[self.groups]
+        wrong = np.flatnonzero(due != packets)
+        if len(wrong):
+            first = int(wrong[0])
+            return (
+                f"they are of {due[first]} packets in group of pictures {first}, "
+                f"which has {packets[first]}"
+            )
+        return ""
+
+
+def read_structure(text: str) -> list[list[Needs]]:
+    """What the coded frames of each packet of a group need.
+
+    Args:
+        text: Matches `STRUCTURE_PATTERN`.
+
+    Raises:
+        StructureError: A frame needs one before the key frame, or distances do not increase.
+    """
+    packets: list[list[Needs]] = []
+    number = 0
+    for packet in text.split(" "):
+        frames: list[Needs] = []
+        for frame in packet.split("+"):
+            distances = () if frame == _KEY else tuple(map(int, frame.split(",")))
+            if any(one >= other for one, other in pairwise(distances)):
+                raise StructureError(f"the distances {frame[:40]} do not increase")
+            if distances and distances[-1] > number:
+                raise StructureError(
+                    f"packet {len(packets)} refers to {distances[-1]} frames back, "
+                    f"before the key frame"
+                )
+            frames.append(tuple(number - distance for distance in distances))
+            number += 1
+        packets.append(frames)
+    return packets
+
+
+def find_structures(
+    codec: str, configuration: bytes, packets: Iterable[tuple[bytes, bool]]
+) -> Structures | None:
+    """The structures of a video.
+
+    Memory is bounded by `MAX_CHARS` and eight bytes per group of pictures.
+
+    Args:
+        codec: Name in the registry.
+        configuration: Of the track, as for its `StreamParser`.
+        packets: As the mp4 holds them, each with whether the file says that decoding can begin
+            there, in the order coded.
+
+    Returns:
+        None if the references of a frame are not known, or there are too many structures, or they
+        are too long.
+    """
+    numbers: dict[str, int] = {}
+    groups = array("q")
+    try:
+        for text in _texts(codec, configuration, packets):
+            groups.append(numbers.setdefault(text, len(numbers)))
+            if len(numbers) > MAX_STRUCTURES or sum(map(len, numbers)) > MAX_CHARS:
+                return None
+    except UnknownStructure:
+        return None
+    return Structures(tuple(numbers), np.array(groups, np.int64)) if groups else None
+
+
+def _texts(
+    codec: str, configuration: bytes, packets: Iterable[tuple[bytes, bool]]
+) -> Iterator[str]:
+    """The structure of each group."""
+    parser: StreamParser | None = None
+    texts: list[str] = []
+    for packet, is_key in packets:
+        if is_key:
+            if texts:
+                yield " ".join(texts)
+            texts, parser = [], CODECS[codec].parser(configuration)
+            chars = 0
+        if parser is None:
+            raise UnknownStructure("it comes before the first key frame")
+        frames = parser.frames(packet, key=is_key)
+        if [frame.shown for frame in frames] != [False] * (len(frames) - 1) + [True]:
+            raise UnknownStructure("it does not end with the only picture that it shows")
+        texts.append("+".join(",".join(map(str, f.references)) or _KEY for f in frames))
+        chars += len(texts[-1]) + 1
+        if chars > MAX_STRUCTURE_CHARS:
+            raise UnknownStructure("its structure is too long")
+    if texts:
+        yield " ".join(texts)
+
+
+# ---------------------------------------------------------------- digest
+
+
+def digest_video(path: Path, codec: str) -> tuple[int, str, Structures | None]:
+    """Hash a video, and find what its frames refer to.
+
+    Memory is one packet, and the video's index.
+
+    Args:
+        path: An mp4.
+        codec: Name in the registry.
+
+    Returns:
+        Bytes of the file, its SHA-256, and what its frames refer to, if known.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    table = _table(path, codec)
+    if table is None:
+        return *digest_file(path), None
+    digest = hashlib.sha256()
+    with path.open("rb") as file:  # read once: it may be large, and far away
+        found = find_structures(
+            codec, table.entry.configuration, _packets(file, table, digest.update)
+        )
+        _pass(file, digest.update)
+        return file.tell(), digest.hexdigest(), found
+
+
+def _table(path: Path, codec: str) -> SampleTable | None:
+    if codec not in CODECS or not CODECS[codec].is_free:
+        return None
+    try:
+        table = sample_table_of(path)
+    except (VideoError, Refused):
+        return None
+    if np.any(table.places[1:] < (table.places + table.sizes)[:-1]):
+        return None  # a forged index could have the whole file read for each packet
+    return table
+
+
+def _packets(
+    file: BinaryIO, table: SampleTable, seen: Callable[[bytes], object]
+) -> Iterator[tuple[bytes, bool]]:
+    columns = (table.places.tolist(), table.sizes.tolist(), table.sync.tolist())
+    for place, size, is_key in zip(*columns, strict=True):
+        _pass(file, seen, place)
+        packet = file.read(size)
+        seen(packet)
+        yield packet, is_key
+
+
+def _pass(file: BinaryIO, seen: Callable[[bytes], object], end: int | None = None) -> None:
+    """Show what there is up to a place, or to the end of the file."""
+    while block := file.read(_BLOCK if end is None else min(_BLOCK, end - file.tell())):
+        seen(block)
+
+
+def packets_of_groups(table: SampleTable) -> NDArray[np.int64]:
+    """How many packets each group of pictures has, shape (groups,)."""
+    return np.diff(np.append(np.flatnonzero(table.sync), len(table.sync)))
+
 
 # ---------------------------------------------------------------- chains
 
@@ -263,7 +483,10 @@ class FrameReader:
         self._file: BinaryIO = self._path.open("rb")
         try:
             self.table = self._read_table()
-            recorded = self._recorded(references) if references else None
+            try:
+                recorded = references(packets_of_groups(self.table)) if references else None
+            except ValueError as error:
+                raise self._unfit(error) from None
             self._chains = Chains(self.table, self._codec, self._packet, recorded)
         except BaseException:
             self._file.close()
@@ -303,12 +526,6 @@ class FrameReader:
                 "it has trailing frames that are not shown, or does not start with a key frame"
             )
         return table
-
-    def _recorded(self, references: Callable[[NDArray[np.int64]], Structures]) -> Structures:
-        try:
-            return references(packets_of_groups(self.table))
-        except ValueError as error:
-            raise self._unfit(error) from None
 
     def _unfit(self, error: ValueError) -> FormatError:
         return FormatError(
@@ -383,27 +600,24 @@ class FrameReader:
     def _decoded(self, group: Group, missing: list[int]) -> Iterator[av.VideoFrame]:
         self._announce(dict.fromkeys(group.pieces[number].sample for number in missing))
         sample, packet = -1, b""
-        for number in missing:
-            piece = group.pieces[number]
+        for place in missing:
+            piece = group.pieces[place]
             if piece.sample != sample:
                 sample, packet = piece.sample, self._packet(piece.sample)
-            data = av.Packet(self._cut(group, piece, packet))
+            try:
+                data = av.Packet(self._chains.cut(group, piece, packet))
+            except Refused as error:
+                number = int(self._numbers[piece.sample])
+                problem = f"is damaged: {error}"
+                raise VideoError("decode-failed", self._path, problem, frame=number) from None
             data.pts = data.dts = sample
             # else ffmpeg adds a PNG file to the picture before it
             data.is_keyframe = bool(self.table.sync[sample])
-            self._fed.add(number)
+            self._fed.add(place)
             yield from self._context.decode(data)
         # some decoders hold frames back; once they gave them they take nothing more
         self._group = None
         yield from self._context.decode(None)
-
-    def _cut(self, group: Group, piece: Piece, packet: bytes) -> bytes:
-        try:
-            return self._chains.cut(group, piece, packet)
-        except Refused as error:
-            number = int(self._numbers[piece.sample])
-            problem = f"is damaged: {error}"
-            raise VideoError("decode-failed", self._path, problem, frame=number) from None
 
     def _begin(self, group: Group, wanted: list[int]) -> list[int]:
         """Numbers of the pieces that the decoder is still to be given, in the order coded.
