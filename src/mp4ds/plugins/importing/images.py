@@ -22,7 +22,7 @@ from mp4ds.format.sidecars import MANIFEST_NAME, model_problems
 from mp4ds.messages.wire import CalibrationFields
 from mp4ds.packing.options import ImportOptions, plugin
 from mp4ds.plugins.importing.reader import ImagesReader, reading
-from mp4ds.video.clips import Clip, open_video
+from mp4ds.video.decoder import Clip, open_video
 from mp4ds.video.images import STILL_SUFFIXES, image_size
 
 MAX_STAMP = 2**31 * 10**9 - 1

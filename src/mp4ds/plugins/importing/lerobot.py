@@ -23,7 +23,7 @@ from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, LEROBOT_SCALE, DepthScal
 from mp4ds.plugins.importing.images import MAX_STAMP
 from mp4ds.plugins.importing.reader import ImagesReader
 from mp4ds.times import nearest
-from mp4ds.video.clips import Clip, open_video
+from mp4ds.video.decoder import Clip, open_video
 
 _INFO = "meta/info.json"
 

@@ -44,7 +44,7 @@ from mp4ds.records import (
 )
 from mp4ds.unpacking.pictures import KINDS, csv_cell
 from mp4ds.unpacking.republish import Types
-from mp4ds.video.clips import Clip
+from mp4ds.video.decoder import Clip
 from mp4ds.video.images import read_image
 
 _INFO = "sensor_msgs/msg/CameraInfo"
