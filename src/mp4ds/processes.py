@@ -170,8 +170,15 @@ class ProcessExecutor(Executor):
             answer: object = None
             try:
                 for _ in range(2):  # once more if its process was killed
-                    if process is None or not process.is_ready:
-                        process = self._in_place_of(process)
+                    if process is not None and not process.is_ready:
+                        self._processes.discard(process)
+                        process.close()
+                        process = None
+                    if process is None:
+                        process = _Process(self._nice)
+                        self._processes.add(process)
+                        if self._is_ended:
+                            process.terminate()
                     answer = process.make(call)
                     if self._is_ended or not process.was_killed:
                         break
@@ -181,16 +188,6 @@ class ProcessExecutor(Executor):
                 future.set_exception(answer)
             else:
                 future.set_result(answer)
-
-    def _in_place_of(self, old: _Process | None) -> _Process:
-        if old is not None:
-            self._processes.discard(old)
-            old.close()
-        process = _Process(self._nice)
-        self._processes.add(process)
-        if self._is_ended:
-            process.terminate()
-        return process
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Take no more calls.

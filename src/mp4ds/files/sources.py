@@ -174,7 +174,9 @@ class SourceState:
         """
         try:
             if is_folder(path):
-                return cls._of_folder(path)
+                digest = xxhash.xxh64()
+                size, latest = _add_listing(digest, members(path))
+                return cls(spelled(path), size, latest, digest.hexdigest())
             stat = path.stat()
             found = remote(path)
             if found and found.tag:
@@ -190,12 +192,6 @@ class SourceState:
         except OSError as error:
             raise SourceError(path, f"cannot be read: {error.strerror}") from None
         return cls(spelled(path), stat.st_size, stat.st_mtime_ns, digest.hexdigest())
-
-    @classmethod
-    def _of_folder(cls, folder: Path) -> SourceState:
-        digest = xxhash.xxh64()
-        size, latest = _add_listing(digest, members(folder))
-        return cls(spelled(folder), size, latest, digest.hexdigest())
 
     def check(self) -> None:
         """Refuse the file if it has changed.

@@ -478,10 +478,9 @@ def _explained(error: BaseException) -> tuple[str, str]:
 def _causes(error: BaseException) -> Iterator[BaseException]:
     cause: BaseException | None = error
     for _ in range(_MAX_CAUSES):
-        if cause is None:
-            return
-        yield cause
-        cause = cause.__cause__
+        if cause is not None:
+            yield cause
+            cause = cause.__cause__
 
 
 def _status(error: BaseException) -> int | None:

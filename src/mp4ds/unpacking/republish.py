@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -48,13 +48,6 @@ def republished_topic(topic: str, type_name: str, kind: str) -> str:
     if suffix is None:
         return stem if has_transport else f"{topic}/raw"
     return f"{stem}/{suffix}"
-
-
-def free_topic(topic: str, kind: str, taken: Collection[str]) -> str:
-    """A topic, or one made from it and its kind, one of `KINDS`, where it is taken."""
-    while topic in taken:
-        topic += "_" + kind.replace("-", "_")
-    return topic
 
 
 # ---------------------------------------------------------------- republisher
@@ -132,8 +125,10 @@ class Republisher:
         staying = [channel for channel in dataset.channels if channel.id not in emptied]
         self.channels = [channel for channel in staying if selected(channel.topic)]
         self._declare(dataset, planned, {channel.topic for channel in staying})
-        if kind:
-            self._count_verbatim(dataset, selected)
+        cameras = {channel.topic for channel in dataset.channels if is_camera(channel)}
+        for entry in dataset.manifest.verbatim if kind and dataset.manifest else []:
+            if entry.topic in cameras and selected(entry.topic):
+                self.as_recorded[entry.topic][f"stored verbatim: {entry.reason}"] += entry.messages
 
     @property
     def omitted(self) -> Mapping[str, int]:
@@ -232,10 +227,13 @@ class Republisher:
                 kind = conversion.form.kind
                 if not conversion.form.in_place and kind not in made:
                     wanted = republished_topic(recorded.topic, recorded.type_name, kind)
-                    if (recorded.topic, kind) not in topics:
-                        topics[recorded.topic, kind] = free_topic(wanted, kind, taken)
-                        taken.add(topics[recorded.topic, kind])
-                    topic = topics[recorded.topic, kind]
+                    key = recorded.topic, kind
+                    if key not in topics:
+                        topics[key] = wanted
+                        while topics[key] in taken:
+                            topics[key] += "_" + kind.replace("-", "_")
+                        taken.add(topics[key])
+                    topic = topics[key]
                     types = self._types_of(self._world, kind)
                     made[kind] = types.channel(recorded, next_id + len(self._made), topic)
                     self._made.add(made[kind].id)
@@ -245,12 +243,6 @@ class Republisher:
                     self.republished.setdefault(recorded.topic, known)
                 channel = None if conversion.form.in_place else made[kind]
                 self.sources[conversion.stream] = partial(self._messages, conversion, channel)
-
-    def _count_verbatim(self, dataset: Dataset, selected: Callable[[str], bool]) -> None:
-        cameras = {channel.topic for channel in dataset.channels if is_camera(channel)}
-        for entry in dataset.manifest.verbatim if dataset.manifest else []:
-            if entry.topic in cameras and selected(entry.topic):
-                self.as_recorded[entry.topic][f"stored verbatim: {entry.reason}"] += entry.messages
 
     # ------------------------------------------------------------ messages
 

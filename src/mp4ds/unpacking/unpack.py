@@ -163,7 +163,9 @@ def unpack(
         if not chosen.salvage:
             stack.enter_context(advising("`salvage` restores what can be read."))
         if to is None:
-            to = _format_of(output) or _own_format(dataset, chosen)
+            suffix = PurePath(output).suffix if output else ""
+            named = (to for to, its_own in SUFFIXES.items() if its_own and its_own == suffix)
+            to = next(named, None) or _own_format(dataset, chosen)
         _check(to, chosen)
         given = local_target(output) if output else None
         whole, losses = _opened(dataset, chosen, verify=to != "images" and not chosen.slice)
@@ -178,8 +180,9 @@ def unpack(
                     losses += examine(stream)
             if not chosen.salvage:
                 whole.verify_sidecars(chosen.selected)
-            if to == "images":
-                reads_all = _needs_messages(whole, chosen)
+            if to == "images":  # some of which are verbatim
+                verbatim = whole.manifest.verbatim if whole.manifest and not chosen.slice else ()
+                reads_all = any(chosen.selected(item.topic) for item in verbatim)
             else:  # a slice is filtered out where log times do not tell the order
                 reads_all = bool(chosen.slice) and not whole.is_in_time
             if reads_all:
@@ -187,7 +190,13 @@ def unpack(
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
             part = slice_of(whole, chosen.slice, chosen.selected)
-            if to == "images" or chosen.images or _has_replaced(whole, chosen):
+            # messages with packets of a view instead of those recorded are converted, too
+            is_replaced = any(
+                stream.sidecar.replaces_packets
+                for stream in whole.streams
+                if chosen.selected(stream.topic)
+            )
+            if to == "images" or chosen.images or is_replaced:
                 # whose frames are counted from the slice's first one
                 with sliced(whole, part, path.parent, chosen.selected) as opened:
                     if to == "images":
@@ -225,19 +234,6 @@ def _opened(
     if layer is None:
         opened.require_exact(selected)
     return opened, losses
-
-
-def _has_replaced(dataset: Dataset, options: UnpackOptions) -> bool:
-    """Whether some selected messages hold packets of a view instead of those recorded."""
-    chosen = (stream for stream in dataset.streams if options.selected(stream.topic))
-    return any(stream.sidecar.replaces_packets for stream in chosen)
-
-
-def _needs_messages(dataset: Dataset, options: UnpackOptions) -> bool:
-    """Whether images of selected topics are stored verbatim, and all of them are wanted."""
-    manifest = dataset.manifest
-    verbatim = manifest.verbatim if manifest and not options.slice else ()
-    return any(options.selected(item.topic) for item in verbatim)
 
 
 def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
@@ -326,12 +322,6 @@ def _unpack_one(
     return unpack(dataset, to, output, options)
 
 
-def _format_of(output: Path | str | None) -> str | None:
-    """The format that the name of an output has as its suffix."""
-    suffix = PurePath(output).suffix if output else ""
-    return next((to for to, its_own in SUFFIXES.items() if its_own and its_own == suffix), None)
-
-
 def _own_format(dataset: Path | str, options: UnpackOptions) -> str:
     opened, _ = _opened(dataset, options)
     with opened:
@@ -411,14 +401,18 @@ def _unpack_recording(
         total = _total(dataset, reader, selected)
         done = found = 0
         for record in reader.records(Excerpt(topics=frozenset(wanted))):
-            if not isinstance(record, Message):
-                _write_other(writer, record, to, source)
-                continue
-            found += 1
-            if topics.write(record):
-                done += 1
-                if progress and done % 16 == 0:
-                    progress(UnpackProgress(done, total))
+            if isinstance(record, Attachment):
+                writer.add_attachment(record)
+            elif isinstance(record, MetadataRecord):
+                # our record of a rosbag2 folder is useless in another format
+                if to == "rosbag2" or source != "rosbag2" or not record.name.startswith(_OURS):
+                    writer.add_metadata(record)
+            else:
+                found += 1
+                if topics.write(record):
+                    done += 1
+                    if progress and done % 16 == 0:
+                        progress(UnpackProgress(done, total))
         if dataset.is_salvaged:
             _account_for(total - found, summary.losses)
         elif found != total:
@@ -536,18 +530,6 @@ def _refusal(problems: dict[str, str]) -> ConversionError:
         + ", leave out and count with `skip_unconvertible`, or unpack to mcap, which keeps "
         "everything unchanged.",
     )
-
-
-def _write_other(
-    writer: BagWriter, record: Attachment | MetadataRecord, to: str, source: str
-) -> None:
-    if isinstance(record, Attachment):
-        writer.add_attachment(record)
-        return
-    # our record of a rosbag2 folder is useless in another format
-    ours = source == "rosbag2" and record.name.startswith(_OURS)
-    if not ours or to == "rosbag2":
-        writer.add_metadata(record)
 
 
 def _unpack_images(

@@ -368,8 +368,10 @@ class Av1(StreamParser):
         sequence = self._sequence
         if sequence is None:
             raise UnknownStructure("its sequence header was not sent before it")
-        if data[obu.start] & 4:
-            _check_layer(data[obu.start + 1], sequence.layers)
+        if data[obu.start] & 4:  # decoders skip it, or show it together with another (5.3.3)
+            temporal, spatial = data[obu.start + 1] >> 5, data[obu.start + 1] >> 3 & 3
+            if spatial or (sequence.layers and not sequence.layers >> temporal & 1):
+                raise UnknownStructure("its AV1 has layers that decoders leave out")
         header = _parse_header(data, obu, sequence)
         number = self._number
         begins = header.is_key
@@ -444,10 +446,3 @@ class Av1(StreamParser):
     def has_parameters(cls, plain: bytes) -> bool:
         """Whether it has a sequence header."""
         return bool(sequence_header(plain))
-
-
-def _check_layer(extension: int, layers: int) -> None:
-    """Refuse a frame that decoders skip, or show together with another (5.3.3)."""
-    temporal, spatial = extension >> 5, extension >> 3 & 3
-    if spatial or (layers and not layers >> temporal & 1):
-        raise UnknownStructure("its AV1 has layers that decoders leave out")

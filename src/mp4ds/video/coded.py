@@ -408,7 +408,10 @@ def parse_jpeg(data: bytes | memoryview) -> tuple[int, int, int]:
             if found is None:
                 raise Refused("its JPEG has a scan before its frame header")
             scans += 1
-            offset = _skip_coded_data(data, offset)
+            coded = _MARKER.search(data, offset)
+            if coded is None:
+                raise Refused("its JPEG is cut short: it has no end-of-image marker")
+            offset = coded.start()
     else:
         raise Refused(f"its JPEG has more than {_MAX_SEGMENTS} segments")
     if found is None or not scans:
@@ -435,13 +438,6 @@ def _segment(data: memoryview, offset: int) -> memoryview:
     if length < 2 or offset + length > len(data):
         raise Refused("its JPEG is cut short, or a length in it is wrong")
     return data[offset + 2 : offset + length]
-
-
-def _skip_coded_data(data: memoryview, offset: int) -> int:
-    found = _MARKER.search(data, offset)
-    if found is None:
-        raise Refused("its JPEG is cut short: it has no end-of-image marker")
-    return found.start()
 
 
 def _frame(segment: memoryview) -> tuple[int, int, int]:

@@ -136,21 +136,17 @@ class PictureOrder:
 
     Attributes:
         is_broken: Whether one was sent after another that is shown later.
+        last: The count of the last picture since the order was restarted; None: there is none.
     """
 
     def __init__(self) -> None:
         self._msb = self._lsb = 0
-        self._last: int | None = None
+        self.last: int | None = None
         self.is_broken = False
-
-    @property
-    def has_begun(self) -> bool:
-        """Whether there was a picture since the last restart."""
-        return self._last is not None
 
     def restart(self, lsb: int = 0) -> None:
         """Start over, from low bits."""
-        self._msb, self._lsb, self._last = 0, lsb, None
+        self._msb, self._lsb, self.last = 0, lsb, None
 
     def take(self, lsb: int, bits: int, *, counts: bool = True) -> None:
         """Compare a picture with the last one.
@@ -168,9 +164,9 @@ class PictureOrder:
         order = msb + lsb
         if counts:
             self._msb, self._lsb = msb, lsb
-        if self._last is not None and order <= self._last:
+        if self.last is not None and order <= self.last:
             self.is_broken = True
-        self._last = order
+        self.last = order
 
 
 # ---------------------------------------------------------------- parsers of units

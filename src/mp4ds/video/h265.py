@@ -163,7 +163,7 @@ class H265(UnitParser):
             self._order.is_broken = True
         elif sps.reorder:
             lsb = 0 if kind in _IDR else reader.bits(sps.poc_bits)
-            if kind in _RESTARTS_ORDER or not self._order.has_begun:
+            if kind in _RESTARTS_ORDER or self._order.last is None:
                 self._order.restart(lsb)
             self._order.take(lsb, sps.poc_bits)
         if self._order.is_broken:

@@ -236,22 +236,16 @@ def _parse_description(file: BinaryIO, stsd: Box) -> SampleEntry:
     values_end = entry.start + _ENTRY_BYTES
     parts = []
     for box in boxes(file, values_end, entry.end):
-        if box.kind != b"btrt":
-            body = data[box.start : box.end]
-            body = _without_rates(body) if box.kind == b"esds" else body
-            parts.append((box.kind.decode("latin-1"), body))
+        if box.kind == b"btrt":
+            continue
+        body = data[box.start : box.end]
+        # an elementary stream descriptor as ffmpeg writes it, whose size of a buffer and rates are
+        # left out (ISO/IEC 14496-1, 7.2.6.5 and 7.2.6.6): tags, each with a length of four bytes,
+        # an ES_ID and flags of three bytes, and two bytes that tell the codec
+        if box.kind == b"esds" and body[4:5] == b"\3" and body[12:13] == b"\4" and len(body) >= 30:
+            body = body[:19] + bytes(11) + body[30:]
+        parts.append((box.kind.decode("latin-1"), body))
     return SampleEntry(entry.kind.decode("latin-1"), data[entry.start : values_end], tuple(parts))
-
-
-def _without_rates(esds: bytes) -> bytes:
-    """An elementary stream descriptor as ffmpeg writes it, with its size of a buffer and rates 0.
-
-    ISO/IEC 14496-1, 7.2.6.5 and 7.2.6.6: tags, each with a length of four bytes, an ES_ID and
-    flags of three bytes, and two bytes that tell the codec.
-    """
-    if esds[4:5] != b"\3" or esds[12:13] != b"\4" or len(esds) < 30:
-        return esds
-    return esds[:19] + bytes(11) + esds[30:]
 
 
 # ---------------------------------------------------------------- samples

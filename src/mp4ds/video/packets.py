@@ -391,7 +391,12 @@ def _write(
     try:
         with closing(Media(segments[0])) as source, closing(new_mp4(target)) as container:
             codec = source.track.codec_context.codec.canonical_name
-            stream = _new_stream(container, source.track, entry)
+            stream = container.add_stream_from_template(source.track, opaque=True)
+            stream.time_base = TIME_BASE
+            # the segment's bit rates, and what ffmpeg may have found of an aspect ratio in its
+            # first packets that its track does not state
+            stream.codec_context.bit_rate = 0
+            stream.codec_context.sample_aspect_ratio = entry.aspect_ratio
             try:
                 for segment in segments:
                     with PacketReader(segment, codec=codec) as reader:
@@ -450,19 +455,6 @@ def _check(path: Path, codec: str, written: _Written, entry: SampleEntry, place:
     if difference := entry.differences(entry_of(path)):
         problem = f"differs from the segments it was made of in {difference}"
         raise VideoError("decode-failed", place, problem)
-
-
-def _new_stream(container: Any, template: Any, entry: SampleEntry) -> Any:
-    """A track described as the segments' tracks are.
-
-    The template has its segment's bit rates, and ffmpeg may have found an aspect ratio in its first
-    packets that the segment's track does not state.
-    """
-    stream = container.add_stream_from_template(template, opaque=True)
-    stream.time_base = TIME_BASE
-    stream.codec_context.bit_rate = 0
-    stream.codec_context.sample_aspect_ratio = entry.aspect_ratio
-    return stream
 
 
 def _last_duration(path: Path) -> int:
