@@ -247,11 +247,7 @@ class Republisher:
     # ------------------------------------------------------------ messages
 
     def _messages(
-        self,
-        conversion: Conversion,
-        made: Channel | None,
-        recorded: Channel,
-        choice: Choice,
+        self, conversion: Conversion, made: Channel | None, recorded: Channel, choice: Choice
     ) -> Iterator[tuple[int, Message]]:
         """The messages of a stream, each with its ordinal in the recorded channel."""
         stream = conversion.stream

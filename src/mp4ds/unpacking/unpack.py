@@ -35,15 +35,7 @@ from mp4ds.files.urls import remote
 from mp4ds.format.sidecars import MANIFEST_NAME, FileNames
 from mp4ds.options import WHAT, Selection, SliceOptions, force, jpeg_quality, latched, option
 from mp4ds.processes import each
-from mp4ds.records import (
-    Attachment,
-    Channel,
-    Excerpt,
-    Loss,
-    Message,
-    MetadataRecord,
-    bounded,
-)
+from mp4ds.records import Attachment, Channel, Excerpt, Loss, Message, MetadataRecord, bounded
 from mp4ds.unpacking.pictures import KINDS, FrameOptions, TopicImages, image_names, shown_by_packets
 from mp4ds.unpacking.republish import Republished, Republisher
 
@@ -457,12 +449,7 @@ class _Topics:
     """The channels of a recording that is written."""
 
     def __init__(
-        self,
-        writer: BagWriter,
-        republisher: Republisher,
-        summary: UnpackSummary,
-        *,
-        may_skip: bool,
+        self, writer: BagWriter, republisher: Republisher, summary: UnpackSummary, *, may_skip: bool
     ) -> None:
         self._may_skip = may_skip
         self._writer = writer

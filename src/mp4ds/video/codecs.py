@@ -194,10 +194,7 @@ _LOSSLESS: dict[str, dict[str, _Coding]] = {
         "ffv1": _Coding("ffv1", "gray10le", _FFV1),
         "h265": _x265_lossless("gray10le"),
     },
-    "gray12le": {
-        "ffv1": _Coding("ffv1", "gray12le", _FFV1),
-        "h265": _x265_lossless("gray12le"),
-    },
+    "gray12le": {"ffv1": _Coding("ffv1", "gray12le", _FFV1), "h265": _x265_lossless("gray12le")},
     "gray14le": {"ffv1": _Coding("ffv1", "gray14le", _FFV1)},
     "gray16le": {"ffv1": _Coding("ffv1", "gray16le", _FFV1)},
     **{

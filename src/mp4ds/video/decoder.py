@@ -134,11 +134,7 @@ class PacketPictures(Generic[_Item]):
         self._parser = CODECS[codec].parser
         self._decoder = open_packet_decoder(codec, size)
         self._maker = PictureMaker(
-            Path(),
-            coded_size=size,
-            picture_format=picture_format,
-            picture_size=size,
-            matrix=None,
+            Path(), coded_size=size, picture_format=picture_format, picture_size=size, matrix=None
         )
         self._waiting: deque[_Item] = deque()
         self._next = 0  # number of the first that waits

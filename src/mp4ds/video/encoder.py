@@ -18,22 +18,9 @@ from av.error import FFmpegError
 
 from mp4ds.errors import EncoderRefusedError, OptionError
 from mp4ds.messages import png
-from mp4ds.messages.encodings import (
-    MAX_SIDE,
-    Encoding,
-    LayoutParameters,
-    Picture,
-    Pixels,
-)
+from mp4ds.messages.encodings import MAX_SIDE, Encoding, LayoutParameters, Picture, Pixels
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit
-from mp4ds.video.codecs import (
-    ARCHIVE,
-    TRAINING,
-    Recipe,
-    codecs_to_try,
-    lossless_codecs,
-    recipe_for,
-)
+from mp4ds.video.codecs import ARCHIVE, TRAINING, Recipe, codecs_to_try, lossless_codecs, recipe_for
 from mp4ds.video.colour import samples
 from mp4ds.video.decoder import open_packet_decoder
 from mp4ds.video.media import TIME_BASE, Mp4Writer, new_mp4, raise_if_scarce, rate_hint

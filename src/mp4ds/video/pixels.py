@@ -109,10 +109,7 @@ _VIA_PLANES = ("rgb24", "bgr24")
 _ROUNDED = ("yuv420p", TEN_BITS)
 _VIEWED = ("gray", "gray16le", *_PACKED)  # PyAV makes frames of their arrays without a copy
 # x264 codes grey with neutral chroma; full range has a name of its own in some decoders
-_DECODED_AS = {
-    "gray": ("gray", "yuv420p", "yuvj420p"),
-    "gray10le": ("gray10le", "yuv420p10le"),
-}
+_DECODED_AS = {"gray": ("gray", "yuv420p", "yuvj420p"), "gray10le": ("gray10le", "yuv420p10le")}
 
 
 @dataclass(frozen=True, slots=True)
