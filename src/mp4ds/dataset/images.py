@@ -200,21 +200,6 @@ class Images(ABC):
 
     # ------------------------------------------------------------ damage
 
-    def name_of(self, first: int, last: int | None = None) -> str:
-        """What errors call a frame, or several in a row: by number, topic and times.
-
-        Args:
-            first: 0 <= first < frames.
-            last: The last one; None for one frame.
-        """
-        ends = [first] if last in (None, first) else [first, last]
-        frames = f"frame{'s' * (len(ends) - 1)} {' to '.join(map(str, ends))}"
-        stamps, times = (
-            " to ".join(seconds_text(int(column[index])) for index in ends)
-            for column in (self.stamps, self.log_times)
-        )
-        return f"{frames} of {self.topic} (stamp {stamps}, log time {times})"
-
     @contextmanager
     def naming_frames(self) -> Iterator[None]:
         """Give errors that have the number of a frame its topic and times."""
@@ -234,7 +219,13 @@ class Images(ABC):
         # a damaged video may have more frames than its sidecar
         if error.frame is None or error.name or error.frame >= len(self.stamps):
             return error
-        name = self.name_of(error.frame, last)
+        ends = [error.frame] if last in (None, error.frame) else [error.frame, last]
+        frames = f"frame{'s' * (len(ends) - 1)} {' to '.join(map(str, ends))}"
+        stamps, times = (
+            " to ".join(seconds_text(int(column[index])) for index in ends)
+            for column in (self.stamps, self.log_times)
+        )
+        name = f"{frames} of {self.topic} (stamp {stamps}, log time {times})"
         return type(error)(error.code, error.place, error.what, frame=error.frame, name=name)
 
 
@@ -345,7 +336,14 @@ def shown_by(channel: Channel, parts: Parts) -> Shown:
     """
     fields = parts.fields
     if isinstance(fields, ImageFields):
-        return _raw(parts.body, fields)
+        size = {"width": fields.width, "height": fields.height, "step": fields.step}
+        raw = ENCODINGS.get(fields.encoding)
+        due = raw.size(fields.step, fields.height) if raw else 0
+        reason = why_not(fields.encoding, **size, size=min(len(parts.body), due))
+        if raw is None or reason:
+            raise Refused(reason)
+        view = pixel_view(parts.body, raw, **size, is_bigendian=bool(fields.is_bigendian))
+        return Shown(raw.name, view.astype(view.dtype.newbyteorder("="), copy=False))
     if not isinstance(fields, CodedFields):
         raise Refused("it holds no image")
     if not channel.type_name.endswith("CompressedImage"):
@@ -361,17 +359,6 @@ def shown_by(channel: Channel, parts: Parts) -> Shown:
     encoding, pixels = coded_pixels(parts.body)
     is_jpeg = bytes(parts.body[: len(_JPEG)]) == _JPEG
     return Shown(encoding, pixels, file=parts.body if is_jpeg else None)
-
-
-def _raw(body: memoryview, fields: ImageFields) -> Shown:
-    encoding = ENCODINGS.get(fields.encoding)
-    size = {"width": fields.width, "height": fields.height, "step": fields.step}
-    due = encoding.size(fields.step, fields.height) if encoding else 0
-    if reason := why_not(fields.encoding, **size, size=min(len(body), due)):
-        raise Refused(reason)
-    is_bigendian = bool(fields.is_bigendian)
-    view = pixel_view(body, ENCODINGS[fields.encoding], **size, is_bigendian=is_bigendian)
-    return Shown(fields.encoding, view.astype(view.dtype.newbyteorder("="), copy=False))
 
 
 _Entry = tuple[int, int, int, int, str]

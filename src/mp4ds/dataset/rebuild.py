@@ -136,7 +136,12 @@ class MessageRebuilder:
         self._place = place
         self._encoding = ENCODINGS[sidecar.image.encoding]
         self.columns = columns
-        self._digests = self._decode_digests()
+        self._digests: list[int] | None = None
+        if sidecar.digests is not None:
+            try:
+                self._digests = sidecar.digests.decode(sidecar.frames).tolist()
+            except ValueError as error:
+                raise FormatError("column-invalid", f"{place} at digests", str(error)) from None
         self._templates = self._make_templates()
         self._recipes = [
             png.PngRecipe(**header.png.model_dump(exclude={"deflate"})) if header.png else None
@@ -250,14 +255,6 @@ class MessageRebuilder:
 
     def _failure(self, code: str, index: int, problem: str) -> FormatError:
         return FormatError(code, self._place, problem, frame=index)
-
-    def _decode_digests(self) -> list[int] | None:
-        if self._sidecar.digests is None:
-            return None
-        try:
-            return self._sidecar.digests.decode(self._sidecar.frames).tolist()  # type: ignore[no-any-return]
-        except ValueError as error:
-            raise FormatError("column-invalid", f"{self._place} at digests", str(error)) from None
 
     def _padding(self, variant: int) -> bytes | None:
         """The row padding in messages of a header; None: zeros.

@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing
 from functools import cached_property
 from itertools import tee
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -317,20 +317,29 @@ class Stream(Images):
             )
         return prefix
 
-    @overload
     def pictures(
         self, choice: Choice = everything, scale: Scale | None = None
-    ) -> Iterator[tuple[int, Picture]]: ...
-
-    @overload
-    def pictures(
-        self, choice: Choice = everything, scale: Scale | None = None, *, is_strict: bool
-    ) -> Iterator[tuple[int, Picture | None]]: ...
-
-    def pictures(
-        self, choice: Choice = everything, scale: Scale | None = None, *, is_strict: bool = True
-    ) -> Iterator[tuple[int, Picture | None]]:
+    ) -> Iterator[tuple[int, Picture]]:
         """The wanted pictures in order, each with its number, from a separate decoder.
+
+        Args:
+            choice: Which are wanted.
+            scale: See `PictureMaker.make`.
+
+        Yields:
+            Views that are valid until the next one is requested.
+
+        Raises:
+            VideoError: See `VideoDecoder.pictures_at`.
+        """
+        for index, picture in self.decodable_pictures(choice, scale, is_strict=True):
+            if picture is not None:
+                yield index, picture
+
+    def decodable_pictures(
+        self, choice: Choice = everything, scale: Scale | None = None, *, is_strict: bool
+    ) -> NumberedPictures:
+        """As `pictures`; those that cannot be decoded may be None.
 
         Args:
             choice: Which are wanted; may be asked twice.
@@ -338,12 +347,6 @@ class Stream(Images):
             is_strict: Whether a picture that cannot be decoded is an error, and not None. What was
                 recorded as packets may have some without any damage to the video: they refer to
                 packets that were lost before they were recorded.
-
-        Yields:
-            Views that are valid until the next one is requested.
-
-        Raises:
-            VideoError: See `VideoDecoder.pictures_at`.
         """
         if is_strict and self.sound is None:
             self._check_size()
@@ -357,7 +360,8 @@ class Stream(Images):
                 wanted, again = tee(choice(self.columns))
                 own, its = lambda _: wanted, lambda _: again
             decoded = self._decoded(own, None, is_strict=is_strict)
-            yield from self.predicted(decoded, self._view.pictures(its, is_strict=is_strict))
+            shown = self._view.decodable_pictures(its, is_strict=is_strict)
+            yield from self.predicted(decoded, shown)
 
     def _decoded(self, choice: Choice, scale: Scale | None, *, is_strict: bool) -> NumberedPictures:
         """The pictures of the video; see `pictures`."""
@@ -474,14 +478,11 @@ class Stream(Images):
             )
         with closing(Media(self.video_path)) as media:
             table = media.table
-        starts = table.presentation[table.order]
+        starts, keys = table.presentation[table.order], table.sync[table.order]
         durations = np.diff(starts, append=2 * starts[-1] - starts[-2] if len(starts) > 1 else 1)
-        keys = table.sync[table.order]
+        rows = np.stack([starts, durations, keys], 1).astype(np.int64).tolist()
         names = ("pts", "duration", "key_frame")
-        columns = (column.astype(np.int64).tolist() for column in (starts, durations, keys))
-        return json.dumps(
-            {"frames": [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]}
-        )
+        return json.dumps({"frames": [dict(zip(names, row, strict=True)) for row in rows]})
 
     # ------------------------------------------------------------ damage
 
@@ -501,28 +502,25 @@ class Stream(Images):
 
     def damages(
         self, report: Callable[[int], None] = lambda _: None
-    ) -> Iterator[tuple[FormatError, int, int]]:
+    ) -> list[tuple[FormatError, int, int]]:
         """What cannot be read: every frame is decoded, rebuilt and compared.
 
         Args:
             report: Called with the number of each frame.
 
-        Yields:
+        Returns:
             An error for frames in a row that cannot be read for the same reason, which it names by
             number, topic and times, and the first and the last of them.
         """
-        row: tuple[FormatError, int, int] | None = None
+        rows: list[tuple[FormatError, int, int]] = []
         for error in self._damaged_frames(report):
             # without a number, none of the frames can be read
             first, last = (0, len(self) - 1) if error.frame is None else (error.frame,) * 2
-            if row and error.frame == row[2] + 1 and error.code == row[0].code:
-                row = row[0], row[1], last
-                continue
-            if row:
-                yield self.named(row[0], row[2]), *row[1:]
-            row = error, first, last
-        if row:
-            yield self.named(row[0], row[2]), *row[1:]
+            if rows and error.frame == rows[-1][2] + 1 and error.code == rows[-1][0].code:
+                rows[-1] = *rows[-1][:2], last
+            else:
+                rows.append((error, first, last))
+        return [(self.named(error, last), first, last) for error, first, last in rows]
 
     def _damaged_frames(self, report: Callable[[int], None]) -> Iterator[FormatError]:
         is_packet, makes = self.sidecar.keeps_packets, self.sidecar.body != "packet"
@@ -534,7 +532,7 @@ class Stream(Images):
                     reader = files.enter_context(self.open_packets())
                     frames = ((index, None) for index in range(len(self)))
                 else:
-                    frames = self.pictures(is_strict=False)
+                    frames = self.decodable_pictures(is_strict=False)
                 for index, picture in frames:
                     report(index)
                     try:

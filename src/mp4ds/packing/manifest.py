@@ -266,7 +266,8 @@ def _why_larger(summary: PackSummary, made: Dataset) -> str:
     if dataset_bytes <= _LARGER * source_bytes:
         return ""
     sidecars = [stream.sidecar for stream in made.streams]
-    views = sum(one.view.size or 0 for one in sidecars if one.view and one.body == "packet")
+    packets = [sidecar for sidecar in sidecars if sidecar.body == "packet"]
+    views = sum(one.view.size or 0 for one in packets if one.view)
     if 2 * views > dataset_bytes - source_bytes:
         return f"views of JPEG files and video packets take {size_text(views)}"
     if any(one.profile != LOSSLESS for one in earlier):
@@ -275,17 +276,13 @@ def _why_larger(summary: PackSummary, made: Dataset) -> str:
         return "the source dataset was stored in a smaller form"
     if sum(topic.raw_bytes for topic in summary.topics) <= source_bytes:
         return "a recording this small takes less space than the index, definitions and sidecars"
+    own = "the source's own compression"
     if 2 * summary.messages_bytes > dataset_bytes:
-        return (
-            "the source's own compression (such as bz2) stores small messages more compactly "
-            "than zstd"
-        )
-    if any(stream.sidecar.body == "packet" for stream in made.streams):
-        return (
-            "JPEG files and video packets are kept as they are, including repeated ones, which "
-            "the source's own compression stores only once"
-        )
-    return "the source's own compression stores its images more compactly than a video"
+        return f"{own} (such as bz2) stores small messages more compactly than zstd"
+    if packets:
+        kept = "JPEG files and video packets are kept as they are, including repeated ones"
+        return f"{kept}, which {own} stores only once"
+    return f"{own} stores its images more compactly than a video"
 
 
 def folder_size(folder: Path) -> int:

@@ -148,6 +148,9 @@ class StreamWriter:
         threads: Of an encoder.
         rate: Frames per second, where known.
 
+    Attributes:
+        note: What the user should know of how the video is made; empty if nothing.
+
     Raises:
         Refused: The encoder does not take such pictures.
     """
@@ -171,12 +174,8 @@ class StreamWriter:
         self._digests = array("Q")
         self._clock = PresentationClock()
         self._track = open_track(plan, self._path, self._view_path, seen, threads, rate)
+        self.note = self._track.note
         self._key = seen.key
-
-    @property
-    def note(self) -> str:
-        """What the user should know of how the video is made; empty if nothing."""
-        return self._track.note
 
     @property
     def frames(self) -> int:
@@ -272,17 +271,14 @@ class StreamWriter:
         padding = None if wrap.padding is None else base64.b64encode(wrap.padding).decode()
         if exceeds_padding((padding, *(head.padding for head in self._table.headers))):
             raise Refused("too much padding between rows, different in each image")
-        png = None
-        if wrap.png is not None:
-            recipe = {**asdict(wrap.png), "deflate": zlib_fingerprint()}
-            png = PngFile.model_validate(recipe)
+        recipe = wrap.png and {**asdict(wrap.png), "deflate": zlib_fingerprint()}
         return Header(
             frame_id=seen.parts.frame_id,
             format=fields.format if isinstance(fields, CodedFields) else None,
             template=template,
             framing=wrap.framing,
             prefix=wrap.prefix.hex(),
-            png=png,
+            png=PngFile.model_validate(recipe) if recipe else None,
             padding=padding,
         )
 
@@ -570,18 +566,13 @@ class Packer:
                 adapted = ", so it is not adapted" if self.reader.reduction.get("images") else ""
                 self.part.topic(channel).notes.append(_UNPAIRED + adapted)
             return self.calibrations.take
-        if self._transforms.takes(channel):
-            return self._take_transforms
         return self.keep
-
-    def _take_transforms(self, message: Message) -> None:
-        self._transforms.add(message.channel, message.data)
-        self.keep(message)
 
     def keep(self, message: Message) -> None:
         """Store a message verbatim."""
         self._verbatim.add_channel(message.channel)
         self._verbatim.write(message)
+        self._transforms.add(message.channel, message.data)
 
     def new_stream(self, seen: CameraMessage, plan: TrackPlan, rate: float | None) -> StreamWriter:
         """Begin a stream.

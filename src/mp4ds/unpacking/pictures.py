@@ -354,7 +354,7 @@ class Conversion:
         with ExitStack() as files:
             packets = None
             is_strict = not stream.sidecar.keeps_packets
-            for index, picture in stream.pictures(choice, is_strict=is_strict):
+            for index, picture in stream.decodable_pictures(choice, is_strict=is_strict):
                 if picture is not None:
                     make = self._makers[stream.columns.variant[index]]
                     yield index, make(stream.recorded_pixels(picture))
@@ -518,7 +518,7 @@ def _files_of(
         if encoder is None:
             yield from files_of(part)
             return
-        for index, picture in part.pictures(is_strict=not part.sidecar.keeps_packets):
+        for index, picture in part.decodable_pictures(is_strict=not part.sidecar.keeps_packets):
             made = None
             if picture is not None:
                 made = encoder.encode(part.recorded_pixels(picture))
