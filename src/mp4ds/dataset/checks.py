@@ -35,7 +35,7 @@ from mp4ds.errors import (
 from mp4ds.files.urls import location
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.manifest import Manifest, StreamEntry, TimeRange
-from mp4ds.format.models import References, StreamSidecar, VideoModel
+from mp4ds.format.models import StreamSidecar, VideoModel
 from mp4ds.format.sidecars import (
     MANIFEST_NAME,
     THE_TOP,
@@ -498,14 +498,15 @@ def _wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[Forma
             "size-mismatch", path, f"has {size} bytes, but its sidecar says {video.size}"
         )
         return
-    references = video.references
     due: Structures | None = None
     try:
-        due = _structures(path, references) if references else None
+        if video.references:
+            due = video.references.decode(packets_of_groups(sample_table_of(path)))
+            due.check()
     except VideoError:
-        pass  # reported when it is opened, if it cannot be read there either
-    except FormatError as error:
-        yield error
+        due = None  # reported when it is opened, if it cannot be read there either
+    except ValueError as error:
+        yield error if isinstance(error, FormatError) else _unfit(path, str(error))
         return
     if not deep or (video.sha256 is None and due is None):
         return
@@ -514,23 +515,6 @@ def _wrong_facts(path: Path, video: VideoModel, *, deep: bool) -> Iterator[Forma
         yield VideoError("hash-mismatch", path, "does not match the SHA-256 in its sidecar")
     elif due is not None and (problem := _difference(due, found)):
         yield _unfit(path, problem)
-
-
-def _structures(path: Path, references: References) -> Structures:
-    """The structures of a video by its references.
-
-    Raises:
-        VideoError: Its index is damaged.
-        FormatError: They do not belong to that video.
-    """
-    try:
-        structures = references.decode(packets_of_groups(sample_table_of(path)))
-        structures.check()
-    except FormatError:
-        raise
-    except ValueError as error:
-        raise _unfit(path, str(error)) from None
-    return structures
 
 
 def _difference(told: Structures, found: Structures | None) -> str:

@@ -64,7 +64,6 @@ from mp4ds.records import (
     OTHER_REASONS,
     Channel,
     Message,
-    Record,
     bounded,
 )
 from mp4ds.times import PresentationClock
@@ -271,30 +270,22 @@ class _Source:
             else earlier.get(key, 0)
             for key, own in self._times.items()
         }
+        self.segments: list[_Segment] = []
         for stream in dataset.streams:
             if len(set(map(selected, stream.topics))) > 1:
                 raise Refused(f"{' and '.join(stream.topics)} share one stream")
-        chosen = (stream for stream in dataset.streams if selected(stream.topic))
-        self.segments = [self._segment(stream) for stream in chosen]
-
-    def _segment(self, stream: Stream) -> _Segment:
-        images = self._rows(stream, stream.sidecar.headers)
-        if np.any(np.diff(images.numbers) != 1):
-            raise Refused(f"frames of {stream.topic} are not ordered by time")
-        infos = stream.infos
-        rows = self._rows(infos, infos.info.calibrations) if infos else None
-        return _Segment(self, stream, images, rows)
+            if selected(stream.topic):
+                images = self._rows(stream, stream.sidecar.headers)
+                if np.any(np.diff(images.numbers) != 1):
+                    raise Refused(f"frames of {stream.topic} are not ordered by time")
+                infos = stream.infos
+                rows = self._rows(infos, infos.info.calibrations) if infos else None
+                self.segments.append(_Segment(self, stream, images, rows))
 
     def _rows(self, part: Part, models: Sequence[Any]) -> _Rows:
         """The messages in the span."""
         numbers = np.fromiter(within(self.span)(part.columns), np.int64)
         return _Rows(part.columns, numbers, models, self._offsets[part.channel.identity])
-
-    def count(self, topic: str) -> int:
-        """How many messages of a topic are copied."""
-        return sum(
-            self.counts[item] for item in {c.identity for c in self.channels if c.topic == topic}
-        )
 
     @property
     def left_out(self) -> list[str]:
@@ -315,21 +306,18 @@ class _Source:
         old = [item for item in self.manifest.verbatim if self.selected(item.topic)]
         if not self.is_slice:
             return old
-        found = []
+        found, file = [], self.dataset.messages_file
         for topic in dict.fromkeys(item.topic for item in old):
-            own = [times for identity, times in self._times.items() if identity[0] == topic]
-            file = self.dataset.messages_file
             ids = [item.id for item in file.channels if item.topic == topic]
             inside = in_span(file.times_of(ids), self.span)
             if len(inside):
+                own = [times for identity, times in self._times.items() if identity[0] == topic]
                 times = in_span(np.sort(np.concatenate([_NONE, *own])), self.span)
-                entry = Verbatim(
-                    topic=topic,
-                    messages=len(inside),
-                    first=int(np.searchsorted(times, inside[0])),
-                    reason="; or ".join(item.reason for item in old if item.topic == topic),
+                first = int(np.searchsorted(times, inside[0]))
+                reason = "; or ".join(item.reason for item in old if item.topic == topic)
+                found.append(
+                    Verbatim(topic=topic, messages=len(inside), first=first, reason=reason)
                 )
-                found.append(entry)
         return found
 
     def recorded_messages(self) -> Iterator[Message]:
@@ -363,8 +351,8 @@ def _verbatim(sources: Sequence[_Source]) -> list[Verbatim]:
             if key in found:
                 first, messages = found[key].first, found[key].messages + messages
             found[key] = Verbatim(topic=key[0], messages=messages, first=first, reason=key[1])
-        for topic in {channel.topic for channel in source.channels}:
-            earlier[topic] += source.count(topic)
+        for (topic, *_), count in source.counts.items():
+            earlier[str(topic)] += count
     return list(found.values())
 
 
@@ -618,9 +606,15 @@ def _write_messages(
             in_videos.add(sidecar.camera_info.channel.to_record(0).identity)
     collector = TransformCollector()
     channels = _channels(sources)
+
+    def messages(number: int) -> Iterator[Message]:
+        for message in sources[number].recorded_messages():
+            yield message.of_channel(channels[number][message.channel.id])
+
+    starts = [source.range[0] if source.range else 0 for source in sources]
     with McapWriter(path, profile=dataset.profile) as writer:
         others = (source.dataset.messages_file.others() for source in sources)
-        for record in chain(chain.from_iterable(others), _recorded_messages(sources, channels)):
+        for record in chain(chain.from_iterable(others), merged(starts, messages)):
             write_record(writer, record)
             if isinstance(record, Message):
                 collector.add(record.channel, record.data)
@@ -650,15 +644,3 @@ def _channels(sources: Sequence[_Source]) -> list[dict[int, Channel]]:
             made[channel.id] = known[channel.identity]
         found.append(made)
     return found
-
-
-def _recorded_messages(
-    sources: Sequence[_Source], channels: Sequence[Mapping[int, Channel]]
-) -> Iterator[Record]:
-    """The messages for messages.mcap, by log time."""
-
-    def messages(number: int) -> Iterator[Message]:
-        for message in sources[number].recorded_messages():
-            yield message.of_channel(channels[number][message.channel.id])
-
-    return merged([source.range[0] if source.range else 0 for source in sources], messages)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from operator import index as as_integer
 from reprlib import repr as shortened
 from typing import TYPE_CHECKING, Any, overload
@@ -331,11 +331,9 @@ class Topic:
         numbers = self._checked(indices)
         found: dict[int, Frame] = {}
         with self._opened.lock:
-            for owner, places, own in self._by_part(sorted(set(numbers))):
-                view = self._view(owner, format, resize, crop)
-                pictures = self._pictures(owner, own, view)
-                for place, (number, picture) in zip(places, pictures, strict=True):
-                    found[place] = self._frame(owner, number, place, picture, view)
+            view_of = partial(self._view, format=format, resize=resize, crop=crop)
+            for owner, number, index, picture in self._pictures(sorted(set(numbers)), view_of, {}):
+                found[index] = self._frame(owner, number, index, picture, view_of(owner))
         given: set[int] = set()
         frames = []
         for number in numbers:
@@ -504,7 +502,7 @@ class Topic:
         """
         indices = self._by_stamp.between(start_ns, end_ns)
         parts = {}
-        for owner in np.unique(self._owners[indices]).tolist() or [0]:  # see `_by_part`
+        for owner in np.unique(self._owners[indices]).tolist() or [0]:  # see `_pictures`
             own = self._numbers[indices[self._owners[indices] == owner]]
             view = self._view(owner, format, resize, crop)
             parts[owner] = self._in_order(owner, own, view)
@@ -545,43 +543,34 @@ class Topic:
             numbers.append(number)
         return numbers
 
-    def _by_part(self, numbers: Sequence[int]) -> Iterator[tuple[int, list[int], list[int]]]:
-        """For each part: which of some frames it has, and their numbers there.
+    def _pictures(
+        self, numbers: Sequence[int], view_of: Callable[[int], View], outs: Mapping[int, Pixels]
+    ) -> Iterator[tuple[int, int, int, Picture]]:
+        """Pictures of some frames, part by part; the lock is held.
 
         Args:
             numbers: Of the frames, increasing; so are those in each part.
+            view_of: How those of a part are returned; asked also if there are no frames, so that
+                it is checked.
+            outs: Where the decoder may write a picture of the view's scale, by number.
 
         Yields:
-            A part, the numbers of its frames in the topic and in the part; of no frames at all
-            those of the first part, so that its view is checked.
+            The part, the frame's number there and in the topic, and its picture.
         """
-        if len(self.parts) == 1:
-            yield 0, [*numbers], [*numbers]
-            return
-        chosen = np.array(numbers, np.int64)
+        chosen, readers = np.array(numbers, np.int64), self._opened.readers
         owners = self._owners[chosen]
-        for owner in np.unique(owners).tolist() or [0]:
-            own = chosen[owners == owner]
-            yield owner, own.tolist(), self._numbers[own].tolist()
-
-    def _pictures(
-        self, owner: int, own: Sequence[int], view: View, outs: Mapping[int, Pixels] | None = None
-    ) -> Iterator[tuple[int, Picture]]:
-        """Pictures of some frames of a part, each with its number there; the lock is held.
-
-        Args:
-            owner: The part.
-            own: Their numbers there, increasing.
-            view: How they are returned.
-            outs: Where the decoder may write a picture of the view's scale, by number.
-        """
-        if not own:
-            return
-        readers = self._opened.readers
-        if owner not in readers:
-            readers[owner] = self.parts[owner].open_reader()
-        with self.parts[owner].naming_frames():
-            yield from readers[owner].pictures_of(own, view.scale, outs)
+        for owner in sorted(set(owners.tolist())) or [0]:
+            scale, places = view_of(owner).scale, chosen[owners == owner]
+            if not len(places):
+                return
+            own: list[int] = self._numbers[places].tolist()
+            if owner not in readers:
+                readers[owner] = self.parts[owner].open_reader()
+            given = {n: outs[i] for n, i in zip(own, places.tolist(), strict=True) if i in outs}
+            with self.parts[owner].naming_frames():
+                pictures = readers[owner].pictures_of(own, scale, given if scale else None)
+                for index, (number, picture) in zip(places.tolist(), pictures, strict=True):
+                    yield owner, number, index, picture
 
     def _write(self, numbers: Sequence[int], views: Sequence[View], out: Sequence[Pixels]) -> None:
         """Write the pixels of frames.
@@ -597,17 +586,13 @@ class Topic:
         places: dict[int, list[int]] = {}
         for place, number in enumerate(numbers):
             places.setdefault(number, []).append(place)
+        outs = {index: out[first] for index, (first, *_) in places.items()}
         with self._opened.lock:
-            for owner, wanted, own in self._by_part(sorted(places)):
-                view, outs = views[owner], {}
-                if view.scale:
-                    outs = {n: out[places[i][0]] for i, n in zip(wanted, own, strict=True)}
-                pictures = self._pictures(owner, own, view, outs)
-                for index, (number, picture) in zip(wanted, pictures, strict=True):
-                    first, *others = places[index]
-                    self.parts[owner].pixels(picture, view, number, out[first])
-                    for place in others:
-                        np.copyto(out[place], out[first])
+            pictures = self._pictures(sorted(places), views.__getitem__, outs)
+            for owner, number, index, picture in pictures:
+                self.parts[owner].pixels(picture, views[owner], number, outs[index])
+                for place in places[index][1:]:
+                    np.copyto(out[place], outs[index])
 
     def _in_order(self, owner: int, own: Integers, view: View) -> Iterator[Frame]:
         """Frames of a part in a given order; increasing runs are decoded in one go."""

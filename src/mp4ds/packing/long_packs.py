@@ -150,9 +150,8 @@ class PartedPack:
         Raises:
             OptionError: Names them.
         """
-        names = [piece.name for piece in self.missing]
-        if names:
-            listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
+        if names := [piece.name for piece in self.missing]:
+            listed = ", ".join(names[:_LISTED]) + ", ..." * (len(names) > _LISTED)
             raise OptionError(
                 f"{path_text(self.target)}: {len(names)} of {len(self.plan.pieces)} parts are "
                 f"missing: {listed}. Run their shards, or pack without `join` to pack them here."

@@ -51,7 +51,7 @@ from mp4ds.files.urls import location, spelled
 from mp4ds.format.fields import document_of, json_parser
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
 from mp4ds.options import CONTENT, ENCODING
-from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools, write_manifest
+from mp4ds.packing.manifest import Digest, origin_of, tools, write_manifest
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.planning import PIECE_NAME, Piece, Plan
 from mp4ds.processes import release_memory
@@ -255,9 +255,8 @@ class PartsFolder:
         path = self.path / _PLAN_NAME
         values = {**asdict(note), "inode": self.path.lstat().st_ino}
         try:
-            write_synced(path, json.dumps(values, indent=1).encode(), replace=False)
-        except FileExistsError:
-            pass
+            with suppress(FileExistsError):
+                write_synced(path, json.dumps(values, indent=1).encode(), replace=False)
         except OSError as error:
             raise as_write_error(error, path) from None
 
@@ -365,17 +364,6 @@ class PartFacts:
     notes: dict[str, list[str]]
     skipped: dict[str, int]
 
-    @classmethod
-    def write(cls, part: PartRecord) -> None:
-        """Write those of a part."""
-        topics = part.topics.values()
-        facts = cls(
-            {topic.topic: (topic.messages, topic.raw_bytes) for topic in topics},
-            {topic.topic: topic.notes for topic in topics if topic.notes},
-            part.skipped,
-        )
-        (part.folder / FACTS_NAME).write_text(json.dumps(asdict(facts)))
-
 
 _parse_facts = json_parser(PartFacts)
 
@@ -384,15 +372,13 @@ def part_facts(part: Path) -> PartFacts | None:
     """What became of a part; None if it is not there, or not whole."""
     try:
         facts: PartFacts = _parse_facts((part / FACTS_NAME).read_bytes())
-        files = load_manifest(part / MANIFEST_NAME).files
-        found = [(part / entry.name).lstat() for entry in files]
+        for entry in load_manifest(part / MANIFEST_NAME).files:
+            found = (part / entry.name).lstat()
+            if not stat.S_ISREG(found.st_mode) or found.st_size != entry.size:
+                return None
     except (OSError, ValueError):
         return None
-    is_whole = all(
-        stat.S_ISREG(status.st_mode) and status.st_size == entry.size
-        for status, entry in zip(found, files, strict=True)
-    )
-    return facts if is_whole else None
+    return facts
 
 
 class PartPacker:
@@ -446,9 +432,14 @@ class PartPacker:
             path.unlink()
         if self._reader is None:
             self._reader = self._plan.open()
-
         part = Packer(self._reader, into, self._plan, piece, exact).run()
-        PartFacts.write(part)
+        topics = part.topics.values()
+        facts = PartFacts(
+            {topic.topic: (topic.messages, topic.raw_bytes) for topic in topics},
+            {topic.topic: topic.notes for topic in topics if topic.notes},
+            part.skipped,
+        )
+        (into / FACTS_NAME).write_text(json.dumps(asdict(facts)))
         write_manifest(part, origin_of(self._reader, part), str(self._plan.options.quality))
 
     def close(self) -> None:
