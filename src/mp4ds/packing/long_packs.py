@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
@@ -80,6 +80,8 @@ class PartedPack:
         self._done: set[str] = set()
         self._messages = Counter[str]()  # packed, by topic
         self._before = self._read = self._written = 0
+        self._digests: dict[str, Future[Digest]] = {}
+        self.calls: dict[Future[Any], Piece | None] = {}
 
     def begin(self, *, anew: bool, alone: bool) -> None:
         """Take over the folder, which is locked.
@@ -109,18 +111,37 @@ class PartedPack:
         """The pieces without parts."""
         return [piece for piece in self.plan.pieces if piece.name not in self._done]
 
-    def ended(self, piece: Piece, error: BaseException | None) -> None:
-        """Note that the call that packs a piece has ended."""
-        place = self.folder.part(piece)
-        if error is None and is_seen(lambda: part_facts(place) is not None, self.folder.path):
-            if facts := part_facts(place):
-                self._note_part(piece, facts)
-        elif error is None:
-            gone = f"its part did not appear in {self.folder.path}; {SHARED}"
-            self.failures.append((piece.name, Mp4dsError(gone)))
-        else:
-            self.failures.append((piece.name, failure_of(error)))
+    def submit(self, executor: Executor, packer: PartPacker, share: tuple[int, int] | None) -> None:
+        """Begin what is left to do.
+
+        Args:
+            executor: Makes the calls.
+            packer: Packs a piece.
+            share: See `pack_parts`.
+        """
+        number, shares = share or (1, 1)
+        hashed = self.plan.hashed if share is None else []
+        self._digests = {one.path: executor.submit(digest_source, one) for one in hashed}
+        self.calls = dict.fromkeys(self._digests.values())
+        missing = self.missing
+        for piece in self.plan.pieces[number - 1 :: shares]:
+            if piece in missing:
+                self.calls[executor.submit(packer, piece)] = piece
         self.tell()
+
+    def ended(self, call: Future[Any]) -> None:
+        """Note that a call has ended: that a piece is packed, or why not."""
+        piece, error = self.calls.pop(call), call.exception()
+        name = piece.name if piece else f"source-{[*self._digests.values()].index(call)}"
+        if error is not None:
+            self.failures.append((name, failure_of(error)))
+        elif piece is not None:
+            place = self.folder.part(piece)
+            if not is_seen(lambda: part_facts(place) is not None, self.folder.path):
+                gone = f"its part did not appear in {self.folder.path}; {SHARED}"
+                self.failures.append((name, Mp4dsError(gone)))
+            elif facts := part_facts(place):
+                self._note_part(piece, facts)
 
     def _note_part(self, piece: Piece, facts: PartFacts) -> None:
         self._done.add(piece.name)
@@ -181,11 +202,8 @@ class PartedPack:
             )
         )
 
-    def finish(self, digests: Mapping[str, Digest]) -> PackSummary:
+    def finish(self) -> PackSummary:
         """Put the parts together, and remove them.
-
-        Args:
-            digests: Of the files that are hashed, by their paths.
 
         Raises:
             PartsFailedError: The dataset could not be written; the parts are kept.
@@ -197,7 +215,7 @@ class PartedPack:
         try:
             with staged(self.target, force=self.force, owned=dataset_files) as made:
                 made.mkdir()
-                summary = self._join(made, places, digests)
+                summary = self._join(made, places)
         except FormatError as error:
             for place in places:
                 if str(error.place).startswith(f"{place}{os.sep}"):
@@ -216,9 +234,7 @@ class PartedPack:
         self.folder.remove()
         return summary
 
-    def _join(
-        self, made: Path, places: Sequence[Path], digests: Mapping[str, Digest]
-    ) -> PackSummary:
+    def _join(self, made: Path, places: Sequence[Path]) -> PackSummary:
         plan, whole = self.plan, PartRecord(made)
         for place in places:
             facts = part_facts(place)
@@ -241,12 +257,9 @@ class PartedPack:
                     whole.losses += [entry.to_record() for entry in manifest.losses]
                     whole.left_out |= dict.fromkeys(manifest.topics_left_out)
                     whole.redactions += manifest.redactions
-            concat(
-                parts,
-                made,
-                changes=plan.origin(reader, whole, digests),
-                report=lambda name: self.tell("joining", name),
-            )
+            digests = {path: call.result() for path, call in self._digests.items()}
+            changes = plan.origin(reader, whole, digests)
+            concat(parts, made, changes=changes, report=lambda name: self.tell("joining", name))
             # last, since damage of a part would be taken for that of the index
             _check_index(reader, parts, plan.options.selected)
             size = sum(source.size for source in plan.sources)
@@ -334,53 +347,31 @@ def pack_parts(
         PartsFailedError: Pieces failed.
         RemoteError: The cluster was lost.
     """
-    number, shares = share or (1, 1)
-    with _claimed(packs, alone=share is None), executor as workers, ExitStack() as stack:
+    alone = share is None
+    with _claimed(packs, alone=alone), executor as workers, ExitStack() as stack:
         for pack in packs:
-            pack.begin(anew=options.restart, alone=share is None)
+            pack.begin(anew=options.restart, alone=alone)
             if options.join:
                 pack.refuse_missing()
-        digests: dict[Path, dict[str, Future[Digest]]] = {}
-        calls: dict[Future[Any], tuple[PartedPack, Piece | None]] = {}
-        for pack in packs:
-            sources = pack.plan.hashed if share is None else []
-            digests[pack.target] = {
-                source.path: workers.submit(digest_source, source) for source in sources
-            }
-            calls.update((call, (pack, None)) for call in digests[pack.target].values())
+        for pack in packs:  # so that all work is known from the beginning
             packer = stack.enter_context(closing(PartPacker(pack.plan, pack.folder.path)))
-            missing = pack.missing
-            for piece in pack.plan.pieces[number - 1 :: shares]:
-                if piece in missing:
-                    calls[workers.submit(packer, piece)] = pack, piece
-            pack.tell()  # so that all work is known from the beginning
-        left = Counter(pack.target for pack, _ in calls.values())
-        ready = [pack for pack in packs if not left[pack.target]]
-        while ready or calls:
-            for pack in ready if share is None else ():
-                if not pack.failures:
-                    found = digests[pack.target]
-                    yield pack.finish({path: call.result() for path, call in found.items()})
-            ready = []
+            pack.submit(workers, packer, share)
+        busy = list(packs)
+        while busy:
+            for pack in [pack for pack in busy if not pack.calls]:
+                busy.remove(pack)
+                if alone and not pack.failures:
+                    yield pack.finish()
+            calls = {call: pack for pack in busy for call in pack.calls}
             for call in wait(calls, _POLL_SECONDS, FIRST_COMPLETED).done:
-                pack, ended = calls.pop(call)
                 if options.cluster and call.cancelled():
                     problem = "the connection to the Dask scheduler was lost"
                     remedy = f"Check whether it is still running; {_KEPT}."
                     raise RemoteError(options.cluster, problem, remedy)
-                error = call.exception()
-                if ended is not None:
-                    pack.ended(ended, error)
-                elif error is not None:
-                    name = f"source-{[*digests[pack.target].values()].index(call)}"
-                    pack.failures.append((name, failure_of(error)))
+                calls[call].ended(call)
                 if not options.keep_going:
-                    pack.refuse_failures()
-                left[pack.target] -= 1
-                if not left[pack.target]:
-                    ready.append(pack)
-            for pack in packs:
-                if left[pack.target]:
-                    pack.tell()
+                    calls[call].refuse_failures()
+            for pack in busy:
+                pack.tell()
         for pack in packs:
             pack.refuse_failures()

@@ -174,7 +174,7 @@ class StreamWriter:
         self._digests = array("Q")
         self._clock = PresentationClock()
         self._track = open_track(plan, self._path, self._view_path, seen, threads, rate)
-        self.note = self._track.note
+        self.note = "; ".join(filter(None, (plan.note, self._track.note)))
         self._key = seen.key
 
     @property

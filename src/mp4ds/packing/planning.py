@@ -37,7 +37,7 @@ from mp4ds.packing.inspection import (
     pair_camera_infos,
 )
 from mp4ds.packing.manifest import Digest, PartRecord, origin_of, tools
-from mp4ds.packing.options import NO_VIEW, ImportOptions, PackOptions, plugin
+from mp4ds.packing.options import NO_VIEW, PackOptions, plugin
 from mp4ds.packing.tracks import TrackPlan
 from mp4ds.packing.windows import WindowCoder
 from mp4ds.processes import available_cores
@@ -126,11 +126,13 @@ def decide(
     try:
         if first.pixels is None:
             return Decision(first.key, _packet_plans(first, options))
-        layout = None if options.goal.lossless else _lossy_layout(samples)
+        encoding = ENCODINGS[first.key.encoding]
+        may_lose = not options.goal.lossless and encoding.name not in DEPTHS
+        layout = _shown_layout(encoding, _pixels(samples)) if may_lose else None
         if layout is not None:
             plans = _lossy_plans(samples, layout, options, threads, rate)
         elif options.is_fast:
-            plans = [_fast_plan(first.key, options)]
+            plans = [_general_plan(first.key, options, is_fast=True)]
         else:
             plans = _lossless_plans(samples, options, threads)
         return Decision(first.key, plans)
@@ -145,12 +147,6 @@ def needs_trial(seen: CameraMessage, options: PackOptions) -> bool:
     lossy = None if options.goal.lossless else ENCODINGS[seen.key.encoding].lossy
     is_tried = seen.key.body != "jpeg" and (lossy is None or bool(LAYOUTS[lossy].parameters))
     return is_tried or options.goal.target is not None
-
-
-def _lossy_layout(samples: Sequence[CameraMessage]) -> Layout | None:
-    """The layout of images that may lose quality; None for those that may be depths, too."""
-    encoding = ENCODINGS[samples[0].key.encoding]
-    return None if encoding.name in DEPTHS else _shown_layout(encoding, _pixels(samples))
 
 
 def _shown_layout(encoding: Encoding, pixels: Sequence[Pixels]) -> Layout | None:
@@ -240,10 +236,17 @@ def _lossy_plans(
 # ---------------------------------------------------------------- lossless
 
 
-def _general_plan(key: StreamKey, options: PackOptions) -> TrackPlan:
-    """For every image of an encoding."""
+def _general_plan(key: StreamKey, options: PackOptions, *, is_fast: bool = False) -> TrackPlan:
+    """For every image of an encoding; fast: by what encodes in the least time (spec/notes.md)."""
     layout = layout_for(ENCODINGS[key.encoding], lossless=True)
-    recipe = recipe_for(layout.pixel_format, lossless=True)
+    codec = preset = None
+    if is_fast:
+        able = lossless_codecs(layout.pixel_format)
+        codec, preset = options.codec, options.preset
+        if codec is None or codec not in able:  # of those that are, H.264 has the fastest presets
+            codec, preset = ("h264" if "h264" in able else able[0]), None
+        preset = preset or fastest_preset(codec)
+    recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset)
     return TrackPlan(Coding(layout, recipe, options.group_frames))
 
 
@@ -333,18 +336,6 @@ def _view_coding(
         recipe = replace(recipe, options={**recipe.options, "svtav1-params": VIEW_LEVELS})
     gop = VIEW_TRAINING_GOP if options.purpose == TRAINING else LOSSY_GOP
     return Coding(layout, recipe, gop)
-
-
-def _fast_plan(key: StreamKey, options: PackOptions) -> TrackPlan:
-    """By what encodes in the least time (spec/notes.md)."""
-    layout = layout_for(ENCODINGS[key.encoding], lossless=True)
-    able = lossless_codecs(layout.pixel_format)
-    codec, preset = options.codec, options.preset
-    if codec is None or codec not in able:  # of those that are, H.264 has the fastest presets
-        codec, preset = ("h264" if "h264" in able else able[0]), None
-    preset = preset or fastest_preset(codec)
-    recipe = recipe_for(layout.pixel_format, lossless=True, codec=codec, preset=preset)
-    return TrackPlan(Coding(layout, recipe, options.group_frames))
 
 
 def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
@@ -504,7 +495,19 @@ def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagR
         SourceError: It cannot be read.
         OptionError: The options do not apply to it.
     """
-    reader = _open_whole(paths, options.images, salvage=options.salvage)
+    images = options.images
+    other = "what is imported" if images else "a dataset" if any(map(dataset_at, paths)) else ""
+    if options.salvage and other:
+        raise OptionError(f"`salvage` works with recordings, not with {other}.")
+    if images is not None and len(paths) != 1:
+        raise OptionError(
+            f"Only one folder or video can be imported at a time, but {len(paths)} were given."
+        )
+    reader: BagReader
+    if images is None:
+        reader = open_sources(paths, salvage=options.salvage, opener=open_source)
+    else:
+        reader = plugin("importing.layouts:open_images")(paths[0], images)
     try:
         if options.slice:
             take_slice(reader, options.slice, options.selected)
@@ -515,20 +518,6 @@ def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagR
     except BaseException:
         reader.close()
         raise
-    return reader
-
-
-def _open_whole(paths: Sequence[Path], images: ImportOptions | None, *, salvage: bool) -> BagReader:
-    other = "what is imported" if images else "a dataset" if any(map(dataset_at, paths)) else ""
-    if salvage and other:
-        raise OptionError(f"`salvage` works with recordings, not with {other}.")
-    if images is None:
-        return open_sources(paths, salvage=salvage, opener=open_source)
-    if len(paths) != 1:
-        raise OptionError(
-            f"Only one folder or video can be imported at a time, but {len(paths)} were given."
-        )
-    reader: BagReader = plugin("importing.images:open_images")(paths[0], images)
     return reader
 
 

@@ -79,11 +79,11 @@ class Track(ABC):
     """A video being written.
 
     Attributes:
-        note: What the user should know about it; empty if nothing.
+        note: How it differs from its plan; empty if it does not.
         view: The track of the view, where there is one; written with this one.
     """
 
-    note: str
+    note = ""
     view: Track | None = None
 
     @abstractmethod
@@ -151,17 +151,15 @@ def open_track(
     """
     size = seen.key.width, seen.key.height
     if plan.coding is None:
-        own: Track = _CopiedTrack(path, seen, rate, plan.note)
+        own: Track = _CopiedTrack(path, seen, rate)
     elif plan.target is None:
-        own = _EncodedTrack(path, plan.coding, size, threads, rate, plan.note)
+        own = _EncodedTrack(path, plan.coding, size, threads, rate)
     else:
-        own = _ScoredTrack(
-            path, WindowCoder(plan.coding, size, plan.target, threads, rate), plan.note
-        )
+        own = _ScoredTrack(path, WindowCoder(plan.coding, size, plan.target, threads, rate))
     if plan.view is None:
         return own
     few = threads if plan.coding is None else min(threads, _VIEW_THREADS)
-    open_view = partial(_EncodedTrack, view_path, plan.view, size, few, rate, "")
+    open_view = partial(_EncodedTrack, view_path, plan.view, size, few, rate)
     try:
         if plan.coding is None:
             return _PacketsTrack(own, open_view, seen)
@@ -178,8 +176,7 @@ def open_track(
 
 
 class _CopiedTrack(Track):
-    def __init__(self, path: Path, seen: CameraMessage, rate: float | None, note: str) -> None:
-        self.note = note
+    def __init__(self, path: Path, seen: CameraMessage, rate: float | None) -> None:
         self._key = seen.key
         self._begun = False
         self._writer = PacketWriter(
@@ -266,7 +263,6 @@ class _EncodedTrack(_PictureTrack):
         size: tuple[int, int],
         threads: int,
         rate: float | None,
-        note: str,
         coded: Callable[[bytes], None] | None = None,
     ) -> None:
         layout = coding.layout
@@ -292,8 +288,8 @@ class _EncodedTrack(_PictureTrack):
             self.coding = replace(coding, recipe=recipe)
             self.size = self._encoder.width, self._encoder.height
             self.options = self._encoder.options
-            other = f"coded as {recipe.codec}: {refusals[0]}" if refusals else ""
-            self.note = "; ".join(filter(None, (note, other)))
+            if refusals:
+                self.note = f"coded as {recipe.codec}: {refusals[0]}"
             return
         raise Refused(refusals[0])
 
@@ -454,8 +450,7 @@ def _recipes(coding: Coding) -> Iterator[Recipe]:
 class _ScoredTrack(_PictureTrack):
     """The videos of its windows are joined at the end."""
 
-    def __init__(self, path: Path, coder: WindowCoder, note: str) -> None:
-        self.note = note
+    def __init__(self, path: Path, coder: WindowCoder) -> None:
         self._path = path
         self._coder = coder
         self.coding, self.size = coder.coding, coder.coded_size
