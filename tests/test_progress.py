@@ -48,7 +48,6 @@ def told(
         topics={f"/cam{n}": (int(36_000 * share), 36_000) for n in range(cameras)},
         tasks_done=max(before, int(parts * share)),
         tasks_total=parts,
-        tasks_before=before,
     )
     return dataclasses.replace(made, **values)
 

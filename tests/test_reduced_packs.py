@@ -257,7 +257,7 @@ def test_what_was_done_is_told(tmp_path: Path) -> None:
             ["--resize", "0.5", "--nearest", "/mask"],
             "--nearest '/mask' matches no topic of images. Topics of images: /cam/image_raw",
         ),
-        (["--every", "0"], "--every 0 is not a number of frames"),
+        (["--every", "0"], "--every 0 is below 1"),
         (["--resize", "0.5", "--for", "training", "--gop", "2"], "Give --for or --gop, not both"),
     ],
 )

@@ -79,7 +79,7 @@ class PartedPack:
         self.folder = PartsFolder(self.target)
         self._done: set[str] = set()
         self._messages = Counter[str]()  # packed, by topic
-        self._before = self._read = self._written = 0
+        self._read = self._written = 0
         self._digests: dict[str, Future[Digest]] = {}
         self.calls: dict[Future[Any], Piece | None] = {}
 
@@ -104,7 +104,6 @@ class PartedPack:
         for piece in self.plan.pieces:
             if facts := part_facts(self.folder.part(piece)):
                 self._note_part(piece, facts)
-        self._before = len(self._done)
 
     @property
     def missing(self) -> list[Piece]:
@@ -196,7 +195,6 @@ class PartedPack:
                 topics={topic: (messages[topic], count) for topic, count in frames.items()},
                 tasks_done=len(self._done),
                 tasks_total=len(self.plan.pieces),
-                tasks_before=self._before,
                 failed=len(self.failures),
                 note=note,
             )

@@ -330,7 +330,6 @@ class PackProgress:
         topics: Messages packed so far and in total (None: unknown), by camera topic.
         tasks_done: Parts that are done.
         tasks_total: Number of parts; 0 for a recording packed in one go.
-        tasks_before: Parts done by an earlier run.
         failed: Parts that failed.
         note: Current activity, if worth reporting.
     """
@@ -344,7 +343,6 @@ class PackProgress:
     topics: Mapping[str, tuple[int, int | None]]
     tasks_done: int = 0
     tasks_total: int = 0
-    tasks_before: int = 0
     failed: int = 0
     note: str = ""
 

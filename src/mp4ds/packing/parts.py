@@ -241,9 +241,7 @@ class PartsFolder:
                 raise TargetError(path, "is not a file, or is a symbolic link", "Remove it.")
             note: PlanNote = _parse_note(path.read_bytes())
         except ValueError:
-            raise TargetError(
-                self.path, "holds an unfinished pack, damaged or of another version", _ANEW
-            ) from None
+            raise self._other("an unfinished pack, damaged or of another version") from None
         except OSError as error:
             if isinstance(error, TargetError):
                 raise
@@ -277,13 +275,9 @@ class PartsFolder:
             return
         if note.tools != plan.tools:
             theirs = ", ".join(f"{name} {version}" for name, version in note.tools.items())
-            raise TargetError(
-                self.path, f"holds a pack started with other versions: {theirs}", _ANEW
-            )
+            raise self._other(f"a pack started with other versions: {theirs}")
         if not shared and note.inode != self.path.lstat().st_ino:
-            raise TargetError(
-                self.path, "holds an unfinished pack that was started elsewhere", _ANEW
-            )
+            raise self._other("an unfinished pack that was started elsewhere")
         if note.paths != plan.paths:
             listed = ", ".join(str(location(path)) for path in note.paths)  # without signatures
             raise OptionError(f"{self.path} holds an unfinished pack of {listed}. {_ANEW}")
@@ -301,7 +295,11 @@ class PartsFolder:
                 "Start over with `restart`.",
             )
         if plan.decisions and note.decisions != plan.decisions:
-            raise TargetError(self.path, "holds parts that were encoded in another way", _ANEW)
+            raise self._other("parts that were encoded in another way")
+
+    def _other(self, found: str) -> TargetError:
+        """The error of a folder that holds something else."""
+        return TargetError(self.path, f"holds {found}", _ANEW)
 
     # ------------------------------------------------------------ parts
 
