@@ -220,16 +220,10 @@ def bounded(losses: Sequence[Loss]) -> list[Loss]:
     if len(losses) <= MAX_LOSSES:
         return list(losses)
     rest = losses[MAX_LOSSES - 1 :]
-    number = sum(_places(loss) for loss in rest)
+    problem, size = more_places(sum(map(_places, rest))), sum(loss.size or 0 for loss in rest)
     counts = [loss.messages for loss in rest if loss.messages is not None]
-    more = Loss(
-        rest[0].file,
-        None,
-        sum(loss.size or 0 for loss in rest),
-        more_places(number),
-        sum(counts) if len(counts) == len(rest) else None,
-    )
-    return [*losses[: MAX_LOSSES - 1], more]
+    messages = sum(counts) if len(counts) == len(rest) else None
+    return [*losses[: MAX_LOSSES - 1], Loss(rest[0].file, None, size, problem, messages)]
 
 
 def _places(loss: Loss) -> int:

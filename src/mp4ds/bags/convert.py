@@ -322,13 +322,9 @@ def ros2_channel(channel_id: int, topic: str, type_name: str, qos: str = "") -> 
     """
     store = get_typestore(Stores.ROS2_HUMBLE)
     definition, _ = store.generate_msgdef(type_name, ros_version=2)
-    return Channel(
-        channel_id,
-        topic,
-        "cdr",
-        Schema(type_name, "ros2msg", definition.encode()),
-        {QOS_KEY: qos, HASH_KEY: store.hash_rihs01(type_name)},
-    )
+    schema = Schema(type_name, "ros2msg", definition.encode())
+    metadata = {QOS_KEY: qos, HASH_KEY: store.hash_rihs01(type_name)}
+    return Channel(channel_id, topic, "cdr", schema, metadata)
 
 
 # ---------------------------------------------------------------- decoding

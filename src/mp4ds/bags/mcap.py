@@ -350,10 +350,9 @@ class McapWriter(BagWriter):
                 self._file, chunk_size=chunk_size, compression=CompressionType[compression.upper()]
             )
             if not hasattr(self._writer, _COMPRESSION):  # else noticed at the first large message
-                raise Mp4dsError(
-                    f"{path}: mcap {mcap.__version__} is newer than this mp4ds supports. Install "
-                    f"an older one: pip install 'mcap<{mcap.__version__}'"
-                )
+                remedy = f"Install an older one: pip install 'mcap<{mcap.__version__}'"
+                problem = f"mcap {mcap.__version__} is newer than this mp4ds supports"
+                raise Mp4dsError(f"{path}: {problem}. {remedy}")
             self._writer.start(profile=profile, library=library or f"mp4ds {__version__}")
         except BaseException:
             self.abandon()
@@ -368,9 +367,8 @@ class McapWriter(BagWriter):
         """
         times = message.log_time, message.publish_time
         if not (min(times) >= 0 and max(times) < 2**64 and 0 <= message.sequence < 2**32):
-            raise ConversionError(
-                message.channel.topic, "has a time or sequence number that MCAP cannot hold"
-            )
+            problem = "has a time or sequence number that MCAP cannot hold"
+            raise ConversionError(message.channel.topic, problem)
 
     def add_schema(self, schema: Schema) -> None:
         """Write a definition, whether a channel refers to it or not."""

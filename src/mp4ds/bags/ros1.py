@@ -163,11 +163,9 @@ def other_format(path: Path, start: bytes) -> SourceError:
     """
     version = re.match(rb"#ROS(?:BAG|RECORD|LOG) V(\d+\.\d+)", start)
     if version and version[1] != b"2.0":
-        return SourceError(
-            path,
-            f"is a ROS 1 bag of version {version[1].decode()}; only version 2.0 is supported",
-            "Convert it first, with `rosbag filter OLD NEW True` of ROS 1.",
-        )
+        problem = f"is a ROS 1 bag of version {version[1].decode()}; only version 2.0 is supported"
+        remedy = "Convert it first, with `rosbag filter OLD NEW True` of ROS 1."
+        return SourceError(path, problem, remedy)
     return other_begin(path, "a ROS 1 bag", MAGIC, start)
 
 
@@ -369,11 +367,8 @@ class Ros1Reader(BagReader):
         if header.get(b"encryptor"):
             raise SourceError(path, "is encrypted", "Decrypt it with `rosbag decrypt` first.")
         if index == 0:
-            raise SourceError(
-                path,
-                "is not indexed: the recording was cut short",
-                f"Run `rosbag reindex` on it first, or {SALVAGE}",
-            )
+            remedy = f"Run `rosbag reindex` on it first, or {SALVAGE}"
+            raise SourceError(path, "is not indexed: the recording was cut short", remedy)
         if index > self._size:
             problem = f"is cut short: its index should begin at byte {index}, and it has "
             raise SourceError(path, f"{problem}{self._size} bytes", _COPY_AGAIN)

@@ -65,12 +65,10 @@ class Ros1Writer(BagWriter):
             ConversionError: It is not a ROS 1 channel.
         """
         if channel.message_encoding != "ros1":
-            raise ConversionError(
-                channel.topic,
-                f"its messages are {channel.message_encoding or 'in an unknown encoding'}, and a "
-                "ROS 1 bag can only hold ROS 1 messages",
-                "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is.",
-            )
+            encoding = channel.message_encoding or "in an unknown encoding"
+            problem = f"its messages are {encoding}, and a ROS 1 bag can only hold ROS 1 messages"
+            remedy = "Exclude the topic with `exclude`, or unpack to mcap, which keeps it as it is."
+            raise ConversionError(channel.topic, problem, remedy)
 
     @staticmethod
     def check_message(message: Message) -> None:
@@ -81,11 +79,10 @@ class Ros1Writer(BagWriter):
         """
         topic = message.channel.topic
         if not 0 <= message.log_time < MAX_TIME:
-            raise ConversionError(
-                topic,
-                f"has a log time of {message.log_time} ns, and ROS 1 can hold 0 to 2^32 seconds",
-                "Unpack to mcap, which keeps it as it is.",
+            problem = (
+                f"has a log time of {message.log_time} ns, and ROS 1 can hold 0 to 2^32 seconds"
             )
+            raise ConversionError(topic, problem, "Unpack to mcap, which keeps it as it is.")
         if len(message.data) > _MAX_PAYLOAD:
             raise ConversionError(topic, "has a message too large for a ROS 1 bag")
 

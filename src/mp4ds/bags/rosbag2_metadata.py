@@ -70,24 +70,16 @@ class TopicMetadata:
     @classmethod
     def of(cls, channel: Channel) -> TopicMetadata:
         """The topic that a channel is; channels that do not differ in this are one."""
-        return cls(
-            channel.topic,
-            channel.type_name,
-            channel.message_encoding,
-            channel.metadata.get(QOS_KEY, ""),
-            channel.metadata.get(HASH_KEY, ""),
-        )
+        qos, type_hash = (channel.metadata.get(key, "") for key in (QOS_KEY, HASH_KEY))
+        encoding = channel.message_encoding
+        return cls(channel.topic, channel.type_name, encoding, qos, type_hash)
 
     def to_channel(self, channel_id: int) -> Channel:
         """The channel of a topic that is not in the storage."""
         metadata = {QOS_KEY: self.qos, HASH_KEY: self.type_hash}
-        return Channel(
-            channel_id,
-            self.name,
-            self.serialization_format,
-            Schema(self.type_name, "", b""),
-            {key: value for key, value in metadata.items() if value is not None},
-        )
+        known = {key: value for key, value in metadata.items() if value is not None}
+        schema = Schema(self.type_name, "", b"")
+        return Channel(channel_id, self.name, self.serialization_format, schema, known)
 
 
 @dataclass(frozen=True)

@@ -77,11 +77,9 @@ class Tables:
         for name, sql in self.rows("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"):
             if not isinstance(sql, bytes) or not _PLAIN.match(sql):
                 shown = bytes(name).decode(errors="replace") if isinstance(name, bytes) else name
-                raise SourceError(
-                    self._path,
-                    f"has a view or virtual table {shown!r}, which recordings never have",
-                    f"Drop it with the sqlite3 tool, or {SALVAGE}",
-                )
+                problem = f"has a view or virtual table {shown!r}, which recordings never have"
+                remedy = f"Drop it with the sqlite3 tool, or {SALVAGE}"
+                raise SourceError(self._path, problem, remedy)
 
     def select(self, query: str, values: Any = ()) -> sqlite3.Cursor:
         """Rows of numbers, or of the schema, which the file's size bounds."""
@@ -139,11 +137,9 @@ def open_tables(path: Path, *, damaged: bool = False) -> Iterator[Tables]:
     except (sqlite3.Error, UnicodeDecodeError) as error:
         if tables and tables.raised:
             raise tables.raised from None
-        remedy = (
-            "It was not closed properly: open and close it once with the sqlite3 tool, or "
-            if beside
-            else "If it was cut short, try `.recover` of the sqlite3 tool, or "
-        )
+        remedy = "If it was cut short, try `.recover` of the sqlite3 tool, or "
+        if beside:
+            remedy = "It was not closed properly: open and close it once with the sqlite3 tool, or "
         problem = f"cannot be read as sqlite3: {error}"
         raise SourceError(path, problem, remedy + SALVAGE) from None
     finally:
@@ -337,11 +333,9 @@ class SqliteReader(BagReader):
                         yield self._message(tables, row_id, f"message of id {row_id}")
 
     def _bad_index(self) -> SourceError:
-        return SourceError(
-            self.path,
-            "is damaged: its index of times does not list its messages",
-            f"Rebuild it with `REINDEX` in the sqlite3 tool, or {SALVAGE}",
-        )
+        problem = "is damaged: its index of times does not list its messages"
+        remedy = f"Rebuild it with `REINDEX` in the sqlite3 tool, or {SALVAGE}"
+        return SourceError(self.path, problem, remedy)
 
     def _message(self, tables: Tables, row_id: int, place: str) -> Message:
         # a decompressed copy may hold a message that is large though its file is small
@@ -417,6 +411,7 @@ def _conditions(excerpt: Excerpt) -> Iterator[tuple[str, list[int]]]:
 
 _WITHOUT_QOS, _WITHOUT_HASHES, _NEWEST = 1, 3, 4  # schemas; 2 differs from 3 by no topic
 
+_REMEDY = "Unpack to mcap instead."
 _MAX_TIME = 2**63 - 1
 _DISK_ERRORS = {"full": errno.ENOSPC, "readonly": errno.EROFS, "read-only": errno.EROFS}
 _MESSAGES = """
@@ -444,11 +439,8 @@ CREATE TABLE message_definitions(
 
 def _schema_of(channel: Channel) -> Schema:
     if channel.schema is None:
-        raise ConversionError(
-            channel.topic,
-            "has no schema, and rosbag2 needs the type of every topic",
-            "Unpack to mcap instead.",
-        )
+        problem = "has no schema, and rosbag2 needs the type of every topic"
+        raise ConversionError(channel.topic, problem, _REMEDY)
     return channel.schema
 
 
@@ -510,11 +502,8 @@ class SqliteWriter(BagWriter):
             ConversionError: Its log time is negative or beyond 63 bits.
         """
         if not 0 <= message.log_time <= _MAX_TIME:
-            raise ConversionError(
-                message.channel.topic,
-                f"has the log time {message.log_time}, which rosbag2 cannot store",
-                "Unpack to mcap instead.",
-            )
+            problem = f"has the log time {message.log_time}, which rosbag2 cannot store"
+            raise ConversionError(message.channel.topic, problem, _REMEDY)
 
     def add_channel(self, channel: Channel) -> None:
         """Add a topic; channels with identical rows share one."""
@@ -551,11 +540,8 @@ class SqliteWriter(BagWriter):
                     "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", row
                 )
         except (OverflowError, sqlite3.DataError):
-            raise ConversionError(
-                message.channel.topic,
-                f"has a message of {len(message.data)} bytes, more than sqlite3 can store",
-                "Unpack to mcap instead.",
-            ) from None
+            problem = f"has a message of {len(message.data)} bytes, more than sqlite3 can store"
+            raise ConversionError(message.channel.topic, problem, _REMEDY) from None
 
     def add_bag_info(self, version: int, text: str, ros_distro: str) -> None:
         """Write the topics, and the storage file's own description of the recording."""
@@ -578,13 +564,12 @@ class SqliteWriter(BagWriter):
                 execute("INSERT INTO metadata VALUES (NULL, ?, ?)", (version, text))
             if schema >= _NEWEST:
                 execute(_DEFINITIONS)
-                executemany(
-                    "INSERT INTO message_definitions VALUES (NULL, ?, ?, ?, ?)",
-                    (
-                        (schema.name, schema.encoding, _text_or_blob(schema.data), type_hash)
-                        for (_, type_hash), schema in self._definitions.items()
-                    ),
+                definitions = (
+                    (schema.name, schema.encoding, _text_or_blob(schema.data), type_hash)
+                    for (_, type_hash), schema in self._definitions.items()
                 )
+                insert = "INSERT INTO message_definitions VALUES (NULL, ?, ?, ?, ?)"
+                executemany(insert, definitions)
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Count an attachment."""

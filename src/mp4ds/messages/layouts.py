@@ -516,11 +516,9 @@ class Layout:
         Returns:
             One array of shape (rows, columns) or (rows, columns, channels), or one per plane.
         """
-        if self.is_source:
-            return self.arrange(self.values.encode(pixels), prediction)
-        if prediction is not None:
-            pixels = difference(pixels, *prediction)
-        return self._arrangement.arrange(self.values.encode(pixels))
+        if prediction is not None and not self.is_source:
+            pixels, prediction = difference(pixels, *prediction), None
+        return self.arrange(self.values.encode(pixels), prediction)
 
     def arrange(self, samples: Samples, prediction: Prediction | None = None) -> Picture:
         """As `to_picture`, of what `Values.prove` gave."""
@@ -571,16 +569,8 @@ def bind(name: str, encoding: Encoding, parameters: LayoutParameters = NO_PARAME
     values = kind.values(encoding, parameters)
     arrangement = kind.arrangement(encoding, parameters)
     pixel_format = arrangement.pixel_format(values.bits)
-    return Layout(
-        name=name,
-        encoding=encoding,
-        parameters=parameters,
-        is_exact=kind.is_exact,
-        is_shown=kind.is_shown,
-        pixel_format=pixel_format,
-        values=values,
-        _arrangement=arrangement,
-    )
+    shown = kind.is_exact, kind.is_shown, pixel_format
+    return Layout(name, encoding, parameters, *shown, values, arrangement)
 
 
 def fit(name: str, encoding: Encoding, samples: Sequence[Pixels]) -> Layout | None:
@@ -636,12 +626,10 @@ def why_not(encoding_name: str, *, width: int, height: int, step: int, size: int
         return f"{size} bytes of pixels where {rows} says {due}"
     if width > MAX_SIDE or height > MAX_SIDE:
         return f"an image of {width}x{height} pixels, beyond {MAX_SIDE}"
-    picture = layout_for(encoding, lossless=True).picture_size(width, height)
-    if max(picture) > MAX_SIDE:
-        return (
-            f"an image of {width}x{height} pixels, whose picture of {picture[0]}x{picture[1]} "
-            f"is beyond {MAX_SIDE}"
-        )
+    size_of_picture = layout_for(encoding, lossless=True).picture_size(width, height)
+    if max(size_of_picture) > MAX_SIDE:
+        picture = "whose picture of {}x{}".format(*size_of_picture)
+        return f"an image of {width}x{height} pixels, {picture} is beyond {MAX_SIDE}"
     if step > width * encoding.pixel_bytes + MAX_ROW_PADDING:
         return f"more than {MAX_ROW_PADDING} bytes of padding in a row"
     return None

@@ -231,10 +231,8 @@ class Few(Whole):
         super().__init__(encoding, given)
         self._entries = given.entries or 0
         if self._entries < FEWEST_ENTRIES or self._entries & (self._entries - 1):
-            raise ValueError(
-                f"a list of {self._entries} values, which is no power of two from "
-                f"{FEWEST_ENTRIES} on"
-            )
+            problem = f"is no power of two from {FEWEST_ENTRIES} on"
+            raise ValueError(f"a list of {self._entries} values, which {problem}")
 
     def refuses(self, pixels: Pixels) -> str | None:
         """Too many values."""

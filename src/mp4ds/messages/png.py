@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -447,12 +448,8 @@ def rebuild(pixels: Pixels, recipe: PngRecipe) -> bytes:
     if channels not in _COLOR_TYPES or pixels.dtype.itemsize > 2 or not pixels.size:
         raise Refused("no PNG holds such pixels")
     height, width = pixels.shape[:2]
-    header = b"IHDR%b%b%b%b\0\0\0" % (
-        width.to_bytes(4, "big"),
-        height.to_bytes(4, "big"),
-        bytes([8 * pixels.dtype.itemsize]),
-        bytes([_COLOR_TYPES[channels]]),
-    )
+    kind = 8 * pixels.dtype.itemsize, _COLOR_TYPES[channels], 0, 0, 0
+    header = b"IHDR" + struct.pack(">II5B", width, height, *kind)
     order = pixels.dtype.newbyteorder(">")
     pixel_rows = np.ascontiguousarray(pixels, order).reshape(height, -1).view(np.uint8)
     rows = filter_rows(pixel_rows, channels * pixels.dtype.itemsize, rule)
@@ -483,19 +480,15 @@ def noise_file(pixels: Pixels) -> bytes:
 
 def _deflate(rows: NDArray[np.uint8], recipe: PngRecipe) -> bytes:
     """Deflate rows, without the two bytes of zlib's header."""
-    compressor = zlib.compressobj(
-        recipe.level, zlib.DEFLATED, recipe.window_bits, recipe.memory_level, recipe.strategy
-    )
+    window, memory = recipe.window_bits, recipe.memory_level
+    compressor = zlib.compressobj(recipe.level, zlib.DEFLATED, window, memory, recipe.strategy)
     return (compressor.compress(rows.data) + compressor.flush())[2:]
 
 
 def _chunk(body: bytes) -> bytes:
     """A chunk from its type and data (5.3)."""
-    return b"%b%b%b" % (
-        (len(body) - 4).to_bytes(4, "big"),
-        body,
-        zlib.crc32(body).to_bytes(4, "big"),
-    )
+    size, checksum = len(body) - 4, zlib.crc32(body)
+    return b"".join((size.to_bytes(4, "big"), body, checksum.to_bytes(4, "big")))
 
 
 def _split(data: bytes | memoryview) -> tuple[PngInfo, bytes, bytes, int, bytes]:

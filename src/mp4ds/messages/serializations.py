@@ -141,14 +141,10 @@ class RosForm(Form):
                 slot, size = _SLOT_FIELDS[name]
                 start = reader.offset - struct.calcsize(code)
                 spans[slot] = start, start + size
-        parts = {
-            "stamp": join_stamp(values["sec"], values["nanosec"]),
-            "seq": values.get("seq"),
-            "pts": values.get("pts"),
-            "frame_id": values["frame_id"],
-            "fields": make_fields(self._kind, values),
-        }
-        return parts, spans, body
+        stamp = join_stamp(values["sec"], values["nanosec"])
+        fields = make_fields(self._kind, values)
+        found = stamp, values.get("seq"), values.get("pts"), values["frame_id"], fields
+        return found, spans, body
 
     def slot(self, name: str, slots: Slots, body_size: int) -> bytes:
         """The bytes of a slot."""
@@ -311,20 +307,19 @@ class ProtobufForm(Form):
         for name, kind in self._kinds.items():
             if kind in _SLOTS and _SLOTS[kind] not in spans:
                 raise Refused(f"it has no {name}")
-        parts = {
-            "stamp": values["timestamp"],
-            "seq": None,
-            "pts": None,
-            "frame_id": values["frame_id"],
-            "fields": make_fields(self._kind, _checked(values)),
-        }
-        return parts, spans, body
+        fields = make_fields(self._kind, _checked(values))
+        return (values["timestamp"], None, None, values["frame_id"], fields), spans, body
 
     def slot(self, name: str, slots: Slots, body_size: int) -> bytes:
         """The bytes of a slot, with its length."""
         if name == "body":
             return _varint_bytes(body_size)
-        timestamp = _timestamp(slots.stamp)
+        # a google.protobuf.Timestamp as serializers write it
+        sec, nanos = divmod(slots.stamp, NS)
+        if not -_INT64 <= sec < _INT64:
+            raise Refused("a time is beyond what its message has bits for")
+        timestamp = b"\x08" + _varint_bytes(sec & _UINT64) if sec else b""
+        timestamp += b"\x10" + _varint_bytes(nanos) if nanos else b""
         return _varint_bytes(len(timestamp)) + timestamp
 
 
@@ -456,15 +451,6 @@ def _stamp(raw: memoryview) -> int:
     return stamp
 
 
-def _timestamp(stamp: int) -> bytes:
-    """A google.protobuf.Timestamp as serializers write it."""
-    sec, nanos = divmod(stamp, NS)
-    if not -(1 << 63) <= sec < 1 << 63:
-        raise Refused("a time is beyond what its message has bits for")
-    out = b"\x08" + _varint_bytes(sec & _UINT64) if sec else b""
-    return out + (b"\x10" + _varint_bytes(nanos) if nanos else b"")
-
-
 def decoder_of_schema(type_name: str, schema: bytes) -> Callable[[memoryview], Any]:
     """A decoder of messages of any type; it raises Refused for invalid ones.
 
@@ -559,10 +545,9 @@ def wire_of(message_encoding: str, data: memoryview) -> str:
             if prefix and data[:4] == prefix:
                 return name
         if data[:4] == _ZSTD:
-            raise Refused(
-                "it is compressed by zstd, as rosbag2 does in its compression mode MESSAGE: pack "
-                "the folder with its metadata.yaml"
-            )
+            remedy = "pack the folder with its metadata.yaml"
+            mode = "as rosbag2 does in its compression mode MESSAGE"
+            raise Refused(f"it is compressed by zstd, {mode}: {remedy}")
         if len(data) < 4:
             raise Refused("it is too short for a CDR encapsulation")
         raise Refused(f"its CDR encapsulation is {bytes(data[:4]).hex()}, which is not plain CDR")

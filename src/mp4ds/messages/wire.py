@@ -123,12 +123,12 @@ class Slots:
 Span = tuple[int, int]
 
 
-Reading = tuple[Mapping[str, Any], Mapping[str, Span], Span]
+Reading = tuple[tuple[int, int | None, int | None, str, Fields], Mapping[str, Span], Span]
 """What a message holds, and where.
 
-Its `Parts` other than body and blank; start and end of each slot that it has, in order: ``stamp``,
-``seq``, ``pts``, and ``body``, which includes the body's length; and start and end of the body,
-empty at the end of a message without one.
+Its `Parts` other than body and blank, in their order; start and end of each slot that it has, in
+order: ``stamp``, ``seq``, ``pts``, and ``body``, which includes the body's length; and start and
+end of the body, empty at the end of a message without one.
 """
 
 
@@ -175,7 +175,7 @@ class Form(ABC):
         # a blank keeps the body's length as far as what follows depends on it
         kept = (end - start) % self.body_alignment
         head, tail = Template(self, data, spans, kept).around(_BLANK, kept)
-        return Parts(**values, body=data[start:end], blank=b"".join((head, bytes(kept), tail)))
+        return Parts(*values, data[start:end], b"".join((head, bytes(kept), tail)))
 
     def template(self, blank: bytes) -> Template:
         """The template of a blank.

@@ -278,17 +278,13 @@ class Ros1Salvage(FileSalvage):
         connection, log_time = frame.fields.number(b"conn"), frame.fields.time(b"time")
         channel = self._channels.get(connection)
         if log_time >= MAX_TIME:
-            self._lose(
-                offset,
-                frame.size,
-                "a message has a time past 2^32 seconds, which ROS cannot represent",
-            )
+            problem = "a message has a time past 2^32 seconds, which ROS cannot represent"
+            self._lose(offset, frame.size, problem)
             return None
         if channel is None:
             self._tally.stray(connection)
             problem = f"messages of connection {connection}, whose record is missing"
-            loss = self._log.lost_of_kind(connection, offset, problem)
-            loss.add(1, ())
+            self._log.lost_of_kind(connection, offset, problem).add(1, ())
             return None
         return Message(channel, log_time, log_time, 0, body)
 
