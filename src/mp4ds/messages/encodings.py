@@ -510,6 +510,14 @@ class Narrow(Values):
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
+        """The bits in use; of colours at least 10, as FFmpeg's planar formats have."""
+        found = cls.used_bits(encoding, samples)
+        if found is None or found.bits != 8 or encoding.channels == 1:
+            return found
+        return LayoutParameters(bits=10, shift=max((found.shift or 0) - 2, 0))
+
+    @staticmethod
+    def used_bits(encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """The fewest bits for values that end at the highest bit, or at the twelfth.
 
         At the highest bit, the zeros below show the sensor's depth. Elsewhere a scene may just be
@@ -534,20 +542,6 @@ class Narrow(Values):
         return Narrow.first_fitting(encoding, samples, *candidates)
 
 
-class NarrowPlanes(Narrow):
-    """Those of colours, which have more than 8 bits in FFmpeg's planar formats."""
-
-    depths = DEPTHS[1:]
-
-    @classmethod
-    def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
-        """As for grey, but at least 10 bits."""
-        found = Narrow.fit(encoding, samples)
-        if found is None or found.bits != 8:
-            return found
-        return LayoutParameters(bits=10, shift=max((found.shift or 0) - 2, 0))
-
-
 _MOST_HIGH = 10  # bits that a plane of folded samples may have
 _LOW_BITS = {12: 3, 14: 5, 16: 8}  # by measurement: the bits that are mostly noise
 
@@ -567,7 +561,7 @@ class NarrowFolded(Narrow):
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
         """All bits, or those in use if there are enough of them to separate noise from the rest."""
-        found = Narrow.fit(encoding, samples) or LayoutParameters(bits=16, shift=0)
+        found = cls.used_bits(encoding, samples) or LayoutParameters(bits=16, shift=0)
         low = _LOW_BITS.get(found.bits or 0)
         return found.model_copy(update={"low": low}) if low else None
 

@@ -24,7 +24,6 @@ from mp4ds.messages.encodings import (
     LayoutParameters,
     Narrow,
     NarrowFolded,
-    NarrowPlanes,
     Opaque,
     Picture,
     Pixels,
@@ -108,7 +107,9 @@ class PlanarRgb(Arrangement):
     order: str
 
     def pixel_format(self, bits: int) -> str:
-        """By alpha and depth."""
+        """By alpha and depth; there are none of 8 bits."""
+        if bits == 8:
+            raise ValueError("no layout has planes of 8 bits")
         return f"{'gbrap' if 'a' in self.order else 'gbrp'}{bits}le"
 
     def arrange(self, samples: Samples) -> Picture:
@@ -427,9 +428,9 @@ LAYOUTS: dict[str, LayoutKind] = {
     "bgra": _shown(lambda e, p: Packed("bgra")),
     "opaque": _shown(lambda e, p: Packed(_COLOURS[_rgb_order(e)]), Opaque),
     "gbr16": _shown(lambda e, p: PlanarRgb(_rgb_order(e))),
-    "gbr_bits": _shown(lambda e, p: PlanarRgb(_rgb_order(e)), NarrowPlanes),
+    "gbr_bits": _shown(lambda e, p: PlanarRgb(_rgb_order(e)), Narrow),
     "gbra16": _shown(lambda e, p: PlanarRgb(_rgb_order(e))),
-    "gbra_bits": _shown(lambda e, p: PlanarRgb(_rgb_order(e)), NarrowPlanes),
+    "gbra_bits": _shown(lambda e, p: PlanarRgb(_rgb_order(e)), Narrow),
     "mosaic8": LayoutKind(Whole, lambda e, p: Mosaic()),
     "mosaic16": LayoutKind(Whole, lambda e, p: Mosaic()),
     "mosaic_bits": LayoutKind(Narrow, lambda e, p: Mosaic()),

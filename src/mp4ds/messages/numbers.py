@@ -143,7 +143,7 @@ class Tone(PatternTable):
         samples have, since a camera may start in the dark. Only values that are close together, far
         from both, as temperatures are, get most of the levels.
         """
-        used = Narrow.fit(encoding, samples) or LayoutParameters(bits=16, shift=0)
+        used = Narrow.used_bits(encoding, samples) or LayoutParameters(bits=16, shift=0)
         bits, shift = used.bits or 16, used.shift or 0
         values = np.concatenate([native(pixels)[::3, ::3].ravel() for pixels in samples]) >> shift
         low, middle, high = map(float, np.quantile(values, (0.001, 0.5, 0.999)))

@@ -410,25 +410,17 @@ class McapSalvage(FileSalvage):
         channel_id = int.from_bytes(body[:2], "little")
         if is_doubtful and channel_id not in self._declared.channels:
             return
-        message = self._message(channel_id, body, offset)
-        if message and is_doubtful:
-            self._tally.hold(channel_id, message)
-        elif message:
-            self._tally.gave(channel_id, message.log_time)
-            yield message
-
-    def _message(self, channel_id: int, body: bytes | memoryview, offset: int) -> Message | None:
-        """A message; None if it is lost.
-
-        Raises:
-            DamageError: It is shorter than its fields.
-        """
         if not self._has_channel(channel_id) and len(body) >= MESSAGE_HEAD.size:
             self._tally.stray(channel_id)
             problem = f"messages of channel {channel_id}, whose record is missing"
             self._log.lost_of_kind(problem, offset, problem).add(1, ())
-            return None
-        return self._declared.message(body)
+            return
+        message = self._declared.message(body)
+        if is_doubtful:
+            self._tally.hold(channel_id, message)
+        else:
+            self._tally.gave(channel_id, message.log_time)
+            yield message
 
     def _has_channel(self, channel_id: int) -> bool:
         """Whether a channel is known; from a damaged summary as a last resort."""

@@ -174,44 +174,41 @@ class Ros1Salvage(FileSalvage):
             self._due = header.fields.number(b"index_pos", 8)
             chunks = int.from_bytes(header.fields.get(b"chunk_count", b""), "little")
             if len(MAGIC) + header.size <= self._due < size:
-                self._read_listed(self._due)
+                for frame, body in self._records_from(self._due):
+                    self._index_offset = self._due
+                    if frame.kind == Op.CONNECTION:
+                        self._declare(frame, body)
+                    elif frame.kind == Op.CHUNK_INFO:
+                        span = frame.fields.time(b"start_time"), frame.fields.time(b"end_time")
+                        counts = body[: len(body) // CHUNK_COUNT.size * CHUNK_COUNT.size]
+                        place = frame.fields.number(b"chunk_pos", 8)
+                        self._infos[place] = span, dict(CHUNK_COUNT.iter_unpack(counts))
+                    else:
+                        break
         is_whole = chunks == len(self._infos) and self._index_offset is not None
         self._infos = dict(sorted(self._infos.items())) if is_whole else {}
         starts = {place: span[0] for place, (span, counts) in self._infos.items() if counts}
         places = np.array(list(starts), np.uint64)
         self._later = later_starts(places, np.array(list(starts.values()), np.uint64))
         if not is_whole and self._due != 0:
-            self._search_connections(max(len(MAGIC), size - _SEARCHED))
-
-    def _read_listed(self, offset: int) -> None:
-        """Read the index at its expected place."""
-        with Window.of_file(self.path, offset) as window:
-            scan = _Scan(window)
-            if scan.here() is None:
-                return
-            self._index_offset = offset
-            while (frame := scan.next()) and frame.kind in (Op.CONNECTION, Op.CHUNK_INFO):
-                body = scan.body(frame)
-                if body is None:
-                    continue
-                if frame.kind == Op.CHUNK_INFO:
-                    span = frame.fields.time(b"start_time"), frame.fields.time(b"end_time")
-                    counts = body[: len(body) // CHUNK_COUNT.size * CHUNK_COUNT.size]
-                    place = frame.fields.number(b"chunk_pos", 8)
-                    self._infos[place] = span, dict(CHUNK_COUNT.iter_unpack(counts))
-                else:
+            for frame, body in self._records_from(max(len(MAGIC), size - _SEARCHED), search=True):
+                if frame.kind == Op.CONNECTION:
                     self._declare(frame, body)
 
-    def _search_connections(self, offset: int) -> None:
-        """Search for connections from a byte on, if the index is not at its expected place."""
+    def _records_from(
+        self, offset: int, *, search: bool = False
+    ) -> Iterator[tuple[RecordFrame, bytes]]:
+        """The readable records from a byte on, where one should begin unless it is searched for."""
         with Window.of_file(self.path, offset) as window:
             scan = _Scan(window)
-            if offset > len(MAGIC):
+            if search and offset > len(MAGIC):
                 scan.resync(offset, "", passed=0)
+            elif scan.here() is None and not search:
+                return
             while frame := scan.next():
                 body = scan.body(frame)
-                if body is not None and frame.kind == Op.CONNECTION:
-                    self._declare(frame, body)
+                if body is not None:
+                    yield frame, body
 
     def _declare(self, frame: RecordFrame, body: bytes) -> None:
         """Take a connection of the index, unless it is damaged; the first of a number counts."""

@@ -266,6 +266,11 @@ class Draft:
     start: int | None = None
     end: int | None = None
 
+    @property
+    def stop(self) -> int | None:
+        """Byte after it, if its place is known."""
+        return None if self.offset is None or self.size is None else self.offset + self.size
+
     def add(self, messages: int, topics: Iterable[str]) -> None:
         """Count messages that were lost."""
         self.messages = (self.messages or 0) + messages
@@ -313,15 +318,8 @@ class LossLog:
             The loss they became part of, to be completed.
         """
         last = self._drafts[-1] if self._drafts and not self._number_more else None
-        if (
-            join
-            and last is not None
-            and offset is not None
-            and last.offset is not None
-            and last.size is not None
-            and last.offset + last.size == offset
-        ):
-            last.size += size or 0
+        if join and last and offset is not None and last.stop == offset:
+            last.size = (last.size or 0) + (size or 0)
             return last
         draft = Draft(offset, size, problem, start=self._last_time)
         if len(self._drafts) < MAX_LOSSES - 1:
