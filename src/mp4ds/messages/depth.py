@@ -38,8 +38,8 @@ def decode_rvl(data: bytes | memoryview) -> Depth:
     check_size(columns, rows)
     if 2 * columns * rows > MAX_IMAGE_BYTES:
         raise Refused(f"its RVL image has {columns}x{rows} pixels")
-    words = np.frombuffer(data, "<u4", offset=_HEADER.size)
-    numbers = _read_numbers(_nibbles_of(words))
+    octets = np.frombuffer(data, "<u4", offset=_HEADER.size).astype(">u4").view(np.uint8)
+    numbers = _read_numbers(np.stack((octets >> 4, octets & 15), axis=1).ravel())
     starts, lengths, first = _read_runs(numbers, columns * rows)
     # every number that is not a count is a difference
     is_difference = np.ones(first[-1] if len(first) else 0, bool)
@@ -50,7 +50,9 @@ def decode_rvl(data: bytes | memoryview) -> Depth:
     if len(values) and (values.min() < 1 or values.max() > 0xFFFF):
         raise Refused("its RVL codes a depth beyond 16 bits")
     image = np.zeros(columns * rows, np.uint16)
-    image[_ranges(starts, lengths)] = values
+    # all places of the runs, in order
+    shifts = starts - (np.cumsum(lengths) - lengths)
+    image[np.repeat(shifts, lengths) + np.arange(lengths.sum())] = values
     return image.reshape(rows, columns)
 
 
@@ -75,22 +77,10 @@ def encode_rvl(depth: Depth) -> bytes:
     is_difference[first] = is_difference[first + 1] = False
     numbers[first], numbers[first + 1] = zeros, nonzeros
     numbers[is_difference] = (differences << 1) ^ (differences >> 63)
-    return _HEADER.pack(columns, rows) + _words_of(_write_numbers(numbers)).tobytes()
-
-
-def _nibbles_of(words: NDArray[np.uint32]) -> NDArray[np.uint8]:
-    octets = words.astype(">u4").view(np.uint8)
-    nibbles = np.empty(2 * len(octets), np.uint8)
-    nibbles[0::2] = octets >> 4
-    nibbles[1::2] = octets & 15
-    return nibbles
-
-
-def _words_of(nibbles: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    padded = np.zeros(-(-len(nibbles) // _WORD_NIBBLES) * _WORD_NIBBLES, np.uint8)
-    padded[: len(nibbles)] = nibbles
-    octets = padded[0::2] << 4 | padded[1::2]
-    return octets.view(">u4").astype("<u4").view(np.uint8)
+    nibbles = _write_numbers(numbers)
+    nibbles = np.pad(nibbles, (0, -len(nibbles) % _WORD_NIBBLES))
+    octets = nibbles[0::2] << 4 | nibbles[1::2]
+    return _HEADER.pack(columns, rows) + octets.view(">u4").astype("<u4").tobytes()
 
 
 def _read_numbers(nibbles: NDArray[np.uint8]) -> _Numbers:
@@ -153,14 +143,6 @@ def _read_runs(numbers: _Numbers, pixels: int) -> tuple[_Numbers, _Numbers, _Num
         raise Refused("its RVL codes another number of pixels than it promises")
     places.append(place)
     return np.array(starts), np.array(lengths), np.array(places)
-
-
-def _ranges(starts: _Numbers, lengths: _Numbers) -> _Numbers:
-    """All places of the runs, in order."""
-    total = int(lengths.sum())
-    shifts = starts - (np.cumsum(lengths) - lengths)
-    places: _Numbers = np.repeat(shifts, lengths) + np.arange(total)
-    return places
 
 
 # ---------------------------------------------------------------- depth

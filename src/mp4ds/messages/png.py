@@ -162,8 +162,12 @@ def filter_rows(pixels: Bytes, pixel_bytes: int, rule: Rule) -> Bytes:
     height, row_bytes = pixels.shape
     out = np.empty((height, 1 + row_bytes), np.uint8)
     kinds = _kinds(rule, height, row_bytes // pixel_bytes)
-    for start, stop, shifted in _bands(pixels):
-        band = pixels[start:stop]
+    nothing, rows = np.zeros_like(pixels[:1]), max(1, _BAND_BYTES // row_bytes)
+    for start in range(0, height, rows):
+        stop = min(start + rows, height)
+        band, shifted = pixels[start:stop], pixels[start - 1 : stop - 1]
+        if not start:
+            shifted = np.concatenate((nothing, pixels[: stop - 1]))
         if len(kinds) == 1:
             out[start:stop, 0] = kinds[0]
             out[start:stop, 1:] = _filtered(band, shifted, pixel_bytes, kinds[0])
@@ -174,7 +178,6 @@ def filter_rows(pixels: Bytes, pixel_bytes: int, rule: Rule) -> Bytes:
         out[start:stop, 0] = np.array(kinds, np.uint8)[chosen]
         out[start:stop, 1:] = tried[chosen, np.arange(stop - start)]
     if rule.first is not None:
-        nothing = np.zeros_like(pixels[:1])
         out[0, 0] = rule.first
         out[0, 1:] = _filtered(pixels[:1], nothing, pixel_bytes, rule.first)[0]
     return out
@@ -193,15 +196,13 @@ def find_rule(kinds: Bytes, pixels: Bytes, pixel_bytes: int) -> str | None:
         return str(first)
     if first == _SUB and (rest == rest[0]).all() and f"1,{rest[0]}" in RULES:
         return f"1,{rest[0]}"
+    sample = min(len(kinds), 1 + _BAND_BYTES // pixels.shape[1])
     for name, rule in RULES.items():
-        if len(rule.kinds) > 1:
-            sample = min(len(kinds), 1 + _BAND_BYTES // pixels.shape[1])
-            if not np.array_equal(
-                filter_rows(pixels[:sample], pixel_bytes, rule)[:, 0], kinds[:sample]
-            ):
-                continue
-            if np.array_equal(filter_rows(pixels, pixel_bytes, rule)[:, 0], kinds):
-                return name
+        if len(rule.kinds) > 1 and all(
+            np.array_equal(filter_rows(pixels[:rows], pixel_bytes, rule)[:, 0], kinds[:rows])
+            for rows in (sample, len(kinds))
+        ):
+            return name
     return None
 
 
@@ -213,18 +214,6 @@ def _kinds(rule: Rule, height: int, width: int) -> tuple[int, ...]:
     if rule.narrow and width == 1:
         left_out |= {_SUB, _AVERAGE, _PAETH}
     return tuple(kind for kind in rule.kinds if kind not in left_out)
-
-
-def _bands(pixels: Bytes) -> Iterator[tuple[int, int, Bytes]]:
-    """Spans of rows, with the rows above them."""
-    height, row_bytes = pixels.shape
-    rows = max(1, _BAND_BYTES // row_bytes)
-    for start in range(0, height, rows):
-        stop = min(start + rows, height)
-        if start:
-            yield start, stop, pixels[start - 1 : stop - 1]
-        else:
-            yield start, stop, np.concatenate((np.zeros_like(pixels[:1]), pixels[: stop - 1]))
 
 
 def _filtered(band: Bytes, above: Bytes, pixel_bytes: int, kind: int) -> Bytes:

@@ -344,33 +344,27 @@ CONVERSIONS = {
 """The rules of the registry."""
 
 
-@dataclass
 class _Solution:
     """The YUV of pixels that share chroma, as far as it was found.
 
-    Attributes:
+    Args:
         rule: The conversion.
-        colours: R, G and B, shape (3, pixels that share chroma, N), int32.
+        colours: R, G and B, shape (3, pixels that share chroma, N), int32; the first pixel of each
+            has neither 0 nor 255.
+
+    Attributes:
         luma: Y, shape (pixels, N).
         chroma: 256 U + V, shape (N,).
         is_open: Where there is no solution yet, shape (N,).
     """
 
-    rule: Conversion
-    colours: Samples
-    luma: Samples
-    chroma: Samples
-    is_open: Samples
-
-    @classmethod
-    def of(cls, rule: Conversion, colours: Samples) -> _Solution:
-        """For colours of which the first pixel has neither 0 nor 255."""
+    def __init__(self, rule: Conversion, colours: Samples) -> None:
         _, sharing, count = colours.shape
-        luma, chroma = np.empty((sharing, count), np.int32), np.empty(count, np.int32)
-        solution = cls(rule, colours, luma, chroma, np.empty(count, bool))
+        self.rule, self.colours = rule, colours
+        self.luma, self.chroma = np.empty((sharing, count), np.int32), np.empty(count, np.int32)
+        self.is_open = np.empty(count, bool)
         for start in range(0, count, _CHUNK):
-            solution._begin(slice(start, start + _CHUNK))
-        return solution
+            self._begin(slice(start, start + _CHUNK))
 
     def _begin(self, part: slice) -> None:
         rule, colours = self.rule, self.colours[:, :, part]
@@ -444,12 +438,8 @@ class _Solution:
         colours = self.colours[:, :, places]
         is_black = (colours == 0).all(axis=0)
         due = np.where(is_black, 1, colours)
-        least = np.stack(
-            [
-                self.rule.least_luma(color, terms[chroma])
-                for color, terms in zip(due, self.rule.chroma, strict=True)
-            ]
-        )
+        offsets = self.rule.chroma[:, chroma][:, None]
+        least = self.rule.least_luma(due, offsets)
         most = np.where(due > 0, least, -256).max(axis=0)
         luma = np.clip(np.where(is_black, least.min(axis=0) - 1, most), 0, 255)
         is_right = np.ones(len(chroma), bool)
@@ -498,8 +488,7 @@ class Converted(Source):
         colours = np.empty((3, down, 2, height // down, width // 2), np.int32)
         for color, y, x in product(range(3), range(down), (0, 1)):
             colours[color, y, x] = rgb[y::down, x::2, color]
-        colours = colours.reshape(3, 2 * down, -1)
-        return _Solution.of(self._conversion, colours)
+        return _Solution(self._conversion, colours.reshape(3, 2 * down, -1))
 
     def _planes(self, samples: Samples) -> tuple[Samples, Samples, Samples]:
         """Views of Y, U and V."""
