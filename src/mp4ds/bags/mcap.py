@@ -398,7 +398,11 @@ class McapWriter(BagWriter):
         """Append a message, payload verbatim."""
         self.check_message(message)
         before = getattr(self._writer, _COMPRESSION)
-        if self._compresses_too_well(message.data):
+        # Readers could suspect a chunk that is compressed too well of claiming more than it holds.
+        # Such a message is larger than a chunk, and so completes the one that it is in.
+        size = 2 * len(message.data)
+        is_large = self._compresses and size > most_unpacked(0)
+        if is_large and size > most_unpacked(compressed_size([message.data])):
             setattr(self._writer, _COMPRESSION, CompressionType.NONE)
         self._writer.add_message(
             self._channel_ids[message.channel.id],
@@ -408,15 +412,6 @@ class McapWriter(BagWriter):
             message.sequence,
         )
         setattr(self._writer, _COMPRESSION, before)
-
-    def _compresses_too_well(self, data: bytes | memoryview) -> bool:
-        """Whether readers could suspect its chunk of claiming more than it holds.
-
-        Such a message is larger than a chunk, and so completes the one that it is in.
-        """
-        size = 2 * len(data)
-        is_large = self._compresses and size > most_unpacked(0)
-        return is_large and size > most_unpacked(compressed_size([data]))
 
     def flush(self) -> None:
         """Give the system all that was written, so that a reader of damaged files has it."""
@@ -482,14 +477,13 @@ def copy_verified(piece: Path, copy: Path) -> list[Loss]:
         while head := source.read(FRAME.size):
             offset = source.tell() - len(head)
             kind, size = FRAME.unpack(head.ljust(FRAME.size, b"\0"))
-            is_whole = kind in _OUTSIDE and size <= min(MAX_RECORD_BYTES, end - source.tell())
-            body = source.read(size) if is_whole else b""
-            if not is_whole:
+            if kind not in _OUTSIDE or size > min(MAX_RECORD_BYTES, end - source.tell()):
                 losses.append(Loss(piece.name, offset, end - offset, "it ends within a record"))
                 break
+            body = source.read(size)
             try:
                 if kind == Opcode.CHUNK:
-                    unpack_chunk(memoryview(body))
+                    unpack_chunk(body)
             except DamageError:
                 problem = "a chunk does not match its checksum"
                 losses.append(Loss(piece.name, offset, len(head) + size, problem))

@@ -166,14 +166,11 @@ class BagReader(ABC):
     def _begun_by(latched: Sequence[Message], records: Iterator[Record]) -> Iterator[Record]:
         # What is not a message comes first: it may tell about those that follow.
         for record in records:
-            if isinstance(record, Message):
+            if latched and isinstance(record, Message):
                 yield from latched
-                yield record
-                break
+                latched = ()
             yield record
-        else:
-            yield from latched
-        yield from records
+        yield from latched
 
     def times(self) -> Mapping[int, NDArray[np.int64]]:
         """Log times of every message, nanoseconds, sorted, by channel id."""
@@ -413,11 +410,6 @@ def merged(
     waiting = sorted(range(len(starts)), key=lambda number: (starts[number], number), reverse=True)
     heads: list[tuple[int, int, Message, Iterator[Record]]] = []
 
-    def is_next(time: int, number: int) -> bool:
-        if waiting and starts[waiting[-1]] <= time:
-            return False
-        return not heads or (time, number) < heads[0][:2]
-
     while waiting or heads:
         if waiting and (not heads or starts[waiting[-1]] <= heads[0][0]):
             number = waiting.pop()
@@ -426,9 +418,12 @@ def merged(
             _, number, message, records = heapq.heappop(heads)
             yield message
         for record in records:
-            if isinstance(record, Message) and not is_next(record.log_time, number):
-                heapq.heappush(heads, (record.log_time, number, record, records))
-                break
+            if isinstance(record, Message):
+                key = record.log_time, number
+                is_first = not heads or key < heads[0][:2]
+                if not is_first or (waiting and starts[waiting[-1]] <= record.log_time):
+                    heapq.heappush(heads, (*key, record, records))
+                    break
             yield record
 
 

@@ -229,15 +229,14 @@ class Rosbag2Salvage(Rosbag2Reader):
         return info, [path / name for name in names]
 
     def _read_info(self, folder: Path) -> BagInfo | None:
-        path = folder / METADATA_FILE
-        if not path.exists():
-            self._lose(METADATA_FILE, "is missing", 0)
-            return None
-        try:
-            return read_bag_info(path)
-        except SourceError as error:
-            self._lose(METADATA_FILE, error.problem, 0)
-            return None
+        path, problem = folder / METADATA_FILE, "is missing"
+        if path.exists():
+            try:
+                return read_bag_info(path)
+            except SourceError as error:
+                problem = error.problem
+        self._lose(METADATA_FILE, problem, 0)
+        return None
 
     def _names(self, info: BagInfo | None) -> Sequence[str]:
         """Storage files in reading order: those listed, and those that should be."""
@@ -318,9 +317,8 @@ class Rosbag2Salvage(Rosbag2Reader):
                 yield record
             self._losses[number] = [*self._losses[number], *log.finish()]
         except SourceError as error:
-            self._losses[number] = [
-                Loss(file.name, None, None, error.problem, self._expected(file))
-            ]
+            messages = self._expected(file)
+            self._losses[number] = [Loss(file.name, None, None, error.problem, messages)]
             self._done += file.stat().st_size
             if number == 0:
                 self._drop_first()

@@ -75,9 +75,8 @@ class Window:
             try:
                 piece = self._source.read(wanted)
             except OSError as error:
-                raise SourceError(
-                    self._path, f"cannot be read: {error.strerror or error}"
-                ) from None
+                problem = f"cannot be read: {error.strerror or error}"
+                raise SourceError(self._path, problem) from None
             self._ended = len(piece) < wanted
             pieces.append(piece)
             have += len(piece)
@@ -106,15 +105,11 @@ class Window:
             raise SourceError(self._path, f"cannot be read: {error.strerror}") from None
         return ahead
 
-    def close(self) -> None:
-        """Close the file."""
-        self._source.close()
-
     def __enter__(self) -> Window:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self._source.close()
 
 
 # ---------------------------------------------------------------- scan
@@ -234,19 +229,13 @@ class Scan(ABC):
             passed: Bytes ahead of the reader in which no record begins, as is already known.
             kinds: Stop only at a record of these kinds; None for all.
         """
-        window, reach = self._window, self.lookahead
+        window, most = self._window, BLOCK + self.lookahead
         window.skip(passed)
-        while True:
-            view = window.peek(BLOCK + reach)
-            at_end = len(view) < BLOCK + reach
-            end = len(view) if at_end else BLOCK
+        found = None
+        while found is None and (view := window.peek(most)):
+            end = BLOCK if len(view) == most else len(view)
             found = self.find(view, end, kinds=kinds)
-            if found is not None:
-                window.skip(found)
-                break
-            window.skip(len(view) if at_end else BLOCK)
-            if at_end:
-                break
+            window.skip(end if found is None else found)
         if window.offset > start:
             self._lose(start, window.offset - start, problem)
 
@@ -386,27 +375,20 @@ class Tally:
             wrong.
     """
 
+    _expected: Counter[int] | None = None
+    _index_is_whole = False
+
     def __init__(self, log: LossLog, topic_of: Callable[[int], str | None]) -> None:
         self._log = log
         self._topic_of = topic_of
         self.held: list[tuple[int, Message]] = []
-        self._begin(None, None, None)
-
-    def _begin(
-        self, expected: Mapping[int, int] | None, end: int | None, span: tuple[int, int] | None
-    ) -> None:
-        self._expected = None if expected is None else Counter(expected)
-        self._end, self._span = end, span
-        self._read: Counter[int] = Counter()
-        self._strays: Counter[int] = Counter()
-        self._index_is_whole = False
-        self._listed: Counter[int] = Counter()
-        self._listed_times: Counter[tuple[int, int]] = Counter()  # only while messages are held
-        self.is_verified = False
-        self.losses: list[Draft] = []
+        self.open(None, None)
 
     def open(
-        self, expected: Mapping[int, int] | None, end: int, span: tuple[int, int] | None = None
+        self,
+        expected: Mapping[int, int] | None,
+        end: int | None,
+        span: tuple[int, int] | None = None,
     ) -> None:
         """Begin a new section, once the previous one is settled.
 
@@ -416,7 +398,15 @@ class Tally:
             span: Earliest and latest possible log time of its messages, ns, if known.
         """
         self.close()
-        self._begin(expected, end, span)
+        self._expected = None if expected is None else Counter(expected)
+        self._end, self._span = end, span
+        self._read: Counter[int] = Counter()
+        self._strays: Counter[int] = Counter()
+        self._index_is_whole = False
+        self._listed: Counter[int] = Counter()
+        self._listed_times: Counter[tuple[int, int]] = Counter()  # only while messages are held
+        self.is_verified = False
+        self.losses: list[Draft] = []
 
     def extend(self, expected: Mapping[int, int] | None) -> None:
         """Another section begins within what is lost, and cannot be separated from this one."""
@@ -457,7 +447,7 @@ class Tally:
     def lost(self, offset: int, size: int | None, problem: str) -> Draft:
         """Record skipped bytes."""
         draft = self._log.lost(offset, size, problem)
-        if all(draft is not known for known in self.losses):
+        if draft not in self.losses:
             self.losses.append(draft)
         if size is None or self._end is None or offset + size > self._end:
             self._index_is_whole = False  # part of it may be lost, and that of others may follow
