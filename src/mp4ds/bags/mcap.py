@@ -108,7 +108,7 @@ class McapReader(BagReader):
     @property
     def position(self) -> int:
         """Bytes of the file that `records` has consumed."""
-        return self._pass.tell() if self._pass else self._position
+        return self._pass.offset if self._pass else self._position
 
     @property
     def is_indexed(self) -> bool:
@@ -189,9 +189,7 @@ class McapReader(BagReader):
                         message = declared.message(part)
                         _check(message, chunk, summary)
                         count += 1
-                        if message.channel.id not in unwanted and excerpt.has_time(
-                            message.log_time
-                        ):
+                        if excerpt.has(message):
                             held.add(message, chunk.offset)
                     elif kind < PRIVATE_OPCODE or counts_private:
                         declared.take(kind, part)
@@ -218,7 +216,7 @@ class McapReader(BagReader):
 
     def _read_through(self, stream: RecordStream, held: HoldBack | None) -> Iterator[Record]:
         declared = self._declared
-        stream.expect([(stream.tell(), stream.size)])
+        stream.expect([(stream.offset, stream.size)])
         read = 0
         while True:
             opcode, body = stream.next()
@@ -284,7 +282,7 @@ def _records_in(stream: RecordStream, chunk: ChunkEntry) -> Iterator[tuple[int, 
     """Opcode and body of each record in a chunk."""
     stream.seek(chunk.offset)
     opcode, body = stream.next()
-    if opcode != Opcode.CHUNK or stream.tell() != chunk.offset + chunk.length:
+    if opcode != Opcode.CHUNK or stream.offset != chunk.offset + chunk.length:
         raise DamageError("it is not the chunk that the index lists there")
     content = unpack_chunk(body)
     if len(content) > chunk.size:
@@ -295,15 +293,14 @@ def _records_in(stream: RecordStream, chunk: ChunkEntry) -> Iterator[tuple[int, 
 def _check(message: Message, chunk: ChunkEntry, summary: McapSummary) -> None:
     """Refuse a message that would be missing from an excerpt without this chunk."""
     channel_id = message.channel.id
+    listed = chunk.channels or summary.channels.keys()
+    problem = ""
     if not chunk.start <= message.log_time <= chunk.end:
         problem = f"of log time {message.log_time}"
-    elif channel_id not in summary.channels or (
-        chunk.channels and channel_id not in chunk.channels
-    ):
+    elif channel_id not in listed or channel_id not in summary.channels:
         problem = f"of channel {channel_id}"
-    else:
-        return
-    raise DamageError(f"it holds a message {problem} that its index does not list")
+    if problem:
+        raise DamageError(f"it holds a message {problem} that its index does not list")
 
 
 # ---------------------------------------------------------------- the writer

@@ -70,6 +70,7 @@ class RecordStream:
 
     Attributes:
         size: Bytes of the file.
+        offset: Bytes of the file consumed.
         start: Byte offset of the record that was read last.
     """
 
@@ -79,23 +80,19 @@ class RecordStream:
         self.size = self._stream.seek(0, os.SEEK_END)
         self._stream.seek(0)
         self._most = most
-        self._offset = 0
+        self.offset = 0
         self.start = 0
 
     def close(self) -> None:
         """Close the stream."""
         self._stream.close()
 
-    def tell(self) -> int:
-        """Bytes of the file consumed."""
-        return self._offset
-
     def seek(self, offset: int) -> None:
         """Continue at a byte offset that an index gave."""
         if offset > self.size:
             raise DamageError(f"an index points to byte {offset}, past the end")
         self._stream.seek(offset)
-        self._offset = offset
+        self.offset = offset
 
     def expect(self, ranges: Iterable[tuple[int, int]]) -> None:
         """Announce which byte ranges will be read, and in which order."""
@@ -103,7 +100,7 @@ class RecordStream:
 
     def read_magic(self) -> None:
         """Read the magic bytes at the beginning and end of a file."""
-        at_start = self._offset == 0
+        at_start = self.offset == 0
         found = self.read(len(MAGIC))
         if found != MAGIC:
             other = other_begin(self.path, "an MCAP file", MAGIC, found)
@@ -112,12 +109,12 @@ class RecordStream:
     def read(self, length: int) -> bytes:
         """Read exactly that many bytes."""
         try:
-            data = self._stream.read(length) if length <= self.size - self._offset else b""
+            data = self._stream.read(length) if length <= self.size - self.offset else b""
         except OSError as error:
             raise SourceError(self.path, f"cannot be read: {error.strerror or error}") from None
         if len(data) != length:
             raise self.cut_short()
-        self._offset += length
+        self.offset += length
         return data
 
     def next(self) -> tuple[int, bytes]:
@@ -143,11 +140,11 @@ class RecordStream:
         opcode, length = self._frame()
         if length > MAX_RECORD_BYTES:
             raise DamageError(f"it says it has {length} bytes")
-        self.seek(self._offset + length)
+        self.seek(self.offset + length)
         return opcode
 
     def _frame(self) -> tuple[int, int]:
-        self.start = self._offset
+        self.start = self.offset
         opcode, length = FRAME.unpack(self.read(FRAME.size))
         return opcode, length
 
@@ -595,7 +592,7 @@ class McapSummary:
         stream.expect((first, end) for _, first, end in self.chunks.places())
         for _, first, end in self.chunks.places():
             stream.seek(first)
-            while stream.tell() < end:
+            while stream.offset < end:
                 opcode, body = stream.next()
                 if opcode != Opcode.MESSAGE_INDEX:
                     raise DamageError("it is in the place of a message index")
@@ -627,7 +624,7 @@ class McapSummary:
                         self.private[opcode] += 1
                     elif opcode in (Opcode.MESSAGE, Opcode.CHUNK, Opcode.FOOTER):
                         return False
-                    place = stream.tell()
+                    place = stream.offset
                 if place != start:
                     return False
                 place = end

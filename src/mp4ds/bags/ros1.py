@@ -462,40 +462,32 @@ class Ros1Reader(BagReader):
 
     def _records(self, excerpt: Excerpt) -> Iterator[Record]:
         """Messages in log-time order, from the chunks that hold them."""
-        self.position = 0
-        visited: set[int] = set()
-        for channel, time, chunk, offset in self._entries(excerpt):
-            if chunk not in visited:
-                visited.add(chunk)
-                self.position += self._chunks[chunk].packed
-            yield self._message(channel, time, chunk, offset)
-        self.position = self._size
-
-    def _entries(self, excerpt: Excerpt) -> Iterator[tuple[Channel, int, int, int]]:
-        """Per message: channel, log time, chunk number, offset."""
         channels = [channel for channel in self.channels if excerpt.has_topic(channel.topic)]
         parts = [_within(self._index[channel.id], excerpt) for channel in channels]
-        if not parts:
-            return
-        index = np.concatenate(parts)
+        index = np.concatenate([np.empty(0, _PLACE), *parts])
         owners = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
         order = np.lexsort((index["offset"], index["chunk"], index["time"]))
-        visited = index["chunk"][order]
-        first_seen = np.sort(np.unique(visited, return_index=True)[1])
-        needed = (self._chunks[number] for number in visited[first_seen].tolist())
+        numbers = index["chunk"][order]
+        first_seen = np.sort(np.unique(numbers, return_index=True)[1])
+        needed = (self._chunks[number] for number in numbers[first_seen].tolist())
         expect(self._stream, ((one.place, one.place + one.packed) for one in needed))
+        self.position = 0
+        visited: set[int] = set()
         for start in range(0, len(order), 4096):
             rows = order[start : start + 4096]
-            for owner, place in zip(owners[rows].tolist(), index[rows].tolist(), strict=True):
-                yield channels[owner], *place
-
-    def _message(self, channel: Channel, time: int, chunk: int, offset: int) -> Message:
-        try:
-            data = _payload(self._content(chunk), offset, channel.id, time)
-        except _DAMAGE as error:
-            place = f": topic {channel.topic}, chunk at byte {self._chunks[chunk].start}"
-            raise _damaged(self.path, error, place) from None
-        return Message(channel, time, time, 0, data)
+            places = zip(owners[rows].tolist(), index[rows].tolist(), strict=True)
+            for owner, (time, number, offset) in places:
+                channel, chunk = channels[owner], self._chunks[number]
+                if number not in visited:
+                    visited.add(number)
+                    self.position += chunk.packed
+                try:
+                    data = _payload(self._content(number), offset, channel.id, time)
+                except _DAMAGE as error:
+                    place = f": topic {channel.topic}, chunk at byte {chunk.start}"
+                    raise _damaged(self.path, error, place) from None
+                yield Message(channel, time, time, 0, data)
+        self.position = self._size
 
     def _content(self, number: int) -> memoryview:
         """A decompressed chunk, from the cache if possible.

@@ -420,6 +420,7 @@ CREATE TABLE messages(
   data BLOB NOT NULL);
 CREATE INDEX timestamp_idx ON messages (timestamp ASC);
 """
+_INSERT = "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)"
 _TOPICS = """
 CREATE TABLE topics(
   id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
@@ -536,9 +537,7 @@ class SqliteWriter(BagWriter):
         row = self._row_of[message.channel.id], message.log_time, message.data
         try:
             with self._disk_errors():
-                self._connection.execute(
-                    "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", row
-                )
+                self._connection.execute(_INSERT, row)
         except (OverflowError, sqlite3.DataError):
             problem = f"has a message of {len(message.data)} bytes, more than sqlite3 can store"
             raise ConversionError(message.channel.topic, problem, _REMEDY) from None

@@ -12,14 +12,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rosbags.interfaces import Msgdef, Nodetype
 from rosbags.serde import SerdeError
 from rosbags.serde.utils import SIZEMAP
-from rosbags.typesys import (
-    Stores,
-    TypesysError,
-    get_types_from_idl,
-    get_types_from_msg,
-    get_typestore,
-)
-from rosbags.typesys.msg import normalize_msgtype
+from rosbags.typesys import Stores, TypesysError, get_typestore
+from rosbags.typesys.idl import get_types_from_idl
+from rosbags.typesys.msg import get_types_from_msg, normalize_msgtype
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores import empty
 
@@ -38,13 +33,8 @@ _MAX_STEPS = 2**16  # fields of a message whose sequences have one item
 _MAX_EMPTY = 2**16  # messages without any byte in one, besides two for each of its bytes
 _MAX_DEPTH = 100
 _READING = (
-    "deserialize_cdr_le",
-    "deserialize_cdr_be",
-    "deserialize_ros1",
-    "getsize_ros1_to_cdr",
-    "ros1_to_cdr",
-    "getsize_cdr_to_ros1",
-    "cdr_to_ros1",
+    *("deserialize_cdr_le", "deserialize_cdr_be", "deserialize_ros1", "getsize_ros1_to_cdr"),
+    *("ros1_to_cdr", "getsize_cdr_to_ros1", "cdr_to_ros1"),
 )
 
 _RAISED = (

@@ -125,6 +125,7 @@ def _of_samples(name: str, channels: int, dtype: str) -> Encoding:
 
 def _encodings() -> list[Encoding]:
     bayer = ("rggb", "bggr", "gbrg", "grbg")
+    tall = Fraction(3, 2), (2, 2)
     bayer16 = ("mosaic16", "mosaic_bits", "mosaic_fold")
     return [
         _of_samples("mono8", 1, "u1"),
@@ -153,10 +154,7 @@ def _encodings() -> list[Encoding]:
             for name in ("yuv422", "uyvy", "yuyv", "yuv422_yuy2")
         ),
         *(
-            Encoding(
-                name, 1, "u1", "planar420", ("planar420",), "planar420",
-                rows=Fraction(3, 2), even=(2, 2),
-            )
+            Encoding(name, 1, "u1", "planar420", ("planar420",), "planar420", "", *tall)
             for name in ("nv12", "nv21")
         ),
         Encoding("nv24", 1, "u1", "planar444", ("planar444",), "halved420", rows=Fraction(3)),
