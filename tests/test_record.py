@@ -24,7 +24,7 @@ from commands import call, tree
 from compare import compare
 from mp4ds.bags.formats import open_sources
 from mp4ds.bags.mcap import McapWriter
-from mp4ds.bags.salvage.mcap import McapSalvage
+from mp4ds.bags.salvage_mcap import McapSalvage
 from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, SourceError, TargetExistsError, WriteError
 from mp4ds.files.sources import RECORDING_NAME

@@ -445,7 +445,7 @@ import resource, sys
 from pathlib import Path
 limit = int(sys.argv[2])
 from mp4ds.bags.formats import open_sources
-from mp4ds.bags.salvage import mcap, ros1, rosbag2
+from mp4ds.bags import salvage_mcap, salvage_ros1, salvage_rosbag2
 from mp4ds.errors import SourceError
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 resource.setrlimit(resource.RLIMIT_CPU, (30, 30))

@@ -35,9 +35,9 @@ from mp4ds.records import (
 
 # by name: each imports its library, and a recording has one format
 _CLASSES = {
-    "bag": ("ros1:Ros1Reader", "salvage.ros1:Ros1Salvage", "ros1_writer:Ros1Writer"),
-    "mcap": ("mcap:McapReader", "salvage.mcap:McapSalvage", "mcap:McapWriter"),
-    "rosbag2": ("rosbag2:Rosbag2Reader", "salvage.rosbag2:Rosbag2Salvage", "rosbag2:Rosbag2Writer"),
+    "bag": ("ros1:Ros1Reader", "salvage_ros1:Ros1Salvage", "ros1_writer:Ros1Writer"),
+    "mcap": ("mcap:McapReader", "salvage_mcap:McapSalvage", "mcap:McapWriter"),
+    "rosbag2": ("rosbag2:Rosbag2Reader", "salvage_rosbag2:Rosbag2Salvage", "rosbag2:Rosbag2Writer"),
 }
 _READER, _SALVAGE, _WRITER = range(3)
 

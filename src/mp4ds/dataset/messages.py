@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mp4ds.bags.mcap import McapReader
 from mp4ds.bags.protocols import Format, times_of
 from mp4ds.bags.rosbag2_metadata import RECORD
-from mp4ds.bags.salvage.mcap import McapSalvage
+from mp4ds.bags.salvage_mcap import McapSalvage
 from mp4ds.dataset.rebuild import CalibrationMessages
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import FormatError, Refused, SourceError

@@ -17,7 +17,7 @@ from typing import IO, Literal
 
 from mp4ds.bags.mcap import McapWriter, copy_verified
 from mp4ds.bags.protocols import Format
-from mp4ds.bags.salvage.mcap import McapSalvage
+from mp4ds.bags.salvage_mcap import McapSalvage
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.concat import concat
 from mp4ds.dataset.dataset import Dataset

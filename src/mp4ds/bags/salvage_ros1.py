@@ -24,7 +24,7 @@ from mp4ds.bags.ros1 import (
     split_header,
     times_in,
 )
-from mp4ds.bags.salvage.scan import FileSalvage, Lose, RecordFrame, Scan, Window
+from mp4ds.bags.salvage_scan import FileSalvage, Lose, RecordFrame, Scan, Window
 from mp4ds.errors import SourceError
 from mp4ds.records import Channel, ChannelStats, Message, Record
 

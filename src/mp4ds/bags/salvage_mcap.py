@@ -30,7 +30,7 @@ from mp4ds.bags.mcap_records import (
     summary_place,
     unpack_chunk,
 )
-from mp4ds.bags.salvage.scan import BLOCK, FileSalvage, Lose, RecordFrame, Scan, Window
+from mp4ds.bags.salvage_scan import BLOCK, FileSalvage, Lose, RecordFrame, Scan, Window
 from mp4ds.errors import SourceError
 from mp4ds.records import Attachment, ChannelStats, Message, MetadataRecord
 

@@ -18,8 +18,8 @@ from mp4ds.bags.protocols import BagReader
 from mp4ds.bags.rosbag2 import STORAGE_NAME, Rosbag2Reader, unlisted_storage
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, BagInfo, read_bag_info
 from mp4ds.bags.rosbag2_sqlite import SqliteReader, Tables
-from mp4ds.bags.salvage.mcap import McapSalvage
-from mp4ds.bags.salvage.scan import LossLog, lost_by
+from mp4ds.bags.salvage_mcap import McapSalvage
+from mp4ds.bags.salvage_scan import LossLog, lost_by
 from mp4ds.errors import Refused, SourceError, SourceNotFoundError
 from mp4ds.records import Excerpt, Loss, Message, Record, bounded
 

@@ -1,1 +1,0 @@
-"""Readers of damaged recordings: they read what is left, and list what is lost."""
