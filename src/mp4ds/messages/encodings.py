@@ -354,6 +354,7 @@ class Values(ABC):
         parameters: Their names.
         bits: Bits per sample of the picture.
         is_identity: Whether the picture's samples have the bit patterns of the image's.
+        is_source: Whether they are what the colours of the image were made of.
 
     Raises:
         ValueError: The parameters contradict themselves, or the encoding.
@@ -361,6 +362,7 @@ class Values(ABC):
 
     parameters: ClassVar[frozenset[str]] = frozenset()
     is_identity = False
+    is_source = False
 
     def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
         self.encoding, self.given = encoding, given
@@ -385,10 +387,6 @@ class Values(ABC):
         """Shape of the samples of pixels."""
         return pixels.shape
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """Why these pixels would not be restored, or None if they would."""
-        return None
-
     def prove(self, pixels: Pixels) -> Samples | None:
         """Prove that pixels would be restored.
 
@@ -398,8 +396,14 @@ class Values(ABC):
         Raises:
             Refused: They would not be.
         """
-        if reason := self.refuses(pixels):
-            raise Refused(reason)
+        return None
+
+    def refuses(self, pixels: Pixels) -> str | None:
+        """What `prove` says against pixels; None if they would be restored."""
+        try:
+            self.prove(pixels)
+        except Refused as reason:
+            return str(reason)
         return None
 
     @abstractmethod
@@ -453,13 +457,16 @@ class Whole(Values):
         patterns(out)[...] = samples ^ samples.dtype.type(1 << (self.bits - 1))
 
 
-def beyond(samples: Samples, bits: int, shift: int) -> str | None:
-    """That samples have other bits than so many above so many zero bits; None if they do not."""
+def refuse_beyond(samples: Samples, bits: int, shift: int) -> None:
+    """Refuse samples with other bits than so many above so many zero bits.
+
+    Raises:
+        Refused: They have.
+    """
     used = int(np.bitwise_or.reduce(samples, axis=None))
     if used & ~(((1 << bits) - 1) << shift):
         below = f" above {shift} zero bits" if shift else ""
-        return f"a value does not fit into {bits} bits{below}"
-    return None
+        raise Refused(f"a value does not fit into {bits} bits{below}")
 
 
 class Narrow(Values):
@@ -502,9 +509,9 @@ class Narrow(Values):
             wide = wide << np.uint16(self.shift)
         patterns(out)[...] = wide - np.uint16(self._half) if self._half else wide
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """A bit outside the kept ones."""
-        return beyond(self._shifted(pixels), self.bits, self.shift)
+    def prove(self, pixels: Pixels) -> None:
+        """Prove that no bit is outside the kept ones."""
+        refuse_beyond(self._shifted(pixels), self.bits, self.shift)
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
@@ -582,11 +589,10 @@ class Opaque(Values):
         out[..., :3] = samples
         out[..., 3] = self.given.alpha
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """A different alpha."""
+    def prove(self, pixels: Pixels) -> None:
+        """Prove that no pixel has a different alpha."""
         if (pixels[..., 3] != self.given.alpha).any():
-            return f"an alpha that is not the stream's, {self.given.alpha}"
-        return None
+            raise Refused(f"an alpha that is not the stream's, {self.given.alpha}")
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:

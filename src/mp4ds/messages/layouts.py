@@ -36,7 +36,7 @@ from mp4ds.messages.encodings import (
     patterns,
 )
 from mp4ds.messages.numbers import Few, Metres, Palette, PatternTable, Tone
-from mp4ds.messages.sources import Converted, ConvertedTall, Demosaiced, Source
+from mp4ds.messages.sources import Converted, ConvertedTall, Demosaiced
 
 # ---------------------------------------------------------------- arrangements
 
@@ -494,7 +494,7 @@ class Layout:
     @property
     def is_source(self) -> bool:
         """Whether its samples are what the colours of the images were made of."""
-        return isinstance(self.values, Source)
+        return self.values.is_source
 
     def picture_size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of the image -> of the picture.

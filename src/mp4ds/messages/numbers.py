@@ -8,6 +8,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
+from mp4ds.errors import Refused
 from mp4ds.messages.encodings import (
     MAX_TABLE,
     NO_PARAMETERS,
@@ -20,9 +21,9 @@ from mp4ds.messages.encodings import (
     Samples,
     Values,
     Whole,
-    beyond,
     native,
     patterns,
+    refuse_beyond,
 )
 
 SCALES = ("product", "quotient")
@@ -71,12 +72,12 @@ class PatternTable(Values):
         """Write the pixels; indices beyond the table, from a damaged video, mean the last entry."""
         patterns(out)[...] = np.take(self.table, samples, mode="clip")
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """A pattern that is not in the table."""
+    def prove(self, pixels: Pixels) -> None:
+        """Prove that all patterns are in the table."""
         unknown = self.table[self.encode(pixels)] != native(pixels)
         if unknown.any():
-            return f"value {np.ascontiguousarray(pixels[unknown][:1]).item()} is {self._unknown()}"
-        return None
+            value = np.ascontiguousarray(pixels[unknown][:1]).item()
+            raise Refused(f"value {value} is {self._unknown()}")
 
     def _unknown(self) -> str:
         return f"not one of the {len(self.table)} in the stream's table"
@@ -121,8 +122,7 @@ class Tone(PatternTable):
             raise ValueError(f"no layout shows {bits} bits above {shift} zero bits")
         if len(self.table) != 256:
             raise ValueError(f"a table of {len(self.table)} values, not of 256")
-        if reason := beyond(self.table, bits, shift):
-            raise ValueError(f"a table in which {reason}")
+        refuse_beyond(self.table, bits, shift)
         wide = self.table.astype(np.uint32)
         self._between = (wide[:-1] + wide[1:] + 1) // 2
 
@@ -130,9 +130,9 @@ class Tone(PatternTable):
         found: Samples = np.searchsorted(self._between, samples, side="right").astype(np.uint8)
         return found
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """A bit outside the kept ones."""
-        return beyond(native(pixels), *self._used)
+    def prove(self, pixels: Pixels) -> None:
+        """Prove that no bit is outside the kept ones."""
+        refuse_beyond(native(pixels), *self._used)
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:
@@ -234,12 +234,12 @@ class Few(Whole):
             problem = f"is no power of two from {FEWEST_ENTRIES} on"
             raise ValueError(f"a list of {self._entries} values, which {problem}")
 
-    def refuses(self, pixels: Pixels) -> str | None:
-        """Too many values."""
+    def prove(self, pixels: Pixels) -> None:
+        """Prove that there are not too many values."""
         count = len(distinct(native(pixels)))
         if count > self._entries:
-            return f"{count} different values, more than the {self._entries} of the stream's list"
-        return None
+            more = f"more than the {self._entries} of the stream's list"
+            raise Refused(f"{count} different values, {more}")
 
     @classmethod
     def fit(cls, encoding: Encoding, samples: Sequence[Pixels]) -> LayoutParameters | None:

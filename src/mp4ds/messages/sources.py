@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -23,22 +22,6 @@ from mp4ds.messages.encodings import (
 )
 
 _BANDS = 6  # places of an image that are looked at first
-
-
-class Source(Values):
-    """What the colours of an image were made of."""
-
-    @abstractmethod
-    def prove(self, pixels: Pixels) -> Samples:
-        """New samples that `decode` gives the pixels of."""
-
-    def refuses(self, pixels: Pixels) -> str | None:
-        """What `prove` says if there are no samples."""
-        try:
-            self.prove(pixels)
-        except Refused as reason:
-            return str(reason)
-        return None
 
 
 def _colours(pixels: Pixels, encoding: Encoding) -> Pixels:
@@ -172,10 +155,11 @@ def _beside(options: int, least: int) -> int:
     )
 
 
-class Demosaiced(Source):
+class Demosaiced(Values):
     """The mosaic of colours that were made of it by bilinear interpolation."""
 
     parameters = frozenset({"mosaic"})
+    is_source = True
 
     def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
         super().__init__(encoding, given)
@@ -464,10 +448,11 @@ def _estimate(colours: Samples) -> Samples:
     return np.stack([u, v])
 
 
-class Converted(Source):
+class Converted(Values):
     """The YUV, chroma halved, of colours that were made of it."""
 
     parameters = frozenset({"rule"})
+    is_source = True
     is_tall = False  # whether chroma is halved in height, too
 
     def __init__(self, encoding: Encoding, given: LayoutParameters) -> None:
