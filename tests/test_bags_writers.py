@@ -14,7 +14,7 @@ from mp4ds.bags.protocols import BagWriter
 from mp4ds.bags.ros1_writer import Ros1Writer
 from mp4ds.bags.rosbag2 import Rosbag2Writer
 from mp4ds.bags.rosbag2_sqlite import SqliteWriter
-from mp4ds.errors import ConversionError, OptionError, SourceError, TargetExistsError
+from mp4ds.errors import ConversionError, SourceError
 from mp4ds.records import Channel, Message, Schema
 
 STRING = Schema("std_msgs/msg/String", "ros2msg", b"string data")
@@ -61,15 +61,13 @@ def test_a_time_that_does_not_fit(name: str, time: int, tmp_path: Path) -> None:
 
 
 def test_what_is_refused_at_once(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="sqlite3, mcap"):
-        Rosbag2Writer(tmp_path / "a", storage="bolt")
     with pytest.raises(OSError, match="unable to open"):
         SqliteWriter(tmp_path / "missing" / "a.db3")
     assert list(tmp_path.iterdir()) == []
     with Ros1Writer(tmp_path / "a.bag") as bag:
         with pytest.raises(ConversionError, match="messages are cdr"):
             bag.add_channel(channel_for("mcap"))
-        with pytest.raises(TargetExistsError):
+        with pytest.raises(FileExistsError):
             Ros1Writer(tmp_path / "a.bag")
     schemaless = pytest.raises(ConversionError, match="topic /a: has no schema")
     with WRITERS["sqlite3"](tmp_path / "sqlite3") as database, schemaless:

@@ -97,14 +97,9 @@ class Converter:
 
     Args:
         target: ``ros1``, ``ros2``, or None to convert nothing.
-
-    Raises:
-        OptionError: The target is not known.
     """
 
     def __init__(self, target: str | None) -> None:
-        if target not in (*ENCODINGS, None):
-            raise OptionError(f"Messages cannot be converted to {target!r}. Use ros1 or ros2.")
         self._to = target
         self._plans: dict[Schema, _Plan] = {}
         self._omitted: Counter[str] = Counter()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mp4ds.bags.protocols import BagWriter
 from mp4ds.bags.ros1 import BASE64, MAGIC, MAX_TIME, UINT32, Op, text_of
-from mp4ds.errors import ConversionError, TargetExistsError
+from mp4ds.errors import ConversionError
 from mp4ds.records import Channel, Message
 
 _MAX_PAYLOAD = 2**32 - 2**24  # lengths are uint32; leaves room for the rest of the chunk
@@ -30,13 +30,10 @@ class Ros1Writer(BagWriter):
         path: The file, which must not exist.
 
     Raises:
-        TargetExistsError: The file exists.
         OSError: It cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
-        if path.exists():
-            raise TargetExistsError(path)
         super().__init__()
         self._numbers: dict[int, int] = {}  # of connections, by channel id
         self._connections: list[bytes] = []

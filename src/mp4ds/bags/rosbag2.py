@@ -44,7 +44,7 @@ from mp4ds.bags.rosbag2_metadata import (
     read_bag_info,
 )
 from mp4ds.bags.rosbag2_sqlite import SqliteReader, SqliteWriter
-from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
+from mp4ds.errors import SourceError, SourceNotFoundError
 from mp4ds.files.urls import remote
 from mp4ds.records import (
     QOS_KEY,
@@ -364,13 +364,10 @@ class Rosbag2Writer(BagWriter):
         name: The recording's name, used as the prefix of its storage file; by default the folder's.
 
     Raises:
-        OptionError: The storage is unknown.
         OSError: It cannot be written.
     """
 
     def __init__(self, folder: Path, *, storage: str, name: str = "") -> None:
-        if storage not in _SUFFIXES:
-            raise OptionError(f"storage {storage!r} is not known. Use {', '.join(_SUFFIXES)}.")
         super().__init__()
         self._folder = folder
         self._storage = storage
