@@ -206,21 +206,32 @@ def parsed(clip: Clip, first: int = 0) -> list[list[CodedFrame]]:
     return [parser.frames(packet.data, key=packet.is_key) for packet in clip.packets[first:]]
 
 
-def chains(frames: list[list[CodedFrame]]) -> list[list[tuple[int, CodedFrame]]]:
-    """For every packet what its shown frame needs and itself, in order, with numbers of packets."""
-    every = [(number, frame) for number, found in enumerate(frames) for frame in found]
-    needed: list[list[tuple[int, CodedFrame]]] = [[] for _ in frames]
-    for at, (number, frame) in enumerate(every):
+def chains(frames: list[list[CodedFrame]]) -> list[list[tuple[int, int, CodedFrame]]]:
+    """For every packet what its shown frame needs and itself, in order: packet, part, frame."""
+    every = [
+        (number, part, frame)
+        for number, found in enumerate(frames)
+        for part, frame in enumerate(found)
+    ]
+    needed: list[list[tuple[int, int, CodedFrame]]] = [[] for _ in frames]
+    for at, (number, _, frame) in enumerate(every):
         if not frame.shown:
             continue
         wanted, chosen = {at}, []
         for place in range(at, -1, -1):
             if place in wanted:
                 chosen.append(every[place])
-                wanted |= {place - distance for distance in every[place][1].references}
+                wanted |= {place - distance for distance in every[place][2].references}
         assert min(wanted) >= 0
         needed[number] = chosen[::-1]
     return needed
+
+
+def cut(clip: Clip, number: int, part: int, frame: CodedFrame) -> bytes:
+    """A coded frame; a key frame with its sequence header."""
+    data = clip.packets[number].data
+    header, start, end = CODECS[clip.codec].parser.spans(data)[part]
+    return data[start if frame.references else header : end]
 
 
 def check(clip: Clip) -> int:
@@ -230,10 +241,7 @@ def check(clip: Clip) -> int:
     left_out = 0
     for number, chain in enumerate(chains(frames)):
         assert sum(frame.shown for frame in frames[number]) == 1
-        given = [
-            (clip.packets[at].data[frame.start : frame.end], clip.packets[at].number)
-            for at, frame in chain
-        ]
+        given = [(cut(clip, at, *which), clip.packets[at].number) for at, *which in chain]
         pts = clip.packets[number].number
         assert shown(clip, given)[pts] == whole[pts], f"packet {number}"
         first = max(n for n in range(number + 1) if clip.packets[n].is_key)
@@ -412,18 +420,21 @@ def test_av1_headers(name: str, configured: bool) -> None:
     parser = CODECS["av1"].parser(b"\x81\0\0\0" + head if configured else b"")
     first = SHOWN_KEY if configured else head + unit(5, b"\4\1") + SHOWN_KEY
     found = parser.frames(first, key=True)
-    assert found == [CodedFrame(0, len(first), (), shown=True)]
+    assert found == [CodedFrame((), shown=True)]
+    ((header, _, end),) = parser.spans(first)
+    assert (header, end) == (0, len(first))
     # frames 1 to 6 fill slots 1 to 6; slots 0 and 7 still hold the key frame
     for number in range(1, 7):
         body = frame([number - 1] * 7, 1 << number, shown=bool(number % 2))
         (only,) = parser.frames(unit(2, b"") + body, key=False)
-        assert only == CodedFrame(2, 2 + len(body), (1,), bool(number % 2))
+        assert only == CodedFrame((1,), bool(number % 2))
+        assert parser.spans(unit(2, b"") + body) == [(2, 2, 2 + len(body))]
     slots = (6, 5, 5, 3, 1, 1, 7)  # the seventh frame's
     both = frame(slots, 0, resilient=True) + unit(3, packed((1, 1), (2, 3)))
     seventh, existing = parser.frames(both, key=False)
     assert seventh.references == (1, 2, 4, 6, 7)
     assert (existing.references, existing.shown) == ((6,), True)
-    assert (seventh.end, existing.end) == (existing.start, len(both))
+    assert [end for *_, end in parser.spans(both)] == [parser.spans(both)[1][1], len(both)]
     (intra,) = parser.frames(frame((), 0x21, kind=2), key=False)
     assert intra.references == (9,)  # the key frame: it is no place to begin
     (after,) = parser.frames(frame([0, 1, 2, 3, 4, 5, 6], 0), key=False)
@@ -496,8 +507,9 @@ def test_av1_headers_and_tiles_apart() -> None:
         apart.append(next(t for t in tried if decodes_to(clip, [*apart, t], whole[number])))
     split = replace(clip, packets=tuple(Packet(data, n, not n) for n, data in enumerate(apart)))
     check(split)
-    for frames, data in zip(parsed(split), apart, strict=True):
-        assert [(frame.start, frame.end) for frame in frames] == [(0, len(data))]
+    for data in apart:
+        ((header, _, end),) = CODECS["av1"].parser.spans(data)
+        assert (header, end) == (0, len(data))
 
 
 def hidden_key(clip: Clip, packet: bytes, slot: int) -> bytes:
@@ -540,7 +552,7 @@ def test_av1_key_frames_shown_later() -> None:
     check(changed)
     frames = parsed(changed)
     assert [len(found) for found in frames[key - 1 : key + 1]] == [2, 1]
-    needed = {at for at, _ in chains(frames)[key + 3]}
+    needed = {at for at, *_ in chains(frames)[key + 3]}
     assert {0, key - 1, key} <= needed <= {0, *range(key - 1, key + 4)}
 
 

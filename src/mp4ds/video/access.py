@@ -264,13 +264,11 @@ class Piece:
         sample: Number of the packet.
         part: Number of the coded frame in it.
         needs: Numbers, within its group, of the pieces that it refers to.
-        span: Its first byte in the packet and the one after its last; None until it is read.
     """
 
     sample: int
     part: int
     needs: tuple[int, ...]
-    span: tuple[int, int] | None
 
 
 @dataclass(slots=True)
@@ -360,12 +358,9 @@ class Chains:
         Raises:
             Refused: It does not hold the coded frames recorded for it.
         """
-        if piece.span is not None:
-            start, end = piece.span
-            return packet if (start, end) == (0, len(packet)) else packet[start:end]
         last = group.pieces[group.shows[piece.sample - group.first]]
         found = CODECS[self._codec].parser.spans(packet)
-        if len(found) != last.part + 1:
+        if group.parser is None and len(found) != last.part + 1:  # by what was recorded
             raise UnknownStructure(f"it holds {len(found)} coded frames, {last.part + 1} are due")
         header, start, end = found[piece.part]
         return packet[start if piece.needs else header : end]
@@ -408,7 +403,7 @@ class Chains:
         text = self._recorded.texts[int(self._recorded.groups[place])]
         for sample, frames in enumerate(read_structure(text), group.first):
             for part, needs in enumerate(frames):
-                group.pieces.append(Piece(sample, part, needs, None))
+                group.pieces.append(Piece(sample, part, needs))
             group.shows.append(len(group.pieces) - 1)
         return group
 
@@ -419,7 +414,7 @@ class Chains:
             for part, frame in enumerate(frames):
                 number = len(group.pieces)
                 needs = tuple(number - distance for distance in frame.references)
-                group.pieces.append(Piece(sample, part, needs, (frame.start, frame.end)))
+                group.pieces.append(Piece(sample, part, needs))
                 if frame.shown:
                     shown = number
             group.shows.append(shown)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -325,7 +325,6 @@ class Av1(StreamParser):
 
     def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
         frames: list[CodedFrame] = []
-        begin = -1  # of the sequence header before the first frame
         open_header = False  # whether the tiles of the last frame are yet to come
         is_existing = False  # whether the last frame only shows another one
         for obu in obus(data):
@@ -334,19 +333,14 @@ class Av1(StreamParser):
                 if open_header:
                     raise UnknownStructure("its AV1 has a frame without tiles")
                 frame, is_existing = self._frame(data, obu, key=key and not frames)
-                if begin >= 0 and not frame.references:
-                    frame = replace(frame, start=begin)
-                begin = -1
                 frames.append(frame)
                 open_header = kind == _FRAME_HEADER and not is_existing
             elif kind == _TILE_GROUP:
                 if not frames or is_existing:
                     raise UnknownStructure("its AV1 has tiles without a frame")
-                frames[-1] = replace(frames[-1], end=obu.end)
                 open_header = False
             elif kind == _SEQUENCE_HEADER:
                 self._take_sequence(bytes(data[obu.payload : obu.end]))
-                begin = obu.start
             elif kind not in (_METADATA, _PADDING, _DELIMITER):
                 raise UnknownStructure(f"it has an AV1 unit of the kind {kind}")
         if not frames or open_header:
@@ -364,7 +358,7 @@ class Av1(StreamParser):
             self._changed = True
 
     def _frame(self, data: memoryview, obu: Obu, *, key: bool) -> tuple[CodedFrame, bool]:
-        """A frame up to its first tiles, and whether it only shows another one."""
+        """A frame, and whether it only shows another one."""
         sequence = self._sequence
         if sequence is None:
             raise UnknownStructure("its sequence header was not sent before it")
@@ -387,7 +381,7 @@ class Av1(StreamParser):
             raise UnknownStructure("its sequence header changes between key frames")
         self._number += 1
         references = () if begins else self._references(header, number)
-        return CodedFrame(obu.start, obu.end, references, header.shown), header.kind is None
+        return CodedFrame(references, header.shown), header.kind is None
 
     def _references(self, header: _Header, number: int) -> tuple[int, ...]:
         """The distances of what a frame needs, after which it is in its slots."""

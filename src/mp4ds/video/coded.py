@@ -93,15 +93,11 @@ class CodedFrame:
     Frames are counted as coded, including those that are not shown or only show another one.
 
     Attributes:
-        start: Offset of its first byte in the packet.
-        end: Offset after its last byte.
         references: How many coded frames back each frame it needs is, 1 being the previous one;
             nearest first, without repetition. Empty for a key frame.
         shown: Whether a picture comes out.
     """
 
-    start: int
-    end: int
     references: tuple[int, ...]
     shown: bool
 
@@ -185,9 +181,7 @@ class StreamParser:
             key: Whether the file says that decoding can begin here.
 
         Returns:
-            At least one frame. Their ranges do not overlap. Of AV1 each is of one frame, with the
-            sequence header just before a key frame, and what is in none (metadata, padding) is
-            not needed to decode; of other codecs there is one frame, the whole packet.
+            At least one frame; see `spans` for where they are.
 
         Raises:
             UnknownStructure: The references cannot be determined, they reach across the key packet,
@@ -200,17 +194,16 @@ class StreamParser:
             raise UnknownStructure(str(error)) from None
 
     def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        return self._link(len(data), begins=True, key=key)  # of an image
+        return self._link(begins=True, key=key)  # of an image
 
     def _forget(self) -> None:
         """Wait for a key frame."""
         self._back = 0
 
-    def _link(self, size: int, *, begins: bool, kept: bool = True, key: bool) -> list[CodedFrame]:
+    def _link(self, *, begins: bool, kept: bool = True, key: bool) -> list[CodedFrame]:
         """The only frame of a packet.
 
         Args:
-            size: Of the packet.
             begins: Whether nothing from here on refers to anything earlier.
             kept: Whether later frames may need something of the packet.
             key: Whether the file says that decoding can begin here.
@@ -223,7 +216,7 @@ class StreamParser:
             raise UnknownStructure("it comes before the first key frame")
         references = () if begins else (self._back,)
         self._back = 1 if kept or begins else self._back + 1
-        return [CodedFrame(0, size, references, shown=True)]
+        return [CodedFrame(references, shown=True)]
 
     @staticmethod
     def units_of(configuration: bytes) -> list[bytes]:
@@ -240,6 +233,9 @@ class StreamParser:
     @staticmethod
     def spans(packet: bytes) -> list[tuple[int, int, int]]:
         """Where the coded frames of a packet are, of which `frames` knows what they need.
+
+        Of AV1, what is in none (metadata, padding) is not needed to decode; of other codecs there
+        is one frame, the whole packet.
 
         Returns:
             For each frame the start of the sequence header before it, its own where there is none,
@@ -323,7 +319,7 @@ class Ffv1(StreamParser):
         if len(data) < 2:
             raise UnknownStructure("it is not FFV1: it is too short")
         is_key = int.from_bytes(data[:2], "big") >= _FFV1_KEY
-        return self._link(len(data), begins=is_key, key=key)
+        return self._link(begins=is_key, key=key)
 
 
 # ---------------------------------------------------------------- markers of JPEG (ITU-T T.81, B)

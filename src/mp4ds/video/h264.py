@@ -568,7 +568,7 @@ class H264(UnitParser):
             elif kind in range(PARTITION_A, IDR):
                 raise UnknownStructure("its slices are in partitions")
         begins = self._only(pictures, kinds) == IDR
-        return self._link(len(data), begins=begins, kept=kept, key=key)
+        return self._link(begins=begins, kept=kept, key=key)
 
     def _take_unit(self, unit: bytes) -> None:
         if self.unit_type(unit) == SPS and not parse_sps(unit).frames_only:

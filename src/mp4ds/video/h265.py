@@ -191,7 +191,7 @@ class H265(UnitParser):
             raise UnknownStructure(
                 "its key frames may be followed by pictures that refer to what is before"
             )
-        return self._link(len(data), begins=kind in _IDR, kept=kept, key=key)
+        return self._link(begins=kind in _IDR, kept=kept, key=key)
 
     def _take_unit(self, unit: bytes) -> None:
         if len(unit) < 3:
