@@ -36,7 +36,6 @@ class Codec:
         ffmpeg: Its name in ffmpeg.
         parser: Of its packets.
         entries: Four letters of the sample entries of an mp4 whose packets the parser knows.
-        decoder: ffmpeg's name of the decoder for single frames; empty: the one of `JpegDecoder`.
         names: In messages: of the codec, or of an encoder that makes it; none: no message has it.
         is_free: Whether a frame may be independent of the one before it, which is worth recording.
         is_split: Whether a packet may hold several coded frames.
@@ -45,7 +44,6 @@ class Codec:
     ffmpeg: str
     parser: type[StreamParser]
     entries: tuple[str, ...]
-    decoder: str = ""
     names: tuple[str, ...] = ()
     is_free: bool = False
     is_split: bool = False
@@ -53,20 +51,17 @@ class Codec:
 
 CODECS: Mapping[str, Codec] = {
     "h264": Codec(
-        "h264", H264, ("avc1", "avc3"), "h264",
-        ("h264", "avc", "libx264", "libopenh264"), is_free=True,
+        "h264", H264, ("avc1", "avc3"), ("h264", "avc", "libx264", "libopenh264"), is_free=True
     ),
-    "h265": Codec(
-        "hevc", H265, ("hvc1", "hev1"), "hevc", ("h265", "hevc", "libx265"), is_free=True,
-    ),
+    "h265": Codec("hevc", H265, ("hvc1", "hev1"), ("h265", "hevc", "libx265"), is_free=True),
     "av1": Codec(
-        "av1", Av1, ("av01",), "libdav1d",
-        ("av1", "libsvtav1", "libaom-av1", "librav1e"), is_free=True, is_split=True,
+        "av1", Av1, ("av01",), ("av1", "libsvtav1", "libaom-av1", "librav1e"),
+        is_free=True, is_split=True,
     ),
-    "vp9": Codec("vp9", StreamParser, (), "vp9"),  # of datasets of version 1: it is not parsed
-    "ffv1": Codec("ffv1", Ffv1, ("FFV1",), "ffv1"),
-    "png": Codec("png", StreamParser, ("mp4v", "png "), "png"),
-    "mjpeg": Codec("mjpeg", Jpeg, ("mp4v", "jpeg"), names=("mjpeg", "jpeg", "jpg")),
+    "vp9": Codec("vp9", StreamParser, ()),  # of datasets of version 1: it is not parsed
+    "ffv1": Codec("ffv1", Ffv1, ("FFV1",)),
+    "png": Codec("png", StreamParser, ("mp4v", "png ")),
+    "mjpeg": Codec("mjpeg", Jpeg, ("mp4v", "jpeg"), ("mjpeg", "jpeg", "jpg")),
 }  # fmt: skip
 """By the name in the registry."""
 
@@ -323,33 +318,26 @@ def check_codec(
     codec = codec and codec_name(codec)
     able = {name for codings in _LOSSLESS.values() for name in codings} if lossless else _LOSSY
     if codec is not None and codec not in able:
-        known = ", ".join(sorted(able))
+        problem = f"does not support {'lossless' if lossless else 'lossy'} packing"
         if codec not in _PRESETS:
-            raise OptionError(f"`codec` {codec!r} is not one that mp4ds can encode. Use {known}.")
-        kind = "lossless" if lossless else "lossy"
-        raise OptionError(f"`codec` {codec!r} does not support {kind} packing. Use {known}.")
+            problem = "is not one that mp4ds can encode"
+        raise OptionError(f"`codec` {codec!r} {problem}. Use {', '.join(sorted(able))}.")
     name = codec or (lossless_codecs("gray")[0] if lossless else DEFAULT_LOSSY)
     if preset is not None and preset not in _PRESETS[name]:
         known = ", ".join(_PRESETS[name])
-        raise OptionError(
-            f"`preset` {preset!r} is not one of {name}. "
-            + (f"Use one of {known}." if known else "It has no presets.")
-        )
+        remedy = f"Use one of {known}." if known else "It has no presets."
+        raise OptionError(f"`preset` {preset!r} is not one of {name}. {remedy}")
     if crf is not None:
-        _check_crf(name, preset or (fastest_preset(name) if fast else None), crf)
+        preset = preset or (fastest_preset(name) if fast else None)
+        least = 1 if name in AV1 else 0  # ffmpeg takes 0 of SVT-AV1 for none
+        if name in AV1 and preset is not None and int(preset) >= _AV1_FAST:
+            least = LEAST_CRF["av1"]
+        if not least <= crf <= MAX_CRF[name]:
+            of = f"{name} with preset {preset}" if preset else name
+            raise OptionError(
+                f"`quality` crf={crf} is out of range for {of}. Use {least} to {MAX_CRF[name]}."
+            )
     return codec
-
-
-def _check_crf(codec: str, preset: str | None, crf: int) -> None:
-    least = 0
-    if codec in AV1:  # ffmpeg takes 0 for none
-        is_fast = preset is not None and int(preset) >= _AV1_FAST
-        least = LEAST_CRF["av1"] if is_fast else 1
-    if not least <= crf <= MAX_CRF[codec]:
-        of = f"{codec} with preset {preset}" if preset else codec
-        raise OptionError(
-            f"`quality` crf={crf} is out of range for {of}. Use {least} to {MAX_CRF[codec]}."
-        )
 
 
 def recipe_for(

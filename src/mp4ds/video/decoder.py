@@ -102,7 +102,8 @@ def open_packet_decoder(codec: str, size: tuple[int, int], configuration: bytes 
     """
     if codec == "mjpeg":
         return JpegDecoder(size)
-    context: Any = av.CodecContext.create(CODECS[codec].decoder, "r")
+    name = "libdav1d" if codec == "av1" else CODECS[codec].ffmpeg
+    context: Any = av.CodecContext.create(name, "r")
     context.width, context.height = size
     context.thread_count = 1
     context.thread_type = "SLICE"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, count
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -106,7 +106,7 @@ class VideoEncoder(Mp4Writer):
         self.recipe = recipe
         self._coded = coded
         self.frames = 0
-        self._format, self._converter = picture_format, _converter(recipe)
+        self._frame = _framer(recipe, picture_format)
         self.width, self.height = coded_size(recipe, width, height)
         self.options = {**_options(recipe, self.width, self.height), "g": str(gop)}
         self._container = new_mp4(path)
@@ -144,7 +144,7 @@ class VideoEncoder(Mp4Writer):
         Raises:
             OSError: It cannot be written.
         """
-        frame = _frame(picture, self._format, self.recipe, self._converter, tick)
+        frame = self._frame(picture, tick)
         frame.time_base = TIME_BASE
         self._mux(self._encoded(frame))
         self.frames += 1
@@ -182,21 +182,19 @@ class VideoEncoder(Mp4Writer):
         return bytes(self._stream.codec_context.extradata or b"")
 
 
-def _converter(recipe: Recipe) -> PictureConverter:
+def _framer(recipe: Recipe, picture_format: str) -> Callable[[Picture, int], av.VideoFrame]:
+    """Makes the frames that the encoder of a recipe takes, of pictures and their times."""
     is_full = recipe.full_range  # a camera's own YUV keeps its range
-    return PictureConverter(source_full_range=is_full, full_range=is_full)
+    converter = PictureConverter(source_full_range=is_full, full_range=is_full)
 
+    def frame_of(picture: Picture, pts: int) -> av.VideoFrame:
+        frame = picture_to_frame(
+            picture, picture_format, recipe.pixel_format, converter, full_range=is_full
+        )
+        frame.pts, frame.color_range = pts, color_range(recipe)
+        return frame
 
-def _frame(
-    picture: Picture, picture_format: str, recipe: Recipe, converter: PictureConverter, pts: int
-) -> av.VideoFrame:
-    """The frame that the encoder of a recipe takes."""
-    is_full = recipe.full_range
-    frame = picture_to_frame(
-        picture, picture_format, recipe.pixel_format, converter, full_range=is_full
-    )
-    frame.pts, frame.color_range = pts, color_range(recipe)
-    return frame
+    return frame_of
 
 
 @contextmanager
@@ -451,8 +449,7 @@ def _encoded(
     """
     rows, columns = pictures[0][0].shape[:2]
     width, height = coded_size(recipe, columns, rows)
-    converter = _converter(recipe)
-    frames = (_frame(p, picture_format, recipe, converter, n) for n, p in enumerate(pictures))
+    frames = map(_framer(recipe, picture_format), pictures, count())
     if recipe.codec == "png":
         return None, list(map(_png_packet, frames))
     context: Any = av.CodecContext.create(recipe.encoder, "w")
