@@ -100,7 +100,7 @@ def test_large_images_are_tried_in_part(encoding: str) -> None:
     samples = scene(encoding, 3, width=1602, height=1202)
     choice = chosen(samples, encoding)
     layout = choice.layout
-    whole = encode_on_trial(
+    whole, *_ = encode_on_trial(
         [layout.to_picture(pixels) for pixels in samples],
         choice.recipe,
         picture_format=layout.pixel_format,

@@ -7,7 +7,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -304,7 +304,19 @@ class Conversion:
         headers = stream.sidecar.headers
         if KINDS[form.kind].family == "video":
             self._shown = shown_by_packets(stream)
-            _check_video(self._shown, form)
+            shown = self._shown.sidecar
+            if shown.video.codec not in _VIDEO_CODECS:
+                name = KINDS[form.kind].type_name.rpartition("/")[2]
+                known = ", ".join(_VIDEO_CODECS)
+                raise Refused(
+                    f"{name} supports the codecs {known}, but this video is {shown.video.codec}"
+                )
+            if shown.body != "packet" and not shown.layout.is_shown:
+                raise Refused(
+                    f"its video does not show the images as they look (layout {shown.layout.name})"
+                )
+            if self._shown.hides_frames:
+                raise Refused("the first packets of the slice depend on packets outside it")
             self.frames = self._packets
         elif holds_files(stream, form.kind):
             encodings = [encoding_of(stream.sidecar, header) for header in headers]
@@ -397,20 +409,6 @@ def files_of(
     for index, body in _bodies(stream, choice, verify):
         start = starts[variants[index]] if stream.sidecar.body == "png" else 0
         yield index, body[start:]
-
-
-def _check_video(stream: Stream, form: ImageForm) -> None:
-    sidecar = stream.sidecar
-    codec = sidecar.video.codec
-    if codec not in _VIDEO_CODECS:
-        known, name = ", ".join(_VIDEO_CODECS), KINDS[form.kind].type_name.rpartition("/")[2]
-        raise Refused(f"{name} supports the codecs {known}, but this video is {codec}")
-    if sidecar.body != "packet" and not sidecar.layout.is_shown:
-        raise Refused(
-            f"its video does not show the images as they look (layout {sidecar.layout.name})"
-        )
-    if stream.hides_frames:
-        raise Refused("the first packets of the slice depend on packets outside it")
 
 
 def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int, memoryview]]:
@@ -530,17 +528,11 @@ def image_names(folder: Path) -> set[str] | None:
     if not folder.is_dir():
         return None
     names: set[str] = set()
-    for place in folder.iterdir():
-        if place.is_dir():
-            names.update(f"{place.name}/{name}" for name in _names_in(place / _STAMPS_NAME))
+    for place in filter(Path.is_dir, folder.iterdir()):
+        with suppress(OSError, ValueError, csv.Error):
+            stamps = (place / _STAMPS_NAME).read_bytes().decode()
+            rows = csv.reader(io.StringIO(stamps, newline=""))
+            if next(rows, None) == _HEAD:
+                files = [_STAMPS_NAME, *(row[0] for row in rows if row)]
+                names.update(f"{place.name}/{name}" for name in files)
     return names or None
-
-
-def _names_in(stamps: Path) -> set[str]:
-    try:
-        rows = csv.reader(io.StringIO(stamps.read_bytes().decode(), newline=""))
-        if next(rows, None) != _HEAD:
-            return set()
-        return {stamps.name, *(row[0] for row in rows if row)}
-    except (OSError, ValueError, csv.Error):
-        return set()

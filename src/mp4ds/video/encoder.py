@@ -382,6 +382,42 @@ class Predictor:
             yield pixels
 
 
+def encode_on_trial(
+    pictures: Sequence[Picture], recipe: Recipe, *, picture_format: str, threads: int
+) -> tuple[list[int], list[bytes], bytes]:
+    """Encode pictures as one group of pictures.
+
+    Args:
+        pictures: Consecutive ones, at least one, all of one size.
+        recipe: Codec and options.
+        picture_format: Pixel format of the pictures.
+        threads: Threads of the encoder.
+
+    Returns:
+        Bytes of each picture, the packets, and what a decoder needs besides these.
+
+    Raises:
+        EncoderRefusedError: The codec does not take such pictures.
+    """
+    rows, columns = pictures[0][0].shape[:2]
+    frames = map(_framer(recipe, picture_format), pictures, count())
+    configuration = b""
+    if recipe.codec == "png":
+        packets = list(map(_png_packet, frames))
+    else:
+        context: Any = av.CodecContext.create(recipe.encoder, "w")
+        context.options = {**recipe.options, "g": str(len(pictures))}
+        context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
+        with _refused(recipe, columns, rows):
+            open_encoder(context, recipe, *coded_size(recipe, columns, rows), threads=threads)
+            packets = [packet for f in chain(frames, [None]) for packet in context.encode(f)]
+        configuration = bytes(context.extradata or b"")
+    sizes = [0] * len(pictures)
+    for packet in packets:
+        sizes[packet.pts] += packet.size
+    return sizes, list(map(bytes, packets)), configuration
+
+
 _UNFILTERED = "enable-tf=0"  # SVT-AV1's option against temporal filtering
 
 
@@ -405,60 +441,12 @@ def predict_on_trial(
         parameters = f"{given}:{_UNFILTERED}" if given else _UNFILTERED
         recipe = replace(recipe, options={**recipe.options, "svtav1-params": parameters})
     pictures = list(map(layout.to_picture, samples))
-    context, packets = _encoded(pictures, recipe, layout.pixel_format, threads)
+    sizes, packets, configuration = encode_on_trial(
+        pictures, recipe, picture_format=layout.pixel_format, threads=threads
+    )
     rows, columns = samples[0].shape[:2]
-    size = columns, int(rows / layout.encoding.rows)
-    predictor = Predictor(coding, size, bytes(context.extradata or b""))
-    data = [*map(bytes, packets), None]
-    shown = [pixels for packet in data for pixels in predictor.images(packet)]
-    return _sizes(packets, len(samples)), shown
-
-
-def encode_on_trial(
-    pictures: Sequence[Picture], recipe: Recipe, *, picture_format: str, threads: int
-) -> list[int]:
-    """Bytes of each of some pictures, encoded as one group of pictures.
-
-    Args:
-        pictures: Consecutive ones, at least one, all of one size.
-        recipe: Codec and options.
-        picture_format: Pixel format of the pictures.
-        threads: Threads of the encoder.
-
-    Raises:
-        EncoderRefusedError: The codec does not take such pictures.
-    """
-    _, packets = _encoded(pictures, recipe, picture_format, threads)
-    return _sizes(packets, len(pictures))
-
-
-def _sizes(packets: Sequence[Any], frames: int) -> list[int]:
-    sizes = [0] * frames
-    for packet in packets:
-        sizes[packet.pts] += packet.size
-    return sizes
-
-
-def _encoded(
-    pictures: Sequence[Picture], recipe: Recipe, picture_format: str, threads: int
-) -> tuple[Any, list[Any]]:
-    """The encoder, and its packets of one group of pictures.
-
-    Raises:
-        EncoderRefusedError: The codec does not take such pictures.
-    """
-    rows, columns = pictures[0][0].shape[:2]
-    width, height = coded_size(recipe, columns, rows)
-    frames = map(_framer(recipe, picture_format), pictures, count())
-    if recipe.codec == "png":
-        return None, list(map(_png_packet, frames))
-    context: Any = av.CodecContext.create(recipe.encoder, "w")
-    context.options = {**recipe.options, "g": str(len(pictures))}
-    context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
-    with _refused(recipe, columns, rows):
-        open_encoder(context, recipe, width, height, threads=threads)
-        packets = [packet for f in chain(frames, [None]) for packet in context.encode(f)]
-    return context, packets
+    predictor = Predictor(coding, (columns, int(rows / layout.encoding.rows)), configuration)
+    return sizes, [pixels for packet in [*packets, None] for pixels in predictor.images(packet)]
 
 
 _DISTANCES = (1, 2, 3, 5)
@@ -515,7 +503,7 @@ def choose(
                 recipe = recipe_for(
                     picture_format, lossless=True, codec=name, preset=preset, is_noise=is_noise
                 )
-                sizes = encode_on_trial(
+                sizes, *_ = encode_on_trial(
                     pictures, recipe, picture_format=picture_format, threads=threads
                 )
             except (OptionError, EncoderRefusedError) as error:

@@ -204,11 +204,13 @@ class UnitParser(StreamParser, ABC):
 
     Attributes:
         parameter_kinds: Types of the parameter sets, all of which a picture needs.
+        slices: Types of the units of pictures.
         delimiter: Type of the unit that comes before them, if it is there.
         slice_at: Bytes of a NAL unit's header.
     """
 
     parameter_kinds: ClassVar[frozenset[int]]
+    slices: ClassVar[range]
     delimiter: ClassVar[int]
     slice_at: ClassVar[int]
 
@@ -269,21 +271,39 @@ class UnitParser(StreamParser, ABC):
     def _is_key(self, first: bytes, slices: Sequence[bytes]) -> bool:
         """Whether decoding can begin at a picture, by the arguments of `_check_order`."""
 
-    def _only(self, pictures: int, kinds: set[int]) -> int:
-        """The type of slices of the only picture of a packet.
-
-        Args:
-            pictures: Number of slices that begin a picture.
-            kinds: Of all slices.
-
-        Raises:
-            UnknownStructure: There is another number of pictures, or its parameters are unfit.
-        """
+    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
+        pictures, kinds, kept = 0, set[int](), False
+        for unit in split_length_prefixed(data):
+            kind = self._kind_in_mp4(unit)
+            if kind in self.slices:
+                kinds.add(kind)
+                # the first slice of a picture
+                pictures += len(unit) > self.slice_at and unit[self.slice_at] >> 7
+                kept |= self._is_referred_to(unit, kind)
+            elif kind in self.parameter_kinds:
+                self._take_unit(bytes(unit))
+                kept = True
         if len(kinds) != 1 or pictures != 1:
             raise UnknownStructure("it does not hold one picture")
         if self._unfit:
             raise UnknownStructure(self._unfit)
-        return kinds.pop()
+        return self._link(begins=self._begins(kinds.pop()), kept=kept, key=key)
+
+    def _kind_in_mp4(self, unit: memoryview) -> int:
+        """Type of a NAL unit; -1 for one that decoders leave out."""
+        return self.unit_type(unit)
+
+    @abstractmethod
+    def _is_referred_to(self, unit: memoryview, kind: int) -> bool:
+        """Whether later pictures may refer to that of a slice."""
+
+    @abstractmethod
+    def _begins(self, kind: int) -> bool:
+        """Whether nothing refers beyond a picture of slices of a kind.
+
+        Raises:
+            UnknownStructure: That is not known.
+        """
 
     @staticmethod
     def plain(body: bytes | memoryview) -> bytes:
@@ -486,6 +506,7 @@ class H264(UnitParser):
     """Access units of H.264."""
 
     parameter_kinds = frozenset((SPS, PPS))
+    slices = range(SLICE, IDR + 1)
     delimiter = AUD
     slice_at = 1
 
@@ -552,23 +573,13 @@ class H264(UnitParser):
             raise Refused(REORDERED)
         return sps
 
-    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        pictures = 0
-        kinds: set[int] = set()
-        kept = False
-        for unit in split_length_prefixed(data):
-            kind = unit[0] & 0x1F
-            if kind in (SLICE, IDR):
-                kinds.add(kind)
-                pictures += len(unit) > 1 and unit[1] >> 7  # its first macroblock is 0
-                kept |= bool(unit[0] & 0x60)  # nal_ref_idc (7.4.1)
-            elif kind in (SPS, PPS):
-                self._take_unit(bytes(unit))
-                kept = True
-            elif kind in range(PARTITION_A, IDR):
-                raise UnknownStructure("its slices are in partitions")
-        begins = self._only(pictures, kinds) == IDR
-        return self._link(begins=begins, kept=kept, key=key)
+    def _is_referred_to(self, unit: memoryview, kind: int) -> bool:
+        return bool(unit[0] & 0x60)  # nal_ref_idc (7.4.1)
+
+    def _begins(self, kind: int) -> bool:
+        if kind not in (SLICE, IDR):
+            raise UnknownStructure("its slices are in partitions")
+        return kind == IDR
 
     def _take_unit(self, unit: bytes) -> None:
         if self.unit_type(unit) == SPS and not parse_sps(unit).frames_only:

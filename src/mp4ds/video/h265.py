@@ -9,19 +9,17 @@ from collections.abc import Sequence
 
 from mp4ds.errors import Refused
 from mp4ds.messages.encodings import check_size
-from mp4ds.video.coded import REORDERED, BitReader, CodedFrame, UnknownStructure
+from mp4ds.video.coded import REORDERED, BitReader, UnknownStructure
 from mp4ds.video.h264 import (
     SLICE_HEADER_BYTES,
     Sps,
     UnitParser,
     check_configuration,
     sized_units,
-    split_length_prefixed,
     unescape,
 )
 
 VPS, SPS, PPS, AUD = 32, 33, 34, 35
-_SLICES = range(32)
 _LEADING = range(6, 10)  # RADL and RASL: shown before the key frame that they follow
 _IRAP = range(16, 24)
 _IDR = (19, 20)
@@ -90,6 +88,7 @@ class H265(UnitParser):
     """Access units of H.265."""
 
     parameter_kinds = frozenset((VPS, SPS, PPS))
+    slices = range(VPS)
     delimiter = AUD
     slice_at = 2
 
@@ -128,7 +127,7 @@ class H265(UnitParser):
             self._sets[SPS, sps.number] = unit
         elif kind == PPS:
             self._take_pps(unit)
-        return kind in _SLICES
+        return kind in self.slices
 
     def _take_pps(self, unit: bytes) -> None:
         reader = BitReader(unescape(unit[2:SLICE_HEADER_BYTES]))
@@ -170,28 +169,19 @@ class H265(UnitParser):
             raise Refused(REORDERED)
         return sps
 
-    def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
-        pictures = 0
-        kinds: set[int] = set()
-        kept = False
-        for unit in split_length_prefixed(data):
-            if _is_of_another_layer(unit):
-                continue
-            kind = unit[0] >> 1
-            if kind < VPS:
-                kinds.add(kind)
-                pictures += len(unit) > 2 and unit[2] >> 7  # its first slice
-                # of a lower TemporalId, pictures of a higher one may refer to it (7.4.2.2)
-                kept |= kind not in _UNREFERRED or (unit[1] & 7) - 1 != self._highest
-            elif kind <= PPS:
-                self._take_unit(bytes(unit))
-                kept = True
-        kind = self._only(pictures, kinds)
+    def _kind_in_mp4(self, unit: memoryview) -> int:
+        return -1 if _is_of_another_layer(unit) else self.unit_type(unit)
+
+    def _is_referred_to(self, unit: memoryview, kind: int) -> bool:
+        # of a lower TemporalId, pictures of a higher one may refer to it (7.4.2.2)
+        return kind not in _UNREFERRED or (unit[1] & 7) - 1 != self._highest
+
+    def _begins(self, kind: int) -> bool:
         if kind not in _IDR and kind not in _AFTER:
             raise UnknownStructure(
                 "its key frames may be followed by pictures that refer to what is before"
             )
-        return self._link(begins=kind in _IDR, kept=kept, key=key)
+        return kind in _IDR
 
     def _take_unit(self, unit: bytes) -> None:
         if len(unit) < 3:
