@@ -48,63 +48,6 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=gc.freeze)
 
 
-class Pictures:
-    """How the frames of all cameras become tensors.
-
-    Args:
-        topics: The cameras.
-        format: Of the frames; like `resize` and `crop` one for all, or a mapping by topic.
-        resize: Factor, or width and height.
-        crop: x, y, width, height.
-        dtype: ``native``, ``uint8`` or ``float32``.
-        channels_first: (C, H, W) instead of (H, W, C).
-        backend: The decoding backend.
-        device: Where the tensors are.
-
-    Attributes:
-        views: Format, size and crop of each camera, as `Topic.read` takes them.
-
-    Raises:
-        OptionError: One is unknown, or for a topic that does not exist.
-    """
-
-    def __init__(
-        self,
-        topics: Sequence[str],
-        *,
-        format: str | Mapping[str, str],  # noqa: A002 - as of Topic.read
-        resize: Resize | Mapping[str, Resize],
-        crop: Crop | Mapping[str, Crop],
-        dtype: str,
-        channels_first: bool,
-        backend: str,
-        device: str,
-    ) -> None:
-        self.dtype = str(dtype).removeprefix("torch.")
-        self.channels_first, self.backend, self.device = channels_first, backend, device
-        one_of("dtype", self.dtype, get_args(Dtype))
-        one_of("backend", backend, get_args(Backend))
-        formats = each("format", format, topics, "rgb")
-        sizes = each("resize", resize, topics, None)
-        crops = each("crop", crop, topics, None)
-        for name in formats:
-            one_of("format", name, FORMATS)
-        for topic, size in zip(topics, sizes, strict=True):
-            if size is not None:  # now, rather than in a worker
-                size_after(topic, (1, 1), size)
-        self.views: list[dict[str, Any]] = [
-            {"format": one, "resize": size, "crop": area}
-            for one, size, area in zip(formats, sizes, crops, strict=True)
-        ]
-        if backend == "mp4ds" and device != "cpu":
-            raise OptionError(f"device={device!r} needs backend='torchcodec'.")
-        is_changed = any(view["format"] != "rgb" or view["resize"] for view in self.views)
-        if backend == "torchcodec" and is_changed:
-            raise OptionError(
-                "backend='torchcodec' only gives format='rgb' without resize; use a transform."
-            )
-
-
 # ---------------------------------------------------------------- torchcodec
 
 
@@ -127,9 +70,21 @@ class TorchcodecReader:
     """
 
     def __init__(self, topic: Topic, crop: Crop, device: str) -> None:
-        self._path, self._streams = topic.parts[0].video_path, topic.streams
+        self._path = topic.parts[0].video_path
         for stream in topic.streams:
-            _check_layout(stream)
+            image, video = stream.sidecar.image, stream.sidecar.video
+            if stream.sidecar.is_predicted:
+                raise OptionError(
+                    f"topic {stream.topic}: its exact frames are made of two videos, which "
+                    "torchcodec cannot do. Use backend='mp4ds', or layer='view'."
+                )
+            is_deep = ENCODINGS[image.encoding].bytes_per_sample > 1
+            if is_deep or not LAYOUTS[video.layout].is_shown:
+                raise OptionError(
+                    f"topic {stream.topic}: {image.encoding} images are stored in the layout "
+                    f"{video.layout}, which torchcodec cannot convert to colour. Use "
+                    "backend='mp4ds'."
+                )
             if stream.hides_frames:
                 raise OptionError(
                     f"topic {stream.topic}: torchcodec returns wrong frames at the beginning of a "
@@ -144,10 +99,6 @@ class TorchcodecReader:
             raise OptionError(f"topic {topic.topic}: crop {crop} is not inside {columns}x{rows}.")
         self._rows, self._columns = slice(y, y + height), slice(x, x + width)
         self._device = device
-        self._decoder = self._opened(device)
-        self._check_range(topic)
-
-    def _opened(self, device: str) -> Any:
         if find_spec("torchcodec") is None:
             raise OptionError(
                 "backend='torchcodec' needs torchcodec. Install it with: pip install torchcodec"
@@ -162,14 +113,14 @@ class TorchcodecReader:
             ) from None
         # either way, frame n is the n-th shown, whatever its presentation time
         how: dict[str, Any] = {"seek_mode": "exact"}  # which reads the whole file
-        if self._streams and self._path.stat().st_size > _SCANNED:
-            how = {"custom_frame_mappings": self._streams[0].frame_mappings()}
+        if topic.streams and self._path.stat().st_size > _SCANNED:
+            how = {"custom_frame_mappings": topic.streams[0].frame_mappings()}
+        how |= {"dimension_order": "NHWC", "device": device}
         try:
-            return module.VideoDecoder(
-                str(self._path), dimension_order="NHWC", device=device, **how
-            )
+            self._decoder = module.VideoDecoder(str(self._path), **how)
         except (RuntimeError, ValueError) as error:
             raise self._refused(error) from None
+        self._check_range(topic)
 
     def _check_range(self, topic: Topic) -> None:
         """Refuse a video whose range torchcodec misinterprets.
@@ -207,21 +158,6 @@ class TorchcodecReader:
         except (RuntimeError, IndexError, ValueError) as error:
             raise self._refused(error) from None
         return pixels[:, self._rows, self._columns]
-
-
-def _check_layout(stream: Stream) -> None:
-    """Refuse pictures that are not the images, and images of more than 8 bits."""
-    image, video = stream.sidecar.image, stream.sidecar.video
-    if stream.sidecar.is_predicted:
-        raise OptionError(
-            f"topic {stream.topic}: its exact frames are made of two videos, which torchcodec "
-            "cannot do. Use backend='mp4ds', or layer='view'."
-        )
-    if not LAYOUTS[video.layout].is_shown or ENCODINGS[image.encoding].bytes_per_sample > 1:
-        raise OptionError(
-            f"topic {stream.topic}: {image.encoding} images are stored in the layout "
-            f"{video.layout}, which torchcodec cannot convert to colour. Use backend='mp4ds'."
-        )
 
 
 # ---------------------------------------------------------------- frames kept for later
@@ -406,34 +342,27 @@ class OpenCamera:
 
     Args:
         source: Which.
-        view: How its frames are wanted, as in `Pictures.views`.
-        pictures: How they become tensors.
-        cache: Where they are kept; None: nowhere.
+        view: How its frames are wanted, as `Topic.read` takes it.
+        cameras: How they become tensors, and where they are kept.
 
     Raises:
         FormatError: The stream breaks a rule of the format.
     """
 
-    def __init__(
-        self,
-        source: CameraSource,
-        view: dict[str, Any],
-        pictures: Pictures,
-        cache: FrameCache | None,
-    ) -> None:
+    def __init__(self, source: CameraSource, view: dict[str, Any], cameras: OpenCameras) -> None:
         self._source = source
         self._view = view
-        self._pictures = pictures
+        self._dtype = cameras.dtype
         self._topic = open_source(source)
         if len(self._topic) != source.frames:
             problem = f"has {len(self._topic)} frames, not {source.frames}"
             raise FormatError("frame-count", source.place, problem)
         self._torchcodec = None
-        if pictures.backend == "torchcodec":
-            self._torchcodec = TorchcodecReader(self._topic, view["crop"], pictures.device)
+        if cameras.backend == "torchcodec":
+            self._torchcodec = TorchcodecReader(self._topic, view["crop"], cameras.device)
         self._cached = None
-        if cache is not None:
-            self._cached = cache.camera(self._topic, view, self._topic.read([], **view))
+        if cameras.cache is not None:
+            self._cached = cameras.cache.camera(self._topic, view, self._topic.read([], **view))
 
     @property
     def stamps(self) -> NDArray[np.int64]:
@@ -471,28 +400,21 @@ class OpenCamera:
         keys = np.flatnonzero(table.sync[table.order])
         return np.union1d(0, keys).astype(np.int64)  # a slice may begin between two
 
-    def empty(self, frames: int) -> Tensor:
-        """A tensor of no samples, each of that many frames.
-
-        Returns:
-            Shape (0, frames, H, W, C).
+    @cached_property
+    def none(self) -> Tensor:
+        """No frames, shape (0, H, W, C).
 
         Raises:
             OptionError: The frames cannot be returned as requested.
         """
-        return self._none.new_empty((0, frames, *self._none.shape[1:]))
-
-    @cached_property
-    def _none(self) -> Tensor:
-        """No frames, shape (0, H, W, C)."""
         like = self._pixels([])
-        if self._pictures.dtype == "uint8" and like.dtype != torch.uint8:
+        if self._dtype == "uint8" and like.dtype != torch.uint8:
             kind = str(like.dtype).removeprefix("torch.")
             raise OptionError(
                 f"topic {self._source.topic}: has frames of {kind}, not uint8. Give "
                 "dtype='native' to get them as stored, or dtype='float32'."
             )
-        dtype = torch.float32 if self._pictures.dtype == "float32" else like.dtype
+        dtype = torch.float32 if self._dtype == "float32" else like.dtype
         return like.new_empty((0, *like.shape[1:3], *(like.shape[3:] or (1,))), dtype=dtype)
 
     def read(self, frames: Sequence[int], outs: Sequence[Tensor]) -> None:
@@ -500,32 +422,31 @@ class OpenCamera:
 
         Args:
             frames: Numbers, in any order.
-            outs: Where each goes: of the type that `empty` has, shape (H, W, C).
+            outs: Where each goes: of the type of `none`, shape (H, W, C).
 
         Raises:
             SampleError: One of them cannot be decoded.
             OptionError: They cannot be returned as requested.
         """
         try:
-            self._read(frames, outs)
+            if self._torchcodec is None and self._dtype != "float32":
+                # arrays share the memory of tensors; those of grey images have no channels
+                rows = [(out.squeeze(-1) if out.shape[-1] == 1 else out).numpy() for out in outs]
+                self._fill(frames, rows)
+                return
+            pixels = self._pixels(frames)
         except OptionError:
             raise
         except Mp4dsError as error:
             raise self._first_failure(frames, error) from None
-
-    def _read(self, frames: Sequence[int], outs: Sequence[Tensor]) -> None:
-        if self._torchcodec is None and self._pictures.dtype != "float32":
-            # arrays share the memory of tensors; those of grey images have no channels
-            rows = [(out.squeeze(-1) if out.shape[-1] == 1 else out).numpy() for out in outs]
-            self._fill(frames, rows)
-            return
-        for pixels, out in zip(self._pixels(frames), outs, strict=True):
-            shaped = pixels.view(out.shape)
-            is_scaled = self._pictures.dtype == "float32" and self._view["format"] != "native"
-            if pixels.dtype.is_floating_point or not is_scaled:
-                out.copy_(shaped)
+        is_scaled = self._dtype == "float32" and self._view["format"] != "native"
+        is_scaled = is_scaled and not pixels.dtype.is_floating_point
+        for frame, out in zip(pixels, outs, strict=True):
+            shaped = frame.view(out.shape)
+            if is_scaled:
+                torch.div(shaped, torch.iinfo(frame.dtype).max, out=out)
             else:
-                torch.div(shaped, torch.iinfo(pixels.dtype).max, out=out)
+                out.copy_(shaped)
 
     def _pixels(self, frames: Sequence[int]) -> Tensor:
         """Frames as decoded, shape (N, H, W) or (N, H, W, C)."""
@@ -538,17 +459,15 @@ class OpenCamera:
 
     def _fill(self, frames: Sequence[int], rows: Sequence[Pixels]) -> None:
         """Write frames, each into its own array: those in the cache, and all others decoded."""
-        cached = self._cached
-        if cached is None:
-            self._topic.read_into(frames, rows, **self._view)
-            return
-        pairs = zip(frames, rows, strict=True)
-        missing = [(number, row) for number, row in pairs if not cached.load(number, row)]
+        cached, missing = self._cached, list(zip(frames, rows, strict=True))
+        if cached is not None:
+            missing = [pair for pair in missing if not cached.load(*pair)]
         if missing:
             numbers, others = zip(*missing, strict=True)
             self._topic.read_into(numbers, others, **self._view)
-        for number, row in missing:
-            cached.store(number, row)
+        if cached is not None:
+            for number, row in missing:
+                cached.store(number, row)
 
     def _first_failure(self, frames: Sequence[int], error: Mp4dsError) -> SampleError:
         """Which frame failed, since an error about many does not always say."""
@@ -578,21 +497,64 @@ class OpenCameras:
     process, and it would wait for them.
 
     Args:
+        topics: The cameras of a sample.
         most: Maximum number of open cameras.
-        pictures: How their frames become tensors.
-        cache: Where these are kept; None: nowhere.
+        format: Of the frames; like `resize` and `crop` one for all, or a mapping by topic.
+        resize: Factor, or width and height.
+        crop: x, y, width, height.
+        dtype: ``native``, ``uint8`` or ``float32``.
+        backend: The decoding backend.
+        device: Where the tensors are.
+
+    Attributes:
+        views: Format, size and crop of each camera, as `Topic.read` takes them.
+        cache: Where frames are kept; None: nowhere.
 
     Raises:
-        OptionError: `most` is less than one.
+        OptionError: An option is unknown, or for a topic that does not exist.
     """
 
-    def __init__(self, most: int, pictures: Pictures, cache: FrameCache | None) -> None:
-        self._most = most
-        self._pictures = pictures
-        self._cache = cache
+    def __init__(
+        self,
+        topics: Sequence[str],
+        most: int,
+        *,
+        format: str | Mapping[str, str],  # noqa: A002 - as of Topic.read
+        resize: Resize | Mapping[str, Resize],
+        crop: Crop | Mapping[str, Crop],
+        dtype: str,
+        backend: str,
+        device: str,
+    ) -> None:
         # by process: what a parent opened is kept as it is, since closing or freeing its decoders
         # could hang, and its lock may be held by a thread that a fork did not copy
         self._opened: dict[int, tuple[threading.RLock, OrderedDict[str, OpenCamera]]] = {}
+        self._most = most
+        self.cache: FrameCache | None = None
+        self.dtype = str(dtype).removeprefix("torch.")
+        self.backend, self.device = backend, device
+        one_of("dtype", self.dtype, get_args(Dtype))
+        one_of("backend", backend, get_args(Backend))
+        self.views: list[dict[str, Any]] = [
+            {"format": name, "resize": size, "crop": area}
+            for name, size, area in zip(
+                each("format", format, topics, "rgb"),
+                each("resize", resize, topics, None),
+                each("crop", crop, topics, None),
+                strict=True,
+            )
+        ]
+        for topic, view in zip(topics, self.views, strict=True):
+            one_of("format", view["format"], FORMATS)
+            if view["resize"] is not None:  # now, rather than in a worker
+                size_after(topic, (1, 1), view["resize"])
+        if backend == "mp4ds" and device != "cpu":
+            raise OptionError(f"device={device!r} needs backend='torchcodec'.")
+        is_changed = any(view["format"] != "rgb" or view["resize"] for view in self.views)
+        if backend == "torchcodec" and is_changed:
+            raise OptionError(
+                "backend='torchcodec' only gives format='rgb' without resize; use a transform."
+            )
         if most < 1:
             raise OptionError(f"cache_files is {most}, but must be at least 1.")
 
@@ -613,8 +575,7 @@ class OpenCameras:
                 if found is None:
                     while len(opened) >= self._most:
                         opened.popitem(last=False)[1].close()
-                    view = self._pictures.views[camera]
-                    found = OpenCamera(source, view, self._pictures, self._cache)
+                    found = OpenCamera(source, self.views[camera], self)
                 opened[source.place] = found
                 yield found
         except OptionError:

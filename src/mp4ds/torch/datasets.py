@@ -18,15 +18,7 @@ from mp4ds.dataset.stream import Layer
 from mp4ds.dataset.vectors import Fields
 from mp4ds.dataset.views import Crop, Resize
 from mp4ds.errors import OptionError, absent, counted
-from mp4ds.torch.cameras import (
-    CACHE_BYTES,
-    Backend,
-    Dtype,
-    FrameCache,
-    OpenCamera,
-    OpenCameras,
-    Pictures,
-)
+from mp4ds.torch.cameras import CACHE_BYTES, Backend, Dtype, FrameCache, OpenCamera, OpenCameras
 from mp4ds.torch.recordings import (
     Paths,
     Pick,
@@ -158,9 +150,8 @@ def _kind(row: torch.Tensor) -> tuple[object, ...]:
     return row.untyped_storage().data_ptr(), row.dtype, row.device, row.shape, row.stride()
 
 
-def _longer(like: torch.Tensor, rows: int, *, shared: bool = False) -> torch.Tensor:
-    """A new tensor of some rows, like one without any; shared with other processes if asked for."""
-    shape = (rows, *like.shape[1:])
+def _new(like: torch.Tensor, *shape: int, shared: bool = False) -> torch.Tensor:
+    """A new tensor of a type and place; shared with other processes if asked for."""
     if not shared or like.device.type != "cpu":
         return like.new_empty(shape)
     # as torch's own collate does in a worker
@@ -291,9 +282,23 @@ class FrameDataset(Dataset):
             timed=episode_topic is not None,
         )
         if episode_topic is not None:
-            self.recordings = self._split(episode_topic, names)
+            first = self.recordings[0].path
+            self.recordings = [
+                part for one in self.recordings for part in episodes_of(one, episode_topic, names)
+            ]
+            if not self.recordings:
+                raise OptionError(
+                    f"{first}: no sample is in an episode: while all cameras run, {episode_topic} "
+                    "is false, empty or not there."
+                )
         given = {key: one for key, one in (("state", state), ("action", action)) if one is not None}
-        self._check_keys(given, message, message_tolerance_ns)
+        one_of("message", message, get_args(Pick))
+        if message_tolerance_ns is not None and message_tolerance_ns < 0:
+            raise OptionError(
+                f"message_tolerance_ns is {message_tolerance_ns}, but must not be negative."
+            )
+        for key in given.keys() & {*self.topics}:
+            raise OptionError(f"a topic named {key!r} cannot be a key beside the {key}.")
         keys = [*self.topics, *(key for key in given if key != "action")]
         values = each("offsets", offsets, keys, (0,))
         self._offsets = {
@@ -314,42 +319,24 @@ class FrameDataset(Dataset):
         starts = np.cumsum([0, *(recording.rows for recording in self.recordings)])
         self._starts: NDArray[np.int64] = starts.astype(np.int64)
         self._transform = transform
-        self._pictures = Pictures(
+        self._channels_first = channels_first
+        self._cameras = OpenCameras(
             self.topics,
+            cache_files,
             format=format,
             resize=resize,
             crop=crop,
             dtype=dtype,
-            channels_first=channels_first,
             backend=backend,
             device=device,
         )
-        kept = None
         if cache is not None:
             if backend != "mp4ds":
                 raise OptionError("cache needs backend='mp4ds'.")
             sources = {one for recording in self.recordings for one in recording.sources}
-            kept = FrameCache(cache, cache_bytes, max(sum(one.frames for one in sources), 1))
-        self._cameras = OpenCameras(cache_files, self._pictures, kept)
+            frames = max(sum(one.frames for one in sources), 1)
+            self._cameras.cache = FrameCache(cache, cache_bytes, frames)
         self._collates = False
-
-    def _split(self, topic: str, rename: Mapping[str, str]) -> list[Recording]:
-        """The episodes of all recordings."""
-        found = [part for one in self.recordings for part in episodes_of(one, topic, rename)]
-        if not found:
-            raise OptionError(
-                f"{self.recordings[0].path}: no sample is in an episode: while all cameras run, "
-                f"{topic} is false, empty or not there."
-            )
-        return found
-
-    def _check_keys(self, given: Mapping[str, object], message: str, tolerance: int | None) -> None:
-        one_of("message", message, get_args(Pick))
-        if tolerance is not None and tolerance < 0:
-            raise OptionError(f"message_tolerance_ns is {tolerance}, but must not be negative.")
-        for key in given:
-            if key in self.topics:
-                raise OptionError(f"a topic named {key!r} cannot be a key beside the {key}.")
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
@@ -419,12 +406,13 @@ class FrameDataset(Dataset):
                 offsets = self._offsets[topic]
                 with self._cameras.using(recording, number) as camera:
                     frames, padded = offsets.frames(recording, number, camera, rows)
-                    like = camera.empty(len(offsets.steps))
+                    like = camera.none
+                    shape = (len(offsets.steps), *like.shape[1:])
                     if topic not in tensors:
-                        tensors[topic] = _longer(like, len(numbers), shared=shared)
+                        tensors[topic] = _new(like, len(numbers), *shape, shared=shared)
                     outs = [tensors[topic][place] for place in places]
-                    if (outs[0].shape, outs[0].dtype) != (like.shape[1:], like.dtype):
-                        outs = list(_longer(like, len(places)))  # of a recording of other images
+                    if (outs[0].shape, outs[0].dtype) != (shape, like.dtype):
+                        outs = list(_new(like, len(places), *shape))  # it has other images
                     camera.read(frames.ravel().tolist(), [frame for row in outs for frame in row])
                     if number == 0:
                         stamps = camera.stamps[recording.frames(rows, 0)].tolist()
@@ -433,7 +421,7 @@ class FrameDataset(Dataset):
                             row_times = camera.times[recording.frames(np.arange(recording.rows), 0)]
                 columns[f"{topic}_is_pad"] = torch.from_numpy(padded)
                 for place, out in zip(places, outs, strict=True):
-                    shown = out.movedim(-1, -3) if self._pictures.channels_first else out
+                    shown = out.movedim(-1, -3) if self._channels_first else out
                     samples[place][topic] = shown[0] if offsets.is_single else shown
             for key, reader in self._vectors.items():
                 offsets = self._offsets[key]

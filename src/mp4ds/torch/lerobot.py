@@ -200,18 +200,31 @@ class LeRobotDataset(FrameDataset):
         self._scales: dict[str, float] = {}  # of depths, to millimetres
         tasks = [task if task is not None else one.task for one in self.recordings]
         self._tasks = list(dict.fromkeys(tasks))
+        edges = self._starts.tolist()
         self.meta = Metadata(
             location(self.paths[0]).name,
             rate,
             self._features(rate),
-            self._episodes(tasks),
+            {
+                "episode_index": [*range(len(tasks))],
+                "tasks": [[text] for text in tasks],
+                "length": self.lengths,
+                "dataset_from_index": edges[:-1],
+                "dataset_to_index": edges[1:],
+            },
             SimpleNamespace(index=self._tasks),
             self._measured,
         )
         self.episodes = None if episodes is None else [*episodes]
         self._selected: NDArray[np.int64] | None = None
         if self.episodes is not None:
-            self._selected = self._samples_of(self.episodes)
+            for number in self.episodes:
+                if not 0 <= number < len(tasks):
+                    raise OptionError(f"episodes has {number}, but there are {len(tasks)}, from 0.")
+            if not self.episodes:
+                raise OptionError("episodes is empty; use None for all.")
+            spans = [np.arange(*edges[one : one + 2]) for one in sorted(set(self.episodes))]
+            self._selected = np.concatenate(spans).astype(np.int64)
 
     def _features(self, fps: int) -> dict[str, Feature]:
         found: dict[str, Feature] = {}
@@ -220,35 +233,14 @@ class LeRobotDataset(FrameDataset):
                 encoding = topic.encoding
             if encoding in _IN_MM:
                 self._scales[key] = _IN_MM[encoding]
-                self._pictures.views[number]["format"] = "native"
+                self._cameras.views[number]["format"] = "native"
             with self._cameras.using(self.recordings[0], number) as camera:
-                height, width = camera.empty(1).shape[2:4]
+                height, width = camera.none.shape[1:3]
             depths = {"is_depth_map": True, "depth_unit": "mm"} if key in self._scales else None
             found[key] = video_feature((width, height), fps, {}, depths)
         found |= {key: vector_feature(self.names[own]) for key, own in self._keys.items()}
         found |= COLUMNS
         return {key: {**one, "shape": tuple(one["shape"])} for key, one in found.items()}
-
-    def _episodes(self, tasks: Sequence[str]) -> dict[str, list[Any]]:
-        edges = self._starts.tolist()
-        return {
-            "episode_index": [*range(len(tasks))],
-            "tasks": [[task] for task in tasks],
-            "length": self.lengths,
-            "dataset_from_index": edges[:-1],
-            "dataset_to_index": edges[1:],
-        }
-
-    def _samples_of(self, episodes: Sequence[int]) -> NDArray[np.int64]:
-        for number in episodes:
-            if not 0 <= number < len(self.recordings):
-                raise OptionError(
-                    f"episodes has {number}, but there are {len(self.recordings)}, from 0."
-                )
-        if not episodes:
-            raise OptionError("episodes is empty; use None for all.")
-        spans = [np.arange(*self._starts[one : one + 2]) for one in sorted(set(episodes))]
-        return np.concatenate(spans).astype(np.int64)
 
     def _measured(self) -> dict[str, dict[str, NDArray[Any]]]:
         parts: dict[str, list[Statistics]] = {key: [] for key in [*self._images, *self._keys]}
@@ -280,9 +272,8 @@ class LeRobotDataset(FrameDataset):
             if image.ndim == 4 and len(image) == 1:
                 image = image[0]
             if key in self._scales:
-                image = (
-                    image.to(torch.float32).nan_to_num(0, posinf=0, neginf=0) * self._scales[key]
-                )
+                image = image.to(torch.float32).nan_to_num(0, posinf=0, neginf=0)
+                image *= self._scales[key]
             elif self._transforms is not None:
                 image = self._transforms(image)
             found[key] = image

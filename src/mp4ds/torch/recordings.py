@@ -21,14 +21,7 @@ from mp4ds.errors import Mp4dsError, OptionError, SampleError
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.fields import MESSAGES_NAME
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
-from mp4ds.times import (
-    constant_rate,
-    intervals,
-    nearest,
-    sound_times,
-    synchronize,
-    usual_interval,
-)
+from mp4ds.times import constant_rate, intervals, nearest, sound_times, synchronize, usual_interval
 
 _T = TypeVar("_T")
 

@@ -12,34 +12,10 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from mp4ds.errors import OptionError, absent
 from mp4ds.torch.datasets import FrameDataset
-from mp4ds.torch.recordings import Paths, Recording
+from mp4ds.torch.recordings import Paths
 
 _T = TypeVar("_T")
 _UNREAD = object()
-
-
-def window_count(recording: Recording, length: int) -> int:
-    """How many windows of `length` samples a recording has."""
-    return -(-recording.rows // length)
-
-
-def window_starts(recording: Recording, length: int, keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The first sample of each window, and the end of the last; int64.
-
-    A window begins with the first sample at or after a multiple of `length` whose frame of the
-    first camera is the first one after a key frame, and ends where the next one begins. So windows
-    partition the samples, whatever the key frames, and some may be empty.
-
-    Args:
-        recording: Of the samples.
-        length: Samples of a window.
-        keys: Numbers of the key frames of the first camera, in order.
-    """
-    rows = recording.rows
-    groups = np.searchsorted(keys, recording.frames(np.arange(rows), 0), side="right")
-    begins = np.append(np.flatnonzero(np.diff(groups) > 0) + 1, rows)
-    asked = np.arange(1, window_count(recording, length)) * length
-    return np.concatenate(([0], begins[np.searchsorted(begins, asked)], [rows])).astype(np.int64)
 
 
 def mixed(
@@ -220,10 +196,7 @@ class FrameStream(IterableDataset):
         worker = get_worker_info()
         if worker is None:
             return self._rank, self._world_size
-        return (
-            self._rank * worker.num_workers + worker.id,
-            self._world_size * worker.num_workers,
-        )
+        return (self._rank * worker.num_workers + worker.id, self._world_size * worker.num_workers)
 
     def __iter__(self) -> Iterator[Any]:
         share, shares = self._share()
@@ -245,11 +218,10 @@ class FrameStream(IterableDataset):
 
     def _rows(self, order: tuple[int, int], share: int, shares: int) -> Iterator[tuple[int, int]]:
         """The samples of a share, in order: recording and row of each."""
-        recordings = self._frames.recordings
         windows = [
             (number, window)
-            for number, recording in enumerate(recordings)
-            for window in range(window_count(recording, self._window))
+            for number in range(len(self._frames.recordings))
+            for window in range(self._window_count(number))
         ]
         if self._shuffle:
             np.random.default_rng(order).shuffle(windows)
@@ -267,11 +239,24 @@ class FrameStream(IterableDataset):
             number, window = windows[at]
             yield number, self._window_rows(number, window)[place - starts[at]]
 
+    def _window_count(self, number: int) -> int:
+        return -(-self._frames.recordings[number].rows // self._window)
+
     def _window_rows(self, number: int, window: int) -> range:
+        """The samples of a window.
+
+        It begins with the first sample at or after a multiple of the length whose frame of the
+        first camera is the first one after a key frame, and ends where the next one begins. So
+        windows partition the samples, whatever the key frames, and some may be empty.
+        """
         if number not in self._starts:
-            keys = self._frames.key_frames(number)
-            recording = self._frames.recordings[number]
-            self._starts[number] = window_starts(recording, self._window, keys)
+            recording, rows = self._frames.recordings[number], self._frames.recordings[number].rows
+            frames = recording.frames(np.arange(rows), 0)
+            groups = np.searchsorted(self._frames.key_frames(number), frames, side="right")
+            begins = np.append(np.flatnonzero(np.diff(groups) > 0) + 1, rows)
+            asked = np.arange(1, self._window_count(number)) * self._window
+            starts = np.concatenate(([0], begins[np.searchsorted(begins, asked)], [rows]))
+            self._starts[number] = starts.astype(np.int64)
         first, end = self._starts[number][window : window + 2].tolist()
         return range(first, end)
 
