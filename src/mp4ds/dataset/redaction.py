@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mp4ds.errors import OptionError
 from mp4ds.files.urls import location
-from mp4ds.format.redaction import LEAST_SQUARE, PROVEN_TOGETHER, Rule, load_rules
+from mp4ds.format.sidecars import LEAST_SQUARE, PROVEN_TOGETHER, Rule, load_rules
 from mp4ds.messages import png
 from mp4ds.messages.encodings import Encoding, Pixels
 from mp4ds.messages.wire import CodedFields, ImageFields, Parts

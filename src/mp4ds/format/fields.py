@@ -410,25 +410,12 @@ def within(excerpt: Excerpt, choice: Choice = everything) -> Choice:
 
 def last_of(end: int, count: int) -> Choice:
     """The last messages before a log time, nanoseconds, as many as there are."""
-
-    def choose(columns: DecodedColumns) -> Iterator[int]:
-        return iter(np.flatnonzero(columns.log_time < end)[-count:].tolist())
-
-    return choose
+    return lambda columns: iter(np.flatnonzero(columns.log_time < end)[-count:].tolist())
 
 
-def marked(is_wanted: NDArray[np.bool_], choice: Choice = everything) -> Choice:
-    """Restrict the wanted messages to marked ones.
-
-    Args:
-        is_wanted: For each message, shape (messages,).
-        choice: Says which are wanted.
-    """
-
-    def choose(columns: DecodedColumns) -> Iterator[int]:
-        return (index for index in choice(columns) if is_wanted[index])
-
-    return choose
+def marked(is_wanted: NDArray[np.bool_]) -> Choice:
+    """The marked messages: for each whether it is, shape (messages,)."""
+    return lambda _: iter(np.flatnonzero(is_wanted).tolist())
 
 
 def unbroken(

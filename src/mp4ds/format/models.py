@@ -47,13 +47,7 @@ from mp4ds.video.access import (
     Structures,
     digest_video,
 )
-from mp4ds.video.codecs import (
-    CODECS,
-    LEAST_CRF,
-    PACKET_CODECS,
-    VISUAL,
-    QualityTarget,
-)
+from mp4ds.video.codecs import CODECS, LEAST_CRF, PACKET_CODECS, VISUAL, QualityTarget
 from mp4ds.video.colour import MATRICES
 from mp4ds.video.pixels import shows_colours
 
@@ -238,8 +232,7 @@ class Header(Model):
     frame_id: str = Field(description="Coordinate frame.")
     format: str | None = Field(None, description="Of a coded image, to the letter.")
     template: Base64 | None = Field(
-        None,
-        description="The blank message, where it is not that of a plain serialization.",
+        None, description="The blank message, where it is not that of a plain serialization."
     )
     framing: Annotated[str, Field(pattern=r"^[0-9a-z +]*$", max_length=4096)] = Field(
         "", description="Of packets: the start codes or delimiter that an mp4 does not keep."
@@ -306,14 +299,11 @@ class VideoModel(Model):
             known = ", ".join(PIXEL_FORMATS)
             raise ValueError(f"pixel format {self.pixel_format!r} is not one of {known}")
         if self.references is not None:
-            self._check_references(self.references)
+            if not CODECS[self.codec].is_free:
+                raise ValueError(f"a video of codec {self.codec} has no references")
+            if self.references.split and not CODECS[self.codec].is_split:
+                raise ValueError(f"a packet of codec {self.codec} holds one frame")
         return self
-
-    def _check_references(self, references: References) -> None:
-        if not CODECS[self.codec].is_free:
-            raise ValueError(f"a video of codec {self.codec} has no references")
-        if references.split and not CODECS[self.codec].is_split:
-            raise ValueError(f"a packet of codec {self.codec} holds one frame")
 
 
 class Roi(Model):
@@ -345,8 +335,7 @@ class Calibration(Model):
     binning_y: Uint32 = 0
     roi: Roi | None = Field(None, description="Absent: all zero.")
     template: Base64 | None = Field(
-        None,
-        description="The blank message, where it is not that of a plain serialization.",
+        None, description="The blank message, where it is not that of a plain serialization."
     )
 
     @classmethod

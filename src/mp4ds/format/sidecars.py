@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import xxhash
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from mp4ds import yamlio
-from mp4ds.errors import FormatError, SourceError, VersionError
+from mp4ds.errors import FormatError, OptionError, SourceError, VersionError
 from mp4ds.files.outputs import digest_file
 from mp4ds.files.urls import location
 from mp4ds.format.fields import FORMAT_VERSION, document_of, parse_version
 from mp4ds.format.manifest import About, FileEntry, Manifest
 from mp4ds.format.models import EXACT_SUFFIX, StreamSidecar
+from mp4ds.options import Time, parse_time
 
 Document = dict[str, Any]
 
@@ -30,41 +30,25 @@ def version_of(document: Document) -> str | None:
     return version if isinstance(version, str) else None
 
 
+MIGRATIONS = {"1.0": ("1.1", "headers", "padding"), "1.1": ("2.0", "streams", "view")}
+"""An older version -> the next one, and the key that this adds, also in the maps of a list."""
+
+
 def migrate(document: Document, place: str) -> Document:
-    """Bring a document of any older version to the current one.
+    """Bring a document of any older version to the current one, of which it has no new key.
 
     Raises:
-        FormatError: ``migration-failed``, with what is missing.
+        FormatError: ``migration-failed``: it has one.
     """
     while (version := version_of(document)) in MIGRATIONS:
-        try:
-            document = MIGRATIONS[str(version)](document)
-        except ValueError as error:
-            raise FormatError(
-                "migration-failed", place, f"is not a complete file of version {version} ({error})"
-            ) from None
+        later, name, key = MIGRATIONS[str(version)]
+        entries = document.get(name)
+        listed = entries if isinstance(entries, list) else []
+        if any(isinstance(item, dict) and key in item for item in (document, *listed)):
+            problem = f"is not a file of version {version}: {key} needs version {later}"
+            raise FormatError("migration-failed", place, problem)
+        document = {**document, "mp4ds": later}
     return document
-
-
-def _from_1_0(old: Document) -> Document:
-    """Version 1.0: no header has padding."""
-    headers = old.get("headers")
-    if isinstance(headers, list) and any(isinstance(h, dict) and "padding" in h for h in headers):
-        raise ValueError("headers with padding need version 1.1")
-    return {**old, "mp4ds": "1.1"}
-
-
-def _from_1_1(old: Document) -> Document:
-    """Version 1.1: no stream has a view."""
-    entries = old.get("streams")
-    listed = entries if isinstance(entries, list) else []
-    if any(isinstance(item, dict) and "view" in item for item in (old, *listed)):
-        raise ValueError("views need version 2.0")
-    return {**old, "mp4ds": "2.0"}
-
-
-MIGRATIONS: dict[str, Callable[[Document], Document]] = {"1.0": _from_1_0, "1.1": _from_1_1}
-"""Version that a step starts from -> the step."""
 
 
 # ---------------------------------------------------------------- files
@@ -256,6 +240,33 @@ def _model(model: type[_ModelT], document: dict[str, Any], path: Path) -> _Model
         raise FormatError("model-invalid", f"{path} at {place}", problem + more) from None
 
 
+def model_problems(error: ValidationError) -> list[tuple[str, str]]:
+    """Place and sentence of each problem that a model found."""
+    return [
+        (".".join(map(str, item["loc"])) or THE_TOP, item["msg"].removeprefix("Value error, "))
+        for item in error.errors(include_url=False, include_input=False)
+    ]
+
+
+@cache
+def schema_text(kind: str) -> str:
+    """The released JSON Schema of ``stream`` or ``dataset``, as shipped with the package."""
+    name = f"v{FORMAT_VERSION}/{kind}.schema.json"
+    shipped = files("mp4ds") / "schemas" / name
+    if shipped.is_file():
+        return shipped.read_text(encoding="utf-8")
+    # a checkout: the wheel's copy is made from this folder
+    return (Path(__file__).parents[3] / "schemas" / name).read_text(encoding="utf-8")
+
+
+# ---------------------------------------------------------------- files of users
+
+LEAST_SQUARE = 8
+"""Pixels of a side of the squares that are blurred."""
+PROVEN_TOGETHER = 300
+"""Changed images of which untouched blocks are proven together, unless the rules say otherwise."""
+
+
 def load_about(path: Path | str) -> About:
     """What a user tells of a recording, in a YAML file.
 
@@ -276,26 +287,89 @@ def load_about(path: Path | str) -> About:
         raise SourceError(place, f"is not valid YAML: {error}", remedy) from None
 
 
-def model_problems(error: ValidationError) -> list[tuple[str, str]]:
-    """Place and sentence of each problem that a model found."""
-    return [
-        (
-            ".".join(map(str, item["loc"])) or THE_TOP,
-            item["msg"].removeprefix("Value error, "),
-        )
-        for item in error.errors(include_url=False, include_input=False)
-    ]
+def _time(text: Any) -> Time | None:
+    try:
+        return None if text is None else parse_time(text)
+    except OptionError as error:
+        raise ValueError(str(error).rstrip(".")) from None
 
 
-@cache
-def schema_text(kind: str) -> str:
-    """The released JSON Schema of ``stream`` or ``dataset``, as shipped with the package."""
-    name = f"v{FORMAT_VERSION}/{kind}.schema.json"
-    shipped = files("mp4ds") / "schemas" / name
-    if shipped.is_file():
-        return shipped.read_text(encoding="utf-8")
-    # a checkout: the wheel's copy is made from this folder
-    return (Path(__file__).parents[3] / "schemas" / name).read_text(encoding="utf-8")
+_TimeText = Annotated[Time | None, BeforeValidator(_time)]
+_Place = Annotated[int, Field(ge=0, lt=2**31)]
+_Side = Annotated[int, Field(ge=1, lt=2**31)]
+
+
+class Rule(BaseModel):
+    """A box of images of some topics, during a time."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    topic: str
+    start: _TimeText = None
+    end: _TimeText = None
+    box: tuple[_Place, _Place, _Side, _Side]
+    fill: float | tuple[float, ...] = 0.0
+    blur: Annotated[int, Field(ge=LEAST_SQUARE, lt=2**31)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Rule:
+        if self.blur is not None and "fill" in self.model_fields_set:
+            raise ValueError("give blur or fill, not both")
+        start, end = self.start, self.end
+        if start and end and start.from_start == end.from_start and end.ns <= start.ns:
+            raise ValueError(f"its range is empty: from {start} to {end}")
+        return self
+
+
+class Rules(BaseModel):
+    """A file of rules."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    rules: Annotated[list[Rule], Field(min_length=1)]
+    proof: Annotated[int, Field(ge=0)] = PROVEN_TOGETHER
+    keep_rules: bool = False
+
+
+def load_rules(path: Path) -> tuple[Rules, bytes]:
+    """Read a file of rules.
+
+    Returns:
+        The rules, and the file.
+
+    Raises:
+        OptionError: It cannot be read, or is not valid; says where.
+    """
+    most = yamlio.MAX_STRUCTURE_BYTES
+    try:
+        if path.exists() and not path.is_file():
+            raise OptionError(f"{path} is not a file of rules.")
+        with path.open("rb") as file:
+            data = file.read(most + 1)
+        if len(data) > most:
+            raise OptionError(f"{path} has more than {most} bytes: give a function instead.")
+        found = Rules.model_validate(yamlio.build(data.decode(), _rule_scalar))
+    except OSError as error:
+        raise OptionError(f"{path} cannot be read: {error.strerror}.") from None
+    except ValidationError as error:
+        key, problem = model_problems(error)[0]
+        names = key.split(".")
+        if names[0] == "rules" and names[1:]:
+            names[:2] = [f"rule {int(names[1]) + 1}"]
+        if names[1:2] == ["box"] and names[2:]:
+            names[1:] = ["box " + ("x", "y", "width", "height")[int(names[2])]]
+        raise OptionError(f"{path}: {', '.join(names)}: {problem}.") from None
+    except OptionError:
+        raise
+    except ValueError as error:
+        raise OptionError(f"{path} is not valid YAML: {error}.") from None
+    return found, data
+
+
+def _rule_scalar(event: Any) -> str | None:
+    """A value as written, such as a time with all of its digits; None for none."""
+    is_none = not event.style and yamlio.WORDS.get(event.value, "") is None
+    return None if is_none else event.value
 
 
 # ---------------------------------------------------------------- file names (spec/index.md)

@@ -102,14 +102,22 @@ class _Image:
 
 
 class _Topic:
-    """What is redacted of the images of a topic.
+    """What is redacted of the images of a topic, and what became of them.
 
     Args:
+        type_name: Of its messages.
         rules: Number of each rule, its box, and its first log time and the first after, ns.
+
+    Attributes:
+        blocks: Proves what was not changed; None for no proof.
+        images: How many there were.
+        changed: How many were changed.
     """
 
-    def __init__(self, rules: list[tuple[int, Box, int, int]]) -> None:
-        self.rules = rules
+    def __init__(self, type_name: str, rules: list[tuple[int, Box, int, int]]) -> None:
+        self.type_name, self.rules = type_name, rules
+        self.blocks: UntouchedBlocks | None = None
+        self.images = self.changed = 0
         self._starts, self._ends = np.array([rule[2:] for rule in rules], np.int64).reshape(-1, 2).T
 
     def due(self, time: int) -> list[tuple[int, Box]]:
@@ -117,23 +125,6 @@ class _Topic:
         time = min(max(time, 0), _LATEST)
         found = np.flatnonzero((self._starts <= time) & (time < self._ends))
         return [self.rules[place][:2] for place in found.tolist()]
-
-
-@dataclass
-class _Tally:
-    """What became of the images of a topic.
-
-    Attributes:
-        type_name: Of its messages.
-        blocks: Proves what was not changed; None for no proof.
-        images: How many there were.
-        changed: How many were changed.
-    """
-
-    type_name: str
-    blocks: UntouchedBlocks | None
-    images: int = 0
-    changed: int = 0
 
 
 class RedactedReader(ChangedReader):
@@ -154,17 +145,22 @@ class RedactedReader(ChangedReader):
         self._redaction = told = options.redaction or Redaction("nothing")
         cameras = [channel for channel in reader.channels if is_camera(channel)]
         selected = [channel for channel in cameras if options.selected(channel.topic)]
-        self._check_topics({channel.topic for channel in cameras})
+        topics = {channel.topic for channel in cameras}
+        for number, rule in enumerate(told.rules):
+            if not any(map(Selection([rule.topic]), topics)):
+                listed = ", ".join(sorted(topics)) or "none"
+                raise OptionError(
+                    f"{told.called(number)}: matches no topic of images. Topics of images: "
+                    f"{listed}."
+                )
         chosen = {one.topic: one for one in selected}
         self._topics = self._rules_of(chosen)
         self._counts = [0] * len(told.rules)
-        self._types = {topic: chosen[topic].type_name for topic in self._topics}
         several = [one.topic for one in selected]
         is_proven = told.proof and options.goal.lossless and not options.derives
         self._proven = {one for one in chosen if is_proven and several.count(one) == 1}
-        self._tallies: dict[str, _Tally] = {}
         self._views: dict[tuple[str, tuple[int, int]], View] = {}
-        videos = [topic for topic, name in self._types.items() if name.endswith(PACKETS)]
+        videos = [name for name, one in self._topics.items() if one.type_name.endswith(PACKETS)]
         if videos:
             self._reader = ReducedReader(reader, PackOptions(topics=videos))
         self.is_indexed = self._reader.is_indexed and self._can_be_sent(options)
@@ -187,15 +183,6 @@ class RedactedReader(ChangedReader):
 
     # ------------------------------------------------------------ rules
 
-    def _check_topics(self, topics: set[str]) -> None:
-        for number, rule in enumerate(self._redaction.rules):
-            if not any(map(Selection([rule.topic]), topics)):
-                listed = ", ".join(sorted(topics)) or "none"
-                raise OptionError(
-                    f"{self._redaction.called(number)}: matches no topic of images. Topics of "
-                    f"images: {listed}."
-                )
-
     def _rules_of(self, chosen: Mapping[str, Channel]) -> dict[str, _Topic]:
         """The rules of each topic that is packed, with their log times.
 
@@ -203,7 +190,7 @@ class RedactedReader(ChangedReader):
             OptionError: One matches no image.
         """
         if self._redaction.find:
-            return {topic: _Topic([]) for topic in chosen}
+            return {topic: _Topic(one.type_name, []) for topic, one in chosen.items()}
         first, _ = ends_of(self._recorded)
         found: dict[str, list[tuple[int, Box, int, int]]] = {}
         self._due: list[int] = []
@@ -225,7 +212,7 @@ class RedactedReader(ChangedReader):
             for one in topics:
                 box = Box(*rule.box, fill=rule.fill, blur=rule.blur)
                 found.setdefault(one.topic, []).append((number, box, start, end))
-        return {topic: _Topic(rules) for topic, rules in found.items()}
+        return {topic: _Topic(chosen[topic].type_name, own) for topic, own in found.items()}
 
     def _no_image(self, number: int) -> OptionError:
         rule = self._redaction.rules[number]
@@ -269,16 +256,22 @@ class RedactedReader(ChangedReader):
             OptionError: A rule was for no image, or cannot be applied to one.
             SourceError: An image that is to be redacted cannot be decoded.
         """
-        self._tallies, self._counts = {}, [0] * len(self._redaction.rules)
+        self._counts = [0] * len(self._redaction.rules)
+        for name, topic in self._topics.items():
+            topic.images = topic.changed = 0
+            is_proven = name in self._proven
+            topic.blocks = UntouchedBlocks(self._redaction.proof) if is_proven else None
         splitters: dict[int, MessageSplitter] = {}
         for record in self._reader.records(excerpt):
-            if not isinstance(record, Message) or not self._takes(record.channel):
-                yield record
-                continue
-            channel = record.channel
-            if channel.id not in splitters:
-                splitters[channel.id] = MessageSplitter(channel)
-            yield self._redacted(record, splitters[channel.id])
+            if (
+                isinstance(record, Message)
+                and record.channel.topic in self._topics
+                and is_camera(record.channel)
+            ):
+                if record.channel.id not in splitters:
+                    splitters[record.channel.id] = MessageSplitter(record.channel)
+                record = self._redacted(record, splitters[record.channel.id])
+            yield record
         is_all = (excerpt.start, excerpt.end) == _ALL and excerpt.topics is None
         if is_all and not excerpt.without and not self._redaction.find:
             for number in self._due:
@@ -289,39 +282,32 @@ class RedactedReader(ChangedReader):
         """Records as recorded, of topics of packets that are not redacted."""
         return self._recorded.records_before(topics)
 
-    def _takes(self, channel: Channel) -> bool:
-        return channel.topic in self._topics and is_camera(channel)
-
     @property
     def redaction(self) -> Mapping[str, Any]:  # type: ignore[override]
         """What the last `records` redacted, as manifests have it."""
         topics = []
-        for topic, tally in self._tallies.items():
-            told: dict[str, Any] = {"topic": topic, "type": tally.type_name}
-            told |= {"images": tally.images, "changed": tally.changed}
-            if values := tally.blocks.values if tally.blocks else "":
+        for name, topic in self._topics.items():
+            told: dict[str, Any] = {"topic": name, "type": topic.type_name}
+            told |= {"images": topic.images, "changed": topic.changed}
+            if values := topic.blocks.values if topic.blocks else "":
                 told["untouched"] = {"values": values}
-            topics.append(told)
+            topics += [told] if topic.images else []
         told = {**self._redaction.told, "rules": list(self._counts), "topics": topics}
         return {**told, "rules_text": self._redaction.text}
 
     # ------------------------------------------------------------ messages
 
     def _redacted(self, message: Message, splitter: MessageSplitter) -> Message:
-        topic = message.channel.topic
-        if topic not in self._tallies:
-            blocks = UntouchedBlocks(self._redaction.proof) if topic in self._proven else None
-            self._tallies[topic] = _Tally(self._types[topic], blocks)
-        tally = self._tallies[topic]
-        tally.images += 1
-        due = self._topics[topic].due(message.log_time)
+        topic = self._topics[message.channel.topic]
+        topic.images += 1
+        due = topic.due(message.log_time)
         is_looked_at = bool(due or self._redaction.find)
         try:
             if message.channel.type_name.endswith(PACKETS):
                 is_looked_at = True  # those around it may have been changed
                 raise Refused("no picture of it: no key frame is before it, or it has B-frames")
             form, parts = splitter.split(message)
-            if not is_looked_at and (tally.blocks is None or not holds_pixels(parts)):
+            if not is_looked_at and (topic.blocks is None or not holds_pixels(parts)):
                 return message
             image = _Image.of(message.channel, form, parts)
         except Refused as reason:
@@ -333,11 +319,11 @@ class RedactedReader(ChangedReader):
             found.append((box, self._place(image, number, box)))
             self._counts[number] += 1
         pixels = np.ascontiguousarray(image.shown.pixels)
-        if tally.blocks is not None and (found or holds_pixels(image.parts)):
-            tally.blocks.add((image.encoding, pixels), [part for _, part in found])
+        if topic.blocks is not None and (found or holds_pixels(image.parts)):
+            topic.blocks.add((image.encoding, pixels), [part for _, part in found])
         if not found:
             return message
-        tally.changed += 1
+        topic.changed += 1
         made = pixels.copy()
         for box, part in found:
             redact(made, image.encoding, box, part)
