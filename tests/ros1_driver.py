@@ -114,7 +114,8 @@ class Driver:
         self.is_paused = is_paused
 
     def dropped(self) -> int:
-        return sum(sender.dropped for sender in self.publisher._senders())
+        topics = self.publisher._topics.values()
+        return sum(sender.dropped for topic in topics for sender in topic.senders)
 
     def close(self) -> None:
         self.publisher.close()

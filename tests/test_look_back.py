@@ -23,10 +23,9 @@ from mp4ds.packing.options import PackOptions
 from mp4ds.packing.spool import SpoolFolder
 from mp4ds.plugins.recording import record
 from mp4ds.plugins.recording.lookback import LookBack, Saved
-from mp4ds.plugins.recording.options import RecordOptions
+from mp4ds.plugins.recording.options import RecordOptions, Trigger
 from mp4ds.plugins.recording.record import Recorder, RecordSummary
 from mp4ds.plugins.recording.spool import Piece
-from mp4ds.plugins.recording.triggers import Trigger
 from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Message
 from player_scenes import START, make_drive, ros1_channel, ros2_channel

@@ -126,8 +126,11 @@ def test_options_of_jazzy_are_taken() -> None:
         ("--ros2 -a -s", "requires an argument"),
         ("--topics", "--topics requires an argument"),
         ("--max-cache-size 1G", "'1G' is not a valid integer"),
-        ("--duration soon", "--duration 'soon' is no duration: give seconds, 5m or 2h"),
-        ("-a --duration +1e9", "--duration 1000000000 is not from 0 to 999999999 seconds"),
+        ("--duration soon", "--duration soon is not a number of seconds, 5m or 2h"),
+        (
+            "-a --duration +1e9",
+            "--duration +1e9 is not a number of seconds, 5m or 2h, from 0 to 999999999 s",
+        ),
     ],
 )
 def test_a_value_that_is_wrong(typed: str, said: str) -> None:

@@ -248,8 +248,8 @@ def test_a_span_without_frames_keeps_the_rest(tmp_path: Path) -> None:
             {"start": "2", "end": "1"},
             "slice is empty: `start` is .*22:13:22Z, `end` is .*22:13:21Z",
         ),
-        ({"start": "3.1"}, r"drive.bag: nothing was recorded from \S*23.1Z on\. .* 3 seconds"),
-        ({"end": "2023-11-14T22:13:20"}, "nothing was recorded before \\S*22:13:20Z"),
+        ({"start": "3.1"}, r"drive.bag: nothing was recorded from \S*23.1Z\. .* 3 seconds"),
+        ({"end": "2023-11-14T22:13:20"}, "nothing was recorded until \\S*22:13:20Z"),
         (
             {"start": "2020-01-01T00:00:00", "duration": 1},
             r"nothing was recorded from \S+ until \S+1Z\.",
@@ -260,4 +260,4 @@ def test_a_span_without_frames_keeps_the_rest(tmp_path: Path) -> None:
 )
 def test_what_is_none(asked: dict[str, Any], message: str) -> None:
     with pytest.raises(OptionError, match=message):
-        PackOptions(**asked).slice.times(START, START + 3 * 10**9, "drive.bag")
+        PackOptions(**asked).slice_times(START, START + 3 * 10**9, "drive.bag")

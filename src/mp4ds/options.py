@@ -74,6 +74,16 @@ def option(help: str, default: Any = None, *flags: str, **more: Any) -> Any:  # 
     return field(default=default, metadata={"declared": Declared(help, flags, **more)})
 
 
+def what(help: str, default: Any = None, *flags: str, **more: Any) -> Any:  # noqa: A002
+    """An option for what is taken of something."""
+    return option(help, default, *flags, panel=WHAT, **more)
+
+
+def where(help: str, default: Any = None, *flags: str, **more: Any) -> Any:  # noqa: A002
+    """An option for where the result goes."""
+    return option(help, default, *flags, panel=WHERE, **more)
+
+
 def argument(help: str, default: Any = None, *, changes: str = "") -> Any:  # noqa: A002
     """A field of `Options` that is no option of the command line."""
     return field(default=default, metadata={"declared": Declared(help, None, changes=changes)})
@@ -105,7 +115,14 @@ class Options:
                 if declared.parse:
                     value = declared.parse(value)
                     object.__setattr__(self, name, value)  # dataclasses of options are frozen
-                _check(value, declared)
+                if declared.choices and value not in ("", *declared.choices):
+                    known = ", ".join(declared.choices)
+                    raise OptionError(f"{value!r} is not known. Use {known}.")
+                if isinstance(value, (int, float)):
+                    if declared.least is not None and not value >= declared.least:  # no number, too
+                        raise OptionError(f"{value} is below {declared.least:g}.")
+                    if declared.most is not None and not value <= declared.most:
+                        raise OptionError(f"{value} is above {declared.most:g}.")
             except OptionError as error:
                 raise OptionError(f"`{name}` {error}") from None
 
@@ -135,16 +152,6 @@ def declared_in(kind: type) -> list[tuple[str, Declared]]:
     """Name and declaration of each field of a dataclass of options."""
     known: Mapping[str, Field[Any]] = getattr(kind, "__dataclass_fields__", {})
     return [(name, item.metadata["declared"]) for name, item in known.items()]
-
-
-def _check(value: Any, declared: Declared) -> None:
-    if declared.choices and value not in ("", *declared.choices):
-        raise OptionError(f"{value!r} is not known. Use {', '.join(declared.choices)}.")
-    if isinstance(value, (int, float)):
-        if declared.least is not None and not value >= declared.least:  # no number, too
-            raise OptionError(f"{value} is below {declared.least:g}.")
-        if declared.most is not None and not value <= declared.most:
-            raise OptionError(f"{value} is above {declared.most:g}.")
 
 
 # ---------------------------------------------------------------- values of text
@@ -192,9 +199,12 @@ def parse_number(value: str | float) -> float:
 
 
 def _parse_seconds(value: str | float) -> float:
-    number = parse_number(value)
-    if not 0 <= number < math.inf:
-        raise OptionError(f"{value} is not a number of seconds, 0 or more.")
+    """Seconds of ``90``, ``90s``, ``5m`` or ``2h``."""
+    text = str(value)
+    factor = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
+    number = parse_number(text[:-1]) * factor if factor else parse_number(text)
+    if not 0 <= number < 1e9:
+        raise OptionError(f"{value} is not a number of seconds, 5m or 2h, from 0 to 999999999 s.")
     return number
 
 
@@ -323,69 +333,6 @@ def seconds_text(time_ns: int) -> str:
     return f"{sign}{whole}.{part:09d}"
 
 
-@dataclass(frozen=True, slots=True)
-class Slice:
-    """A time slice. False if it is the whole recording.
-
-    Attributes:
-        start: The first time included; None for the beginning.
-        end: The time before which everything is included; None for no end.
-        duration: Length from `start`, or before `end`; None if the others define the slice.
-        latched: Include the latched messages from before it.
-    """
-
-    start: Time | None = None
-    end: Time | None = None
-    duration: Time | None = None
-    latched: bool = False
-
-    def __bool__(self) -> bool:
-        return (self.start, self.end, self.duration) != (None, None, None)
-
-    def times(self, first: int, last: int, place: object) -> tuple[int | None, int | None]:
-        """The first log time included, and the first one after; None for open.
-
-        Args:
-            first: Of the recording, nanoseconds.
-            last: Of the recording, nanoseconds.
-            place: The recording, for errors.
-
-        Raises:
-            OptionError: The slice contains nothing.
-        """
-        start = None if self.start is None else self.start.after(first)
-        end = None if self.end is None else self.end.after(first)
-        if self.duration is not None:
-            if start is not None and end is not None:
-                raise OptionError("Give at most two of `start`, `end` and `duration`.")
-            if end is not None:
-                start = max(end - self.duration.ns, -_LATEST)
-            else:
-                end = self.duration.after(first if start is None else start)
-        if start is not None and end is not None and start >= end:
-            raise OptionError(
-                f"The slice is empty: `start` is {iso_text(start)}, `end` is {iso_text(end)}."
-            )
-        if (start is not None and start > last) or (end is not None and end <= first):
-            raise OptionError(
-                f"{place}: nothing was recorded {_span_text(start, end)}. It has messages from "
-                f"{iso_text(first)} to {iso_text(last)}, {(last - first) / _NS:.9g} seconds."
-            )
-        return start, end
-
-
-def _span_text(start: int | None, end: int | None) -> str:
-    if start is None:
-        return f"before {iso_text(end or 0)}"
-    if end is None:
-        return f"from {iso_text(start)} on"
-    return f"from {iso_text(start)} until {iso_text(end)}"
-
-
-WHOLE = Slice()
-"""No slice: the whole recording."""
-
-
 # ---------------------------------------------------------------- topics
 
 
@@ -437,16 +384,11 @@ def _matches(topic: str, patterns: Iterable[str]) -> bool:
 class TopicOptions(Options):
     """Which topics."""
 
-    topics: Sequence[str] = option(
-        "Only matching topics; repeatable.",
-        (),
-        "-t",
-        panel=WHAT,
-        metavar="GLOB",
-        changes=CONTENT,
+    topics: Sequence[str] = what(
+        "Only matching topics; repeatable.", (), "-t", metavar="GLOB", changes=CONTENT
     )
-    exclude: Sequence[str] = option(
-        "Leave out matching topics.", (), "-x", panel=WHAT, metavar="GLOB", changes=CONTENT
+    exclude: Sequence[str] = what(
+        "Leave out matching topics.", (), "-x", metavar="GLOB", changes=CONTENT
     )
 
     @property
@@ -457,26 +399,20 @@ class TopicOptions(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class SliceOptions(Options):
-    """Which time."""
+    """Which time: a slice of the recording, or all of it."""
 
-    start: Parsed[Time | None] = option(
+    start: Parsed[Time | None] = what(
         "Begin at this time: seconds from the beginning or since 1970, nanoseconds since 1970, "
         "or an ISO date.",
-        panel=WHAT,
         metavar="TIME",
         parse=parse_time,
         changes=CONTENT,
     )
-    end: Parsed[Time | None] = option(
-        "Stop before this time.",
-        panel=WHAT,
-        metavar="TIME",
-        parse=parse_time,
-        changes=CONTENT,
+    end: Parsed[Time | None] = what(
+        "Stop before this time.", metavar="TIME", parse=parse_time, changes=CONTENT
     )
-    duration: Parsed[Time | None] = option(
+    duration: Parsed[Time | None] = what(
         "Length of the slice: seconds from `start`, or before `end`.",
-        panel=WHAT,
         metavar="SECONDS",
         parse=parse_duration,
         changes=CONTENT,
@@ -485,18 +421,50 @@ class SliceOptions(Options):
     latched = False  # for those without the option
 
     @property
-    def slice(self) -> Slice:
-        """The slice of the recording; false for all of it."""
-        return Slice(self.start, self.end, self.duration, self.latched)
+    def is_slice(self) -> bool:
+        """Whether they choose less than the whole recording."""
+        return (self.start, self.end, self.duration) != (None, None, None)
+
+    def slice_times(self, first: int, last: int, place: object) -> tuple[int | None, int | None]:
+        """The first log time included, and the first one after; None for open.
+
+        Args:
+            first: Of the recording, nanoseconds.
+            last: Of the recording, nanoseconds.
+            place: The recording, for errors.
+
+        Raises:
+            OptionError: The slice contains nothing.
+        """
+        start = None if self.start is None else self.start.after(first)
+        end = None if self.end is None else self.end.after(first)
+        if self.duration is not None:
+            if start is not None and end is not None:
+                raise OptionError("Give at most two of `start`, `end` and `duration`.")
+            if end is not None:
+                start = max(end - self.duration.ns, -_LATEST)
+            else:
+                end = self.duration.after(first if start is None else start)
+        if start is not None and end is not None and start >= end:
+            raise OptionError(
+                f"The slice is empty: `start` is {iso_text(start)}, `end` is {iso_text(end)}."
+            )
+        if (start is not None and start > last) or (end is not None and end <= first):
+            bounds = [f"from {iso_text(start)}"] if start is not None else []
+            bounds += [f"until {iso_text(end)}"] if end is not None else []
+            raise OptionError(
+                f"{place}: nothing was recorded {' '.join(bounds)}. It has messages from "
+                f"{iso_text(first)} to {iso_text(last)}, {(last - first) / _NS:.9g} seconds."
+            )
+        return start, end
 
 
 def latched() -> Any:
     """The option for latched messages from before a slice."""
-    return option(
+    return what(
         "Begin a slice with the latched messages from before it, such as those of /tf_static.",
         True,
         "--latched/--no-latched",
-        panel=WHAT,
         changes=CONTENT,
     )
 
@@ -508,7 +476,7 @@ def jpeg_quality() -> Any:
 
 def pattern(help: str, *flags: str) -> Any:  # noqa: A002
     """An option for topics by a regular expression."""
-    return option(help, None, *flags, panel=WHAT, metavar="PATTERN", parse=parse_pattern)
+    return what(help, None, *flags, metavar="PATTERN", parse=parse_pattern)
 
 
 def seconds(help: str, default: float | None = None, *flags: str, panel: str = HOW) -> Any:  # noqa: A002
@@ -532,4 +500,4 @@ def jobs(help: str, default: int | None = None) -> Any:  # noqa: A002
 
 def force(help: str = "Replace an existing output.") -> Any:  # noqa: A002
     """The option to replace existing output."""
-    return option(help, False, "-f", panel=WHERE)
+    return where(help, False, "-f")

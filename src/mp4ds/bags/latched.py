@@ -20,7 +20,7 @@ from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import Refused, SourceError
 from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.transforms import transform_parser
-from mp4ds.options import Slice
+from mp4ds.options import SliceOptions
 from mp4ds.records import QOS_KEY, Channel, Excerpt, Message
 
 _QOS = """\
@@ -162,7 +162,7 @@ def _is_tf_static(channel: Channel) -> bool:
 
 
 def take_slice(
-    reader: BagReader, asked: Slice, selected: Callable[[str], bool] = lambda _: True
+    reader: BagReader, asked: SliceOptions, selected: Callable[[str], bool] = lambda _: True
 ) -> None:
     """Let a reader give a slice of its recording, with latched messages if requested.
 
@@ -176,7 +176,7 @@ def take_slice(
         SourceError: The recording is damaged, or without messages.
     """
     first, last = ends_of(reader)
-    span = Excerpt(*asked.times(first, last, reader.path))
+    span = Excerpt(*asked.slice_times(first, last, reader.path))
     latched: tuple[Sequence[Message], Sequence[str]] = ((), ())
     if asked.latched and span.start is not None:
         latched = latched_before(reader, Excerpt(end=span.start), selected)

@@ -24,7 +24,7 @@ import click
 
 from mp4ds._version import __version__
 from mp4ds.cli.options import in_flags, quiet_option
-from mp4ds.cli.output import complain, is_json, print_json, printed, say
+from mp4ds.cli.output import JSON, complain, is_set, print_json, printed, say
 from mp4ds.errors import Mp4dsError, sentence_of
 
 COMMANDS = {
@@ -47,10 +47,7 @@ COMMANDS = {
         "report",
         "Compare encoder settings on clips of a recording: quality, size and time.",
     ),
-    "validate": (
-        "info",
-        "Check datasets and list every problem; exits with 1 if there are any.",
-    ),
+    "validate": ("info", "Check datasets and list every problem; exits with 1 if there are any."),
     "info": ("info", "Show what is in a recording or a dataset."),
     "demo": (
         "pack",
@@ -158,7 +155,7 @@ def _fail(message: str, code: Any, *, versions: dict[str, str] | None = None) ->
     if os.environ.get(DEBUG):
         for line in traceback.format_exc().splitlines():
             complain(line)
-    if is_json():
+    if is_set(JSON):
         with suppress(Mp4dsError):  # nobody reads it
             print_json(
                 {"error": message, "exit_code": code} | ({"versions": versions} if versions else {})

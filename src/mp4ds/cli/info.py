@@ -6,8 +6,8 @@ import os
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from functools import partial
-from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -49,13 +49,13 @@ _TEXTS = {
 def info_command(paths: Sequence[str], checksums: bool, options: SliceOptions) -> None:
     """Show what is in a recording or a dataset."""
     found = _found(paths)
-    if len(found) > 1 and (options.slice or checksums):
+    if len(found) > 1 and (options.is_slice or checksums):
         raise OptionError("These options work with one recording or dataset only.")
     with progress_of("reading") as tell:
         if checksums:
             show(_checksums(found[0]), _print_checksums)
         elif len(found) == 1:
-            show(facts.info(found[0], options.slice), _print_info)
+            show(facts.info(found[0], options), _print_info)
         else:
             rows = []
             for done, path in enumerate(found):
@@ -84,31 +84,18 @@ def validate_command(datasets: Sequence[str], deep: bool, jobs: int | None) -> N
             for path, problems in each(partial(validate, deep=deep), places, jobs):
                 found[path] = problems
                 tell(f"{len(found)} of {len(places)} datasets", len(found) / len(places))
-    absent, reduced = {}, {}
+    results = []
     for path, problems in found.items():
-        absent[path], reduced[path] = ("", "") if problems else _remarks(path)
-    result = [
-        {
-            "path": path,
-            "deep": deep,
-            "problems": problems,
-            "absent": absent[path],
-            "reduced": reduced[path],
-        }
-        for path, problems in found.items()
-    ]
-    show(
-        result[0] if len(result) == 1 else result,
-        lambda _: _print_validation(found, absent, reduced, deep=deep),
-    )
+        result = {"path": path, "deep": deep, "problems": problems, "absent": "", "reduced": ""}
+        if not problems:
+            with Dataset(path) as dataset:
+                result["absent"] = dataset.absence()
+                result["reduced"] = dataset.manifest.reduced if dataset.manifest else ""
+        results.append(result)
+    shown = results[0] if len(results) == 1 else results
+    show(shown, lambda _: _print_validation(results, deep=deep))
     if any(found.values()):
         raise click.exceptions.Exit(1)
-
-
-def _remarks(path: Path) -> tuple[str, str]:
-    """Which files of a valid dataset are not here, and what was done to its images."""
-    with Dataset(path) as dataset:
-        return dataset.absence(), dataset.manifest.reduced if dataset.manifest else ""
 
 
 def _found(paths: Sequence[str]) -> list[Path]:
@@ -134,34 +121,29 @@ def _print_checksums(found: Mapping[str, str]) -> None:
         say(f"{sha256}  {name}")
 
 
-def _print_validation(
-    found: Mapping[Path, list[Problem]],
-    absent: Mapping[Path, str],
-    reduced: Mapping[Path, str],
-    *,
-    deep: bool,
-) -> None:
+def _print_validation(results: Sequence[Mapping[str, Any]], *, deep: bool) -> None:
     """Print all problems of datasets, what they lack, and how thorough the check was."""
-    for problem in chain.from_iterable(found.values()):
+    found: list[Problem] = [problem for result in results for problem in result["problems"]]
+    for problem in found:
         say(path_text(problem))
-    for path, remark in chain(absent.items(), reduced.items()):
-        if remark:
-            say(f"{path_text(path)}: {remark}")
-    count = sum(map(len, found.values()))
-    problems = counted(count, "problem") if count else "no problems"
+    for what in ("absent", "reduced"):
+        for result in results:
+            if result[what]:
+                say(f"{path_text(result['path'])}: {result[what]}")
+    problems = counted(len(found), "problem") if found else "no problems"
     if not deep:
         depth = "; frames were not decoded (--deep does)"
-    elif not count:
-        here = " here" if any(absent.values()) else ""
+    elif not found:
+        here = " here" if any(result["absent"] for result in results) else ""
         depth = f"; every video{here} was decoded, every message with a digest{here} checked"
     else:
         depth = ""  # what is missing or broken was not
-    if len(found) == 1:
-        say(f"{path_text(next(iter(found)))}: {problems}{depth}")
+    if len(results) == 1:
+        say(f"{path_text(results[0]['path'])}: {problems}{depth}")
         return
-    wrong = sum(map(bool, found.values()))
+    wrong = sum(bool(result["problems"]) for result in results)
     where = f" in {wrong} of them" if wrong else ""
-    say(f"{len(found)} datasets: {problems}{where}{depth}")
+    say(f"{len(results)} datasets: {problems}{where}{depth}")
 
 
 def _print_overview(rows: Sequence[facts.Brief]) -> None:
@@ -200,24 +182,23 @@ def _print_info(result: facts.Info) -> None:
         )
     cameras = [topic for topic in result.topics if topic.content or topic.stored]
     others = [topic for topic in result.topics if not topic.content and not topic.stored]
-    rows = [_info_row(topic) for topic in (*cameras, *others)]
+    rows = [
+        {
+            "topic": topic.topic,
+            "type": topic.type_name,
+            "messages": str(topic.messages),
+            "Hz": number(topic.rate_hz, 2),
+            "jitter ms": number(topic.jitter_ms, 2),
+            "gaps": str(topic.gaps or ""),
+            "longest s": number(topic.longest_gap_s, 3),
+            "size": size_text(topic.bytes) if topic.bytes is not None else "",
+            "content": topic.content,
+            "stored": topic.stored,
+        }
+        for topic in (*cameras, *others)
+    ]
     spare = ("jitter ms", "longest s", "gaps", "stored", "size", "type")
     if print_table(rows, _TEXTS, spare=spare, first=len(cameras)):
         say("shortened to fit; in full: --json, or `| less -S`")
     for note in result.notes:
         say(note)
-
-
-def _info_row(topic: facts.TopicInfo) -> dict[str, str]:
-    return {
-        "topic": topic.topic,
-        "type": topic.type_name,
-        "messages": str(topic.messages),
-        "Hz": number(topic.rate_hz, 2),
-        "jitter ms": number(topic.jitter_ms, 2),
-        "gaps": str(topic.gaps) if topic.gaps else "",
-        "longest s": number(topic.longest_gap_s, 3),
-        "size": size_text(topic.bytes) if topic.bytes is not None else "",
-        "content": topic.content,
-        "stored": topic.stored,
-    }

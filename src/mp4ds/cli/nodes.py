@@ -19,7 +19,7 @@ import click
 
 from mp4ds.cli import DEBUG, ending_signals
 from mp4ds.cli.options import Command, option
-from mp4ds.cli.output import Row, be_quiet, complain, display
+from mp4ds.cli.output import QUIET, Row, complain, display
 from mp4ds.errors import OptionError
 from mp4ds.options import WHERE, Options
 from mp4ds.options import option as field_option
@@ -66,7 +66,7 @@ def node_names(options: RosOptions) -> NodeNames:
     if level == "debug":
         os.environ[DEBUG] = "1"
     if level in ("warn", "error", "fatal"):
-        be_quiet()
+        click.get_current_context().meta[QUIET] = True
     if level in ("error", "fatal"):
         warnings.simplefilter("ignore")
     return names

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import click
 
-from mp4ds.cli.output import be_json, be_quiet
+from mp4ds.cli.output import JSON, QUIET
 from mp4ds.errors import OptionError
 from mp4ds.options import LONG, PANELS, WHERE, Declared, Options, declared_in
 
@@ -21,20 +21,11 @@ _METAVARS = {int: "N", float: "N", Path: "PATH"}
 
 def _set_quiet(ctx: click.Context, _: click.Parameter, value: bool) -> None:
     if value:
-        be_quiet()
+        ctx.meta[QUIET] = True
 
 
-_QUIET: dict[str, Any] = {
-    "is_flag": True,
-    "expose_value": False,
-    "callback": _set_quiet,
-    "help": "Print nothing but errors and --json output.",
-}
-_JSON: dict[str, Any] = {
-    "is_flag": True,
-    "expose_value": False,
-    "help": "Print the result as JSON.",
-}
+_FLAG: dict[str, Any] = {"is_flag": True, "expose_value": False}
+_QUIET = _FLAG | {"callback": _set_quiet, "help": "Print nothing but errors and --json output."}
 quiet_option = click.option("--quiet", "-q", **_QUIET)
 
 
@@ -85,13 +76,14 @@ class Command(click.Command):
 
     def __init__(self, *args: Any, **values: Any) -> None:
         super().__init__(*args, **values)
-        self.params += [Option(["--json"], **_JSON), Option(["--quiet", "-q"], **_QUIET)]
+        self.params.append(Option(["--json"], help="Print the result as JSON.", **_FLAG))
+        self.params.append(Option(["--quiet", "-q"], **_QUIET))
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments."""
         ctx.meta[_COMMAND] = self
         if "--json" in args:  # for errors of the others, too
-            be_json()
+            ctx.meta[JSON] = True
         return super().parse_args(ctx, self._completed(self.translated(ctx, args)))
 
     def _completed(self, words: list[str]) -> list[str]:

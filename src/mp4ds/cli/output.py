@@ -19,30 +19,12 @@ import click
 
 from mp4ds.errors import Mp4dsError, counted
 
-_QUIET, _JSON = "mp4ds.quiet", "mp4ds.json"  # keys in click's context
+QUIET, JSON = "mp4ds.quiet", "mp4ds.json"
+"""Keys in click's context: print nothing but errors and JSON; print results for programs."""
 
 
-def be_quiet() -> None:
-    """From now on, print neither results for people nor progress."""
-    click.get_current_context().meta[_QUIET] = True
-
-
-def be_json() -> None:
-    """From now on, print results and errors for programs."""
-    click.get_current_context().meta[_JSON] = True
-
-
-def is_quiet() -> bool:
-    """Whether nothing but errors and JSON is printed."""
-    return _is_set(_QUIET)
-
-
-def is_json() -> bool:
-    """Whether results are printed for programs."""
-    return _is_set(_JSON)
-
-
-def _is_set(key: str) -> bool:
+def is_set(key: str) -> bool:
+    """Whether that holds for the command that runs."""
     context = click.get_current_context(silent=True)
     return context is not None and key in context.meta
 
@@ -68,21 +50,19 @@ def printed() -> Iterator[None]:
 
 def show(result: Any, say_it: Callable[[Any], object]) -> None:
     """Print a result: as JSON for programs, or by a function for people."""
-    if is_json():
+    if is_set(JSON):
         print_json(result)
-    elif not is_quiet():
+    elif not is_set(QUIET):
         say_it(result)
-
-
-def _jsonable(value: Any) -> Any:
-    if is_dataclass(value) and not isinstance(value, type):
-        return asdict(value)
-    return str(value)
 
 
 def print_json(value: Any) -> None:
     """Print a result for scripts."""
-    text = json.dumps(value, default=_jsonable, indent=2)
+
+    def jsonable(part: Any) -> Any:
+        return asdict(part) if is_dataclass(part) and not isinstance(part, type) else str(part)
+
+    text = json.dumps(value, default=jsonable, indent=2)
     with printed():
         print(text)
 
@@ -97,10 +77,18 @@ def shown(value: object) -> str:
 
 def say(value: object) -> None:
     """Print one line."""
-    if is_quiet():
+    if is_set(QUIET):
         return
     with printed():
         print(shown(value))
+
+
+def say_counts(counts: Mapping[str, int | Mapping[str, int]], what: str) -> None:
+    """Print what became of so many messages, by topic or by topic and reason."""
+    for topic, found in counts.items():
+        for reason, count in found.items() if isinstance(found, Mapping) else [("", found)]:
+            why = f": {reason}" if reason else ""
+            say(f"{topic}: {counted(count, 'message')} {what}{why}")
 
 
 def complain(value: object) -> None:
@@ -137,7 +125,7 @@ def print_table(
     Returns:
         Whether anything was shortened or left out.
     """
-    if is_quiet() or not rows:
+    if is_set(QUIET) or not rows:
         return False
     is_terminal = sys.stdout.isatty()
     most = (first or _MOST_ROWS) if is_terminal and len(rows) > _MOST_ROWS else len(rows)
@@ -249,7 +237,7 @@ def display(*, timed: bool = True) -> Iterator[Show]:
     Args:
         timed: Say how long it still takes.
     """
-    if is_quiet() or is_json():
+    if is_set(QUIET) or is_set(JSON):
         yield lambda _: None
     elif sys.stderr.isatty():
         with _bars(timed=timed) as show:

@@ -30,6 +30,7 @@ from mp4ds.cli.output import (
     print_table,
     progress_of,
     say,
+    say_counts,
     show,
 )
 from mp4ds.dataset.dataset import datasets_in
@@ -40,7 +41,6 @@ from mp4ds.packing.options import (
     PackOptions,
     PackProgress,
     PackSummary,
-    TopicSummary,
 )
 from mp4ds.packing.pack import is_packed
 from mp4ds.plugins.demo import demo
@@ -101,15 +101,26 @@ def print_pack(summary: PackSummary) -> None:
     """Print what became of each topic."""
     cameras = [topic for topic in summary.topics if topic.frames]
     others = [topic for topic in summary.topics if not topic.frames]
-    rows = [_pack_row(topic) for topic in (*cameras, *others)]
+    rows = []
+    for topic in (*cameras, *others):
+        is_modelled = topic.messages and topic.frames == topic.messages
+        ratio = topic.raw_bytes / topic.packed_bytes if topic.packed_bytes else 0
+        row = {
+            "topic": topic.topic,
+            "type": topic.type_name,
+            "messages": str(topic.messages),
+            "frames": str(topic.frames) if topic.files else "",
+            "raw": size_text(topic.raw_bytes) if topic.raw_bytes else "",
+            "packed": size_text(topic.packed_bytes) if topic.packed_bytes else "",
+            "ratio": number(ratio or None, 2),
+            "stored in": ", ".join(topic.files) or ("sidecar" if is_modelled else "messages.mcap"),
+        }
+        rows.append(row)
     print_table(rows, _TEXTS, spare=_SPARE, first=len(cameras))
     for topic in summary.topics:
         for reason, (count, first) in topic.verbatim.items():
-            share = f"{count} of {counted(topic.messages, 'message')}"
-            say(
-                f"{topic.topic}: {share} stored verbatim in messages.mcap: {reason} (first: "
-                f"message {first})"
-            )
+            share = f"{count} of {counted(topic.messages, 'message')} stored verbatim"
+            say(f"{topic.topic}: {share} in messages.mcap: {reason} (first: message {first})")
         for note in topic.notes:
             say(f"{topic.topic}: {note}")
     for what, count in summary.skipped.items():
@@ -125,39 +136,18 @@ def print_pack(summary: PackSummary) -> None:
     if summary.is_copy:
         say(f"{path_text(summary.dataset)}: {size_text(summary.dataset_bytes)}, copied")
         return
+    change = ""
+    if summary.source_bytes:
+        ratio = summary.source_bytes / summary.dataset_bytes
+        change = f"{ratio:.2f} times smaller" if ratio >= 1 else f"{1 / ratio:.2f} times as large"
+        change = f" ({change})"
     say(
         f"{path_text(summary.dataset)}: {size_text(summary.source_bytes)} -> "
-        f"{size_text(summary.dataset_bytes)}{_change(summary)}, of which messages.mcap "
+        f"{size_text(summary.dataset_bytes)}{change}, of which messages.mcap "
         f"{size_text(summary.messages_bytes)}"
     )
     if summary.larger:
         say(f"larger than its source: {summary.larger}")
-
-
-def _change(summary: PackSummary) -> str:
-    """How much smaller a dataset is than its source; empty if the source has no bytes."""
-    if not summary.source_bytes:
-        return ""
-    ratio = summary.source_bytes / summary.dataset_bytes
-    return f" ({ratio:.2f} times smaller)" if ratio >= 1 else f" ({1 / ratio:.2f} times as large)"
-
-
-def _pack_row(topic: TopicSummary) -> dict[str, str]:
-    stored = ", ".join(topic.files)
-    if not stored:
-        modelled = topic.messages and topic.frames == topic.messages
-        stored = "sidecar" if modelled else "messages.mcap"
-    ratio = topic.raw_bytes / topic.packed_bytes if topic.packed_bytes else 0
-    return {
-        "topic": topic.topic,
-        "type": topic.type_name,
-        "messages": str(topic.messages),
-        "frames": str(topic.frames) if topic.files else "",
-        "raw": size_text(topic.raw_bytes) if topic.raw_bytes else "",
-        "packed": size_text(topic.packed_bytes) if topic.packed_bytes else "",
-        "ratio": number(ratio or None, 2),
-        "stored in": stored,
-    }
 
 
 # ---------------------------------------------------------------- progress of packs
@@ -182,11 +172,9 @@ def share_of(states: States) -> float | None:
 def rows_of(states: States) -> list[Row]:
     """All packs, and each dataset or, of one, each camera."""
     if len(states) > 1:
-        all_of_it = Row(
-            f"packing {len(states)} datasets", _amounts(*states.values()), share_of(states)
-        )
+        name, text = f"packing {len(states)} datasets", _amounts(*states.values())
         rows = [Row(one.dataset.name, _text(one), packed_share(one)) for one in states.values()]
-        return [all_of_it, *rows]
+        return [Row(name, text, share_of(states)), *rows]
     (state,) = states.values()
     cameras = [
         Row(
@@ -300,12 +288,8 @@ def _print_unpack(summary: UnpackSummary, noun: str) -> None:
     for topic, now in summary.republished.items():
         taken = f" (the name {now.instead_of} is taken)" if now.instead_of else ""
         say(f"{topic}: written as {now.topic}, {now.type_name}{taken}")
-    for topic, reasons in summary.as_recorded.items():
-        for reason, count in reasons.items():
-            say(f"{topic}: {counted(count, 'message')} as recorded: {reason}")
-    for topic, reasons in summary.unconvertible.items():
-        for reason, count in reasons.items():
-            say(f"{topic}: {counted(count, 'message')} left out: {reason}")
+    say_counts(summary.as_recorded, "as recorded")
+    say_counts(summary.unconvertible, "left out")
     if summary.converted:
         say(f"converted between ROS 1 and ROS 2: {', '.join(summary.converted)}")
     for what, count in summary.omitted.items():
@@ -324,25 +308,22 @@ def _print_unpack(summary: UnpackSummary, noun: str) -> None:
 def _print_losses(losses: Sequence[Loss], where: str) -> None:
     """Print what could not be read, and where the rest is listed."""
     for loss in losses[:_LOSSES_SHOWN]:
-        say(f"lost: {_loss_text(loss)}")
+        topics = f" of {', '.join(loss.topics)}" if loss.topics else ""
+        if loss.frames is not None:
+            first, last = loss.frames
+            frames = f"frame {first}" if first == last else f"frames {first} to {last}"
+            ends = [seconds_text(time) for time in (loss.start, loss.end) if time is not None]
+            logged = f", log time {' to '.join(dict.fromkeys(ends))}" if ends else ""
+            say(f"lost: {loss.file}: {frames}{topics}{logged}: {loss.problem}")
+            continue
+        place = f" at byte {loss.offset}" if loss.offset is not None else ""
+        size = f", {size_text(loss.size)}" if loss.size is not None else ""
+        messages = f"; {counted(loss.messages, 'message')}" if loss.messages else ""
+        if loss.messages == 0:
+            messages = "; no messages"
+        say(f"lost: {loss.file}{place}{size}: {loss.problem}{messages}{topics}")
     if len(losses) > _LOSSES_SHOWN:
         say(f"lost: {counted(len(losses) - _LOSSES_SHOWN, 'more place')}, {where}")
-
-
-def _loss_text(loss: Loss) -> str:
-    place = f" at byte {loss.offset}" if loss.offset is not None else ""
-    size = f", {size_text(loss.size)}" if loss.size is not None else ""
-    messages = ""
-    if loss.messages is not None:
-        messages = f"; {counted(loss.messages, 'message') if loss.messages else 'no messages'}"
-    topics = f" of {', '.join(loss.topics)}" if loss.topics else ""
-    if loss.frames is None:
-        return f"{loss.file}{place}{size}: {loss.problem}{messages}{topics}"
-    first, last = loss.frames
-    frames = f"frame {first}" if first == last else f"frames {first} to {last}"
-    times = dict.fromkeys(seconds_text(time) for time in (loss.start, loss.end) if time is not None)
-    logged = f", log time {' to '.join(times)}" if times else ""
-    return f"{loss.file}: {frames}{topics}{logged}: {loss.problem}"
 
 
 def _print_latched(latched: Mapping[str, int], left_out: Sequence[str]) -> None:
@@ -375,19 +356,6 @@ def _import(source: str, output: str, images: ImportOptions, options: PackOption
     with pack_progress() as progress:
         summary = mp4ds.pack(source, output, replace(options, images=images), progress=progress)
     show(summary, print_pack)
-
-
-def _import_episodes(folder: str, output: str, images: ImportOptions, options: PackOptions) -> None:
-    """A dataset for each episode; those that an earlier run made are left as they are."""
-    numbers, summaries = episodes_in(Path(folder)), []
-    with pack_progress() as progress:
-        for number in numbers:
-            target = Path(output) / f"episode_{number:06d}"
-            chosen = replace(options, images=replace(images, episode=number))
-            if options.force or not is_packed(Path(folder), target, chosen):
-                target.parent.mkdir(exist_ok=True)
-                summaries.append(mp4ds.pack(folder, target, chosen, progress=progress))
-    show(summaries, lambda _: [*map(print_pack, summaries)])
 
 
 @command("images")
@@ -429,10 +397,19 @@ def lerobot_command(folder: str, output: str, images: ImportOptions, options: Pa
     Packets of videos are copied; states, actions and other rows become messages. To resume, run
     the same command again.
     """
-    if images.episode is None:
-        _import_episodes(folder, output, images, options)
-    else:
+    if images.episode is not None:
         _import(folder, output, images, options)
+        return
+    numbers, summaries = episodes_in(Path(folder)), []
+    with pack_progress() as progress:
+        for number in numbers:
+            target = Path(output) / f"episode_{number:06d}"
+            chosen = replace(options, images=replace(images, episode=number))
+            # those that an earlier run made are left as they are
+            if options.force or not is_packed(Path(folder), target, chosen):
+                target.parent.mkdir(exist_ok=True)
+                summaries.append(mp4ds.pack(folder, target, chosen, progress=progress))
+    show(summaries, lambda _: [*map(print_pack, summaries)])
 
 
 @command("ros-mp4")
@@ -448,10 +425,8 @@ def ros_mp4_command(video: str, sidecar: str, output: str, force: bool) -> None:
     show(mp4ds.import_ros_mp4(video, sidecar, output, force=force), print_pack)
 
 
-import_command.add_command(images_command)
-import_command.add_command(video_command)
-import_command.add_command(lerobot_command)
-import_command.add_command(ros_mp4_command)
+for _command in (images_command, video_command, lerobot_command, ros_mp4_command):
+    import_command.add_command(_command)
 
 
 @command()

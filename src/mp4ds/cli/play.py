@@ -18,7 +18,7 @@ from mp4ds.cli.nodes import (
     node_progress,
 )
 from mp4ds.cli.options import argument, command, option, takes
-from mp4ds.cli.output import Row, complain, is_quiet, say, show, shown
+from mp4ds.cli.output import QUIET, Row, complain, is_set, say, say_counts, show, shown
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary, open_player
 from mp4ds.plugins.ros.node import SERVICE_EVENTS
@@ -104,7 +104,7 @@ def play_command(
     with ExitStack() as stack:
         report = stack.enter_context(node_progress(_rows, _warnings, is_shown=is_shown))
         player = stack.enter_context(open_player(datasets, options, progress=report))
-        if not is_quiet():
+        if not is_set(QUIET):
             complain(f"publishing to {player.address}")
             if player.follows_clock:
                 complain("following another player's /clock (--no-follow-clock: do not follow)")
@@ -137,9 +137,9 @@ def _rounded(rate: float) -> float:
 
 
 def _warnings(state: PlayProgress) -> Iterator[str]:
-    if state.so_far.slowed_s >= _SLOW_S and not is_quiet():
+    if state.so_far.slowed_s >= _SLOW_S and not is_set(QUIET):
         yield "slowing down: messages are not ready in time (--drop drops late frames instead)"
-    if state.so_far.dropped and not is_quiet():
+    if state.so_far.dropped and not is_set(QUIET):
         yield "dropping late frames: they are not decoded in time"
 
 
@@ -159,11 +159,8 @@ def _print(summary: PlaySummary) -> None:
     """Print what was played."""
     for topic, count in summary.messages.items():
         say(f"{topic}: {count}")
-    for topic, reasons in summary.as_recorded.items():
-        for reason, count in reasons.items():
-            say(f"{topic}: {count} published as recorded: {reason}")
-    for topic, count in summary.not_installed.items():
-        say(f"{topic}: {count} not played: the message type is not installed")
+    say_counts(summary.as_recorded, "published as recorded")
+    say_counts(summary.not_installed, "not played: the message type is not installed")
     total = sum(summary.messages.values())
     text = f"{total} messages in {summary.seconds:.1f} s"
     if summary.loops:

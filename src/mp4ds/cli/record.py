@@ -17,9 +17,9 @@ from mp4ds.cli.nodes import (
     node_progress,
 )
 from mp4ds.cli.options import argument, command, option, takes
-from mp4ds.cli.output import Row, complain, is_quiet, say, show
+from mp4ds.cli.output import QUIET, Row, complain, is_set, say, say_counts, show
 from mp4ds.cli.pack import print_pack
-from mp4ds.errors import counted, path_text
+from mp4ds.errors import path_text
 from mp4ds.files.sources import salvage_command
 from mp4ds.options import WHERE, parse_pattern
 from mp4ds.plugins.recording.options import RecordOptions
@@ -114,7 +114,7 @@ def record_command(
         # a launch file cannot leave out an argument: an empty one is none
         opened = open_recorder(topics, output or None, options, progress=report)
         recorder = stack.enter_context(opened)
-        if not is_quiet():
+        if not is_set(QUIET):
             complain(f"recording from {recorder.address}")
         keys = {" ": recorder.toggle_paused, "q": recorder.stop, "s": recorder.snapshot}
         signals = {"SIGUSR1": recorder.snapshot} if options.keep_last else {}
@@ -144,7 +144,7 @@ def _whole(patterns: Sequence[str]) -> str:
 
 def _warnings(state: RecordProgress) -> Iterator[str]:
     yield from state.warnings
-    for path, is_complete in state.saved.items() if not is_quiet() else ():
+    for path, is_complete in state.saved.items() if not is_set(QUIET) else ():
         yield f"saving {path_text(path)}"
         if is_complete:
             yield f"saved {path_text(path)}"
@@ -194,9 +194,6 @@ def _print(summary: RecordSummary) -> None:
         say(f"{path_text(made.dataset)}: empty: {why}")
     for problem in summary.failed:
         say(problem)
-    for topic, count in summary.dropped.items():
-        say(f"{topic}: {counted(count, 'message')} dropped: the buffer was full")
-    for topic, count in summary.lost.items():
-        say(f"{topic}: {counted(count, 'message')} lost by the middleware")
-    for topic, count in summary.untimed.items():
-        say(f"{topic}: {counted(count, 'message')} left out: {_UNTIMED}")
+    say_counts(summary.dropped, "dropped: the buffer was full")
+    say_counts(summary.lost, "lost by the middleware")
+    say_counts(summary.untimed, f"left out: {_UNTIMED}")

@@ -46,30 +46,23 @@ def report_command(datasets: Sequence[str], jobs: int | None, options: ReportOpt
     them, get an overview page with a picture of each and links to their reports.
     """
     found = datasets_in(datasets)
-    if len(found) > 1:
-        summaries = _reports(datasets, found, options, jobs)
-        show(summaries, _print_reports)
-        if summaries.problems:
-            raise click.exceptions.Exit(1)
-        return
-    with progress_of("reporting") as tell:
-        summary = report(found[0], options, progress=tell)
-    show(summary, _print_report)
+    if len(found) == 1:
+        with progress_of("reporting") as tell:
+            summary: ReportSummary | OverviewSummary = report(found[0], options, progress=tell)
+        show(summary, _print_report)
+    else:
+        folder = options.output
+        if folder is None and len(datasets) == 1 and Path(datasets[0]).is_dir():
+            folder = Path(datasets[0])
+        if folder is None:
+            problem = "Give `output`: where to write the overview page of several datasets."
+            raise OptionError(problem)
+        options = replace(options, output=None)
+        with progress_of("reporting") as tell:
+            summary = reports(found, folder, options, jobs=jobs, progress=tell)
+        show(summary, _print_reports)
     if summary.problems:
         raise click.exceptions.Exit(1)
-
-
-def _reports(
-    datasets: Sequence[str], found: Sequence[Path], options: ReportOptions, jobs: int | None
-) -> OverviewSummary:
-    """Make the reports of several datasets, and the page that leads to them."""
-    folder = options.output
-    if folder is None and len(datasets) == 1 and Path(datasets[0]).is_dir():
-        folder = Path(datasets[0])
-    if folder is None:
-        raise OptionError("Give `output`: where to write the overview page of several datasets.")
-    with progress_of("reporting") as tell:
-        return reports(found, folder, replace(options, output=None), jobs=jobs, progress=tell)
 
 
 def _print_reports(summary: OverviewSummary) -> None:

@@ -36,7 +36,7 @@ from mp4ds.format.fields import FORMAT_VERSION, MESSAGES_NAME
 from mp4ds.format.manifest import About, EarlierDataset, Manifest, StreamEntry, Verbatim
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_manifest, verify_file
 from mp4ds.messages.serializations import calibration_topics, is_camera
-from mp4ds.options import Slice
+from mp4ds.options import SliceOptions
 from mp4ds.records import Channel, ChannelStats, Excerpt, Loss, Message, Record, Schema
 from mp4ds.video.codecs import VISUAL
 
@@ -159,14 +159,16 @@ def open_source(path: Path) -> BagReader:
     return DatasetReader(dataset, advice=COPY_AGAIN)
 
 
-def slice_of(dataset: Dataset, asked: Slice, selected: Callable[[str], bool]) -> RecordingSlice:
+def slice_of(
+    dataset: Dataset, asked: SliceOptions, selected: Callable[[str], bool]
+) -> RecordingSlice:
     """A slice of a dataset, with latched messages of selected topics if requested.
 
     Raises:
         OptionError: It is empty, or a time is not valid.
         SourceError: There are no messages.
     """
-    if not asked:
+    if not asked.is_slice:
         return WHOLE
     reader = DatasetReader(dataset)
     take_slice(reader, asked, selected)

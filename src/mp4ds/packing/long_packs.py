@@ -261,7 +261,7 @@ class PartedPack:
             # last, since damage of a part would be taken for that of the index
             _check_index(reader, parts, plan.options.selected)
             size = sum(source.size for source in plan.sources)
-            source_bytes = None if plan.options.slice else size
+            source_bytes = None if plan.options.is_slice else size
             return summarize(whole, self.target, source_bytes, too_large=reader.slice.left_out)
 
 

@@ -98,7 +98,7 @@ def _pack_in_one_pass(parted: PartedPack, exact: Exact) -> PackSummary:
 
 def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> PackSummary:
     plan, report = parted.plan, parted.report
-    is_slice = bool(plan.options.slice)
+    is_slice = plan.options.is_slice
     total = sum(map(source_size, reader.files))
     due = sum(item.count for item in reader.stats().values())
     next_report = 0.0
@@ -250,11 +250,12 @@ def _copy(path: Path, target: Path, options: PackOptions) -> PackSummary:
             ]
         selected.check(channel.topic for channel in dataset.channels)
         folder.mkdir()
-        part = slice_of(dataset, options.slice, selected)
-        if options.slice or options.topics or options.exclude:  # whole files are checked as copied
+        part = slice_of(dataset, options, selected)
+        # whole files are checked as copied
+        if options.is_slice or options.topics or options.exclude:
             dataset.verify_messages()
         copy_part(dataset, folder, part=part, selected=selected, about=about)
-        if options.slice:
+        if options.is_slice:
             for problem in validate(folder, deep=True):
                 raise FormatError(problem.code, dataset.path, f"is damaged: {problem}")
         left_out = [item.topic for item in dataset.channels if not selected(item.topic)]

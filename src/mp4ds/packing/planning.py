@@ -451,7 +451,7 @@ class Plan:
     @property
     def hashed(self) -> list[SourceState]:
         """The files that are hashed: of a slice, not those that are read only in part."""
-        is_part = bool(self.options.slice)
+        is_part = self.options.is_slice
         return [
             source
             for source in self.sources
@@ -509,8 +509,8 @@ def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagR
     else:
         reader = plugin("importing.layouts:open_images")(paths[0], images)
     try:
-        if options.slice:
-            take_slice(reader, options.slice, options.selected)
+        if options.is_slice:
+            take_slice(reader, options, options.selected)
         if options.redact:
             reader = plugin("redacting:RedactedReader")(reader, options)
         if options.derives:

@@ -20,7 +20,7 @@ from mp4ds.format.models import Calibration
 from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest, names_dataset
 from mp4ds.messages.serializations import MessageSplitter, kind_of
 from mp4ds.messages.wire import CalibrationFields, CodedFields, ImageFields
-from mp4ds.options import WHOLE, Slice, iso_text
+from mp4ds.options import SliceOptions, iso_text
 from mp4ds.packing.planning import open_recording
 from mp4ds.records import Channel, latched_text
 from mp4ds.times import intervals, lost_frames
@@ -80,7 +80,7 @@ class Info:
     notes: list[str] = field(default_factory=list)
 
 
-def info(path: Path | str, asked: Slice = WHOLE) -> Info:
+def info(path: Path | str, asked: SliceOptions | None = None) -> Info:
     """Inspect a recording, a dataset, or a video with its sidecar.
 
     Args:
@@ -93,7 +93,9 @@ def info(path: Path | str, asked: Slice = WHOLE) -> Info:
         OptionError: The slice is empty.
     """
     place = location(path)
-    if not asked and names_dataset(place):
+    if asked is not None and not asked.is_slice:
+        asked = None
+    if asked is None and names_dataset(place):
         with Dataset(place) as dataset:
             return _dataset_info(dataset)
     with open_recording([place]) if asked else open_reader(place) as reader:

@@ -138,7 +138,9 @@ class ReducedReader(ChangedReader):
         self._types: dict[int, Types] = {}
         self._given: dict[int, Channel] = {}
         for one in chosen:
-            if one.id in self.remade and not _keeps_type(one):
+            # messages that are made anew are of these types, too
+            keeps_type = one.message_encoding in ("ros1", "cdr") and kind_of(one) is not CodedFields
+            if one.id in self.remade and not keeps_type:
                 world = "ros1" if one.message_encoding == "ros1" else "ros2"
                 types = Types(world, "raw", _INFO if is_calibration(one) else None)
                 self._types[one.id] = types
@@ -313,11 +315,6 @@ class ReducedReader(ChangedReader):
         if channel.id not in self._given:
             return message
         return message.of_channel(replace(channel, id=-1 - channel.id))
-
-
-def _keeps_type(channel: Channel) -> bool:
-    """Whether messages that are made anew are of the type that is recorded."""
-    return channel.message_encoding in ("ros1", "cdr") and kind_of(channel) is not CodedFields
 
 
 def _kind_of(parts: Parts, shown: Shown) -> _Kind:

@@ -160,7 +160,7 @@ def unpack(
             to = next(named, None) or _own_format(dataset, chosen)
         _check(to, chosen)
         given = local_target(output) if output else None
-        whole, losses = _opened(dataset, chosen, verify=to != "images" and not chosen.slice)
+        whole, losses = _opened(dataset, chosen, verify=to != "images" and not chosen.is_slice)
         stack.enter_context(whole)
         target = given or local_target(default_output(whole.path, to))
         path = stack.enter_context(
@@ -173,15 +173,15 @@ def unpack(
             if not chosen.salvage:
                 whole.verify_sidecars(chosen.selected)
             if to == "images":  # some of which are verbatim
-                verbatim = whole.manifest.verbatim if whole.manifest and not chosen.slice else ()
+                verbatim = whole.manifest.verbatim if whole.manifest and not chosen.is_slice else ()
                 reads_all = any(chosen.selected(item.topic) for item in verbatim)
             else:  # a slice is filtered out where log times do not tell the order
-                reads_all = bool(chosen.slice) and not whole.is_in_time
+                reads_all = chosen.is_slice and not whole.is_in_time
             if reads_all:
                 whole.verify_messages()
             summary = UnpackSummary(target, losses=losses)
             summary.left_out.extend(_left_out(whole, chosen.selected, to))
-            part = slice_of(whole, chosen.slice, chosen.selected)
+            part = slice_of(whole, chosen, chosen.selected)
             # messages with packets of a view instead of those recorded are converted, too
             is_replaced = any(
                 stream.sidecar.replaces_packets
@@ -196,7 +196,7 @@ def unpack(
                     else:
                         _unpack_recording(opened, path, to, chosen, summary, progress)
             else:
-                if chosen.slice:
+                if chosen.is_slice:
                     whole.verify_lossy_videos(chosen.selected)
                 _unpack_recording(whole, path, to, chosen, summary, progress, part)
             if to != "images":
@@ -332,7 +332,7 @@ def _check(to: str, options: UnpackOptions) -> None:
         raise OptionError(f"`storage` works with `to` rosbag2, not with `to` {to}.")
     if options.images and to == "images":
         raise OptionError("`images` is for recordings; with `to` images, use `image_format`.")
-    if options.salvage and options.slice:
+    if options.salvage and options.is_slice:
         raise OptionError(
             "`salvage` restores a whole dataset: pack what it restores, and unpack a slice of that."
         )

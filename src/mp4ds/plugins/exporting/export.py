@@ -75,7 +75,7 @@ def export(
     chosen.check_for(to)
     target = local_target(output)
     with ExitStack() as stack, advising(HOW_TO_SALVAGE):
-        layer, check_all = "view" if in_colour else chosen.layer, not chosen.slice
+        layer, check_all = "view" if in_colour else chosen.layer, not chosen.is_slice
         opened = [
             stack.enter_context(
                 open_selected(path, chosen.uses, layer=layer, verify_messages=check_all)
@@ -89,7 +89,7 @@ def export(
         path = stack.enter_context(staged(target, force=chosen.force, owned=owned, sources=sources))
         summary, jobs = ExportSummary(target, to), list[ExportJob]()
         for number, one in enumerate(opened):
-            span, place = slice_of(one, chosen.slice, chosen.uses), path.parent / str(number)
+            span, place = slice_of(one, chosen, chosen.uses), path.parent / str(number)
             job = ExportJob(
                 stack.enter_context(sliced(one, span, place, chosen.uses)),
                 path,

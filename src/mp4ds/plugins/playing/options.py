@@ -11,7 +11,6 @@ from functools import cached_property
 from mp4ds.errors import OptionError
 from mp4ds.options import (
     WHAT,
-    WHERE,
     Parsed,
     Selection,
     jpeg_quality,
@@ -19,6 +18,8 @@ from mp4ds.options import (
     parse_number,
     pattern,
     seconds,
+    what,
+    where,
 )
 from mp4ds.plugins.ros.node import CLOCK, NodeOptions
 from mp4ds.unpacking.pictures import FrameOptions
@@ -45,19 +46,11 @@ def rooted(topic: str) -> str:
 class PlayOptions(FrameOptions, NodeOptions):
     """How to play datasets back."""
 
-    exclude: Sequence[str] = option(
-        "Leave out matching topics.",
-        (),
-        *("--exclude", "--exclude-topics", "-x"),
-        panel=WHAT,
-        metavar="GLOB",
+    exclude: Sequence[str] = what(
+        "Leave out matching topics.", (), *("--exclude", "--exclude-topics", "-x"), metavar="GLOB"
     )
     rate: Parsed[float] = option(
-        "Playback rate; 2 is twice as fast.",
-        1.0,
-        "-r",
-        metavar="FACTOR",
-        parse=_parse_rate,
+        "Playback rate; 2 is twice as fast.", 1.0, "-r", metavar="FACTOR", parse=_parse_rate
     )
     start_offset: Parsed[float] = seconds(
         "Start this many seconds into the recording.",
@@ -71,17 +64,13 @@ class PlayOptions(FrameOptions, NodeOptions):
         *("--duration", "--playback-duration", "-u"),
         panel=WHAT,
     )
-    until_sec: float | None = option(
+    until_sec: float | None = what(
         "Play until this time, in seconds since 1970, or for `duration`, whichever is later.",
         None,
         "--playback-until-sec",
-        panel=WHAT,
     )
-    until_nsec: int | None = option(
-        "Play until this time, in nanoseconds since 1970.",
-        None,
-        "--playback-until-nsec",
-        panel=WHAT,
+    until_nsec: int | None = what(
+        "Play until this time, in nanoseconds since 1970.", None, "--playback-until-nsec"
     )
     loop: bool = option("Loop playback.", False, "-l")
     keep_alive: bool = option("Keep running at the end, for late subscribers.", False, "-k")
@@ -95,10 +84,8 @@ class PlayOptions(FrameOptions, NodeOptions):
     exclude_regex: Parsed[re.Pattern[str] | None] = pattern(
         "Leave out topics that fully match a regular expression."
     )
-    remap: Sequence[str] = option(
-        "Rename a topic; repeatable.", (), "-m", metavar="OLD:=NEW", panel=WHERE
-    )
-    prefix: str = option("Prefix for all topics that are not remapped.", "", panel=WHERE)
+    remap: Sequence[str] = where("Rename a topic; repeatable.", (), "-m", metavar="OLD:=NEW")
+    prefix: str = where("Prefix for all topics that are not remapped.", "")
     clock: float | None = option(
         "Publish /clock, at this rate if one is given; default: 100, or 40 with --ros2.",
         None,

@@ -112,33 +112,6 @@ class Pace:
         return waiting
 
 
-class Ticks:
-    """When /clock is to be published: at a fixed rate, if the machine keeps up.
-
-    Args:
-        hertz: The rate; None for never.
-    """
-
-    def __init__(self, hertz: float | None) -> None:
-        self._period = 1 / hertz if hertz else math.inf
-        self._next = 0.0 if hertz else math.inf
-
-    def is_due(self) -> bool:
-        """Whether it is time to publish; if so, the caller is expected to do it."""
-        now = time.monotonic()
-        if now < self._next:
-            return False
-        self._next += self._period
-        if self._next <= now:  # do not make up for missed ones
-            self._next = now + self._period
-        return True
-
-    @property
-    def seconds_left(self) -> float:
-        """Seconds until the next one."""
-        return max(0.0, self._next - time.monotonic())
-
-
 class FollowedClock:
     """Another player's clock, which publishes its time now and then.
 

@@ -17,7 +17,7 @@ from mp4ds.dataset.dataset import datasets_in
 from mp4ds.dataset.recording import HOW_TO_SALVAGE, open_selected
 from mp4ds.errors import Refused, RemoteError, advising
 from mp4ds.plugins.playing.options import PlayOptions
-from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Pace, Ticks
+from mp4ds.plugins.playing.pace import CATCH_UP_NS, NS, FollowedClock, Pace
 from mp4ds.plugins.playing.timeline import ReadAhead, Timeline
 from mp4ds.plugins.ros.node import Node, Service, action, chosen_world, open_node, quick_switches
 from mp4ds.records import Channel, Message
@@ -140,7 +140,8 @@ class Player:
         self._paused_at: Message | None = None  # the message before which it paused
         self._last_frame: int | None = None  # log time of the last frame published
         self._reached = self._start  # log time of the last message published
-        self._ticks = Ticks(self._options.clock)
+        self._tick_s = 1 / options.clock if options.clock else math.inf
+        self._next_tick = 0.0 if options.clock else math.inf
         self._next_report = 0.0
         self._installed: dict[int, tuple[Channel, bool]] = {}  # whether its type is, by id()
         self._done = PlaySummary()
@@ -318,13 +319,17 @@ class Player:
     def _wait(self, seconds: float, state: str) -> None:
         end = time.monotonic() + seconds
         while not self._is_stopped and (left := end - time.monotonic()) > 0:
-            self._tick()
             self._report(state)
-            time.sleep(min(left, 0.05, self._ticks.seconds_left))
+            time.sleep(min(left, 0.05, self._tick()))
 
-    def _tick(self) -> None:
-        if self._ticks.is_due():
+    def _tick(self) -> float:
+        """Publish /clock if that is due, and return the seconds until it is again."""
+        now = time.monotonic()
+        if now >= self._next_tick:
+            is_behind = self._next_tick + self._tick_s <= now  # those missed are not made up for
+            self._next_tick = (now if is_behind else self._next_tick) + self._tick_s
             self._node.clock(self._time())
+        return max(0.0, self._next_tick - time.monotonic())
 
     def _advance(self) -> bool:
         """Publish the next message if it is due, else wait a little; returns False at the end."""
@@ -333,7 +338,7 @@ class Player:
         if target is not None:
             self._read_from(target)
             self._begin_at(target)
-        self._tick()
+        tick = self._tick()
         with self._changed:  # held until `wait`, so that no notification is missed
             try:
                 due = self._playback.head() if self._playback else None
@@ -348,7 +353,7 @@ class Player:
                 if self._followed.silent_s > _FOLLOW_END_S and not is_awaited:
                     self._is_stopped = True
                 elif self._target is None:
-                    self._changed.wait(min(seconds, self._ticks.seconds_left, _WAKE_S))
+                    self._changed.wait(min(seconds, tick, _WAKE_S))
                 return True
             burst = self._burst
             if burst is not None:
@@ -388,17 +393,6 @@ class Player:
         if self.follows_clock:
             state = "waiting for" if self._followed.time_ns is None else "following"
             return self._followed.seconds_until(due.log_time), f"{state} /clock"
-        return self._until_due(due), "playing"
-
-    def _hold(self, due: Message, topic: str) -> tuple[float, str]:
-        """Stop the clock at a message that has to wait for a message on another topic."""
-        if self._pace.now() >= due.log_time or topic == self._options.rate_control_topic:
-            now = min(self._pace.now(), due.log_time)
-            self._pace.pause()
-            self._pace.jump(now)
-        return math.inf, f"waiting for {topic}"
-
-    def _until_due(self, due: Message) -> float:
         if not self._pace.is_running:
             self._pace.resume()
         skip = self._options.skip_empty
@@ -409,7 +403,15 @@ class Player:
             waited = self._pace.hold_back(due.log_time, was_awaited=self._was_awaited)
             self._done.slowed_s += waited / NS
         self._was_awaited = False
-        return max(seconds, 0.0)
+        return max(seconds, 0.0), "playing"
+
+    def _hold(self, due: Message, topic: str) -> tuple[float, str]:
+        """Stop the clock at a message that has to wait for a message on another topic."""
+        if self._pace.now() >= due.log_time or topic == self._options.rate_control_topic:
+            now = min(self._pace.now(), due.log_time)
+            self._pace.pause()
+            self._pace.jump(now)
+        return math.inf, f"waiting for {topic}"
 
     def _time(self) -> int:
         """The recording time; never later than a message that is still to be published."""
@@ -468,8 +470,7 @@ class Player:
                 return True  # it was resumed
             self._burst = None
             self._report("at the end")
-            self._tick()
-            self._changed.wait(min(_WAKE_S, self._ticks.seconds_left))
+            self._changed.wait(min(_WAKE_S, self._tick()))
         return True
 
     def _publish(self, due: Message, burst: _Burst | None) -> None:
@@ -485,24 +486,21 @@ class Player:
             if is_chosen or (self._options.clock is not None and self._options.immediate):
                 self._node.clock(due.log_time)
             self._send(due, due.log_time)
-            self._sent(due, burst)
+            with self._changed:
+                self._reached = max(self._reached, due.log_time)
+                if self.is_paused:
+                    self._pace.jump(due.log_time)
+                if burst is not None:
+                    burst.done += 1
+                    burst.left -= 1
+                    if burst.left <= 0 and burst is self._burst:
+                        self._burst = None
+                        self._changed.notify_all()
+                if self._timeline.is_frame(due):
+                    if self._options.lock_step and due.log_time != self._last_frame:
+                        self._replies -= 1
+                    self._last_frame = due.log_time
         self._report("paused" if self.is_paused else "playing")
-
-    def _sent(self, due: Message, burst: _Burst | None) -> None:
-        with self._changed:
-            self._reached = max(self._reached, due.log_time)
-            if self.is_paused:
-                self._pace.jump(due.log_time)
-            if burst is not None:
-                burst.done += 1
-                burst.left -= 1
-                if burst.left <= 0 and burst is self._burst:
-                    self._burst = None
-                    self._changed.notify_all()
-            if self._timeline.is_frame(due):
-                if self._options.lock_step and due.log_time != self._last_frame:
-                    self._replies -= 1
-                self._last_frame = due.log_time
 
     def _send(self, due: Message, time_ns: int) -> None:
         if not self._is_installed(due.channel):

@@ -90,8 +90,19 @@ class ReadAhead(Generic[T]):
     def _work(self) -> None:
         try:
             for item in self._items:
-                if not self._put(item):
-                    break
+                size = self._size_of(item)
+                with self._changed:
+                    self._changed.wait_for(
+                        lambda: size <= self._room or not self._waiting or self._is_over  # noqa: B023
+                    )
+                    if self._is_over:
+                        break
+                    is_first = not self._waiting
+                    self._room -= size
+                    self._waiting.append(item)
+                    self._changed.notify_all()
+                if is_first:
+                    self._on_ready()
         except BaseException as error:
             self._error = error
         finally:
@@ -100,20 +111,6 @@ class ReadAhead(Generic[T]):
                 close()
             self._end()
             self._on_ready()
-
-    def _put(self, item: T) -> bool:
-        with self._changed:
-            size = self._size_of(item)
-            self._changed.wait_for(lambda: size <= self._room or not self._waiting or self._is_over)
-            if self._is_over:
-                return False
-            is_first = not self._waiting
-            self._room -= size
-            self._waiting.append(item)
-            self._changed.notify_all()
-        if is_first:
-            self._on_ready()
-        return True
 
     def _end(self) -> None:
         with self._changed:

@@ -133,6 +133,9 @@ class LookBack(Split):
     Attributes:
         saved: The datasets, complete or not.
         unsaved: Why something could not be saved, if so.
+
+    Raises:
+        TargetError: The file system cannot link files.
     """
 
     looks_back = True
@@ -158,15 +161,6 @@ class LookBack(Split):
         super().__init__(target, *spool)
         self._window_ns = min(WINDOW_NS, keep_ns // _PIECES)
         self._close_piece(self._open.pop())
-        self._check_links()
-        self._begin(0)
-
-    def _check_links(self) -> None:
-        """Refuse a file system that cannot link files.
-
-        Raises:
-            TargetError: It cannot.
-        """
         link = self.folder.piece(1)
         try:
             link.hardlink_to(self.folder.piece(0))
@@ -175,6 +169,7 @@ class LookBack(Split):
             self._remove()
             problem = f"its file system cannot link files: {error.strerror}"
             raise TargetError(self.target, problem, "Look back on another one.") from None
+        self._begin(0)
 
     # ------------------------------------------------------------ writing
 
@@ -221,14 +216,14 @@ class LookBack(Split):
             return
         self.saved.append(saved)
         self._saving.append(saved)
-        self._for(saved, saved.begin, self.folder.piece(0), [*self._kept], [*announced])
+        self._later(saved.begin, self.folder.piece(0), [*self._kept], [*announced], saved=saved)
         for piece in self._open:
             self._include(saved, piece)
 
     def _include(self, saved: Saved, piece: Piece) -> None:
         if piece.start < saved.end:
             saved.awaited.add(piece.number)
-            self._for(saved, saved.link, piece)
+            self._later(saved.link, piece, saved=saved)
 
     def _begin(self, start: int) -> Piece:
         piece = super()._begin(start)
@@ -242,14 +237,14 @@ class LookBack(Split):
         self._kept.append(piece)
         for saved in [one for one in self._saving if piece.number in one.awaited]:
             saved.awaited.remove(piece.number)
-            self._for(saved, saved.take, piece)
+            self._later(saved.take, piece, saved=saved)
             self._finish(saved)
         self._prune(max(piece.span[1], piece.start))
 
     def _finish(self, saved: Saved) -> None:
         if saved.is_over and not saved.awaited:
             self._saving.remove(saved)
-            self._for(saved, saved.finish)
+            self._later(saved.finish, saved=saved)
 
     def _prune(self, time: int) -> None:
         """Remove the pieces that are too old at a log time, ns, or from before a clock's jump."""
@@ -285,27 +280,23 @@ class LookBack(Split):
 
     # ------------------------------------------------------------ in a thread of its own
 
-    def _later(self, call: Callable[..., None], *arguments: Any) -> None:
+    def _later(
+        self, call: Callable[..., None], *arguments: Any, saved: Saved | None = None
+    ) -> None:
+        """Do something later; if it fails for a dataset, its messages stay, and all goes on."""
+
         def run() -> None:
             try:
                 if self.error is None:
                     call(*arguments)
             except FAILURES as error:
-                self.error = error
-
-        self._keeper.submit(run)
-
-    def _for(self, saved: Saved, call: Callable[..., None], *arguments: Any) -> None:
-        """Do something for a dataset later; if it fails, its messages stay, and all goes on."""
-
-        def run() -> None:
-            try:
-                call(*arguments)
-            except FAILURES as error:
+                if saved is None:
+                    self.error = error
+                    return
                 saved.error = saved.error or error
                 self._keep_unsaved(saved.start, saved.end, error)
 
-        self._later(run)
+        self._keeper.submit(run)
 
     def _keep_unsaved(self, start: int, end: int, error: Exception) -> None:
         self.unsaved = error

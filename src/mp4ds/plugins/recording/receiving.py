@@ -58,11 +58,7 @@ class Source:
     """
 
     def __init__(
-        self,
-        node: Node,
-        options: RecordOptions,
-        wanted: Wanted,
-        take: Callable[[Message], None],
+        self, node: Node, options: RecordOptions, wanted: Wanted, take: Callable[[Message], None]
     ) -> None:
         self.warnings: dict[str, None] = {}
         self.topics: dict[str, Channel | None] = {}

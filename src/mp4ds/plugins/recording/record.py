@@ -18,25 +18,17 @@ from pathlib import Path
 
 from mp4ds.bags.latched import MOST_BYTES, LatchedMessages, has_late
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, NEWEST_VERSION, RECORD, dump_bag_info
-from mp4ds.errors import OptionError, Refused, TargetError
+from mp4ds.errors import Mp4dsError, OptionError, Refused, TargetError
 from mp4ds.files.sources import UNFINISHED, is_unfinished, salvage_command
 from mp4ds.format.sidecars import load_about
 from mp4ds.messages.serializations import is_camera
 from mp4ds.packing.options import PackSummary
 from mp4ds.packing.spool import remove_dataset
 from mp4ds.plugins.recording.lookback import LookBack, at_first_free
-from mp4ds.plugins.recording.options import RecordOptions, Wanted
+from mp4ds.plugins.recording.options import RecordOptions, Trigger, Wanted
 from mp4ds.plugins.recording.receiving import MessageBuffer, Source, TopicProgress
 from mp4ds.plugins.recording.spool import Split, sync_all
-from mp4ds.plugins.recording.triggers import Trigger
-from mp4ds.plugins.ros.node import (
-    Node,
-    Service,
-    action,
-    chosen_world,
-    open_node,
-    quick_switches,
-)
+from mp4ds.plugins.ros.node import Node, Service, action, chosen_world, open_node, quick_switches
 from mp4ds.processes import ProcessExecutor
 from mp4ds.records import Channel, Loss, Message, MetadataRecord
 from mp4ds.times import INT64_MAX
@@ -187,21 +179,21 @@ def _check(options: RecordOptions) -> None:
             f"`quality` {options.quality} takes several tries per video. Record lossless or "
             "visual, then pack the dataset with this quality."
         )
-    if options.keep_last is None and (options.and_then is not None or options.trigger):
-        raise OptionError("`and_then` and `trigger` need `keep_last`.")
     for text in options.trigger:
         Trigger(text)
-    if options.keep_last is not None and (
-        options.max_duration or options.max_size or options.max_splits
-    ):
-        raise OptionError("`keep_last` contradicts `max_duration`, `max_size` and `max_splits`.")
-    if options.keep_last is not None and options.repeat_latched:
+    splits = options.max_duration or options.max_size or options.max_splits
+    if options.keep_last is None:
+        if options.and_then is not None or options.trigger:
+            raise OptionError("`and_then` and `trigger` need `keep_last`.")
+    elif splits or options.limit:
+        raise OptionError(
+            "`keep_last` contradicts `max_duration`, `max_size`, `max_splits` and `limit`."
+        )
+    elif options.repeat_latched:
         raise OptionError(
             "`keep_last` saves latched messages with each dataset: leave out `repeat_latched`."
         )
-    if options.keep_last is not None and options.limit:
-        raise OptionError("`keep_last` contradicts `limit`.")
-    if options.keep_last == 0:
+    elif options.keep_last == 0:
         raise OptionError("`keep_last` must be more than 0 seconds.")
     if options.about is not None:
         load_about(options.about)
@@ -345,7 +337,12 @@ class Recorder:
         Raises:
             Mp4dsError: As for `record`.
         """
-        self._warn_of_unfinished()
+        for folder in sorted(self._target.parent.glob(f"*{UNFINISHED}")):
+            if is_unfinished(folder):
+                self._source.warn(
+                    f"{folder}: unfinished recording; if no recorder is writing it any more, "
+                    f"recover it: {salvage_command(folder)}"
+                )
         if self._has_no_space():
             problem = f"its file system has less than {self._options.min_space} bytes free"
             raise TargetError(self._target, problem, "Make room, or choose a smaller `min_space`.")
@@ -359,7 +356,8 @@ class Recorder:
         for split in self._all_splits:
             error = split.error or (self._error if split.made is None else None)
             if error and (self._look_back is None or self._error is not None):
-                raise split.failure(error)
+                is_ours = isinstance(error, Mp4dsError) and error is not split.error
+                raise error if is_ours else split.left(error)
         if self._error is not None:
             raise self._error
         received = self._buffer.topics
@@ -395,15 +393,13 @@ class Recorder:
             while not self._is_stopped:
                 self._changed.wait(_REPORT_S)
                 self._changed.clear()
-                clock = self._source.waiting_for
-                if clock:
-                    begun = time.monotonic()
+                state = "looking back" if self._look_back else "recording"
+                if clock := self._source.waiting_for:
+                    begun, state = time.monotonic(), f"waiting for {clock}"
                 if self._options.duration and time.monotonic() - begun >= self._options.duration:
                     self._is_stopped = True
                 if self._options.limit and self._buffer.has_all({*self._source.topics, *self._due}):
                     self._is_stopped = True
-                usual = "looking back" if self._look_back else "recording"
-                state = f"waiting for {clock}" if clock else usual
                 self._report(begun, "paused" if self.is_paused else state)
         finally:
             self._source.close()
@@ -438,13 +434,14 @@ class Recorder:
         except Refused as reason:
             self._source.warn(f"--trigger {text!r} cannot trigger: {reason}")
             return lambda data: None
-        return lambda data: self._on_trigger() if is_triggered(data) else None
 
-    def _on_trigger(self) -> None:
-        """Save because of a message; those that come while what follows is saved belong to it."""
-        now = time.monotonic()
-        if now >= self._quiet_until and self.snapshot():
-            self._quiet_until = now + max(_QUIET_S, self._options.and_then or 0)
+        def on_message(data: bytes) -> None:
+            now = time.monotonic()
+            # those that come while what follows is saved belong to it
+            if is_triggered(data) and now >= self._quiet_until and self.snapshot():
+                self._quiet_until = now + max(_QUIET_S, self._options.and_then or 0)
+
+        return on_message
 
     def _new_paths(self) -> Iterator[Path]:
         """Paths for the next dataset that is saved, where nothing is."""
@@ -498,7 +495,9 @@ class Recorder:
                     self._close_split()
                     self._begin_split()
                     syncing = disk.submit(sync_all, self._written())
-                    self._repeat_latched(message.log_time)
+                    latched = chain.from_iterable(self._latched.values())
+                    for one in sorted(latched, key=lambda one: one.log_time):
+                        self._splits[-1].write(replace(one, log_time=message.log_time))
                 self._splits[-1].write(message)
                 if self._options.repeat_latched and has_late(message.channel):
                     self._keep_latched(message)
@@ -519,17 +518,13 @@ class Recorder:
         return [path for split in self._splits for path in split.written()]
 
     def _close_split(self) -> None:
-        self._splits[-1].close(self._announced(), self._newly_dropped())
-        if most := self._options.max_splits:
-            self._jobs.submit(self._remove_old, most)  # when it is made
-
-    def _newly_dropped(self) -> list[Loss]:
-        """Messages that were dropped since the last dataset."""
-        topics = dict(self._buffer.topics)
-        counts = Counter({topic: one.dropped for topic, one in topics.items()})
+        counts = Counter({topic: one.dropped for topic, one in dict(self._buffer.topics).items()})
         new, self._told_dropped = counts - self._told_dropped, counts
         name, problem = self._splits[-1].target.name, "dropped: the recorder's buffer was full"
-        return [Loss(name, None, None, problem, new[topic], (topic,)) for topic in sorted(new)]
+        losses = [Loss(name, None, None, problem, new[topic], (topic,)) for topic in sorted(new)]
+        self._splits[-1].close(self._announced(), losses)
+        if most := self._options.max_splits:
+            self._jobs.submit(self._remove_old, most)  # when it is made
 
     def _remove_old(self, most: int) -> None:
         """Remove the oldest datasets that were made but for so many."""
@@ -549,12 +544,6 @@ class Recorder:
             largest = max(known, key=lambda key: known[key].size)
             topic = next(iter(known.pop(largest))).channel.topic
             self._source.warn(f"{topic}: its latched messages are too large to be repeated")
-
-    def _repeat_latched(self, time: int) -> None:
-        """Begin a dataset with latched messages, as of its first log time."""
-        found = chain.from_iterable(self._latched.values())
-        for message in sorted(found, key=lambda one: one.log_time):
-            self._splits[-1].write(replace(message, log_time=time))
 
     def _save_snapshots(self, written: int) -> None:
         """Begin to save at the triggers that came after so many messages."""
@@ -599,15 +588,6 @@ class Recorder:
             self._counted[topic] = now, before
         lost, hz, rate = self._source.lost[topic], before.hz, before.bytes_per_s
         return replace(received, lost=lost, hz=hz, bytes_per_s=rate)
-
-    def _warn_of_unfinished(self) -> None:
-        """Warn of unfinished recordings next to this one."""
-        for folder in sorted(self._target.parent.glob(f"*{UNFINISHED}")):
-            if is_unfinished(folder):
-                self._source.warn(
-                    f"{folder}: unfinished recording; if no recorder is writing it any more, "
-                    f"recover it: {salvage_command(folder)}"
-                )
 
 
 def recorder_services(recorder: Recorder) -> Sequence[Service]:

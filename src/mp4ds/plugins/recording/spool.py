@@ -323,12 +323,6 @@ class Split:
         """What the dataset is a slice of."""
         return []
 
-    def failure(self, error: Exception) -> Exception:
-        """What to raise because of an error; what was recorded stays where it is."""
-        if isinstance(error, Mp4dsError) and error is not self.error:  # of the recorder
-            return error
-        return self.left(error)
-
     def left(self, error: Exception) -> WriteError:
         """The error, with where its messages are, and how they become a dataset."""
         path, target = (shlex.quote(path_text(path)) for path in (self.folder.path, self.target))

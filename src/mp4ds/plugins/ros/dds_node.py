@@ -92,8 +92,10 @@ def _open_participant(domain: int) -> Any:
     Raises:
         RemoteError: It cannot join the domain.
     """
+    discovery = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").strip().upper()
+    is_local = os.environ.get("ROS_LOCALHOST_ONLY", "").strip() == "1" or discovery == "LOCALHOST"
     try:
-        if not _is_local():
+        if not is_local:
             return DomainParticipant(domain)
         config = ",".join(filter(None, (_LOCAL, os.environ.get("CYCLONEDDS_URI"))))
         opened = Domain(domain, config)
@@ -105,15 +107,9 @@ def _open_participant(domain: int) -> Any:
         raise RemoteError(f"DDS domain {domain}", problem) from None
 
 
-def _is_local() -> bool:
-    discovery = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").strip().upper()
-    return discovery == "LOCALHOST" or os.environ.get("ROS_LOCALHOST_ONLY", "").strip() == "1"
-
-
 # ---------------------------------------------------------------- QoS
 
 _PATIENCE_S = 15.0  # DDS considers a subscriber that is silent for 10 s gone
-_FOREVER = 2**63 - 1
 _HASH = re.compile(rb"(?:^|;)typehash=(RIHS\d\d_[0-9a-f]{64});")
 
 
@@ -134,7 +130,7 @@ def _dds_qos(qos: Qos, user_data: str, *, is_reader: bool = False, unacknowledge
     if qos.history == "keep_last" and not is_reader:
         late = Policy.History.KeepLast(qos.depth)
         kept = Policy.History.KeepLast(max(qos.depth, unacknowledged))
-    lease = _FOREVER if qos.liveliness_lease_duration is None else qos.liveliness_lease_duration
+    lease = qos.liveliness_lease_duration or 2**63 - 1
     liveliness = {
         "automatic": Policy.Liveliness.Automatic,
         "manual_by_node": Policy.Liveliness.ManualByParticipant,
@@ -150,11 +146,8 @@ def _dds_qos(qos: Qos, user_data: str, *, is_reader: bool = False, unacknowledge
         liveliness(lease),
     ]
     if qos.is_latched:
-        unlimited = (-1, -1, -1)
-        policies += [
-            Policy.Durability.TransientLocal,
-            Policy.DurabilityService(0, late, *unlimited),
-        ]
+        service = Policy.DurabilityService(0, late, -1, -1, -1)  # without limits
+        policies += [Policy.Durability.TransientLocal, service]
     if qos.deadline is not None:
         policies.append(Policy.Deadline(qos.deadline))
     if qos.lifespan is not None:
@@ -231,7 +224,11 @@ class _DdsWriter:
         With keep_last, which players use, it does not wait. With keep_all, it waits until
         subscribers have most of the messages; the library would do that while holding the GIL.
         """
-        self._check(payload)
+        if len(payload) < 4:
+            raise ConversionError(self._name, "a message has no CDR header")
+        if not payload[1] & 1 and not self._kind.is_real:
+            problem = "a message is big-endian, and cannot be converted without its definition"
+            raise ConversionError(self._name, problem)
         if self._kind.is_empty and len(payload) == 4:
             payload += b"\0"
         is_much = self._keeps_all and self._under_way + len(payload) > _UNDER_WAY
@@ -247,13 +244,6 @@ class _DdsWriter:
             if error.code == DDSException.DDS_RETCODE_BAD_PARAMETER:
                 raise ConversionError(self._name, "a message is not of its type") from None
             raise RemoteError(self._name, f"DDS refuses a message: {error.msg}") from None
-
-    def _check(self, message: bytes) -> None:
-        if len(message) < 4:
-            raise ConversionError(self._name, "a message has no CDR header")
-        if not message[1] & 1 and not self._kind.is_real:
-            problem = "a message is big-endian, and cannot be converted without its definition"
-            raise ConversionError(self._name, problem)
 
     def wait(self, seconds: float) -> bool:
         if not self._is_reliable:

@@ -20,7 +20,7 @@ from mp4ds.plugins.ros.ros2 import (
     full_name,
     hash_of,
     is_topic,
-    metadata_hash,
+    recorded_hash,
     types_in,
 )
 from mp4ds.records import Channel, Schema
@@ -141,10 +141,9 @@ def message_type(channel: Channel) -> DdsType:
     if not _NAME.fullmatch(name):
         problem = f"{channel.type_name!r} is not a ROS 2 message type"
         raise ConversionError(channel.topic, problem, "Leave the topic out.")
-    type_hash = metadata_hash(channel)
+    type_hash = recorded_hash(channel)
     try:
         found = types_in(channel.schema)
-        type_hash = type_hash or hash_of(found, name)
         real = as_is(make_struct(found, name))
     except Refused:
         return DdsType(_opaque_type(dds_name(name)), type_hash, False, False, _FEW)

@@ -139,7 +139,16 @@ def node_arguments(
             is_own = word in rules_of or (is_own and ":=" in word)
             rest.append(word)
     for kind, value in parameters:  # last, as files have sections for node names
-        names = _with_file(names, Path(value)) if kind == "file" else _with(names, value)
+        if kind == "file":
+            for node, found in _nodes(load_map(Path(value), "nodes to parameters"), ""):
+                if node in ("**", names.of_node("")) and _SIM_TIME in found:
+                    names = replace(names, use_sim_time=_truth(found[_SIM_TIME], value))
+            continue
+        name, is_given, text = value.partition(":=")
+        if not is_given:
+            raise OptionError(f"{value!r} is not a ROS parameter; write it as name:=value.")
+        if name.rpartition(":")[2] == _SIM_TIME:
+            names = replace(names, use_sim_time=_truth(text, "--ros-args"))
     return rest, names
 
 
@@ -161,25 +170,6 @@ def _ros2(words: Iterator[str], names: NodeNames, parameters: list[tuple[str, st
             names = replace(names, log_level=value if value in LOG_LEVELS else "")
         elif _VALUED[name]:
             parameters.append((_VALUED[name], value))
-    return names
-
-
-def _with(names: NodeNames, parameter: str) -> NodeNames:
-    """Add a parameter given as ``name:=value``."""
-    name, is_given, value = parameter.partition(":=")
-    if not is_given:
-        raise OptionError(f"{parameter!r} is not a ROS parameter; write it as name:=value.")
-    if name.rpartition(":")[2] != _SIM_TIME:
-        return names
-    return replace(names, use_sim_time=_truth(value, "--ros-args"))
-
-
-def _with_file(names: NodeNames, path: Path) -> NodeNames:
-    """Add the parameters that a file has for this node."""
-    own = names.of_node("")
-    for node, parameters in _nodes(load_map(path, "nodes to parameters"), ""):
-        if node in ("**", own) and _SIM_TIME in parameters:
-            names = replace(names, use_sim_time=_truth(parameters[_SIM_TIME], str(path)))
     return names
 
 

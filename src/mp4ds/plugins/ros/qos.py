@@ -92,20 +92,15 @@ def offered_qos(channel: Channel, overrides: Mapping[str, Qos]) -> Qos:
     if channel.topic in overrides:
         return overrides[channel.topic]
     profiles = recorded_qos(channel.metadata.get(QOS_KEY, ""))
-    if len({_as_subscribers_see(profile) for profile in profiles}) != 1:
+    unseen: dict[str, Any] = {
+        "lifespan": None,
+        "avoid_ros_namespace_conventions": False,
+    }  # by subscribers
+    unseen |= {"history": "keep_last", "depth": PLAYER_DEPTH}
+    if len({replace(profile, **unseen) for profile in profiles}) != 1:
         return Qos()
     depth = latched_depth(channel) if profiles[0].is_latched else PLAYER_DEPTH
     return replace(profiles[0], history="keep_last", depth=depth)
-
-
-def _as_subscribers_see(qos: Qos) -> Qos:
-    return replace(
-        qos,
-        history="keep_last",
-        depth=PLAYER_DEPTH,
-        lifespan=None,
-        avoid_ros_namespace_conventions=False,
-    )
 
 
 def asked_qos(profiles: Sequence[Qos]) -> Qos:
@@ -150,17 +145,16 @@ def recorded_qos(text: str) -> tuple[Qos, ...]:
     Args:
         text: YAML as rosbag2 of metadata versions 2 to 9 writes it.
     """
-    return tuple(map(_recorded, native_qos(text)))
-
-
-def _recorded(profile: Mapping[str, Any]) -> Qos:
-    found: dict[str, Any] = {}
-    has_depth = profile.get("history") == "keep_last" and profile.get("depth") != 0
-    for key in _POLICIES:
-        if key in profile and (key != "depth" or has_depth):
-            with suppress(ValueError):
-                found[key] = _policy(key, profile[key])
-    return Qos(**found)
+    profiles = []
+    for profile in native_qos(text):
+        has_depth = profile.get("history") == "keep_last" and profile.get("depth") != 0
+        found: dict[str, Any] = {}
+        for key in _POLICIES:
+            if key in profile and (key != "depth" or has_depth):
+                with suppress(ValueError):
+                    found[key] = _policy(key, profile[key])
+        profiles.append(Qos(**found))
+    return tuple(profiles)
 
 
 def load_overrides(path: Path | None) -> dict[str, Qos]:
@@ -177,8 +171,21 @@ def load_overrides(path: Path | None) -> dict[str, Qos]:
     """
     if path is None:
         return {}
-    document = load_map(path, "topics to QoS profiles")
-    return {topic: _override(path, topic, value) for topic, value in document.items()}
+    overrides = {}
+    for topic, profile in load_map(path, "topics to QoS profiles").items():
+        if not isinstance(topic, str):
+            raise OptionError(f"{path}: {topic!r} is not a topic name; put it in quotes.")
+        if not isinstance(profile, dict):
+            problem = "is not a QoS profile; list policies such as depth: 1."
+            raise OptionError(f"{path}: {topic}: {problem}")
+        found: dict[str, Any] = {}
+        for key, value in profile.items():
+            try:
+                found[key] = _policy(key, value)
+            except ValueError as reason:
+                raise OptionError(f"{path}: {topic}: {key}: {reason}.") from None
+        overrides[topic] = Qos(**found)
+    return overrides
 
 
 def load_map(path: Path, of: str) -> dict[Any, Any]:
@@ -207,20 +214,6 @@ def load_map(path: Path, of: str) -> dict[Any, Any]:
     if not isinstance(document, dict):
         raise OptionError(f"{path}: does not map {of}.")
     return document
-
-
-def _override(path: Path, topic: Any, profile: Any) -> Qos:
-    if not isinstance(topic, str):
-        raise OptionError(f"{path}: {topic!r} is not a topic name; put it in quotes.")
-    if not isinstance(profile, dict):
-        raise OptionError(f"{path}: {topic}: is not a QoS profile; list policies such as depth: 1.")
-    found: dict[str, Any] = {}
-    for key, value in profile.items():
-        try:
-            found[key] = _policy(key, value)
-        except ValueError as reason:
-            raise OptionError(f"{path}: {topic}: {key}: {reason}.") from None
-    return Qos(**found)
 
 
 def _policy(key: str, value: Any) -> Any:

@@ -170,8 +170,9 @@ class RclpyNode(Ros2Node):
 
     def _announced(self, topic: str, kind: str) -> tuple[list[Qos], str, str]:
         publishers = self._node.get_publishers_info_by_topic(topic)
-        hashes = [_hash_text(getattr(one, "topic_type_hash", None)) for one in publishers]
-        type_hash = hashes[0] if hashes else ""
+        told: Any = publishers and getattr(publishers[0], "topic_type_hash", None)  # since Jazzy
+        value = bytes(getattr(told, "value", None) or b"")
+        type_hash = f"RIHS{told.version:02}_{value.hex()}" if any(value) else ""
         share = [Path(p, "share") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
         definition = installed_definition(kind, share) or standard_definition(kind, type_hash)
         return [_offered_by(one.qos_profile) for one in publishers], type_hash, definition
@@ -241,12 +242,6 @@ def _installed_hash(type_name: str) -> str:
         return str(found[0])
     except (LookupError, OSError, TypeError, ValueError):
         return ""
-
-
-def _hash_text(type_hash: Any) -> str:
-    """A type hash of rclpy (Jazzy and later) as ``RIHS01_...``; empty if there is none."""
-    value = bytes(getattr(type_hash, "value", None) or b"")
-    return f"RIHS{type_hash.version:02}_{value.hex()}" if any(value) else ""
 
 
 # ---------------------------------------------------------------- QoS

@@ -32,21 +32,11 @@ from mp4ds.bags.convert import Converter
 from mp4ds.bags.latched import is_ros1
 from mp4ds.bags.ros1 import make_channel
 from mp4ds.errors import ConversionError, OptionError, RemoteError
-from mp4ds.plugins.ros.node import (
-    CLOCK,
-    Follower,
-    Node,
-    NodeNames,
-    NodeOptions,
-    Receive,
-    Service,
-)
+from mp4ds.plugins.ros.node import CLOCK, Follower, Node, NodeNames, NodeOptions, Receive, Service
 from mp4ds.records import Channel
 
 MAX_BYTES = 128 << 20
 """Queue limit per subscriber and topic: nearly a second of a 5 MB camera at 30 Hz."""
-
-_LENGTH = struct.Struct("<I")
 
 
 class Sender:
@@ -193,7 +183,7 @@ class AdvertisedTopic:
             self._greet()
             if not self._senders and caller is None:
                 return
-            data = b"".join((_LENGTH.pack(len(payload)), payload))
+            data = b"".join((struct.pack("<I", len(payload)), payload))
             for sender in self._senders.values():
                 sender.put(data, wait_s)
             if caller is not None:
@@ -235,9 +225,6 @@ _T = TypeVar("_T")
 _ANSWER_S = 4.0
 """Seconds to wait for an answer of the master."""
 
-_BACKLOG = 1024
-_LOGGING = "version: 1\nincremental: true\n"
-
 
 def _start_node(node: str, names: NodeNames) -> str:
     """Make this process a node; returns the address of the master.
@@ -274,17 +261,12 @@ def _start_node(node: str, names: NodeNames) -> str:
                 disable_rostime=True,  # this process publishes the time, and must not wait for it
                 disable_rosout=True,  # /rosout may be a topic of the recording
             )
-            _receive_many()
+            server = init_tcpros_server().tcp_ros_server
+            if server is not None:  # beyond rospy's 5 at once, subscribers retry only after seconds
+                server.server_sock.listen(1024)
     except (rospy.ROSException, ValueError, OSError) as error:
         raise RemoteError(master, f"cannot start a node ({error})") from None
     return master
-
-
-def _receive_many() -> None:
-    """Let many subscribers connect at once: beyond rospy's 5, they retry only after seconds."""
-    server = init_tcpros_server().tcp_ros_server
-    if server is not None:
-        server.server_sock.listen(_BACKLOG)
 
 
 @contextmanager
@@ -292,7 +274,7 @@ def _own_logging() -> Iterator[None]:
     """Keep rospy from configuring the logging of the process, unless the user configured it."""
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder, "logging.yaml")
-        config.write_text(_LOGGING)
+        config.write_text("version: 1\nincremental: true\n")
         mine = {"ROS_PYTHON_LOG_CONFIG_FILE": str(config), "ROS_LOG_DIR": folder}
         mine = {key: value for key, value in mine.items() if key not in os.environ}
         os.environ.update(mine)
@@ -322,7 +304,7 @@ def _answer(call: Callable[[], _T], seconds: float) -> _T | None:
 
 def _is_name(name: str) -> bool:
     """Whether a topic name is valid."""
-    return bool(name.strip("/")) and bool(rosgraph.names.is_legal_name(name))
+    return bool(name.strip("/") and rosgraph.names.is_legal_name(name))
 
 
 def _raw_class(name: str, md5sum: str, definition: bytes) -> Any:
@@ -348,43 +330,44 @@ def _raw_class(name: str, md5sum: str, definition: bytes) -> Any:
     return type(name.rpartition("/")[2], (genpy.Message,), members)
 
 
-_SERVICES = {
-    "SetBool": (
-        "09fb03525b03e7ea1fd3992bafd87e16",
-        ("8b94c1b53db61fb6aed406028ad6332a", b"bool data\n"),
-    ),
-    "Trigger": (
-        "937c9679a518e3a18d831e57125ea522",
-        ("d41d8cd98f00b204e9800998ecf8427e", b""),
-    ),
-}
-"""Of std_srvs: checksum, and that of the request with its definition."""
+_SET_BOOL = (
+    *("SetBool", "09fb03525b03e7ea1fd3992bafd87e16"),
+    *("8b94c1b53db61fb6aed406028ad6332a", b"bool data\n"),
+)
+_TRIGGER = (
+    *("Trigger", "937c9679a518e3a18d831e57125ea522"),
+    *("d41d8cd98f00b204e9800998ecf8427e", b""),
+)
+"""Of services of std_srvs, which may not be installed: type, checksum, that of the request, and the
+definition of the request."""
 
 
-def _serve(name: str, kind: str, answer: Callable[[bytes], tuple[bool, str]]) -> None:
-    """Offer a service of std_srvs, which may not be installed.
+def _serve(name: str, kind: Sequence[Any], answer: Callable[[bytes], tuple[bool, str]]) -> None:
+    """Offer a service.
 
     Args:
         name: Of the service.
         kind: Its type.
         answer: Called with a request; returns whether it succeeded, and a message.
     """
-    response = "937c9679a518e3a18d831e57125ea522", b"bool success\nstring message\n"
-    md5sum, request = _SERVICES[kind]
-    response_class = _raw_class(f"std_srvs/{kind}Response", *response)
+    type_name, md5sum, *request = kind
+    fields = b"bool success\nstring message\n"
+    response = _raw_class(
+        f"std_srvs/{type_name}Response", "937c9679a518e3a18d831e57125ea522", fields
+    )
     members = {
-        "_type": f"std_srvs/{kind}",
+        "_type": f"std_srvs/{type_name}",
         "_md5sum": md5sum,
-        "_request_class": _raw_class(f"std_srvs/{kind}Request", *request),
-        "_response_class": response_class,
+        "_request_class": _raw_class(f"std_srvs/{type_name}Request", *request),
+        "_response_class": response,
     }
 
     def handle(request: Any) -> Any:
         is_done, said = answer(request.payload)
         text = said.encode()
-        return response_class(struct.pack("<BI", is_done, len(text)) + text)
+        return response(struct.pack("<BI", is_done, len(text)) + text)
 
-    rospy.Service(name, type(kind, (), members), handle)
+    rospy.Service(name, type(type_name, (), members), handle)
 
 
 # ---------------------------------------------------------------- publishing and receiving
@@ -395,10 +378,7 @@ _TIME = struct.Struct("<II")
 _NS = 1_000_000_000
 _CLOCK = _raw_class("rosgraph_msgs/Clock", "a9c97c1d230cfc112e270351a944ee47", b"time clock\n")
 _CLOCK_QUEUE = 10  # old times are of no use, but one of the last few may belong to a message
-_RENAME = "Leave the topic out with `exclude`, or rename it with `remap`."
 _REMEDY = "Leave the topic out with `exclude`."
-_RECEIVED_BYTES = 2**18
-"""Bytes read from a socket at a time; rospy's 64 KB take a third more CPU time."""
 
 
 class Ros1Node(Node):
@@ -491,7 +471,8 @@ class Ros1Node(Node):
     def _topic(self, name: str, kind: Any, queue_size: int) -> AdvertisedTopic:
         """The topic of that name, advertised; channels of one topic share it."""
         if not _is_name(name):
-            raise ConversionError(name, "its name is not valid in ROS 1", _RENAME)
+            remedy = "Leave the topic out with `exclude`, or rename it with `remap`."
+            raise ConversionError(name, "its name is not valid in ROS 1", remedy)
         resolved = rospy.resolve_name(name)
         topic = self._topics.get(resolved)
         if topic is None:
@@ -565,15 +546,9 @@ class Ros1Node(Node):
         self._subscribe(topic, on_message)
 
     def _subscribe(self, topic: str, on_message: Callable[[Any], None]) -> None:
-        self._subscribers.append(
-            rospy.Subscriber(
-                topic,
-                rospy.AnyMsg,
-                on_message,
-                buff_size=_RECEIVED_BYTES,
-                tcp_nodelay=True,
-            )
-        )
+        # 256 KB are read at a time; rospy's 64 take a third more CPU time
+        how = {"buff_size": 2**18, "tcp_nodelay": True}
+        self._subscribers.append(rospy.Subscriber(topic, rospy.AnyMsg, on_message, **how))
 
     def _channel(self, topic: str, header: Mapping[str, str]) -> Channel:
         key = topic, tuple(sorted(header.items()))
@@ -604,9 +579,9 @@ class Ros1Node(Node):
             return is_done, "saving" if is_done else "not recording"
 
         if "is_paused" in answers:
-            _serve("~pause_playback", "SetBool", pause)
+            _serve("~pause_playback", _SET_BOOL, pause)
         if "snapshot" in answers:
-            _serve("~snapshot", "Trigger", snapshot)
+            _serve("~snapshot", _TRIGGER, snapshot)
 
     # ------------------------------------------------------------ the end
 
@@ -623,14 +598,13 @@ class Ros1Node(Node):
         for subscriber in self._subscribers:
             subscriber.unregister()
         deadline = time.monotonic() + _FLUSH_S
-        for sender in self._senders():
-            sender.flush(deadline)
+        for topic in self._topics.values():
+            for sender in topic.senders:
+                sender.flush(deadline)
         if self.is_alive and any(topic.subscribers for topic in self._topics.values()):
             time.sleep(_FAREWELL_S)
         # The master may be gone.
         _answer(lambda: rospy.signal_shutdown("the node is closed"), _ANSWER_S)
-        for sender in self._senders():
-            sender.end()
-
-    def _senders(self) -> list[Sender]:
-        return [sender for topic in self._topics.values() for sender in topic.senders]
+        for topic in self._topics.values():
+            for sender in topic.senders:
+                sender.end()

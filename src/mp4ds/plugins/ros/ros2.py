@@ -14,29 +14,15 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from mp4ds.bags.types import (
-    by_library,
-    incomprehensible,
-    make_store,
-    ros2_types,
-    types_of,
-)
+from mp4ds.bags.types import by_library, incomprehensible, make_store, ros2_types, types_of
 from mp4ds.errors import ConversionError, OptionError, Refused
-from mp4ds.plugins.ros.node import (
-    CLOCK,
-    SERVICE_EVENTS,
-    Follower,
-    Node,
-    NodeOptions,
-    Receive,
-)
+from mp4ds.plugins.ros.node import CLOCK, SERVICE_EVENTS, Follower, Node, NodeOptions, Receive
 from mp4ds.plugins.ros.qos import CLOCK_QOS, Qos, asked_qos, offered_qos, qos_text
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 _NS = 10**9
-_LITTLE = b"\0\1\0\0"
 _PARTING_S = 3.0
 _LOOK_S = 0.05  # between two checks for publishers of a topic that is listened to
 _TOPIC = re.compile(r"/?[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*", re.ASCII)
@@ -154,7 +140,7 @@ class Ros2Node(Node):
             self._clock = self._make_writer(
                 Channel(0, self._clock_topic, "cdr", schema, {}), CLOCK_QOS
             )
-        self._clock.write(_LITTLE + struct.pack("<iI", *divmod(time_ns, _NS)))
+        self._clock.write(b"\0\1\0\0" + struct.pack("<iI", *divmod(time_ns, _NS)))
 
     def subscribers(self, channel: Channel) -> int:
         """How many subscribers a channel's topic has now."""
@@ -171,8 +157,7 @@ class Ros2Node(Node):
         if late:
             topics = ", ".join(sorted(late))
             warnings.warn(
-                f"{topics}: subscribers have not acknowledged every message in time",
-                stacklevel=2,
+                f"{topics}: subscribers have not acknowledged every message in time", stacklevel=2
             )
         self._channels.clear()
         self._shared.clear()
@@ -184,7 +169,8 @@ class Ros2Node(Node):
         """Subscribe to /clock."""
 
         def on_message(data: bytes, _: int) -> None:
-            on_time(clock_time(data))
+            sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+            on_time(int(sec) * _NS + int(nanosec))
 
         self._read(self._clock_topic, CLOCK_TYPE, CLOCK_QOS, on_message)
 
@@ -201,8 +187,9 @@ class Ros2Node(Node):
                 known.add(kind)
                 channel, qos = self._channel(topic, kind, topic)
                 qos = replace(qos, durability="volatile")  # no message of the past
+                take = follower(channel)
                 try:
-                    self._read(topic, kind, qos, partial(_take, follower(channel)))
+                    self._read(topic, kind, qos, partial(_first_of, take))
                 except (Refused, ConversionError) as error:  # perhaps because of another type
                     self._complain(f"{topic}: {error}")
 
@@ -224,7 +211,7 @@ class Ros2Node(Node):
         return Channel(len(self._received), name, "cdr", schema, metadata), asked_qos(offered)
 
 
-def _take(take: Callable[[bytes], object], data: bytes, _: int) -> None:
+def _first_of(take: Callable[[bytes], object], data: bytes, _: int) -> None:
     take(data)
 
 
@@ -243,12 +230,6 @@ def is_hidden(topic: str) -> bool:
     )
 
 
-def clock_time(payload: bytes | memoryview) -> int:
-    """The time in a message of /clock (CDR), nanoseconds."""
-    sec, nanosec = struct.unpack_from("<iI" if payload[1] & 1 else ">iI", payload, 4)
-    return int(sec) * _NS + int(nanosec)
-
-
 def finite(nanoseconds: int) -> int | None:
     """A duration of a QoS profile; None if it is infinite or unspecified."""
     return nanoseconds if 0 < nanoseconds < 2**63 - 1 else None
@@ -257,7 +238,6 @@ def finite(nanoseconds: int) -> int | None:
 # ---------------------------------------------------------------- definitions of types
 
 _ENCODING = "ros2msg"
-_SEPARATOR = "=" * 80
 _MAX_TEXT = 2**22
 _FIELD = re.compile(r"^\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w+")
 _PRIMITIVE = re.compile(r"bool|byte|char|u?int(?:8|16|32|64)|float(?:32|64)|w?string")
@@ -301,17 +281,12 @@ def hash_of(types: Mapping[str, Any], name: str) -> str:
     return by_library(incomprehensible(name), hashed, name)
 
 
-def metadata_hash(channel: Channel) -> str:
-    """The recorded hash of a channel's type; empty if there is none."""
-    recorded = channel.metadata.get(HASH_KEY, "")
-    return recorded if _HASH.fullmatch(recorded) else ""
-
-
 def recorded_hash(channel: Channel) -> str:
     """The hash of a channel's type, as recorded or of its definition; empty if it has none."""
+    recorded = channel.metadata.get(HASH_KEY, "")
+    if _HASH.fullmatch(recorded):
+        return recorded
     try:
-        if recorded := metadata_hash(channel):
-            return recorded
         return hash_of(types_in(channel.schema), full_name(channel.type_name))
     except (Refused, KeyError):
         return ""
@@ -387,7 +362,8 @@ def installed_definition(type_name: str, share: Sequence[Path]) -> str:
 def _with_parts(texts: Mapping[str, str]) -> str:
     """A definition followed by those of its parts; the first text is the type's own."""
     main, *parts = texts.items()
-    rest = (f"\n{_SEPARATOR}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in parts)
+    line = "=" * 80
+    rest = (f"\n{line}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in parts)
     return "".join((main[1], *rest))
 
 
