@@ -84,31 +84,26 @@ def realsense(folder: Path, encoding: str, count: int) -> Iterator[Pixels]:
             yield depth.copy() if encoding == "16UC1" else metres(depth)
 
 
-def tof(folder: Path, encoding: str, count: int) -> Iterator[Pixels]:
-    """Every view for as many frames as make the clip full."""
-    views = [read_pnm(path) for path in sorted(folder.glob(KINECT))]
-    for number in range(count):
-        rng = np.random.default_rng((SEED, number))
-        distance = _moved(views[number * len(views) // count], number).astype(np.float32)
-        noise = rng.standard_normal(distance.shape, np.float32) * (TOF_DEVIATION * distance)
-        depth = np.where(distance > 0, np.rint(distance + noise), 0).astype(np.uint16)
-        yield depth if encoding == "16UC1" else metres(depth)
+def tof(bits: int | None = None) -> Callable[[Path, str, int], Iterator[Pixels]]:
+    """Every view for as many frames as make the clip full; if asked, its views fill so many bits.
 
-
-def scaled(bits: int) -> Callable[[Path, str, int], Iterator[Pixels]]:
-    """`tof`, scaled before the noise so that its views fill so many bits."""
+    They are scaled before the noise.
+    """
 
     def make(folder: Path, encoding: str, count: int) -> Iterator[Pixels]:
-        top = 2**bits - 1
         views = [read_pnm(path) for path in sorted(folder.glob(KINECT))]
-        scale = np.float32(top) / np.float32(max(view.max() for view in views))
+        least, top, scale = 0, 2**16 - 1, np.float32(1)
+        if bits is not None:
+            least, top = 1, 2**bits - 1
+            scale = np.float32(top) / np.float32(max(view.max() for view in views))
         for number in range(count):
             rng = np.random.default_rng((SEED, number))
             view = _moved(views[number * len(views) // count], number)
             distance = view.astype(np.float32) * scale
             noise = rng.standard_normal(distance.shape, np.float32) * (TOF_DEVIATION * distance)
-            depth = np.clip(np.rint(distance + noise), 1, top)
-            yield np.where(distance > 0, depth, 0).astype(np.uint16)
+            depth = np.clip(np.rint(distance + noise), least, top)
+            found = np.where(distance > 0, depth, 0).astype(np.uint16)
+            yield found if encoding == "16UC1" else metres(found)
 
     return make
 
@@ -153,14 +148,14 @@ def _moved(scene: Pixels, number: int) -> Pixels:
 MAKERS: dict[tuple[str, str], Callable[[Path, str, int], Iterator[Pixels]]] = {
     ("kinect", "16UC1"): kinect,
     ("realsense", "16UC1"): realsense,
-    ("tof", "16UC1"): tof,
-    ("tof10", "16UC1"): scaled(10),
-    ("tof12", "16UC1"): scaled(12),
-    ("tof16", "16UC1"): scaled(16),
+    ("tof", "16UC1"): tof(),
+    ("tof10", "16UC1"): tof(10),
+    ("tof12", "16UC1"): tof(12),
+    ("tof16", "16UC1"): tof(16),
     ("aloe", "16UC1"): aloe,
     ("kinect", "32FC1"): kinect,
     ("realsense", "32FC1"): realsense,
-    ("tof", "32FC1"): tof,
+    ("tof", "32FC1"): tof(),
     ("aloe", "32FC1"): aloe,
     ("waves", "32FC1"): waves,
 }

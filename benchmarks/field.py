@@ -31,7 +31,6 @@ from pathlib import Path
 from statistics import geometric_mean
 from typing import Any
 
-import av
 import numpy as np
 from mcap.reader import make_reader
 from numpy.typing import NDArray
@@ -40,7 +39,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import clips
 import mp4ds
-from loader_readers import write_lerobot_video
+from loader_readers import write_video
 from measure import (
     figure_of,
     parse_size,
@@ -51,7 +50,7 @@ from measure import (
     save,
     size_of,
 )
-from recordings import HERTZ, write_mcap
+from recordings import write_mcap
 
 TRANSPORT = {"qmax": "10", "b": "8242880", "g": "15", "bf": "0"}
 """Of x264, as ffmpeg_image_transport 3 sets it unless asked."""
@@ -105,20 +104,14 @@ def roscompress(program: str) -> Make:
 def transport(source: Path, frames: Pixels, folder: Path) -> Made:
     """The same packets in an mp4."""
     target = folder / "transport.mp4"
-    with av.open(str(target), "w") as container:
-        stream: Any = container.add_stream("libx264", HERTZ, options=TRANSPORT)
-        stream.pix_fmt = "yuv420p"
-        stream.height, stream.width = frames.shape[1:3]
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
+    write_video(target, iter(frames), "libx264", TRANSPORT)
     return Made(target, target)
 
 
 def lerobot(source: Path, frames: Pixels, folder: Path) -> Made:
     """A video alone; the table beside it is small."""
     target = folder / "lerobot.mp4"
-    write_lerobot_video(target, iter(frames))
+    write_video(target, iter(frames))
     return Made(target, target)
 
 

@@ -32,7 +32,6 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -57,30 +56,8 @@ _FINE = ("packed", "read", "refused", "valid")
 # ---------------------------------------------------------------- running
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Something that may not come of any input.
-
-    Attributes:
-        kind: What was changed.
-        seed: Makes the input again.
-        what: What came of it.
-    """
-
-    kind: str
-    seed: str
-    what: str
-
-
 class _TookTooLongError(BaseException):
     pass
-
-
-def make_input(kind: Kind, seed: str, folder: Path) -> random.Random:
-    """Put a changed copy into an empty folder."""
-    rng = random.Random(seed)
-    kind.make(folder, rng)
-    return rng
 
 
 def _content(folder: Path) -> dict[str, bytes | None]:
@@ -107,7 +84,8 @@ def try_input(kind: Kind, seed: str, around: Path) -> tuple[str, str]:
     for folder in (given, out):
         folder.mkdir(parents=True)
     others = sorted(path.name for path in around.iterdir())
-    rng = make_input(kind, seed, given)
+    rng = random.Random(seed)
+    kind.make(given, rng)
     _forget_peak()
     before, peak = _content(given), _peak()
 
@@ -201,7 +179,7 @@ def run(
     seed: int,
     seconds: float,
     around: Path,
-) -> tuple[dict[str, Counter[str]], list[tuple[Finding, str]]]:
+) -> tuple[dict[str, Counter[str]], list[tuple[str, str, str]]]:
     """Check inputs of all kinds in turn.
 
     Args:
@@ -212,10 +190,10 @@ def run(
         around: An empty folder, in which nothing may be written but by us.
 
     Returns:
-        Results by kind, and the findings with their tracebacks.
+        Results by kind, and findings: seed, what came of it, and the traceback.
     """
     counts: dict[str, Counter[str]] = {name: Counter() for name in kinds}
-    findings: list[tuple[Finding, str]] = []
+    findings: list[tuple[str, str, str]] = []
     end = time.monotonic() + seconds
     names = [*kinds]
     unit = count / sum(kind.weight for kind in kinds.values())
@@ -233,7 +211,7 @@ def run(
         for one, result, text in _batch(kinds[name], seeds, around):
             counts[name][result if result in _FINE else "found"] += 1
             if result not in _FINE:
-                findings.append((Finding(name, one, result), text))
+                findings.append((one, result, text))
     return counts, findings
 
 
@@ -258,7 +236,7 @@ def main() -> None:
         if options.only:
             kind = kinds[options.only.split(":")[1]]
             if options.keep:
-                _keep(Finding("", options.only, "asked for"), "", kind, options.keep)
+                _keep(options.only, "asked for", "", kind, options.keep)
             print(*try_input(kind, options.only, folder / "around"), sep="\n")
             return
         start, wanted = time.monotonic(), {key: kinds[key] for key in options.kind or kinds}
@@ -269,9 +247,8 @@ def main() -> None:
             seconds=options.seconds,
             around=folder / "around",
         )
-        for finding, text in findings:
-            if options.keep:
-                _keep(finding, text, kinds[finding.kind], options.keep)
+        for finding in findings if options.keep else ():
+            _keep(*finding, kinds[finding[0].split(":")[1]], options.keep)
     total = sum(sum(results.values()) for results in counts.values())
     seconds = time.monotonic() - start
     for key, results in counts.items():
@@ -279,17 +256,17 @@ def main() -> None:
     print(f"all {total}, findings {len(findings)}, seed {options.seed}")
     print(f"{seconds:.0f} s, {total / seconds:.0f} inputs a second")
     print_machine()
-    for finding, _ in findings:
-        print(finding.kind, finding.seed, finding.what)
+    for one, what, _ in findings:
+        print(one, what)
     sys.exit(bool(findings))
 
 
-def _keep(finding: Finding, text: str, kind: Kind, keep: Path) -> None:
-    place = keep / hashlib.sha256(finding.seed.encode()).hexdigest()[:12]
+def _keep(seed: str, what: str, text: str, kind: Kind, keep: Path) -> None:
+    place = keep / hashlib.sha256(seed.encode()).hexdigest()[:12]
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
-    make_input(kind, finding.seed, place)
-    (place / "finding.txt").write_text(f"{finding.seed}\n{finding.what}\n{text}")
+    kind.make(place, random.Random(seed))
+    (place / "finding.txt").write_text(f"{seed}\n{what}\n{text}")
 
 
 if __name__ == "__main__":

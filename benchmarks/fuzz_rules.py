@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
-import xxhash
 import zstandard
 
 import mp4ds
 from fuzz_changes import (
     MANIFEST,
-    Good,
+    Document,
     changed_bag,
     changed_bag_records,
     changed_dataset,
@@ -29,6 +28,7 @@ from fuzz_changes import (
     changed_metadata,
     changed_sqlite,
     damaged,
+    read_dataset,
 )
 from in_parts import InlineExecutor, use
 from mp4ds import Mp4dsError
@@ -85,7 +85,10 @@ def make_kinds(folder: Path) -> dict[str, Kind]:
         place = folder / name
         place.mkdir()
         (path,) = SOURCES[name](place, _scene(len(kinds)))
-        check = partial(_check_recording, name=path.name)
+
+        def check(folder: Path, out: Path, rng: random.Random, name: str = path.name) -> str:
+            return check_recording(folder / name, out, rng)
+
         if path.is_dir():
             files = {p.name: p.read_bytes() for p in path.iterdir()}
             kinds[name] = Kind(partial(_make_rosbag2, name=path.name, files=files), check)
@@ -100,10 +103,10 @@ def make_kinds(folder: Path) -> dict[str, Kind]:
         images = Scene([m for m in images.messages if m.topic not in ("/tf", "/imu")])
         (source,) = SOURCES[name](place / "source", images)
         mp4ds.pack(source, place / "drive", PackOptions(codec="h264"))
-        good = Good.read(place / "drive")
+        files, documents = read_dataset(place / "drive")
         for part in ("manifest", "sidecar", "columns", "video", "messages"):
-            make = partial(_make_dataset, good=good, part=part)
-            kinds[f"{part}-{name}"] = Kind(make, _check_dataset, 1 if part == "video" else 2)
+            make = partial(_make_dataset, files=files, documents=documents, part=part)
+            kinds[f"{part}-{name}"] = Kind(make, check_dataset, 1 if part == "video" else 2)
     return kinds | _work_kinds(folder)
 
 
@@ -152,35 +155,29 @@ def _make_rosbag2(folder: Path, rng: random.Random, *, name: str, files: dict[st
         plain.unlink()
 
 
-def _make_dataset(folder: Path, rng: random.Random, *, good: Good, part: str) -> None:
+def _make_dataset(
+    folder: Path,
+    rng: random.Random,
+    *,
+    files: dict[str, bytes],
+    documents: dict[str, Document],
+    part: str,
+) -> None:
     place = folder / "drive"
     place.mkdir()
     if rng.random() < 0.1:
-        files = dict(good.files)
+        files = dict(files)
         chosen = {"manifest": MANIFEST, "video": ".mp4", "messages": ".mcap"}.get(
             part, "image_raw.yaml"
         )
         name = next(file for file in files if file.endswith(chosen))
         files[name] = damaged(files[name], rng)
         if name.endswith(".yaml") and rng.random() < 0.5:
-            files[name] = _signed(files[name])
+            files[name] = files[name].rpartition(b"checksum:")[0]  # so that it is not told first
     else:
-        files = changed_dataset(good, part, rng)
+        files = changed_dataset(files, documents, part, rng)
     for name, data in files.items():
         (place / name).write_bytes(data)
-
-
-def _signed(data: bytes) -> bytes:
-    body = data[: data.rfind(b"checksum:")]
-    return body + b'checksum: "xxh64:%s"\n' % xxhash.xxh64(body).hexdigest().encode()
-
-
-def _check_recording(folder: Path, out: Path, rng: random.Random, *, name: str) -> str:
-    return check_recording(folder / name, out, rng)
-
-
-def _check_dataset(folder: Path, out: Path, rng: random.Random) -> str:
-    return check_dataset(folder / "drive", out, rng)
 
 
 def _work_kinds(folder: Path) -> dict[str, Kind]:
@@ -391,11 +388,11 @@ def _unpacked(dataset: Path, kind: str, out: Path) -> list[Key]:
     return read(target)
 
 
-def check_dataset(path: Path, out: Path, rng: random.Random) -> str:
+def check_dataset(folder: Path, out: Path, rng: random.Random) -> str:
     """What has to hold of a dataset.
 
     Args:
-        path: The dataset.
+        folder: Where the dataset is.
         out: An empty folder.
         rng: Which of the costly rules are tried.
 
@@ -405,6 +402,7 @@ def check_dataset(path: Path, out: Path, rng: random.Random) -> str:
     Raises:
         BrokenRuleError: One does not hold.
     """
+    path = folder / "drive"
     with _must("validation ends"):
         deep = mp4ds.validate(path, deep=True)
         plain = mp4ds.validate(path) if rng.random() < 0.3 else []

@@ -1,13 +1,13 @@
 """What packing in parts costs and gains, is killed and resumed with, and takes of memory.
 
-    python benchmarks/jobs.py [--frames N] [--window N] [--jobs N] [--only WAY ...] [--work FOLDER]
+    python benchmarks/jobs.py [--frames N] [--window N] [--jobs N] [--work FOLDER]
 
 One recording of a Bayer camera, 1280x720 at 30 Hz, is packed by `mp4ds pack` in several ways: in
 one pass; in parts, by one process and by several; the same, ended by ``kill -9`` when half of the
-parts are there, and resumed; and by Dask with a scheduler of its own on this machine. Time on the
-clock and CPU time are those of all processes, with their start; of one that is resumed, of both
-runs. Memory is asked for every 20 ms: shared pages are counted in every process that has them, so
-the sums are above what is taken. Every way in parts has to make the same videos, byte for byte.
+parts are there, and resumed. Time on the clock and CPU time are those of all processes, with their
+start; of one that is resumed, of both runs. Memory is asked for every 20 ms: shared pages are
+counted in every process that has them, so the sums are above what is taken. Every way in parts has
+to make the same videos, byte for byte.
 """
 
 from __future__ import annotations
@@ -84,11 +84,9 @@ def digest(dataset: Path) -> str:
 def main() -> None:
     """Measure and print."""
     parser = parser_of(__doc__)
-    ways = ("pass", "one", "several", "killed")
     parser.add_argument("--frames", type=int, default=1500)
     parser.add_argument("--window", type=int, default=75, help="frames of a part")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--only", nargs="+", choices=ways, default=ways)
     parser.add_argument("--work", type=Path, help="where the recording is made")
     chosen = parser.parse_args()
     print_machine()
@@ -102,14 +100,14 @@ def main() -> None:
         half = -(-chosen.frames // chosen.window) // 2
         in_parts = ["--window", str(chosen.window), "--jobs"]
         several = [*in_parts, str(chosen.jobs)]
-        told = {
-            "pass": ("in one pass", ["--window", "10000000"], 0),
-            "one": ("in parts, 1 process", [*in_parts, "1"], 0),
-            "several": (f"in parts, {chosen.jobs} processes", several, 0),
-            "killed": ("the same, killed at half of the parts and resumed", several, half),
-        }
+        ways = [
+            ("in one pass", ["--window", "10000000"], 0),
+            ("in parts, 1 process", [*in_parts, "1"], 0),
+            (f"in parts, {chosen.jobs} processes", several, 0),
+            ("the same, killed at half of the parts and resumed", several, half),
+        ]
         header = ("packed", "clock s", "CPU s, all", "peak of all, MB", "videos")
-        print_table(header, rows(source, [told[way] for way in chosen.only]))
+        print_table(header, rows(source, ways))
 
 
 def rows(source: Path, told: list[tuple[str, list[str], int]]) -> Iterator[tuple[object, ...]]:

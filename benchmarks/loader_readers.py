@@ -6,19 +6,19 @@ of 2.6 of 255 levels in mid grey). A scene that ends begins anew, with other noi
 path. The same numbers give the same clip.
 
 All is made once, below a folder: the clip as an MCAP file, and of this file a dataset for each
-codec and GOP, LeRobot's video, PNG and JPEG files, and for each video its *reference*: of each
-frame of one pass in order a digest, and 16 x 16 of its pixels.
+codec and GOP, LeRobot's video, PNG and JPEG files, and for each video its *reference*: 16 x 16
+pixels of each frame of one pass in order.
 
 Each reader is used as its documentation shows, with its defaults, and is kept open between reads.
-All give RGB of 8 bits, but for LeRobot's, which gives floats.
+All give RGB of 8 bits.
 
 - mp4ds: `Stream.read` with ``format="rgb"``; in order, iteration.
 - pyav: seeks to the key frame before each wanted frame, unless the frames up to it can be had by
   decoding on, and decodes up to it. The presentation times are known beforehand.
-- torchcodec: `get_frames_at` with each of its seek modes; custom frame mappings are the file's own
-  index, made beforehand.
-- lerobot (emulated): a torchcodec decoder of the mode that LeRobot uses, and its conversion to
-  floats; lerobot, uint8: without the conversion, as LeRobot 0.6 reads on request.
+- torchcodec: `get_frames_at` with exact seeking, and with custom frame mappings, which are the
+  file's own index, made beforehand.
+- lerobot, uint8 (emulated): a torchcodec decoder of the mode that LeRobot 0.6 uses, which stacks
+  what it picks.
 - pil: one file per frame.
 - FrameDataset, FrameStream: those of `mp4ds.torch`, through a DataLoader without workers.
 """
@@ -34,11 +34,10 @@ from functools import cached_property, partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import av
 import numpy as np
-import xxhash
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -121,19 +120,9 @@ class Stored:
     frames: int
 
     @property
-    def codec(self) -> str:
-        """Of the video, or the kind of the stills."""
-        return self.name.partition("-")[0]
-
-    @property
-    def gop(self) -> int:
-        """Frames from one key frame to the next."""
-        return int(self.name.partition("-")[2] or (1 if self.path.is_dir() else 2))
-
-    @property
     def is_stills(self) -> bool:
         """Whether each frame is a file."""
-        return self.codec in STILLS
+        return self.name in STILLS
 
     @cached_property
     def bytes_per_frame(self) -> float:
@@ -143,11 +132,11 @@ class Stored:
 
     def still(self, number: int) -> str:
         """The file of a frame."""
-        return os.fspath(self.path / f"{number:06}{STILLS[self.codec]}")
+        return os.fspath(self.path / f"{number:06}{STILLS[self.name]}")
 
     @cached_property
     def reference(self) -> dict[str, NDArray[Any]]:
-        """What the frames are: ``digests``, ``grids``, and the video's ``pts`` and ``keys``."""
+        """What the frames are: ``grids``, and the video's ``pts`` and ``keys``."""
         with np.load(self._reference_path) as arrays:
             return dict(arrays)
 
@@ -160,14 +149,10 @@ class Stored:
         """Read all frames in order, once."""
         if self._reference_path.exists():
             return
-        digests, grids = [], []
-        for frame in self._in_order():
-            digests.append(digest(frame))
-            grids.append(grid(frame))
+        grids = [grid(frame) for frame in self._in_order()]
         pts, keys, ticks = ([], [], 1) if self.is_stills else _index(self.path)
         np.savez(
             self._reference_path,
-            digests=np.array(digests, np.uint64),
             grids=np.stack(grids),
             pts=np.array(pts, np.int64),
             keys=np.array(keys, bool),
@@ -190,11 +175,6 @@ def grid(frames: Any) -> Any:
     rows, columns = frames.shape[-3] // GRID, frames.shape[-2] // GRID
     some = frames[..., rows // 2 :: rows, columns // 2 :: columns, :]
     return some[..., :GRID, :GRID, :]
-
-
-def digest(frame: Pixels) -> int:
-    """Of all pixels of a frame."""
-    return xxhash.xxh3_64_intdigest(np.ascontiguousarray(frame).data)
 
 
 def _index(path: Path) -> tuple[list[int], list[bool], int]:
@@ -273,7 +253,7 @@ class Store:
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
             part = path.with_suffix(".part.mp4")
-            write_lerobot_video(part, moving(self.frames, self.size))
+            write_video(part, moving(self.frames, self.size))
             part.rename(path)
         return path
 
@@ -292,13 +272,18 @@ class Store:
         return path
 
 
-def write_lerobot_video(path: Path, frames: Iterable[Pixels]) -> None:
-    """A video with LeRobot's settings, and as LeRobot calls PyAV."""
+def write_video(
+    path: Path,
+    frames: Iterable[Pixels],
+    encoder: str = "libsvtav1",
+    options: dict[str, str] = LEROBOT_OPTIONS,
+) -> None:
+    """A video with settings, LeRobot's by default, made as LeRobot calls PyAV."""
     with av.open(os.fspath(path), "w") as container:
         stream: Any = None
         for frame in frames:
             if stream is None:
-                stream = container.add_stream("libsvtav1", HERTZ, options=LEROBOT_OPTIONS)
+                stream = container.add_stream(encoder, HERTZ, options=options)
                 stream.pix_fmt = "yuv420p"
                 stream.height, stream.width = frame.shape[:2]
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
@@ -310,15 +295,7 @@ def write_lerobot_video(path: Path, frames: Iterable[Pixels]) -> None:
 Size = tuple[int, int]
 """Width and height, pixels."""
 
-
-class Peer(Protocol):
-    """An opened video, or folder of stills."""
-
-    def read(self, numbers: Sequence[int]) -> Any:
-        """Frames, shape (len(numbers), H, W, 3), a numpy array or tensor."""
-
-    def in_order(self) -> Iterator[Any]:
-        """All frames, each of shape (H, W, 3)."""
+# each reads frames by number, in an array or tensor of shape (count, H, W, 3), and all in order
 
 
 class Mp4ds:
@@ -379,7 +356,7 @@ class TorchCodec:
     Args:
         stored: What to read.
         size: Width and height to make, by its Resize.
-        mode: ``exact``, ``approximate`` or ``mappings``.
+        mode: ``exact`` or ``mappings``.
     """
 
     def __init__(self, stored: Stored, size: Size | None = None, *, mode: str) -> None:
@@ -412,27 +389,18 @@ def _mappings(stored: Stored) -> str:
 
 
 class EmulatedLeRobot:
-    """What LeRobot does with torchcodec, without LeRobot.
+    """What LeRobot does with torchcodec, without LeRobot."""
 
-    Args:
-        stored: What to read.
-        floats: Whether to convert to 0 to 1.
-    """
-
-    def __init__(self, stored: Stored, _: Size | None = None, *, floats: bool) -> None:
+    def __init__(self, stored: Stored, _: Size | None = None) -> None:
         from torchcodec.decoders import VideoDecoder
 
         self._decoder: Any = VideoDecoder(str(stored.path), seek_mode="approximate")
-        self._floats = floats
 
     def read(self, numbers: Sequence[int]) -> Any:  # noqa: D102
         import torch
 
         found = self._decoder.get_frames_at(list(numbers)).data
-        frames = torch.stack(list(found))  # it stacks what it picks by time
-        if self._floats:
-            frames = (frames / 255.0).type(torch.float32)
-        return frames.permute(0, 2, 3, 1)
+        return torch.stack(list(found)).permute(0, 2, 3, 1)  # it stacks what it picks by time
 
     def in_order(self) -> Iterator[Any]:  # noqa: D102
         for number in range(len(self._decoder)):
@@ -491,7 +459,7 @@ STREAM = {"window": 120, "buffer": 240}
 """What the stream keeps together, and mixes: frames."""
 OURS = "mp4ds"
 LOADERS = ("FrameDataset", "FrameStream")
-Opener = Callable[[Stored, Size | None], Peer]
+Opener = Callable[[Stored, Size | None], Any]
 OWN_PEERS: dict[str, Opener] = {
     OURS: Mp4ds,
     **{kind: partial(Loader, kind=kind) for kind in LOADERS},
@@ -499,14 +467,10 @@ OWN_PEERS: dict[str, Opener] = {
 VIDEO_PEERS: dict[str, Opener] = {
     **OWN_PEERS,
     "pyav": PyAv,
-    **{
-        f"torchcodec {mode}": partial(TorchCodec, mode=mode)
-        for mode in ("exact", "approximate", "mappings")
-    },
+    **{f"torchcodec {mode}": partial(TorchCodec, mode=mode) for mode in ("exact", "mappings")},
 }
 LEROBOT_PEERS: dict[str, Opener] = {
-    "lerobot, uint8 (emulated)": partial(EmulatedLeRobot, floats=False),
-    "lerobot (emulated)": partial(EmulatedLeRobot, floats=True),
+    "lerobot, uint8 (emulated)": EmulatedLeRobot,
     OURS: Mp4ds,
 }
 STILL_PEERS: dict[str, Opener] = {"pil": PilStills}

@@ -1,6 +1,6 @@
 """What packing costs on top of encoding, and how much memory it takes.
 
-    python benchmarks/pack.py [--frames N] [--size WxH] [--encoding E] [--rounds N] [--memory]
+    python benchmarks/pack.py [--frames N] [--size WxH] [--rounds N] [--memory]
 
 Bare encoder: the same pictures, in memory and laid out before the measurement starts, given by
 PyAV to the same encoder with the same options and threads, and muxed into an mp4. Its figure
@@ -62,9 +62,6 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--size", type=parse_size, default=(1280, 720), help="WxH")
-    parser.add_argument("--encoding", choices=clips.CAMERA_FAMILIES, default="bayer_rggb8")
-    parser.add_argument("--noise", choices=list(clips.SENSORS), default="low")
-    parser.add_argument("--scene", default=None, help="the first that is there by default")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="threads of the encoder")
     parser.add_argument("--memory", action="store_true", help="measure memory instead")
@@ -76,11 +73,8 @@ def main() -> None:
         if options.memory:
             compare_memory(Path(folder), options.minutes)
         else:
-            specs = clips.specs(options.encoding, options.frames, options.size, (options.noise,))
-            wanted = [s for s in specs if options.scene in (None, s.scene)]
-            if not wanted:
-                raise SystemExit(f"There is no scene {options.scene}: {[s.scene for s in specs]}.")
-            compare_cpu(wanted[0], Path(folder), options.rounds, options.jobs)
+            spec, *_ = clips.specs("bayer_rggb8", options.frames, options.size, ("low",))
+            compare_cpu(spec, Path(folder), options.rounds, options.jobs)
 
 
 def compare_cpu(spec: clips.ClipSpec, folder: Path, rounds: int, jobs: int) -> None:

@@ -1,8 +1,6 @@
-"""What starting costs: importing, the command line, a short pack, and loading a long sidecar.
+"""What starting costs: importing, the command line, and loading a long sidecar.
 
     python benchmarks/startup.py [--frames N] [--rounds N]
-
-The pack is of a recording of 0.2 s, two cameras.
 
 The sidecars are those of packed recordings with their columns continued to 432,000 frames, two
 hours at 60 Hz, with jittered stamps and log times and a digest per frame. They are loaded through
@@ -15,7 +13,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -56,26 +54,16 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     options = parser.parse_args()
     print_machine()
-    with tempfile.TemporaryDirectory(prefix="mp4ds-benchmark-") as folder:
-        rows = commands({**COMMANDS, **pack_commands(Path(folder))}, options.rounds)
-        print_table(("command", "CPU ms", "more than bare python"), rows)
+    print_table(("command", "CPU ms", "more than bare python"), commands(options.rounds))
     print(f"\nLoading a sidecar of {options.frames} frames, CPU ms, median of {options.rounds}:")
     print_table(("sidecar", "MB", *STEPS), sidecars(options.frames, options.rounds))
 
 
-def pack_commands(folder: Path) -> dict[str, tuple[str, ...]]:
-    """A short pack on the command line."""
-    source, dataset = str(folder / "short.bag"), str(folder / "dataset")
-    python("-m", "mp4ds", "demo", source, "--seconds", "0.2")
-    arguments = ("pack", source, "--output", dataset, "--force")
-    return {"python -m mp4ds pack SHORT": ("-m", "mp4ds", *arguments)}
-
-
-def commands(named: Mapping[str, tuple[str, ...]], rounds: int) -> Iterator[tuple[object, ...]]:
+def commands(rounds: int) -> Iterator[tuple[object, ...]]:
     """CPU time of each command; they take turns."""
-    cpu: dict[str, list[float]] = {name: [] for name in named}
+    cpu: dict[str, list[float]] = {name: [] for name in COMMANDS}
     for number in range(rounds + 1):
-        for name, arguments in named.items():
+        for name, arguments in COMMANDS.items():
             run = python(*arguments)
             if number:  # the first one fills caches and compiles
                 cpu[name].append(1000 * run.cpu)
