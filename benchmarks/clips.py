@@ -68,13 +68,9 @@ class Sensor:
     full_well: float
     read_electrons: float
 
-    def gain(self, levels: int) -> float:
-        """Grey levels per electron, where ``levels`` is full scale."""
-        return levels / self.full_well
-
     def expose(self, signal: Signal, levels: int, rng: np.random.Generator) -> Pixels:
         """Pixels of a signal in grey levels, 0 to ``levels``."""
-        gain = self.gain(levels)
+        gain = levels / self.full_well  # levels of an electron
         variance = (self.read_electrons * gain) ** 2 + gain * signal
         noise = np.sqrt(variance) * rng.standard_normal(signal.shape, np.float32)
         dtype = np.uint8 if levels < 256 else np.uint16
@@ -92,23 +88,18 @@ AS_MADE = "own"
 """Instead of a sensor: depth_clips.py has the noise of its scenes."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Scene:
-    pattern: str  # a video, or single images, below the data folder
-    encodings: tuple[str, ...] = ()  # of single images only: what they are published as
-
-
-SCENES = {
-    "cups": _Scene("video/sam2_02_cups.mp4"),  # 1280x720, hand-held
-    "cars": _Scene("video/intel_car-detection.mp4"),  # 768x432, camera at rest
-    "people": _Scene("video/vtest.avi"),  # 768x576, camera at rest
-    "stereo": _Scene("images/image_pipeline_wide_stereo_pgm/left*.pgm", ("rgb8",)),
-    "openisp": _Scene("images/openISP_bayer_rggb12_1920x1080.raw", ("bayer_rggb16",)),
+SCENES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "cups": ("video/sam2_02_cups.mp4", ()),  # 1280x720, hand-held
+    "cars": ("video/intel_car-detection.mp4", ()),  # 768x432, camera at rest
+    "people": ("video/vtest.avi", ()),  # 768x576, camera at rest
+    "stereo": ("images/image_pipeline_wide_stereo_pgm/left*.pgm", ("rgb8",)),
+    "openisp": ("images/openISP_bayer_rggb12_1920x1080.raw", ("bayer_rggb16",)),
 }
+"""A video, or images, below the data folder; and what single images are published as."""
 MOVING = {
     **{name: SCENES[name] for name in ("cups", "cars", "people")},
-    "lane": _Scene("video/carnd_solidWhiteRight.mp4"),  # 960x540, from a car
-    "arm": _Scene("video/lerobot_aloha_insertion_human_yuv444.mp4"),  # 640x480, over a table
+    "lane": ("video/carnd_solidWhiteRight.mp4", ()),  # 960x540, from a car
+    "arm": ("video/lerobot_aloha_insertion_human_yuv444.mp4", ()),  # 640x480, over a table
 }
 """The scenes that are videos, for lossy codecs."""
 DEMO = "demo"
@@ -165,14 +156,13 @@ def specs(
     folder = data_folder()
     found = []
     if family in _CAMERA:
-        if folder is None:
-            scenes = {DEMO: _Scene("")}
-        else:
-            scenes = {n: scene for n, scene in SCENES.items() if any(folder.glob(scene.pattern))}
-        for name, scene in scenes.items():
-            if not scene.encodings:
+        scenes = {DEMO: ("", ())} if folder is None else SCENES
+        for name, (pattern, encodings) in scenes.items():
+            if folder and not any(folder.glob(pattern)):
+                continue
+            if not encodings:
                 found += [ClipSpec(name, family, noise, frames, size) for noise in noises]
-            elif family in scene.encodings:
+            elif family in encodings:
                 found.append(ClipSpec(name, family, AS_RECORDED, frames))
     for scene_name, encoding in depth_clips.MAKERS:
         needs = depth_clips.NEEDS.get(scene_name)
@@ -194,21 +184,18 @@ def make(spec: ClipSpec) -> Iterator[Pixels]:
     if spec.noise == AS_RECORDED:
         if folder is None:
             raise SystemExit(f"{spec.scene}: set MP4DS_DATA to the folder of recordings.")
-        paths = sorted(folder.glob(SCENES[spec.scene].pattern))
+        paths = sorted(folder.glob(SCENES[spec.scene][0]))
         yield from (_read_still(path) for path in paths[: spec.frames])
         return
     for number, rgb in enumerate(islice(rgb_frames(spec), spec.frames)):
-        yield _camera(spec, rgb, SENSORS[spec.noise], noise_of(spec.noise, number))
+        rng = np.random.default_rng((SEED, list(SENSORS).index(spec.noise), number))
+        camera = _GRAY16 if spec.scene == WIDE else _CAMERA[spec.encoding]
+        yield camera(rgb, SENSORS[spec.noise], rng)
 
 
 def expose(encoding: str, rgb: Signal, sensor: Sensor, rng: np.random.Generator) -> Pixels:
     """What a camera publishes of a picture of a scene, given in grey levels, 0 to 255."""
     return _CAMERA[encoding](rgb, sensor, rng)
-
-
-def noise_of(noise: str, number: int) -> np.random.Generator:
-    """Where frame ``number`` has its noise from; the same each time."""
-    return np.random.default_rng((SEED, list(SENSORS).index(noise), number))
 
 
 def load(spec: ClipSpec) -> Pixels:
@@ -245,13 +232,6 @@ _CAMERA: dict[str, Callable[[Signal, Sensor, np.random.Generator], Pixels]] = {
     "nv12": lambda *scene: nv12(demosaic_bilinear(_BAYER8(*scene))),
 }
 """Encoding -> what a camera publishes of a scene, given in grey levels of 8 bits."""
-CAMERA_FAMILIES = tuple(_CAMERA)
-
-
-def _camera(spec: ClipSpec, rgb: Signal, sensor: Sensor, rng: np.random.Generator) -> Pixels:
-    if spec.scene == WIDE:
-        return _GRAY16(rgb, sensor, rng)
-    return _CAMERA[spec.encoding](rgb, sensor, rng)
 
 
 _RGGB = ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2))  # row, column, colour
@@ -332,7 +312,7 @@ def rgb_frames(spec: ClipSpec) -> Iterator[Signal]:
         frames = _demo_frames(spec.frames)
     else:
         scene = "cups" if spec.scene == WIDE else spec.scene
-        frames = _video_frames(folder / {**SCENES, **MOVING}[scene].pattern)
+        frames = _video_frames(folder / {**SCENES, **MOVING}[scene][0])
     for frame in frames:
         yield _fit(frame, spec.size)
 
@@ -379,7 +359,7 @@ def main() -> None:
     """Record a clip."""
     parser = parser_of(__doc__)
     parser.add_argument("scene", choices=MOVING)
-    parser.add_argument("encoding", choices=CAMERA_FAMILIES)
+    parser.add_argument("encoding", choices=_CAMERA)
     parser.add_argument("bag", type=Path)
     parser.add_argument("--noise", choices=SENSORS, default="low")
     parser.add_argument("--frames", type=int, default=90)

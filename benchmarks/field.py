@@ -26,7 +26,6 @@ import subprocess
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import geometric_mean
 from typing import Any
@@ -55,20 +54,9 @@ from recordings import write_mcap
 TRANSPORT = {"qmax": "10", "b": "8242880", "g": "15", "bf": "0"}
 """Of x264, as ffmpeg_image_transport 3 sets it unless asked."""
 Pixels = NDArray[np.uint8]
-Make = Callable[[Path, Pixels, Path], "Made"]
-
-
-@dataclass(frozen=True, slots=True)
-class Made:
-    """A recording in another form.
-
-    Attributes:
-        path: A file or folder, which counts as a whole.
-        video: What its frames are read from; None where it is exact by construction.
-    """
-
-    path: Path
-    video: Path | None = None
+Made = tuple[Path, Path | None]
+"""A file or folder, which counts as a whole, and what its frames are read from, if it is lossy."""
+Make = Callable[[Path, Pixels, Path], Made]
 
 
 def rosbag2(source: Path, frames: Pixels, folder: Path) -> Made:
@@ -85,7 +73,7 @@ def rosbag2(source: Path, frames: Pixels, folder: Path) -> Made:
                     channel.topic, schema.name, typestore=store
                 )
             writer.write(connections[channel.topic], message.log_time, message.data)
-    return Made(target)
+    return target, None
 
 
 def roscompress(program: str) -> Make:
@@ -96,7 +84,7 @@ def roscompress(program: str) -> Make:
         command = [program, "roscompress", str(source), "--output", str(target)]
         subprocess.run(command, check=True, capture_output=True)
         mp4ds.pack(target, readable)  # copies its packets, so that frames can be read
-        return Made(target, readable)
+        return target, readable
 
     return make
 
@@ -105,14 +93,14 @@ def transport(source: Path, frames: Pixels, folder: Path) -> Made:
     """The same packets in an mp4."""
     target = folder / "transport.mp4"
     write_video(target, iter(frames), "libx264", TRANSPORT)
-    return Made(target, target)
+    return target, target
 
 
 def lerobot(source: Path, frames: Pixels, folder: Path) -> Made:
     """A video alone; the table beside it is small."""
     target = folder / "lerobot.mp4"
     write_video(target, iter(frames))
-    return Made(target, target)
+    return target, target
 
 
 def packed(quality: str) -> Make:
@@ -121,7 +109,7 @@ def packed(quality: str) -> Make:
     def make(source: Path, frames: Pixels, folder: Path) -> Made:
         target = folder / quality
         mp4ds.pack(source, target, mp4ds.PackOptions(quality=quality))
-        return Made(target, target)
+        return target, target
 
     return make
 
@@ -142,15 +130,15 @@ def forms(program: str | None) -> dict[str, Make]:
     }
 
 
-def error_of(made: Made, frames: Pixels) -> float:
-    """The mean squared error of its values."""
-    if made.video is None:
+def error_of(video: Path | None, frames: Pixels) -> float:
+    """The mean squared error of the values of a video; 0 without."""
+    if video is None:
         return 0.0
-    with mp4ds.open(made.video) as dataset:
+    with mp4ds.open(video) as dataset:
         (topic,) = dataset.topics
         stream = dataset[topic]
         if len(stream) != len(frames):
-            raise SystemExit(f"{made.path} has {len(stream)} frames of {len(frames)}.")
+            raise SystemExit(f"{video} has {len(stream)} frames of {len(frames)}.")
         total = 0.0
         for number, frame in enumerate(frames):
             found = stream.read([number], format="rgb")[0]
@@ -184,8 +172,8 @@ def measure(frames: Pixels, makers: dict[str, Make]) -> Iterator[tuple[str, floa
         source = folder / "clip.mcap"
         write_mcap(source, frames, "rgb8", compression="none")
         for form, make in makers.items():
-            made = make(source, frames, folder)
-            yield form, source.stat().st_size / size_of(made.path), error_of(made, frames)
+            path, video = make(source, frames, folder)
+            yield form, source.stat().st_size / size_of(path), error_of(video, frames)
 
 
 def draw(found: Mapping[str, tuple[Sequence[float], str]], path: Path) -> None:

@@ -180,14 +180,7 @@ def run(
     seconds: float,
     around: Path,
 ) -> tuple[dict[str, Counter[str]], list[tuple[str, str, str]]]:
-    """Check inputs of all kinds in turn.
-
-    Args:
-        kinds: From `make_kinds`.
-        count: Inputs in all, or a few more.
-        seed: Of the first of them.
-        seconds: After which no further batch is begun.
-        around: An empty folder, in which nothing may be written but by us.
+    """Check inputs of all kinds in turn, and begin no batch after so many seconds.
 
     Returns:
         Results by kind, and findings: seed, what came of it, and the traceback.

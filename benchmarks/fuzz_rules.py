@@ -107,7 +107,7 @@ def make_kinds(folder: Path) -> dict[str, Kind]:
         for part in ("manifest", "sidecar", "columns", "video", "messages"):
             make = partial(_make_dataset, files=files, documents=documents, part=part)
             kinds[f"{part}-{name}"] = Kind(make, check_dataset, 1 if part == "video" else 2)
-    return kinds | _work_kinds(folder)
+    return kinds | {"work": _work_kind(folder)}
 
 
 def _scene(number: int) -> Scene:
@@ -180,7 +180,7 @@ def _make_dataset(
         (place / name).write_bytes(data)
 
 
-def _work_kinds(folder: Path) -> dict[str, Kind]:
+def _work_kind(folder: Path) -> Kind:
     """What a pack in parts leaves that was ended, and how it goes on."""
     place = folder / "work"
     place.mkdir()
@@ -191,38 +191,32 @@ def _work_kinds(folder: Path) -> dict[str, Kind]:
     part = f"{work}/00000"
     if not (place / part).is_dir():
         raise RuntimeError("no part was made")
+    victims = [f"{part}/{p.name}" for p in sorted((place / part).iterdir())]
     # in its copies, the note of the plan names this very recording
-    victims = {"plan": [f"{work}/plan.json"], "part": [f"{part}/part.json"]}
-    others = [f"{part}/{p.name}" for p in sorted((place / part).iterdir())]
-    victims["part-files"] = [name for name in others if not name.endswith("part.json")]
-    check = partial(_check_work, source=source)
-    return {
-        name: Kind(partial(_make_work, good=place, victims=files), check)
-        for name, files in victims.items()
-    }
+    victims += [f"{work}/plan.json", f"{part}/part.json"] * 5
 
+    def make(folder: Path, rng: random.Random) -> None:
+        shutil.copytree(place, folder, dirs_exist_ok=True)
+        victim = folder / rng.choice(victims)
+        victim.write_bytes(damaged(victim.read_bytes(), rng))
 
-def _make_work(folder: Path, rng: random.Random, *, good: Path, victims: list[str]) -> None:
-    shutil.copytree(good, folder, dirs_exist_ok=True)
-    victim = folder / rng.choice(victims)
-    victim.write_bytes(damaged(victim.read_bytes(), rng))
+    def check(folder: Path, out: Path, rng: random.Random) -> str:
+        shutil.copytree(folder, out, dirs_exist_ok=True)
+        parts = PartsFolder(out / "drive")
+        # let it be one that was begun there
+        inode, path = parts.path.lstat().st_ino, parts.path / "plan.json"
+        path.write_bytes(re.sub(rb'"inode": \d+', b'"inode": %d' % inode, path.read_bytes()))
+        with suppress(Mp4dsError):
+            parts.note()
+        part_facts(parts.path / "00000")
+        if rng.random() < 0.25:
+            _pack(source, out / "drive", InlineExecutor())
+            if problems := mp4ds.validate(out / "drive", deep=True):
+                raise BrokenRuleError(f"what was packed has a problem: {problems[0]}")
+            return "packed"
+        return "read"
 
-
-def _check_work(folder: Path, out: Path, rng: random.Random, *, source: Path) -> str:
-    shutil.copytree(folder, out, dirs_exist_ok=True)
-    place = PartsFolder(out / "drive")
-    # let it be one that was begun there
-    inode, path = place.path.lstat().st_ino, place.path / "plan.json"
-    path.write_bytes(re.sub(rb'"inode": \d+', b'"inode": %d' % inode, path.read_bytes()))
-    with suppress(Mp4dsError):
-        place.note()
-    part_facts(place.path / "00000")
-    if rng.random() < 0.25:
-        _pack(source, out / "drive", InlineExecutor())
-        if problems := mp4ds.validate(out / "drive", deep=True):
-            raise BrokenRuleError(f"what was packed has a problem: {problems[0]}")
-        return "packed"
-    return "read"
+    return Kind(make, check, 3)
 
 
 def _pack(source: Path, target: Path, executor: InlineExecutor) -> None:
@@ -298,18 +292,10 @@ def _names(folder: Path) -> list[str]:
 
 
 def check_recording(path: Path, out: Path, rng: random.Random) -> str:
-    """What has to hold of a recording.
-
-    Args:
-        path: The recording.
-        out: An empty folder.
-        rng: Which of the costly rules are tried.
+    """What has to hold of a recording; `rng` says which of the costly rules are tried.
 
     Returns:
         ``refused``, ``read``, or ``packed``.
-
-    Raises:
-        BrokenRuleError: One does not hold.
     """
     strict, refusal = _attempt(lambda: read(path))
     saved, problem = _attempt(lambda: read(path, salvage=True))
@@ -389,18 +375,10 @@ def _unpacked(dataset: Path, kind: str, out: Path) -> list[Key]:
 
 
 def check_dataset(folder: Path, out: Path, rng: random.Random) -> str:
-    """What has to hold of a dataset.
-
-    Args:
-        folder: Where the dataset is.
-        out: An empty folder.
-        rng: Which of the costly rules are tried.
+    """What has to hold of a dataset; `rng` says which of the costly rules are tried.
 
     Returns:
         ``refused``, or ``valid`` where deep validation finds nothing.
-
-    Raises:
-        BrokenRuleError: One does not hold.
     """
     path = folder / "drive"
     with _must("validation ends"):

@@ -54,7 +54,6 @@ from loader_readers import (
     Stored,
     grid,
     peers_for,
-    versions,
 )
 from measure import (
     cpu_seconds,
@@ -90,8 +89,7 @@ def main() -> None:
     folder = Path(tempfile.gettempdir()) / "mp4ds-loader"
     parser.add_argument("--folder", type=Path, default=folder)
     options = parser.parse_args()
-    print_machine()
-    print(f"- {versions()}")
+    print_machine("torchcodec", "torch")
     print(
         f"- {options.frames} frames of {options.size[0]}x{options.size[1]}, "
         f"{options.seconds:g} s a pattern, {options.rounds} rounds",

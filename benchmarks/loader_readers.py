@@ -31,7 +31,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property, partial
-from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -92,8 +91,8 @@ def _scenes(size: tuple[int, int]) -> Iterator[NDArray[np.float32]]:
     wide = (size[0] + 2 * MARGIN, size[1] + 2 * MARGIN)
     found = [
         name
-        for name, scene in SCENES.items()
-        if folder and not scene.encodings and any(folder.glob(scene.pattern))
+        for name, (pattern, encodings) in SCENES.items()
+        if folder and not encodings and any(folder.glob(pattern))
     ]
     while True:
         for name in found or ["demo"]:
@@ -483,14 +482,3 @@ def peers_for(name: str) -> dict[str, Opener]:
     if name in ("lossless", "exact"):  # whose planes no other reader puts together
         return OWN_PEERS
     return STILL_PEERS if name in STILLS else VIDEO_PEERS
-
-
-def versions() -> str:
-    """Of the readers, and which are missing."""
-    found = {}
-    for package in ("torchcodec", "torch"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "missing"
-    return ", ".join(f"{package} {told}" for package, told in found.items())

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -102,8 +103,8 @@ def save(figure: Any, path: Path) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
-def print_machine() -> None:
-    """What the figures were measured with."""
+def print_machine(*more: str) -> None:
+    """What the figures were measured with; more packages are named if they are installed."""
     model = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -111,7 +112,8 @@ def print_machine() -> None:
     except (OSError, StopIteration):
         pass
     packages = ("mp4ds", "av", "mcap", "rosbags", "numpy", "pillow", "zstandard", "pydantic")
-    versions = ", ".join(f"{name} {version(name)}" for name in packages)
+    names = (*packages, *filter(find_spec, more))
+    versions = ", ".join(f"{name} {version(name)}" for name in names)
     print(f"- machine: {model}, {os.cpu_count()} cores, {platform.system()} {platform.release()}")
     print(f"- Python {platform.python_version()}, {versions}")
     print(f"- load before: {os.getloadavg()[0]:.2f}", flush=True)

@@ -403,7 +403,7 @@ def kills(core: Core, folder: Path, count: int) -> None:
         dataset.parent.mkdir()
         recorder = core.start(*ours(dataset))
         unfinished = dataset.with_name(f"{dataset.name}.recording")
-        until(lambda path=unfinished: _size(path) > 1_000_000)
+        until(lambda path=unfinished: size_of(path) > 1_000_000)
         time.sleep(chance.uniform(1.0, 6.0))
         killed = time.time_ns()
         recorder.kill()
@@ -434,10 +434,6 @@ def kills(core: Core, folder: Path, count: int) -> None:
     ]
     print_table(("topic", "kills", "most seconds lost", "median"), rows)
     print(f"\ntopics of which something before the last message differs: {wrong}")
-
-
-def _size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.glob("*"))
 
 
 SECTIONS = ("steady", "overload", "look-back", "long", "kills")

@@ -88,11 +88,12 @@ def main() -> None:
     options = parser.parse_args()
     print_machine()
     with tempfile.TemporaryDirectory(dir=options.work) as place:
-        report(Path(place), options.minutes * 60, options.seconds, is_remote=options.remote)
+        table = lines(Path(place), options.minutes * 60, options.seconds, is_remote=options.remote)
+        print_table(["", "of", "s", "CPU s", "read", "compared"], table)
 
 
-def report(work: Path, length: float, duration: float, *, is_remote: bool) -> None:
-    """Make the recordings, and print the table."""
+def lines(work: Path, length: float, duration: float, *, is_remote: bool) -> Iterator[list[object]]:
+    """Make the recordings, and give the lines of the table."""
     count = round(length * HERTZ)
     start = length / 2
     first = START_NS + round(start * 1e9)
@@ -111,38 +112,34 @@ def report(work: Path, length: float, duration: float, *, is_remote: bool) -> No
         ("pack", "dataset", dataset, bag, ""),
         ("unpack", "dataset", dataset, bag, "bag"),
     ]
-
-    def lines() -> Iterator[list[object]]:
-        with s3_server() as server:
-            os.environ |= {
-                "AWS_ENDPOINT_URL": server.url,
-                "AWS_ACCESS_KEY_ID": "a",
-                "AWS_SECRET_ACCESS_KEY": "b",
-                "AWS_DEFAULT_REGION": "us-east-1",
-            }
-            files = s3fs.S3FileSystem(use_listings_cache=False)
-            if not files.exists(BUCKET):
-                files.mkdir(BUCKET)
-            for number, (command, what, source, recorded, to) in enumerate(rows):
-                url = f"s3://{BUCKET}/{number}/{source.name}"
-                if is_remote:
-                    files.put(str(source), url, recursive=source.is_dir())
-                server.forget()
-                target = work / f"out{number}{'.bag' if to else ''}"
-                small = work / ("small" if source is dataset else "small.bag")
-                where = url if is_remote else str(source)
-                begin = f"{first // 10**9}.{first % 10**9:09d}"
-                told = python("-c", _PROGRAM, where, small, target, to, begin, duration).output
-                wall, cpu, read = json.loads(told)
-                if is_remote:
-                    asked = [item.span for item in server.requests if item.method == "GET"]
-                    read = sum(min(s[1] + 1, size_of(source)) - s[0] for s in asked if s)
-                    files.rm(url, recursive=True)
-                result = is_equal(recorded, target, to, work, span)
-                share = f"{read / 1e6:.1f} MB of {size_of(source) / 1e6:.0f}"
-                yield [command, what, f"{wall:.1f}", f"{cpu:.1f}", share, result]
-
-    print_table(["", "of", "s", "CPU s", "read", "compared"], lines())
+    with s3_server() as server:
+        os.environ |= {
+            "AWS_ENDPOINT_URL": server.url,
+            "AWS_ACCESS_KEY_ID": "a",
+            "AWS_SECRET_ACCESS_KEY": "b",
+            "AWS_DEFAULT_REGION": "us-east-1",
+        }
+        files = s3fs.S3FileSystem(use_listings_cache=False)
+        if not files.exists(BUCKET):
+            files.mkdir(BUCKET)
+        for number, (command, what, source, recorded, to) in enumerate(rows):
+            url = f"s3://{BUCKET}/{number}/{source.name}"
+            if is_remote:
+                files.put(str(source), url, recursive=source.is_dir())
+            server.forget()
+            target = work / f"out{number}{'.bag' if to else ''}"
+            small = work / ("small" if source is dataset else "small.bag")
+            where = url if is_remote else str(source)
+            begin = f"{first // 10**9}.{first % 10**9:09d}"
+            told = python("-c", _PROGRAM, where, small, target, to, begin, duration).output
+            wall, cpu, read = json.loads(told)
+            if is_remote:
+                asked = [item.span for item in server.requests if item.method == "GET"]
+                read = sum(min(s[1] + 1, size_of(source)) - s[0] for s in asked if s)
+                files.rm(url, recursive=True)
+            result = is_equal(recorded, target, to, work, span)
+            share = f"{read / 1e6:.1f} MB of {size_of(source) / 1e6:.0f}"
+            yield [command, what, f"{wall:.1f}", f"{cpu:.1f}", share, result]
 
 
 if __name__ == "__main__":
