@@ -108,41 +108,21 @@ def check_replaceable(target: Path, owned: Owned) -> None:
     is_folder = target.is_dir()
     if is_folder and not any(target.iterdir()):
         return
-    names = refuse_not_ours(target, owned(target))
-    if is_folder:
-        refuse_unknown_files(target, unknown_files(target, names))
-
-
-def refuse_not_ours(target: Path, names: Iterable[str] | None) -> set[str]:
-    """The names of an output's files.
-
-    Raises:
-        TargetError: There are none: it is not of that kind.
-    """
+    names = owned(target)
     if names is None:
         raise TargetError(
             target,
             "exists and was not written by mp4ds, so `force` does not replace it",
             "Choose another name, or remove it yourself.",
         )
-    return set(names)
-
-
-def refuse_unknown_files(target: Path, others: Collection[str]) -> None:
-    """Refuse to replace a folder that holds something else, too.
-
-    Raises:
-        TargetError: Names some of it.
-    """
-    if not others:
-        return
-    listed = ", ".join(sorted(others)[:_NAMED]) + (", ..." if len(others) > _NAMED else "")
-    raise TargetError(
-        target,
-        f"holds {counted(len(others), 'item')} that mp4ds did not write ({listed}), so `force` "
-        "does not replace it",
-        "Move them elsewhere, or choose another name.",
-    )
+    if is_folder and (others := unknown_files(target, set(names))):
+        listed = ", ".join(sorted(others)[:_NAMED]) + (", ..." if len(others) > _NAMED else "")
+        raise TargetError(
+            target,
+            f"holds {counted(len(others), 'item')} that mp4ds did not write ({listed}), so `force` "
+            "does not replace it",
+            "Move them elsewhere, or choose another name.",
+        )
 
 
 def unknown_files(folder: Path, names: Collection[str]) -> list[str]:
@@ -390,7 +370,14 @@ def check_target(
     sources: Sequence[Path] = (),
 ) -> None:
     """Refuse a target early, before any work is done, as `staged` refuses it."""
-    check_place(target, sources)
+    place = target.resolve()
+    for source in (path.resolve() for path in sources if not remote(path)):
+        # which would be written into, or replaced with its surroundings
+        if place == source or source in place.parents or place in source.parents:
+            problem = f"overlaps with the source {source}"
+            raise TargetError(target, problem, "Choose a location outside the source.")
+    if not target.parent.is_dir():
+        raise TargetError(target, f"{target.parent} is not a folder", "Create the folder first.")
     if not os.path.lexists(target):
         return
     if not force:
@@ -398,31 +385,10 @@ def check_target(
     check_replaceable(target, owned)
 
 
-def check_place(target: Path, sources: Sequence[Path]) -> None:
-    """Protect a source from being written into, or replaced with its surroundings.
-
-    Raises:
-        TargetError: It would be, or there is no folder to write to.
-    """
-    place = target.resolve()
-    for source in (path.resolve() for path in sources if not remote(path)):
-        if place == source or source in place.parents or place in source.parents:
-            raise TargetError(
-                target,
-                f"overlaps with the source {source}",
-                "Choose a location outside the source.",
-            )
-    if not target.parent.is_dir():
-        raise TargetError(target, f"{target.parent} is not a folder", "Create the folder first.")
-
-
 def as_write_error(error: OSError, target: Path) -> OSError:
     """The error to report for an operating system's error while writing."""
-    if isinstance(error, (WriteError, TargetError)) or error.errno is None:
-        return error
-    if error.errno in _WRITE_ERRNOS:
-        return WriteError(target, error)
-    return error
+    is_told = isinstance(error, (WriteError, TargetError)) or error.errno not in _WRITE_ERRNOS
+    return error if is_told else WriteError(target, error)
 
 
 _BLOCK = 2**20

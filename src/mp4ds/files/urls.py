@@ -260,16 +260,13 @@ class RemotePath(_Path):
 
     def rglob(self, name: str) -> Iterator[RemotePath]:  # type: ignore[override]
         """The files with a name (not a pattern) in and below it; none on a web server."""
-        return (path for path in self.files() if path.name == name)
-
-    def files(self) -> list[RemotePath]:
-        """All files in and below it; none on a web server, which does not list."""
         if self._on_web:
-            return []
+            return iter(())
         with _sentences(self):
             self._files.invalidate_cache()
             keys = self._files.find(self._key)
-        return [self / key for key in sorted(str(key).removeprefix(self._key) for key in keys)]
+        found = (self / key for key in sorted(str(key).removeprefix(self._key) for key in keys))
+        return (path for path in found if path.name == name)
 
     # ---------------------------------------------------------------- content
 
