@@ -134,12 +134,9 @@ def load(data: bytes, place: str) -> dict[str, Any]:
     if match:
         end = match.start() + 1 if match.start() or data[:1] == b"\n" else 0
         if xxhash.xxh64(memoryview(data)[:end]).hexdigest().encode() != match.group(1):
-            raise FormatError(
-                "checksum-mismatch",
-                place,
-                "does not match the checksum in its last line: it was damaged or edited; if the "
-                "edit was intended, remove that line",
-            )
+            problem = "does not match the checksum in its last line: it was damaged or edited"
+            problem += "; if the edit was intended, remove that line"
+            raise FormatError("checksum-mismatch", place, problem)
     structure, columns = _slice_columns(data, end)
     if len(structure) > MAX_STRUCTURE_BYTES:
         raise FormatError("yaml-invalid", place, "has too many values outside its columns")

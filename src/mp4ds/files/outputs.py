@@ -100,29 +100,20 @@ def check_replaceable(target: Path, owned: Owned) -> None:
         TargetError: It is something else, or holds something else.
     """
     if target.is_symlink():
-        raise TargetError(
-            target,
-            "is a symbolic link, which `force` does not replace",
-            f"Give {os.path.realpath(target)} itself, or remove the link.",
-        )
+        remedy = f"Give {os.path.realpath(target)} itself, or remove the link."
+        raise TargetError(target, "is a symbolic link, which `force` does not replace", remedy)
     is_folder = target.is_dir()
     if is_folder and not any(target.iterdir()):
         return
     names = owned(target)
     if names is None:
-        raise TargetError(
-            target,
-            "exists and was not written by mp4ds, so `force` does not replace it",
-            "Choose another name, or remove it yourself.",
-        )
+        problem = "exists and was not written by mp4ds, so `force` does not replace it"
+        raise TargetError(target, problem, "Choose another name, or remove it yourself.")
     if is_folder and (others := unknown_files(target, set(names))):
         listed = ", ".join(sorted(others)[:_NAMED]) + (", ..." if len(others) > _NAMED else "")
-        raise TargetError(
-            target,
-            f"holds {counted(len(others), 'item')} that mp4ds did not write ({listed}), so `force` "
-            "does not replace it",
-            "Move them elsewhere, or choose another name.",
-        )
+        problem = f"holds {counted(len(others), 'item')} that mp4ds did not write ({listed})"
+        problem += ", so `force` does not replace it"
+        raise TargetError(target, problem, "Move them elsewhere, or choose another name.")
 
 
 def unknown_files(folder: Path, names: Collection[str]) -> list[str]:

@@ -71,11 +71,8 @@ def refuse_unfinished(folder: Path) -> None:
         SourceError: It is one.
     """
     if is_unfinished(folder):
-        raise SourceError(
-            folder,
-            "is being recorded, or was cut off",
-            f"Make a dataset of it first: {salvage_command(folder)}",
-        )
+        remedy = f"Make a dataset of it first: {salvage_command(folder)}"
+        raise SourceError(folder, "is being recorded, or was cut off", remedy)
 
 
 def video_at(path: Path) -> str:
@@ -201,11 +198,8 @@ class SourceState:
         """
         path = location(self.path)
         if SourceState.of(path) != self:
-            raise SourceError(
-                path,
-                "has changed since packing began",
-                "Start over with `restart`, or restore the file as it was.",
-            )
+            remedy = "Start over with `restart`, or restore the file as it was."
+            raise SourceError(path, "has changed since packing began", remedy)
 
 
 def _add_listing(digest: xxhash.xxh64, files: Sequence[Path]) -> tuple[int, int]:
@@ -237,11 +231,8 @@ def unchanged(states: Sequence[SourceState]) -> Iterator[None]:
         for state, identities in zip(states, before, strict=True):
             path = location(state.path)
             if SourceState.of(path) != state or any(map(_differ, identities, _identities(path))):
-                raise SourceError(
-                    path,
-                    "changed while it was being read",
-                    "Pack it again when nothing is writing to it.",
-                )
+                remedy = "Pack it again when nothing is writing to it."
+                raise SourceError(path, "changed while it was being read", remedy)
 
     try:
         yield

@@ -238,11 +238,8 @@ class RemotePath(_Path):
             raise FileNotFoundError(2, "No such file", str(self))
         size: int | None = self._info.get("size")
         if size is None:
-            raise SourceError(
-                self,
-                "cannot be read remotely: the server does not report its size",
-                "Download it first.",
-            )
+            problem = "cannot be read remotely: the server does not report its size"
+            raise SourceError(self, problem, "Download it first.")
         return size
 
     def iterdir(self) -> Iterator[RemotePath]:  # type: ignore[override]

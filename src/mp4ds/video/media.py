@@ -200,12 +200,9 @@ class Media:
                 "codec-mismatch", self._path, f"is coded as {found}, but its sidecar says {codec}"
             )
         if coded_size is not None and (context.width, context.height) != coded_size:
-            raise VideoError(
-                "geometry-mismatch",
-                self._path,
-                f"has {context.width}x{context.height} pixels, but its sidecar says "
-                f"{coded_size[0]}x{coded_size[1]}",
-            )
+            found, told = f"{context.width}x{context.height}", "{}x{}".format(*coded_size)
+            problem = f"has {found} pixels, but its sidecar says {told}"
+            raise VideoError("geometry-mismatch", self._path, problem)
 
     def close(self) -> None:
         """Close it."""

@@ -410,12 +410,8 @@ class PictureMaker:
             raise VideoError("decode-failed", self._path, "is marked as corrupt", frame=number)
         if (frame.width, frame.height) != self.coded_size:
             width, height = self.coded_size
-            raise VideoError(
-                "geometry-mismatch",
-                self._path,
-                f"has {frame.width}x{frame.height} pixels, others have {width}x{height}",
-                frame=number,
-            )
+            problem = f"has {frame.width}x{frame.height} pixels, others have {width}x{height}"
+            raise VideoError("geometry-mismatch", self._path, problem, frame=number)
         if scale is not None:
             return (self._converter.scale(frame, scale, out),)
         is_mosaic = self._picture_format.startswith("bayer_")
