@@ -639,8 +639,8 @@ class FrameReader:
         if self._codec == "mjpeg":
             return JpegDecoder(self._maker.coded_size)
         context = open_packet_decoder(self._codec, size, entry.configuration)
-        if entry.colour:
-            entry.colour.apply(context)
+        for name, value in entry.colour.items():
+            setattr(context, name, value)
         if self._codec != "av1":
             # concealed damage would depend on which frames were decoded before
             context.options = {**context.options, "err_detect": "explode"}

@@ -97,47 +97,21 @@ def why_unreadable(path: Path) -> str:
     return "" if b"moov" in kinds else "was cut short: it has no index (moov)"
 
 
-# ---------------------------------------------------------------- track colour
-
-_UNSPECIFIED = 2
-_LIMITED, _FULL = 1, 2  # ffmpeg's AVColorRange
-_WORDS = 6  # bytes of three numbers, behind the four letters of the box's kind
-# the numbers of ITU-T H.273 that ffmpeg knows
-_PRIMARIES = frozenset((1, *range(4, 13), 22))
-_TRANSFERS = frozenset((1, *range(4, 19)))
-_MATRICES = frozenset((0, 1, *range(4, 18)))
-
-
-@dataclass(frozen=True, slots=True)
-class TrackColour:
-    """The box ``colr`` (ISO/IEC 14496-12, 12.1.5), numbers as in ITU-T H.273.
-
-    Attributes:
-        primaries: Colour primaries.
-        transfer: Transfer characteristics.
-        matrix: Matrix coefficients.
-        full_range: Whether samples use their full range; None if not stated.
-    """
-
-    primaries: int
-    transfer: int
-    matrix: int
-    full_range: bool | None
-
-    def apply(self, context: Any) -> None:
-        """Set them on PyAV's decoder context; the packets' own values take precedence."""
-        context.color_primaries = self.primaries
-        context.color_trc = self.transfer
-        context.colorspace = self.matrix
-        if self.full_range is not None:
-            context.color_range = _FULL if self.full_range else _LIMITED
-
-
 # ---------------------------------------------------------------- sample entry
 
 _ENTRY_BYTES = 78  # of a video's sample entry, between its header and the boxes in it
 _LONGEST_ENTRY = 1 << 20
 _CONFIGURATIONS = ("avcC", "hvcC", "av1C", "vpcC", "glbl")
+
+_UNSPECIFIED = 2
+_LIMITED, _FULL = 1, 2  # ffmpeg's AVColorRange
+_WORDS = 6  # bytes of three numbers, behind the four letters of the box's kind
+# what PyAV calls the numbers of the box colr, and those of ITU-T H.273 that ffmpeg knows
+_COLOURS = {
+    "color_primaries": frozenset((1, *range(4, 13), 22)),
+    "color_trc": frozenset((1, *range(4, 19))),
+    "colorspace": frozenset((0, 1, *range(4, 18))),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,26 +154,22 @@ class SampleEntry:
         return next((body for kind, body in self.boxes if kind in _CONFIGURATIONS), b"")
 
     @property
-    def colour(self) -> TrackColour | None:
-        """The colours of the track, as ffmpeg reads them; None if not stated.
+    def colour(self) -> dict[str, int]:
+        """The colours of the track (12.1.5), as attributes of PyAV's decoder; none if not stated.
 
         QuickTime's ``nclc`` has no range. Undefined values count as unspecified; profiles are
-        ignored.
+        ignored. The packets' own values take precedence.
         """
-        found = None
+        found: dict[str, int] = {}
         for kind, body in self.boxes:
-            if kind != "colr" or body[:4] not in (b"nclx", b"nclc") or len(body) < 4 + _WORDS:
-                continue
-            primaries, transfer, matrix = (
-                int.from_bytes(body[at : at + 2], "big") for at in (4, 6, 8)
-            )
-            is_stated = body[:4] == b"nclx" and len(body) > 10
-            found = TrackColour(
-                primaries if primaries in _PRIMARIES else _UNSPECIFIED,
-                transfer if transfer in _TRANSFERS else _UNSPECIFIED,
-                matrix if matrix in _MATRICES else _UNSPECIFIED,
-                bool(body[10] & 0x80) if is_stated else None,
-            )
+            if kind == "colr" and body[:4] in (b"nclx", b"nclc") and len(body) >= 4 + _WORDS:
+                numbers = struct.unpack_from(">3H", body, 4)
+                found = {
+                    name: number if number in known else _UNSPECIFIED
+                    for (name, known), number in zip(_COLOURS.items(), numbers, strict=True)
+                }
+                if body[:4] == b"nclx" and len(body) > 10:
+                    found["color_range"] = _FULL if body[10] & 0x80 else _LIMITED
         return found
 
     def differences(self, other: SampleEntry) -> str:
