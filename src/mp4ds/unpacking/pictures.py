@@ -100,30 +100,6 @@ FAMILIES = {kind.type_name.rpartition("/")[2]: kind.family for kind in KINDS.val
 FAMILIES["RawImage"] = FAMILIES["Image"]  # Foxglove's
 
 
-def packet_format(form: ImageForm, sidecar: StreamSidecar, pixel_format: str) -> str:
-    """What messages say about the coding of their packets.
-
-    Args:
-        form: Of the messages: ``compressed-video`` or ``ffmpeg``.
-        sidecar: Of the video.
-        pixel_format: Of the video as ffmpeg calls it.
-    """
-    if form.kind == "compressed-video":
-        return sidecar.video.codec
-    codec = CODECS[sidecar.video.codec].ffmpeg
-    if form.world == "ros1":
-        return _ENCODERS.get(sidecar.video.codec, codec)
-    encoding = sidecar.image.encoding
-    known = ENCODINGS[encoding]
-    if known.channels == 1 and not known.mosaic and known.rows == 1:
-        before = shown = "mono8"
-    else:
-        before = "bgr8"
-        shown = "rgb8" if encoding.startswith("rgb") else "bgr8"
-    pixel_format = pixel_format.replace("yuvj", "yuv")  # the video itself has its range
-    return ";".join((codec, pixel_format, before, shown))
-
-
 # ---------------------------------------------------------------- layers
 
 
@@ -162,53 +138,6 @@ class Given:
     is_key: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class ImageForm:
-    """The form to convert images to.
-
-    Attributes:
-        kind: One of `KINDS`.
-        world: ``ros1`` or ``ros2``: what the messages are for.
-        jpeg_quality: Of new JPEG files, 1 to 100.
-        in_place: Whether the messages are of that kind already, and stay on their channel. Files
-            then keep their format field if they hold the same.
-    """
-
-    kind: str
-    world: str
-    jpeg_quality: int
-    in_place: bool
-
-
-Make = Callable[[Pixels], Given]
-"""Makes the new form of an image from its pixels."""
-
-
-def _maker(stream: Stream, header: Header, form: ImageForm) -> Make:
-    """What gives images with a header their new form.
-
-    Raises:
-        Refused: They have no such form; says why.
-    """
-    sidecar = stream.sidecar
-    is_inverse = is_inverse_depth(sidecar, header)
-    if is_inverse and len(header.prefix) != 2 * HEADER_BYTES:
-        raise Refused("the parameters of its quantised depths are missing")
-    recorded = encoding_of(sidecar, header)
-    if form.kind == "raw":
-        prefix = bytes.fromhex(header.prefix)
-        as_metres = partial(metres_of, header=prefix) if is_inverse else None
-        return partial(raw_image, encoding=recorded, convert=as_metres)
-    try:
-        file = ImageFile(recorded, form.kind, quality=form.jpeg_quality)
-    except OptionError:
-        raise Refused(f"{form.kind.upper()} files cannot hold {recorded} images") from None
-    told = format_of(recorded, form, has_mosaic=form.kind == "png")
-    if form.in_place:
-        told = header.format or ""
-    return lambda pixels: Given(CodedFields(told), file.encode(pixels))
-
-
 def encoding_of(sidecar: StreamSidecar, header: Header) -> str:
     """ROS image encoding of the images; their format tells a mosaic or depths from plain grey."""
     own, told = ENCODINGS[sidecar.image.encoding], told_encoding(header.format)
@@ -240,27 +169,6 @@ def is_inverse_depth(sidecar: StreamSidecar, header: Header) -> bool:
     return _is_depth(sidecar, header) and is_quantised(header.format, bytes.fromhex(header.prefix))
 
 
-def format_of(encoding: str, form: ImageForm, *, has_mosaic: bool) -> str:
-    """The field ``format``: the image's encoding, then that of the file.
-
-    Args:
-        encoding: Of the image.
-        form: The form.
-        has_mosaic: Whether the file shows a raw Bayer mosaic, not its colours.
-    """
-    known = ENCODINGS[encoding]
-    if known.even != (1, 1) or known.rows != 1 or (known.mosaic and not has_mosaic):
-        encoding = "rgb8"
-    elif encoding == "8UC4" and form.kind == "jpeg":
-        encoding = "8UC3"  # alpha is dropped
-    if encoding in _COLOURS:
-        inner = "bgr16" if encoding.endswith("16") else "bgr8"
-    else:
-        is_grey = known.channels == 1 and form.kind == "jpeg"
-        inner = "mono8" if is_grey and form.world == "ros2" else ""  # ROS 1 leaves it empty
-    return f"{encoding}; {form.kind} compressed {inner}"
-
-
 def raw_image(
     pixels: Pixels, *, encoding: str, convert: Callable[[Pixels], Pixels] | None = None
 ) -> Given:
@@ -286,7 +194,11 @@ class Conversion:
 
     Args:
         stream: The stream.
-        form: The form.
+        kind: The form, one of `KINDS`.
+        world: ``ros1`` or ``ros2``: what the messages are for.
+        jpeg_quality: Of new JPEG files, 1 to 100.
+        in_place: Whether the messages are of that kind already, and stay on their channel. Files
+            then keep their format field if they hold the same.
 
     Attributes:
         frames: Gives the wanted frames, in order; packets come with those they refer to, from a key
@@ -299,18 +211,17 @@ class Conversion:
 
     frames: Callable[[Choice, bool], Frames]
 
-    def __init__(self, stream: Stream, form: ImageForm) -> None:
-        self.stream, self.form = stream, form
+    def __init__(
+        self, stream: Stream, kind: str, world: str, *, jpeg_quality: int, in_place: bool
+    ) -> None:
+        self.stream, self.kind, self.world, self.in_place = stream, kind, world, in_place
         headers = stream.sidecar.headers
-        if KINDS[form.kind].family == "video":
+        if KINDS[kind].family == "video":
             self._shown = shown_by_packets(stream)
-            shown = self._shown.sidecar
+            shown, known = self._shown.sidecar, ", ".join(_VIDEO_CODECS)
             if shown.video.codec not in _VIDEO_CODECS:
-                name = KINDS[form.kind].type_name.rpartition("/")[2]
-                known = ", ".join(_VIDEO_CODECS)
-                raise Refused(
-                    f"{name} supports the codecs {known}, but this video is {shown.video.codec}"
-                )
+                name, codec = KINDS[kind].type_name.rpartition("/")[2], shown.video.codec
+                raise Refused(f"{name} supports the codecs {known}, but this video is {codec}")
             if shown.body != "packet" and not shown.layout.is_shown:
                 raise Refused(
                     f"its video does not show the images as they look (layout {shown.layout.name})"
@@ -318,14 +229,72 @@ class Conversion:
             if self._shown.hides_frames:
                 raise Refused("the first packets of the slice depend on packets outside it")
             self.frames = self._packets
-        elif holds_files(stream, form.kind):
+        elif holds_files(stream, kind):
             encodings = [encoding_of(stream.sidecar, header) for header in headers]
-            self._formats = [format_of(one, form, has_mosaic=True) for one in encodings]
+            self._formats = [self._format(one, has_mosaic=True) for one in encodings]
             self.frames = self._files
         else:
-            self._makers = [_maker(stream, header, form) for header in headers]
+            self._makers = [self._maker(header, jpeg_quality) for header in headers]
             is_raw = stream.sidecar.body == "pixels"
             self.frames = self._from_pixels if is_raw else self._from_pictures
+
+    def _maker(self, header: Header, jpeg_quality: int) -> Callable[[Pixels], Given]:
+        """What makes the new form of images with a header from their pixels.
+
+        Raises:
+            Refused: They have no such form; says why.
+        """
+        sidecar, kind = self.stream.sidecar, self.kind
+        is_inverse = is_inverse_depth(sidecar, header)
+        if is_inverse and len(header.prefix) != 2 * HEADER_BYTES:
+            raise Refused("the parameters of its quantised depths are missing")
+        recorded = encoding_of(sidecar, header)
+        if kind == "raw":
+            prefix = bytes.fromhex(header.prefix)
+            as_metres = partial(metres_of, header=prefix) if is_inverse else None
+            return partial(raw_image, encoding=recorded, convert=as_metres)
+        try:
+            file = ImageFile(recorded, kind, quality=jpeg_quality)
+        except OptionError:
+            raise Refused(f"{kind.upper()} files cannot hold {recorded} images") from None
+        told = self._format(recorded, has_mosaic=kind == "png")
+        if self.in_place:
+            told = header.format or ""
+        return lambda pixels: Given(CodedFields(told), file.encode(pixels))
+
+    def _format(self, encoding: str, *, has_mosaic: bool) -> str:
+        """The field ``format`` of files: the image's encoding, then that of the file.
+
+        Args:
+            encoding: Of the image.
+            has_mosaic: Whether the file shows a raw Bayer mosaic, not its colours.
+        """
+        known, is_jpeg = ENCODINGS[encoding], self.kind == "jpeg"
+        if known.even != (1, 1) or known.rows != 1 or (known.mosaic and not has_mosaic):
+            encoding = "rgb8"
+        elif encoding == "8UC4" and is_jpeg:
+            encoding = "8UC3"  # alpha is dropped
+        if encoding in _COLOURS:
+            inner = "bgr16" if encoding.endswith("16") else "bgr8"
+        else:
+            is_grey = known.channels == 1 and is_jpeg
+            inner = "mono8" if is_grey and self.world == "ros2" else ""  # ROS 1 leaves it empty
+        return f"{encoding}; {self.kind} compressed {inner}"
+
+    def _packet_format(self, pixel_format: str) -> str:
+        """What messages say about the coding of their packets, whose pictures have a format."""
+        sidecar = self._shown.sidecar
+        if self.kind == "compressed-video":
+            return sidecar.video.codec
+        codec = CODECS[sidecar.video.codec].ffmpeg
+        if self.world == "ros1":
+            return _ENCODERS.get(sidecar.video.codec, codec)
+        known = ENCODINGS[sidecar.image.encoding]
+        before = shown = "mono8"
+        if known.channels != 1 or known.mosaic or known.rows != 1:
+            before, shown = "bgr8", "rgb8" if known.name.startswith("rgb") else "bgr8"
+        # the video itself has its range
+        return ";".join((codec, pixel_format.replace("yuvj", "yuv"), before, shown))
 
     def _packets(self, choice: Choice, verify: bool) -> Frames:
         """The packets of the video, self-contained from each key frame on."""
@@ -333,7 +302,7 @@ class Conversion:
         if verify:  # without a hash, digests of exact images tell of damage to what predicts them
             (shown if shown.sidecar.video.sha256 else stream).verify_pictures()
         with shown.open_packets() as packets:
-            told = packet_format(self.form, shown.sidecar, packets.pixel_format)
+            told = self._packet_format(packets.pixel_format)
             fields = CodedFields(told, *stream.image_size)
             wanted = unbroken(choice(stream.columns), packets.key_numbers, from_key=True)
             for index in stream.sound_of(wanted):
@@ -347,11 +316,11 @@ class Conversion:
 
     def _from_pixels(self, choice: Choice, verify: bool) -> Frames:
         """From raw images, checked against their digests."""
-        form, image, make = self.form, self.stream.sidecar.image, self._makers[0]
+        image, make = self.stream.sidecar.image, self._makers[0]
         size = {"width": image.width, "height": image.height, "step": image.step}
         fields = ImageFields(image.encoding, is_bigendian=image.is_bigendian, **size)
         for index, body in _bodies(self.stream, choice, verify):
-            if form.kind == "raw":
+            if self.kind == "raw":
                 yield index, Given(fields, body)
                 continue
             is_bigendian = bool(image.is_bigendian)

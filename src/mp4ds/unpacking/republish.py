@@ -23,7 +23,6 @@ from mp4ds.unpacking.pictures import (
     KINDS,
     Conversion,
     Given,
-    ImageForm,
     Kind,
     holds_files,
 )
@@ -120,7 +119,7 @@ class Republisher:
         emptied = {
             item.channel.id
             for item, conversions in planned
-            if all(one and not one.form.in_place for one in conversions) and not item.recorded_count
+            if all(one and not one.in_place for one in conversions) and not item.recorded_count
         }
         staying = [channel for channel in dataset.channels if channel.id not in emptied]
         self.channels = [channel for channel in staying if selected(channel.topic)]
@@ -183,7 +182,8 @@ class Republisher:
             world = self._world
             if is_done and stream.channel.message_encoding != ENCODINGS[world]:
                 world = "ros2" if world == "ros1" else "ros1"
-            return Conversion(stream, ImageForm(kind, world, self._jpeg_quality, in_place=is_done))
+            quality = self._jpeg_quality
+            return Conversion(stream, kind, world, jpeg_quality=quality, in_place=is_done)
         except Refused as reason:
             if is_replaced:
                 problem = f"its view has no such form: {reason}"
@@ -224,8 +224,8 @@ class Republisher:
             recorded = item.channel
             made: dict[str, Channel] = {}
             for conversion in filter(None, conversions):
-                kind = conversion.form.kind
-                if not conversion.form.in_place and kind not in made:
+                kind = conversion.kind
+                if not conversion.in_place and kind not in made:
                     wanted = republished_topic(recorded.topic, recorded.type_name, kind)
                     key = recorded.topic, kind
                     if key not in topics:
@@ -241,7 +241,7 @@ class Republisher:
                     instead_of = wanted if topic != wanted else ""
                     known = Republished(topic, made[kind].type_name, instead_of)
                     self.republished.setdefault(recorded.topic, known)
-                channel = None if conversion.form.in_place else made[kind]
+                channel = None if conversion.in_place else made[kind]
                 self.sources[conversion.stream] = partial(self._messages, conversion, channel)
 
     # ------------------------------------------------------------ messages
@@ -252,7 +252,7 @@ class Republisher:
         """The messages of a stream, each with its ordinal in the recorded channel."""
         stream = conversion.stream
         columns, headers = stream.columns, stream.sidecar.headers
-        types = self._types_of(conversion.form.world, conversion.form.kind)
+        types = self._types_of(conversion.world, conversion.kind)
         count = 0
         for index, frame in conversion.frames(choice, choice is everything):
             count += 1
