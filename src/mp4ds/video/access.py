@@ -360,7 +360,8 @@ class Chains:
         """
         last = group.pieces[group.shows[piece.sample - group.first]]
         found = CODECS[self._codec].parser.spans(packet)
-        if group.parser is None and len(found) != last.part + 1:  # by what was recorded
+        is_recorded = group.parser is None
+        if len(found) <= piece.part or (is_recorded and len(found) != last.part + 1):
             raise UnknownStructure(f"it holds {len(found)} coded frames, {last.part + 1} are due")
         header, start, end = found[piece.part]
         return packet[start if piece.needs else header : end]
