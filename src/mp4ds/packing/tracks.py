@@ -32,7 +32,7 @@ from mp4ds.video.codecs import (
     recipe_for,
 )
 from mp4ds.video.decoder import PacketPictures
-from mp4ds.video.encoder import Coding, Predictor, VideoEncoder
+from mp4ds.video.encoder import Coding, VideoEncoder, predictor
 from mp4ds.video.packets import PacketWriter, join_segments
 from mp4ds.video.pixels import PlaneSpool
 
@@ -365,7 +365,7 @@ class _DifferencesTrack(_ViewedTrack):
     ) -> None:
         super().__init__(own, partial(open_view, coded=self._follow))
         self._bits = self.view.coding.layout.used_bits
-        self._predictor = Predictor(self.view.coding, size, self.view.configuration)
+        self._predicted = predictor(self.view.coding, size, self.view.configuration)
         self._waiting: deque[tuple[Pixels, int]] = deque()
 
     def prove(self, seen: CameraMessage) -> CameraMessage:
@@ -382,7 +382,7 @@ class _DifferencesTrack(_ViewedTrack):
         self.view.encode(pixels, tick)
 
     def _follow(self, packet: bytes | None) -> None:
-        for prediction in self._predictor.images(packet):
+        for prediction in self._predicted(packet):
             pixels, tick = self._waiting.popleft()
             self._own.encode(pixels, tick, (prediction, self._bits))
 

@@ -349,37 +349,40 @@ def bytes_per_frame(sizes: Sequence[int], gop: int) -> float:
     return (sizes[0] + (gop - 1) * float(np.mean(sizes[1:] or sizes))) / gop
 
 
-class Predictor:
+def predictor(
+    coding: Coding, size: tuple[int, int], configuration: bytes
+) -> Callable[[bytes | None], Iterator[Pixels]]:
     """What a view shows of each image, decoded from the packets of its encoder.
 
     Args:
         coding: How the view is encoded.
         size: Columns and rows of the images.
         configuration: Of the encoder.
+
+    Returns:
+        Gives the images that are complete with one more packet; with None, those still due at the
+        end.
     """
+    recipe, layout = coding.recipe, coding.layout
+    picture_size = layout.picture_size(*size)
+    coded = coded_size(recipe, *picture_size)
+    maker = PictureMaker(
+        Path(),
+        coded_size=coded,
+        picture_format=layout.pixel_format,
+        picture_size=picture_size,
+        matrix=recipe.matrix,
+        full_range=recipe.full_range,
+    )
+    decoder = open_packet_decoder(recipe.codec, coded, configuration)
 
-    def __init__(self, coding: Coding, size: tuple[int, int], configuration: bytes) -> None:
-        recipe, self._layout = coding.recipe, coding.layout
-        picture_size = self._layout.picture_size(*size)
-        width, height = coded_size(recipe, *picture_size)
-        self._maker = PictureMaker(
-            Path(),
-            coded_size=(width, height),
-            picture_format=self._layout.pixel_format,
-            picture_size=picture_size,
-            matrix=recipe.matrix,
-            full_range=recipe.full_range,
-        )
-        encoding = self._layout.encoding
-        self._shape, self._type = encoding.shape(*size), encoding.dtype
-        self._decoder = open_packet_decoder(recipe.codec, (width, height), configuration)
-
-    def images(self, packet: bytes | None) -> Iterator[Pixels]:
-        """The images that are complete with one more packet; None: those still due at the end."""
-        for frame in self._decoder.decode(av.Packet(packet) if packet is not None else None):
-            pixels: Pixels = np.empty(self._shape, self._type)
-            self._layout.to_pixels(self._maker.make(frame, 0), pixels)
+    def images(packet: bytes | None) -> Iterator[Pixels]:
+        for frame in decoder.decode(av.Packet(packet) if packet is not None else None):
+            pixels: Pixels = np.empty(layout.encoding.shape(*size), layout.encoding.dtype)
+            layout.to_pixels(maker.make(frame, 0), pixels)
             yield pixels
+
+    return images
 
 
 def encode_on_trial(
@@ -445,8 +448,8 @@ def predict_on_trial(
         pictures, recipe, picture_format=layout.pixel_format, threads=threads
     )
     rows, columns = samples[0].shape[:2]
-    predictor = Predictor(coding, (columns, int(rows / layout.encoding.rows)), configuration)
-    return sizes, [pixels for packet in [*packets, None] for pixels in predictor.images(packet)]
+    predicted = predictor(coding, (columns, int(rows / layout.encoding.rows)), configuration)
+    return sizes, [pixels for packet in [*packets, None] for pixels in predicted(packet)]
 
 
 _DISTANCES = (1, 2, 3, 5)
