@@ -507,7 +507,7 @@ def open_recording(paths: Sequence[Path], options: PackOptions = _USUAL) -> BagR
     if images is None:
         reader = open_sources(paths, salvage=options.salvage, opener=open_source)
     else:
-        reader = plugin("importing.layouts:open_images")(paths[0], images)
+        reader = plugin("importing.images:open_images")(paths[0], images)
     try:
         if options.is_slice:
             take_slice(reader, options, options.selected)
