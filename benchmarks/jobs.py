@@ -77,8 +77,8 @@ def run(source: Path, target: Path, options: list[str], until: int = 0) -> tuple
 
 def digest(dataset: Path) -> str:
     """Of the videos."""
-    (video,) = dataset.glob("*.mp4")
-    return hashlib.sha256(video.read_bytes()).hexdigest()
+    videos = sorted(dataset.glob("*.mp4"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in videos)).hexdigest()
 
 
 def main() -> None:

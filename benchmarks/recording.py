@@ -374,7 +374,7 @@ def long(folder: Path, hours: float) -> None:
         robot.stop = recorder.stop
         summary = recorder.run()
     ended = time.monotonic() - begun
-    tenth = len(samples) // 10
+    tenth = len(samples) // 10 or 1
     parts = [max(one[1] + one[2] for one in part) for part in (samples[:tenth], samples[-tenth:])]
     print(f"\n- {hours:.1f} hours in {ended:.0f} s; dropped: {summary.dropped}")
     print(f"- peak MiB of the first tenth and of the last: {parts[0]:.0f}, {parts[1]:.0f}")
