@@ -14,15 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap_ros2.writer import CompressionType, Writer
+from mcap_ros2.writer import serialize_dynamic
 from numpy.typing import NDArray
 
 from mp4ds.bags.convert import Converter, ros2_channel
-from mp4ds.bags.formats import open_reader, open_writer, recording_names
+from mp4ds.bags.formats import open_writer, recording_names
 from mp4ds.bags.latched import DEFAULT_QOS, LATCHED_QOS
+from mp4ds.bags.mcap import McapWriter
+from mp4ds.bags.protocols import BagWriter
 from mp4ds.errors import OptionError
 from mp4ds.files.outputs import local_target, staged
-from mp4ds.records import Channel, Message
+from mp4ds.records import Message
 
 START_NS = 1_712_647_128_027_473_200
 WIDTH, HEIGHT = 480, 360
@@ -83,63 +85,35 @@ def demo(output: Path | str = "demo.mcap", *, seconds: float = 3.0, force: bool 
         )
     kind = _KINDS[target.suffix]
     with staged(target, force=force, owned=recording_names) as path:
-        if kind == "mcap":
-            return _record(path, seconds)
-        original = path.parent / "demo.mcap"  # goes when this temporary folder goes
-        count = _record(original, seconds)
-        _copy(original, path, kind, target.name)
-    return count
+        if kind == "mcap":  # rosbag2 does not compress, either
+            writer: BagWriter = McapWriter(path, profile="ros2", compression="none")
+        else:
+            writer = open_writer(
+                path, kind, name=target.name, profile="", library="", storage="mcap"
+            )
+        with writer:
+            return _record(writer, seconds, is_ros1=kind == "bag")
 
 
-def _declared(writer: Writer, channel: Channel) -> Any:
-    """Add a topic with its QoS and type hash, as ``ros2 bag record`` does.
-
-    Returns:
-        The schema that `write_message` takes.
-    """
-    definition = channel.schema.data.decode() if channel.schema else ""
-    schema = writer.register_msgdef(channel.type_name, definition)
-    # otherwise the first message would declare it, without metadata
-    writer._channel_ids[channel.topic] = writer._writer.register_channel(
-        channel.topic, channel.message_encoding, schema.id, dict(channel.metadata)
-    )
-    return schema
-
-
-def _record(path: Path, seconds: float) -> int:
+def _record(writer: BagWriter, seconds: float, *, is_ros1: bool) -> int:
+    converter, topics = Converter("ros1" if is_ros1 else None), {}
+    for number, (topic, (type_name, node)) in enumerate(_TOPICS.items()):
+        qos = LATCHED_QOS if topic == _LATCHED else DEFAULT_QOS
+        channel = ros2_channel(number, topic, type_name, qos)
+        definition = channel.schema.data.decode() if channel.schema else ""
+        made = converter.channel(channel)
+        if is_ros1:
+            made = replace(made, metadata={**made.metadata, "callerid": node})
+        writer.add_channel(made)
+        topics[topic] = channel, serialize_dynamic(type_name, definition)[type_name], made
     messages = sorted(_messages(seconds), key=lambda item: item[:2])
-    # rosbag2 does not compress, either
-    with path.open("wb") as file, Writer(file, compression=CompressionType.NONE) as writer:
-        schemas = {}
-        for number, (topic, (type_name, _)) in enumerate(_TOPICS.items()):
-            qos = LATCHED_QOS if topic == _LATCHED else DEFAULT_QOS
-            schemas[topic] = _declared(writer, ros2_channel(number, topic, type_name, qos))
-        for time, topic, seq, make in messages:
-            writer.write_message(topic, schemas[topic], make(), time, time, seq)
+    for time, topic, seq, make in messages:
+        channel, encode, made = topics[topic]
+        data = bytes(converter.payload(channel, encode(make())))
+        if is_ros1 and not topic.startswith("/tf"):
+            data = struct.pack("<I", seq) + data[4:]  # of the header
+        writer.write(Message(made, time, time, seq, data))
     return len(messages)
-
-
-def _copy(original: Path, path: Path, kind: str, name: str) -> None:
-    """Copy the MCAP file into a recording of another kind."""
-    converter = Converter("ros1" if kind == "bag" else None)
-    with (
-        open_reader(original) as reader,
-        open_writer(path, kind, name=name, profile="", library="", storage="mcap") as writer,
-    ):
-        channels = {}
-        for channel in reader.channels:
-            made = converter.channel(channel)
-            if kind == "bag":
-                callerid = {"callerid": _TOPICS[channel.topic][1]}
-                made = replace(made, metadata={**made.metadata, **callerid})
-            channels[channel.id] = made
-            writer.add_channel(made)
-        for record in reader.records():
-            if isinstance(record, Message):
-                data = bytes(converter.payload(record.channel, record.data))
-                if kind == "bag" and not record.channel.topic.startswith("/tf"):
-                    data = struct.pack("<I", record.sequence) + data[4:]  # of the header
-                writer.write(replace(record, channel=channels[record.channel.id], data=data))
 
 
 # ---------------------------------------------------------------- messages
