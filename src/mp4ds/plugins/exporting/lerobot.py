@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -32,7 +33,7 @@ from mp4ds.dataset.vectors import (
     video_feature,
 )
 from mp4ds.errors import OptionError
-from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, DepthCodes
+from mp4ds.messages.encodings import Pixels
 from mp4ds.plugins.exporting.job import ExportedCamera, ExportJob, ros_type
 from mp4ds.times import TIMESCALE, Integers, constant_rate, nearest
 from mp4ds.video.codecs import CODECS, recipe_for
@@ -147,7 +148,7 @@ def _shown(job: ExportJob) -> list[ExportedCamera]:
 
 
 def _is_depth(camera: ExportedCamera) -> bool:
-    return DepthCodes.suit(camera.view.encoding.name)
+    return camera.view.encoding.name in _UNITS
 
 
 # ---------------------------------------------------------------- videos
@@ -228,6 +229,118 @@ def _encode(
                 encoder.write((shown,), (written * TIMESCALE + fps // 2) // fps)
                 written += 1
         return encoder.width, encoder.height
+
+
+# ---------------------------------------------------------------- depths
+
+# codes of 12 bits on a logarithmic scale, in a lossless video; the constants and the steps in
+# single precision are LeRobot's (0.6.1), so that codes are its own
+
+DEPTH_FORMAT = "gray12le"
+"""Pixel format of the videos."""
+
+_UNITS = {"16UC1": ("mm", 1.0), "32FC1": ("m", 1000.0)}
+"""Encoding of depths -> unit of its numbers, in LeRobot's words, and millimetres in it; ``mono16``
+may also be infrared."""
+
+_MOST = 2**12 - 1
+_MM = 1000.0
+
+
+class DepthScale(NamedTuple):
+    """What depths codes stand for, as LeRobot names it; metres."""
+
+    depth_min: float = 0.01
+    depth_max: float = 10.0
+    shift: float = 3.5
+    use_log: bool = True
+
+    def table(self, *, in_metres: bool = False) -> NDArray[Any]:
+        """The depths that LeRobot gives for codes, by code.
+
+        Args:
+            in_metres: Whether as float32 in metres; else as uint16 in millimetres.
+
+        Raises:
+            ValueError: There are no such codes.
+        """
+        near, far = float(self.depth_min), float(self.depth_max)
+        shift = float(self.shift) if self.use_log else 0.0
+        ends = [math.log(x + shift) if self.use_log else x for x in (near, far)]
+        if not 0 <= near < far < math.inf:
+            raise ValueError(f"depths from {near} to {far} m")
+        scale, offset = np.float32((ends[1] - ends[0]) / _MOST), np.float32(ends[0])
+        depth = np.arange(_MOST + 1, dtype=np.float32) * scale + offset
+        depth = np.exp(depth) - np.float32(shift) if self.use_log else depth
+        depth = depth.clip(near, far).astype(np.float32)
+        return depth if in_metres else np.rint(depth * np.float32(_MM)).clip(0, 65535).astype("<u2")
+
+
+# others would do, but datasets with different ones cannot be merged
+LEROBOT_SCALE = DepthScale()
+"""That of LeRobot's own recordings."""
+
+_NEAR, _FAR, _SHIFT, _ = LEROBOT_SCALE
+_RESTORED = LEROBOT_SCALE.table().astype(np.float64)
+
+
+class DepthCodes:
+    """The codes of a camera's depths, and how far off they are.
+
+    Args:
+        encoding: Of its images.
+    """
+
+    def __init__(self, encoding: str) -> None:
+        self._unit, self._in_mm = _UNITS[encoding]
+        self._measured = self._missing = self._outside = 0
+        self._sum = self._most = 0.0
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What LeRobot's loader has to know to make depths of the codes."""
+        return {
+            "is_depth_map": True,
+            "depth_unit": self._unit,
+            **{f"video.{name}": value for name, value in LEROBOT_SCALE._asdict().items()},
+        }
+
+    def of(self, pixels: Pixels) -> NDArray[np.uint16]:
+        """The codes of an image, whose errors are counted.
+
+        Args:
+            pixels: Depths, shape (H, W).
+        """
+        depth = pixels.astype(np.float32)
+        is_there = depth > 0  # not a number is no measurement, either
+        depth[~is_there] = 0
+        shift, near, far = (np.float32(x * _MM / self._in_mm) for x in (_SHIFT, _NEAR, _FAR))
+        low, high = math.log(float(near + shift)), math.log(float(far + shift))
+        scaled = (np.log(depth + shift) - low) / (high - low)
+        codes: NDArray[np.uint16] = np.rint(scaled * _MOST).clip(0, _MOST).astype(np.uint16)
+        is_within = (depth >= near) & (depth <= far)
+        off = np.abs(_RESTORED[codes[is_within]] - depth[is_within].astype(float) * self._in_mm)
+        self._measured += off.size
+        self._missing += int((~is_there).sum())
+        self._outside += int(is_there.sum()) - off.size
+        self._sum += float(off.sum())
+        self._most = max(self._most, float(off.max(initial=0)))
+        return codes
+
+    def __str__(self) -> str:
+        total = max(1, self._measured + self._missing + self._outside) / 100
+        text = (
+            "its depths are LeRobot's codes of 12 bits, which it gives back "
+            f"{self._sum / max(1, self._measured):.2f} mm off on average, "
+            f"at most {self._most:.1f} mm"
+        )
+        if self._missing:
+            share = self._missing / total
+            text += f"; {share:.1f} % of the pixels have no measurement and become 10 mm"
+        if self._outside:
+            share = self._outside / total
+            text += f"; {share:.1f} % are not from 10 mm to 10 m and become the nearer of these"
+        return text
 
 
 # ---------------------------------------------------------------- vectors

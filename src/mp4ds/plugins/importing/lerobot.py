@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mp4ds.dataset.vectors import COLUMNS
 from mp4ds.errors import OptionError, SourceError
 from mp4ds.packing.options import ImportOptions
-from mp4ds.plugins.exporting.depth import DEPTH_FORMAT, LEROBOT_SCALE, DepthScale
+from mp4ds.plugins.exporting.lerobot import DEPTH_FORMAT, LEROBOT_SCALE, DepthScale
 from mp4ds.plugins.importing.images import MAX_STAMP
 from mp4ds.plugins.importing.reader import ImagesReader
 from mp4ds.times import nearest
