@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 import fake_rclpy
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.ros.node import Node, open_node
-from mp4ds.plugins.ros.qos import Qos
+from mp4ds.plugins.ros.ros2 import Qos
 from mp4ds.records import Channel, Schema
 from roscore import Process
 from waiting import WATCHDOG_S, until
@@ -168,9 +168,9 @@ class Side:
     def open(
         self, name: str = "rosbag2_player", overrides: Mapping[str, Qos] = {}, **options: Any
     ) -> Node:
-        chosen = PlayOptions(**options)
-        vars(chosen)["overrides"] = overrides  # as read from a file
-        return open_node("ros2", chosen, name)
+        node = open_node("ros2", PlayOptions(**options), name)
+        vars(node)["_overrides"] = overrides  # as read from a file
+        return node
 
     @contextmanager
     def stopped(self, publisher: Any, recorded: Channel) -> Iterator[None]:

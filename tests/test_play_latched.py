@@ -8,7 +8,7 @@ import pytest
 
 import mp4ds
 from mp4ds.bags.latched import LATCHED_QOS, LatchedMessages, latched_depth
-from mp4ds.plugins.ros.qos import offered_qos
+from mp4ds.plugins.ros.ros2 import offered_qos
 from mp4ds.records import Channel, Message
 from player_scenes import (
     STATIC,

@@ -18,7 +18,7 @@ from mp4ds.bags.convert import Converter
 from mp4ds.errors import ConversionError, OptionError, RemoteError
 from mp4ds.plugins.ros.dds_types import dds_name, dds_topic, message_type
 from mp4ds.plugins.ros.node import NodeOptions, open_node
-from mp4ds.plugins.ros.qos import Qos
+from mp4ds.plugins.ros.ros2 import Qos
 from mp4ds.records import Channel, Schema
 from ros2_sides import KINDS, STORE, Side, channel, connect, dds_side, message, padded
 from waiting import WATCHDOG_S, until

@@ -18,7 +18,7 @@ from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.errors import ConversionError, OptionError, Refused, RemoteError
 from mp4ds.plugins.playing.player import player_services
 from mp4ds.plugins.ros.node import NodeNames
-from mp4ds.plugins.ros.qos import Qos, load_overrides, offered_qos, qos_text, recorded_qos
+from mp4ds.plugins.ros.ros2 import Qos, load_overrides, offered_qos, qos_text, recorded_qos
 from mp4ds.records import Channel, Schema
 from player_scenes import STATIC, static_channel, static_transform
 from ros2_sides import KINDS, STORE, Controls, Side, channel, connect, message, padded

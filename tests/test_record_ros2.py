@@ -23,8 +23,14 @@ from mp4ds.plugins.recording.options import RecordOptions, Wanted
 from mp4ds.plugins.recording.receiving import Source
 from mp4ds.plugins.recording.record import RecordProgress, open_recorder, recorder_services
 from mp4ds.plugins.ros.node import Node, NodeNames, open_node
-from mp4ds.plugins.ros.qos import Qos, asked_qos, recorded_qos
-from mp4ds.plugins.ros.ros2 import installed_definition, is_hidden, standard_definition
+from mp4ds.plugins.ros.ros2 import (
+    Qos,
+    asked_qos,
+    installed_definition,
+    is_hidden,
+    recorded_qos,
+    standard_definition,
+)
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Message, Schema
 from ros2_sides import SIDES, STORE, Controls, Side, channel, message, padded
 from ros2_sides import side as side

@@ -51,8 +51,8 @@ from mp4ds.plugins.ros.dds_types import (
     service_types,
 )
 from mp4ds.plugins.ros.node import NodeOptions, Service
-from mp4ds.plugins.ros.qos import Qos
 from mp4ds.plugins.ros.ros2 import (
+    Qos,
     Ros2Node,
     described_definition,
     finite,

@@ -12,18 +12,19 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args
 
+import yaml
+
 from mp4ds.errors import OptionError, RemoteError
 from mp4ds.options import WHERE, Options, argument, option
-from mp4ds.plugins.ros.qos import Qos, load_map, load_overrides
 from mp4ds.records import Channel
 
 World = Literal["ros1", "ros2"]
+_Loader: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 CLOCK = "/clock"
 _Node = TypeVar("_Node", bound="Node")
 
@@ -54,6 +55,7 @@ _VALUED = {
 """ROS 2 arguments that take a value -> what it is; empty for those that are ignored."""
 
 _SIM_TIME = "use_sim_time"
+_MOST_BYTES = 2**20  # of a file
 _FLAG = re.compile(r"--(?:enable|disable)-[\w-]+-logs")
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
@@ -173,6 +175,34 @@ def _ros2(words: Iterator[str], names: NodeNames, parameters: list[tuple[str, st
     return names
 
 
+def load_map(path: Path, of: str) -> dict[Any, Any]:
+    """Read a small YAML file of the user's.
+
+    Args:
+        path: The file; an empty one is an empty map.
+        of: What it maps, for errors.
+
+    Raises:
+        OptionError: It cannot be read, or is not a map.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read: {error.strerror}.") from None
+    if len(data) > _MOST_BYTES:
+        raise OptionError(f"{path}: is larger than {_MOST_BYTES} bytes, too large to map {of}.")
+    try:
+        document = yaml.load(data.decode(), Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise OptionError(f"{path}: is not valid YAML: {reason}.") from None
+    if document is None:
+        return {}
+    if not isinstance(document, dict):
+        raise OptionError(f"{path}: does not map {of}.")
+    return document
+
+
 def _nodes(found: Mapping[Any, Any], place: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:
     for key, value in found.items():
         if isinstance(value, dict) and key == "ros__parameters":
@@ -227,15 +257,6 @@ class NodeOptions(Options):
     # for those without the option
     queue = 0
     unpublished = False
-
-    @cached_property
-    def overrides(self) -> Mapping[str, Qos]:
-        """QoS profiles to use instead of the usual ones, by topic.
-
-        Raises:
-            OptionError: Their file cannot be read or is not valid.
-        """
-        return load_overrides(self.qos_overrides)
 
     @property
     def parting_s(self) -> float | None:

@@ -29,8 +29,9 @@ from rosidl_runtime_py.utilities import get_message, get_service
 
 from mp4ds.errors import ConversionError, Refused, RemoteError
 from mp4ds.plugins.ros.node import NodeOptions, Service
-from mp4ds.plugins.ros.qos import DURATIONS, Qos
 from mp4ds.plugins.ros.ros2 import (
+    DURATIONS,
+    Qos,
     Ros2Node,
     finite,
     installed_definition,
