@@ -465,9 +465,9 @@ class FrameDataset(Dataset):
             return default_collate(samples)
         return {key: _whole([sample[key] for sample in samples]) for key in samples[0]}
 
-    def number(self, recording: int, row: int) -> int:
-        """Number of a sample by the numbers of its dataset and of its row there."""
-        return int(self._starts[recording]) + row
+    def first_number(self, recording: int) -> int:
+        """Number of the first sample of a dataset, by its number."""
+        return int(self._starts[recording])
 
     def key_frames(self, recording: int) -> NDArray[np.int64]:
         """Numbers of the key frames of a dataset's first camera, in order.

@@ -115,7 +115,7 @@ class FrameStream(IterableDataset):
                 f"cache_files is {cache_files}, but must be at least {len(self.topics)}: one per "
                 "camera."
             )
-        self._window = window
+        self._length = window
         self._shuffle = shuffle
         self._seed = seed
         self._buffer = buffer
@@ -182,7 +182,7 @@ class FrameStream(IterableDataset):
         share, shares = self._share()
         return {
             "samples": self.samples,
-            "window": self._window,
+            "window": self._length,
             "shuffle": self._shuffle,
             "seed": self._seed,
             "buffer": self._buffer,
@@ -203,9 +203,11 @@ class FrameStream(IterableDataset):
         self._given, self._resumed = self._resumed, 0
         order = (self._seed, int(self._epoch))
         random = np.random.default_rng((*order, share))
-        rows = self._rows(order, share, shares)
+        rows = self._numbers(order, share, shares)
         return self._counted(
-            mixed(rows, self._read, size=self._buffer, random=random, skip=self._given)
+            mixed(
+                rows, self._frames.__getitem__, size=self._buffer, random=random, skip=self._given
+            )
         )
 
     def _counted(self, samples: Iterator[Any]) -> Iterator[Any]:
@@ -213,11 +215,8 @@ class FrameStream(IterableDataset):
             self._given += 1
             yield sample
 
-    def _read(self, place: tuple[int, int]) -> Any:
-        return self._frames[self._frames.number(*place)]
-
-    def _rows(self, order: tuple[int, int], share: int, shares: int) -> Iterator[tuple[int, int]]:
-        """The samples of a share, in order: recording and row of each."""
+    def _numbers(self, order: tuple[int, int], share: int, shares: int) -> Iterator[int]:
+        """The samples of a share, in order."""
         windows = [
             (number, window)
             for number in range(len(self._frames.recordings))
@@ -227,23 +226,22 @@ class FrameStream(IterableDataset):
             np.random.default_rng(order).shuffle(windows)
         if self._world_size == 1:
             for number, window in windows[share::shares]:
-                yield from ((number, row) for row in self._window_rows(number, window))
+                yield from self._window(number, window)
             return
         # equal parts of all windows in sequence: at most one window is divided per share
-        lengths = [len(self._window_rows(*window)) for window in windows]
+        lengths = [len(self._window(*window)) for window in windows]
         starts = np.cumsum([0, *lengths[:-1]])
         total = self.samples
         count = total // shares if self._drop_last else -(-total // shares)
         for place in np.arange(share * count, (share + 1) * count) % total:
             at = int(np.searchsorted(starts, place, side="right")) - 1
-            number, window = windows[at]
-            yield number, self._window_rows(number, window)[place - starts[at]]
+            yield self._window(*windows[at])[place - starts[at]]
 
     def _window_count(self, number: int) -> int:
-        return -(-self._frames.recordings[number].rows // self._window)
+        return -(-self._frames.recordings[number].rows // self._length)
 
-    def _window_rows(self, number: int, window: int) -> range:
-        """The samples of a window.
+    def _window(self, number: int, window: int) -> range:
+        """The samples of a window of a recording.
 
         It begins with the first sample at or after a multiple of the length whose frame of the
         first camera is the first one after a key frame, and ends where the next one begins. So
@@ -254,11 +252,11 @@ class FrameStream(IterableDataset):
             frames = recording.frames(np.arange(rows), 0)
             groups = np.searchsorted(self._frames.key_frames(number), frames, side="right")
             begins = np.append(np.flatnonzero(np.diff(groups) > 0) + 1, rows)
-            asked = np.arange(1, self._window_count(number)) * self._window
+            asked = np.arange(1, self._window_count(number)) * self._length
             starts = np.concatenate(([0], begins[np.searchsorted(begins, asked)], [rows]))
             self._starts[number] = starts.astype(np.int64)
-        first, end = self._starts[number][window : window + 2].tolist()
-        return range(first, end)
+        first = self._frames.first_number(number)
+        return range(*(first + self._starts[number][window : window + 2]).tolist())
 
     def close(self) -> None:
         """Close the videos that this process has open; they are opened again when needed."""
