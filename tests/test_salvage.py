@@ -278,6 +278,15 @@ def test_a_file_that_was_cut_short_says_so(intact: Intact, salvaged_as: Salvaged
     assert loss.problem == "the file ends before its footer"
 
 
+def test_nothing_but_the_index_was_cut_off(intact: Intact, salvaged_as: SalvagedAs) -> None:
+    """Even where its first record is incomplete, no message is lost from there on."""
+    data, pieces = intact("bag-none")
+    index = next(piece for piece in pieces if piece.is_index and piece.defines)
+    records, (loss,) = salvaged_as("bag-none", data[: (index.start + index.end) // 2])
+    assert keys(records) == Counter(all_messages(pieces))
+    assert loss.messages == 0
+
+
 def test_messages_without_their_channel(intact: Intact, salvaged_as: SalvagedAs) -> None:
     """Nothing tells what they are: they are counted."""
     for kind, word in (("bag-none-unindexed", "connection"), ("mcap-unchunked", "channel")):

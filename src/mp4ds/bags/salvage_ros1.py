@@ -175,7 +175,6 @@ class Ros1Salvage(FileSalvage):
             chunks = int.from_bytes(header.fields.get(b"chunk_count", b""), "little")
             if len(MAGIC) + header.size <= self._due < size:
                 for frame, body in self._records_from(self._due):
-                    self._index_offset = self._due
                     if frame.kind == Op.CONNECTION:
                         self._declare(frame, body)
                     elif frame.kind == Op.CHUNK_INFO:
@@ -198,13 +197,15 @@ class Ros1Salvage(FileSalvage):
     def _records_from(
         self, offset: int, *, search: bool = False
     ) -> Iterator[tuple[RecordFrame, bytes]]:
-        """The readable records from a byte on, where one should begin unless it is searched for."""
+        """The readable records from a byte on: of the index, if it is there, or of a search."""
         with Window.of_file(self.path, offset) as window:
             scan = _Scan(window)
             if search and offset > len(MAGIC):
                 scan.resync(offset, "", passed=0)
-            elif scan.here() is None and not search:
-                return
+            elif not search:
+                if scan.here() is None:
+                    return
+                self._index_offset = offset  # even if its first record is cut short
             while frame := scan.next():
                 body = scan.body(frame)
                 if body is not None:
