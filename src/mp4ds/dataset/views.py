@@ -12,7 +12,7 @@ from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
-from mp4ds.options import ENCODING, WHAT, Options, Parsed, option, parse_resize
+from mp4ds.options import ENCODING, WHAT, Options, Parsed, option, parse_number, parse_resize
 from mp4ds.video.images import Renderer, encoding_as, shown_format
 from mp4ds.video.pixels import Scale
 
@@ -216,6 +216,23 @@ def view_of(
 # ---------------------------------------------------------------- fewer, and smaller
 
 
+def _parse_rate(value: str | float) -> float:
+    rate = parse_number(value)
+    if not 0 < rate <= 1e9:
+        raise OptionError(f"{value} is not a rate. Use Hz, such as 10.")
+    return rate
+
+
+def _parse_size(value: str | float | tuple[int, int]) -> float | tuple[int, int]:
+    size = parse_resize(value)
+    try:
+        size_after("", (1, 1), size)
+    except OptionError:
+        sides = f"width and height of 1 to {MAX_SIDE} pixels"
+        raise OptionError(f"{value} is not a size. Use a factor such as 0.5, or {sides}.") from None
+    return size
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reduction(Options):
     """How to leave out images, and make them smaller."""
@@ -232,14 +249,13 @@ class Reduction(Options):
         "Maximum frames per second.",
         panel=WHAT,
         metavar="HZ",
-        least=1e-6,
-        most=1e9,
+        parse=_parse_rate,
         changes=ENCODING,
     )
     resize: Parsed[float | tuple[int, int] | None] = option(
         "Scale images down, and the calibrations with them.",
         metavar="0.5|WxH",
-        parse=parse_resize,
+        parse=_parse_size,
         changes=ENCODING,
     )
 
@@ -247,8 +263,6 @@ class Reduction(Options):
         super().__post_init__()
         if not isinstance(self.every, int):
             raise OptionError(f"`every` {self.every!r} is not a number of frames: use 1 or more.")
-        if self.resize is not None:
-            size_after("any topic", (1, 1), self.resize)
 
     @property
     def leaves_out(self) -> bool:
