@@ -210,7 +210,7 @@ class UnitParser(StreamParser, ABC):
     """
 
     parameter_kinds: ClassVar[frozenset[int]]
-    slices: ClassVar[range]
+    slices: ClassVar[frozenset[int]]
     delimiter: ClassVar[int]
     slice_at: ClassVar[int]
 
@@ -248,9 +248,16 @@ class UnitParser(StreamParser, ABC):
             raise Refused("its parameter sets were not sent before it")
         return CodedPicture(sps.width, sps.height, self._is_key(first[0], slices), framing)
 
-    @abstractmethod
     def _is_slice(self, unit: bytes) -> bool:
         """Whether a NAL unit is one of a picture; if it is a parameter set, keep it."""
+        kind = self._kind(unit)
+        if kind in self.parameter_kinds:
+            self._sets[kind, self._keep(kind, unit)] = unit
+        return kind in self.slices
+
+    @abstractmethod
+    def _keep(self, kind: int, unit: bytes) -> int:
+        """Keep what pictures need of a parameter set; returns its id."""
 
     @abstractmethod
     def _check_order(self, first: bytes, slices: Sequence[bytes]) -> Sps:
@@ -274,7 +281,7 @@ class UnitParser(StreamParser, ABC):
     def _frames(self, data: memoryview, *, key: bool) -> list[CodedFrame]:
         pictures, kinds, kept = 0, set[int](), False
         for unit in split_length_prefixed(data):
-            kind = self._kind_in_mp4(unit)
+            kind = self._kind(unit)
             if kind in self.slices:
                 kinds.add(kind)
                 # the first slice of a picture
@@ -289,7 +296,7 @@ class UnitParser(StreamParser, ABC):
             raise UnknownStructure(self._unfit)
         return self._link(begins=self._begins(kinds.pop()), kept=kept, key=key)
 
-    def _kind_in_mp4(self, unit: memoryview) -> int:
+    def _kind(self, unit: bytes | memoryview) -> int:
         """Type of a NAL unit; -1 for one that decoders leave out."""
         return self.unit_type(unit)
 
@@ -506,7 +513,7 @@ class H264(UnitParser):
     """Access units of H.264."""
 
     parameter_kinds = frozenset((SPS, PPS))
-    slices = range(SLICE, IDR + 1)
+    slices = frozenset((SLICE, PARTITION_A, IDR))
     delimiter = AUD
     slice_at = 1
 
@@ -528,20 +535,17 @@ class H264(UnitParser):
             raise Refused(_CUT_SHORT)
         return units + sized_units(configuration, at + 1, configuration[at])[0]
 
-    def _is_slice(self, unit: bytes) -> bool:
-        kind = self.unit_type(unit)
+    def _keep(self, kind: int, unit: bytes) -> int:
         if kind == SPS:
             sps = parse_sps(unit)
             self._sps[sps.number] = sps
-            self._sets[SPS, sps.number] = unit
-        elif kind == PPS:
-            reader = BitReader(unescape(unit[1:SLICE_HEADER_BYTES]))
-            number, of = reader.ue(), reader.ue()
-            if number > 255 or of > 31:
-                raise Refused("its H.264 parameters are malformed")
-            self._sps_of_pps[number] = of
-            self._sets[PPS, number] = unit
-        return kind in (SLICE, PARTITION_A, IDR)
+            return sps.number
+        reader = BitReader(unescape(unit[1:SLICE_HEADER_BYTES]))
+        number, of = reader.ue(), reader.ue()
+        if number > 255 or of > 31:
+            raise Refused("its H.264 parameters are malformed")
+        self._sps_of_pps[number] = of
+        return number
 
     def _is_key(self, first: bytes, slices: Sequence[bytes]) -> bool:
         return all(self.unit_type(unit) == IDR for unit in slices)

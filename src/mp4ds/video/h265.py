@@ -88,7 +88,7 @@ class H265(UnitParser):
     """Access units of H.265."""
 
     parameter_kinds = frozenset((VPS, SPS, PPS))
-    slices = range(VPS)
+    slices = frozenset(range(VPS))
     delimiter = AUD
     slice_at = 2
 
@@ -115,28 +115,20 @@ class H265(UnitParser):
             units += found
         return units
 
-    def _is_slice(self, unit: bytes) -> bool:
-        if _is_of_another_layer(unit):
-            return False
-        kind = self.unit_type(unit)
+    def _keep(self, kind: int, unit: bytes) -> int:
         if kind == VPS:
-            self._sets[VPS, unit[2] >> 4 if len(unit) > 2 else 0] = unit
-        elif kind == SPS:
+            return unit[2] >> 4 if len(unit) > 2 else 0
+        if kind == SPS:
             sps = parse_sps(unit)
             self._sps[sps.number] = sps
-            self._sets[SPS, sps.number] = unit
-        elif kind == PPS:
-            self._take_pps(unit)
-        return kind in self.slices
-
-    def _take_pps(self, unit: bytes) -> None:
+            return sps.number
         reader = BitReader(unescape(unit[2:SLICE_HEADER_BYTES]))
-        number, sps = reader.ue(), reader.ue()
+        number, of = reader.ue(), reader.ue()
         reader.flag()
-        if number > 63 or sps > 15:
+        if number > 63 or of > 15:
             raise Refused("its H.265 parameters are malformed")
-        self._pps[number] = sps, reader.flag(), reader.bits(3)
-        self._sets[PPS, number] = unit
+        self._pps[number] = of, reader.flag(), reader.bits(3)
+        return number
 
     def _is_key(self, first: bytes, slices: Sequence[bytes]) -> bool:
         return self.unit_type(first) in _IRAP
@@ -169,7 +161,7 @@ class H265(UnitParser):
             raise Refused(REORDERED)
         return sps
 
-    def _kind_in_mp4(self, unit: memoryview) -> int:
+    def _kind(self, unit: bytes | memoryview) -> int:
         return -1 if _is_of_another_layer(unit) else self.unit_type(unit)
 
     def _is_referred_to(self, unit: memoryview, kind: int) -> bool:
