@@ -27,7 +27,6 @@ from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import LONG, WHAT, Parsed, TopicOptions, force, jobs, option, parse_words
 from mp4ds.plugins.evaluating.page import write_files
 from mp4ds.plugins.evaluating.trials import (
-    CEILING_MARGIN,
     PICTURES,
     Camera,
     CameraEvaluation,
@@ -40,7 +39,6 @@ from mp4ds.plugins.evaluating.trials import (
     make_clip,
     mean_score,
     open_cameras,
-    reachable_score,
     recommend,
     try_setting,
 )
@@ -145,11 +143,6 @@ class EvaluateOptions(TopicOptions):
     )
     jobs: int = jobs("Settings tried in parallel; use 1 for accurate times.", 1)
 
-    @property
-    def encoder_threads(self) -> int:
-        """Threads of an encoder."""
-        return self.threads or max(1, (os.cpu_count() or 1) // self.jobs)
-
 
 def settings_of(options: EvaluateOptions) -> list[Setting]:
     """The requested grid; a codec is not tried with a crf that it does not have.
@@ -196,6 +189,7 @@ def _has(codec: str, preset: str) -> bool:
 # ---------------------------------------------------------------- evaluation
 
 _SHORT = 30  # frames
+_CEILING_MARGIN = 0.2  # of VMAF: what is closer to the ceiling is indistinguishable from noise
 _JPEG_FRAMES = 20
 _DAY = 86_400
 
@@ -310,7 +304,8 @@ def _evaluated(
         Refused: The camera's images are not usable.
         ScoringError: No setting could be tried.
     """
-    goal, threads, has_vmaf = options.target, options.encoder_threads, ffmpeg is not None
+    goal, has_vmaf = options.target, ffmpeg is not None
+    threads = options.threads or max(1, (os.cpu_count() or 1) // options.jobs)
     truth = f"{PICTURES}/{name}-original.png"
     cells: list[Cell] = []
     failures: dict[str, list[str]] = {}
@@ -323,7 +318,9 @@ def _evaluated(
             # without which the scores of settings say little
             scores = scores_of(frames, frames, ffmpeg=ffmpeg, threads=threads)
         ceiling = {metric: summary_of(values) for metric, values in scores.items()}
-        reachable = reachable_score(goal, ceiling)
+        reachable = goal.score
+        if goal.metric == "vmaf":
+            reachable = min(reachable, ceiling["vmaf"].mean - _CEILING_MARGIN)
         attempt = partial(try_setting, clip, threads=threads, has_vmaf=has_vmaf)
         with ProcessExecutor(options.jobs) as executor:
             calls = {}
@@ -410,8 +407,8 @@ def _notes(
     notes = {
         f"its images are already lossy ({lossy}): scores measure the distance from these, not "
         "from what the camera saw": bool(lossy),
-        f"the clip scored against itself has {goal.metric} {reachable + CEILING_MARGIN:.2f}, so "
-        f"the target is {CEILING_MARGIN} below that, {reachable:.2f} instead of "
+        f"the clip scored against itself has {goal.metric} {reachable + _CEILING_MARGIN:.2f}, so "
+        f"the target is {_CEILING_MARGIN} below that, {reachable:.2f} instead of "
         f"{goal.score:g}": reachable < goal.score,
         f"no setting reaches {goal.metric} {reachable:.2f}; the best is {best.setting.name} with "
         f"{reached:.2f}: try a lower --crf": reached < reachable,

@@ -365,21 +365,6 @@ class Evaluation:
 
 # ---------------------------------------------------------------- conclusions
 
-CEILING_MARGIN = 0.2
-"""In VMAF: a target closer to the ceiling than this is indistinguishable from noise."""
-
-
-def reachable_score(target: QualityTarget, ceiling: Mapping[str, ScoreSummary]) -> float:
-    """The target, or less if the ceiling is too close.
-
-    Args:
-        target: The requested target.
-        ceiling: Scores of the clip against itself.
-    """
-    if target.metric != "vmaf":
-        return target.score
-    return min(target.score, ceiling["vmaf"].mean - CEILING_MARGIN)
-
 
 def mean_score(scores: Mapping[str, ScoreSummary], target: QualityTarget) -> float:
     """Mean score in the target's metric."""

@@ -90,13 +90,13 @@ def static_poses(dataset: Dataset) -> Callable[[str, str], Pose | None]:
 def _poses(job: ExportJob) -> Measures | None:
     """The requested poses: before any frame is decoded, as the topic may be unsuitable."""
     topic = job.options.poses
-    return Measures(job.dataset, topic, "poses", "poses") if topic else None
+    return Measures(job.dataset, topic, "poses") if topic else None
 
 
 def _imus(job: ExportJob) -> list[Measures]:
     topics = filter(job.options.chosen, dict.fromkeys(one.topic for one in job.dataset.channels))
     own = (topic for topic in topics if ros_type(job.dataset, topic) == IMU)
-    return [Measures(job.dataset, topic, "imu") for topic in own]
+    return [Measures(job.dataset, topic) for topic in own]
 
 
 # ---------------------------------------------------------------- euroc

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -228,32 +229,15 @@ _WINDOW = 1000  # messages that may be out of order
 _ROS = ("ros1", "cdr")
 
 
-def _pose(at: Any, turn: Any) -> Sequence[float]:
-    return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
-
-
-def _imu(message: Any) -> Sequence[float]:
-    turn, pull = message.angular_velocity, message.linear_acceleration
-    return turn.x, turn.y, turn.z, pull.x, pull.y, pull.z
-
-
 IMU = "sensor_msgs/Imu"
 
-# what is asked for -> types that have it -> its numbers in a message
-_MEASURES: Mapping[str, Mapping[str, Callable[[Any], Sequence[float]]]] = {
-    # angular velocity x, y, z in rad/s, then acceleration x, y, z in m/s^2
-    "imu": {IMU: _imu},
-    # position x, y, z in metres, then the quaternion x, y, z, w
-    "poses": {
-        "geometry_msgs/PoseStamped": lambda m: _pose(m.pose.position, m.pose.orientation),
-        "geometry_msgs/PoseWithCovarianceStamped": lambda m: _pose(
-            m.pose.pose.position, m.pose.pose.orientation
-        ),
-        "nav_msgs/Odometry": lambda m: _pose(m.pose.pose.position, m.pose.pose.orientation),
-        "geometry_msgs/TransformStamped": lambda m: _pose(
-            m.transform.translation, m.transform.rotation
-        ),
-    },
+# type -> where its messages have x, y, z and, of quaternions, w
+_VECTORS: Mapping[str, tuple[str, str]] = {
+    IMU: ("angular_velocity", "linear_acceleration"),  # rad/s, m/s^2
+    "geometry_msgs/PoseStamped": ("pose.position", "pose.orientation"),  # metres
+    "geometry_msgs/PoseWithCovarianceStamped": ("pose.pose.position", "pose.pose.orientation"),
+    "nav_msgs/Odometry": ("pose.pose.position", "pose.pose.orientation"),
+    "geometry_msgs/TransformStamped": ("transform.translation", "transform.rotation"),
 }
 
 
@@ -271,8 +255,7 @@ class Measures:
     Args:
         dataset: The dataset.
         topic: The topic.
-        kind: ``imu`` or ``poses``.
-        option: That named the topic, for errors.
+        option: That named the topic, if it is one of poses.
 
     Attributes:
         topic: The topic.
@@ -282,15 +265,14 @@ class Measures:
         OptionError: The topic does not exist, or has the wrong type.
     """
 
-    def __init__(self, dataset: Dataset, topic: str, kind: str, option: str = "topics") -> None:
-        types, name = _MEASURES[kind], ros_type(dataset, topic)
+    def __init__(self, dataset: Dataset, topic: str, option: str = "") -> None:
+        types, name = set(_VECTORS) - {IMU} if option else {IMU}, ros_type(dataset, topic)
         if name not in types:
             raise OptionError(
                 f"`{option}` {topic} is {f'of type {name}' if name else 'not a ROS topic'} in "
-                f"{dataset.path}. Use a topic of type {', '.join(types)}."
+                f"{dataset.path}. Use a topic of type {', '.join(sorted(types))}."
             )
-        self._dataset = dataset
-        self._values = types[name]
+        self._dataset, self._vectors = dataset, attrgetter(*_VECTORS[name])
         self.topic = topic
         first = next(dataset.messages([topic]), None)
         self.first: Any = None if first is None else first.decoded
@@ -317,7 +299,13 @@ class Measures:
         for message in self._dataset.messages([self.topic]):
             decoded = message.decoded
             time = int(decoded.header.stamp.sec) * _NS + int(decoded.header.stamp.nanosec)
-            yield time, tuple(map(float, self._values(decoded)))
+            values = [
+                float(getattr(vector, axis))
+                for vector in self._vectors(decoded)
+                for axis in "xyzw"
+                if hasattr(vector, axis)
+            ]
+            yield time, tuple(values)
 
 
 def in_order(rows: Iterable[Row], window: int = _WINDOW) -> Iterator[Row]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -297,13 +297,23 @@ def _add_rows(
     stamps: NDArray[np.int64],
 ) -> None:
     """Add a feature's rows: with names as joints, which keep them, else as plain numbers."""
-    shape = feature["shape"]
-    rows = _rows(column, math.prod(shape), len(stamps))
-    names = _names(feature.get("names"), rows.shape[1])
-    if names and rows.dtype.kind == "f":
+    count = math.prod(feature["shape"])
+    values = column.combine_chunks()
+    while pa.types.is_nested(values.type):
+        if len(pc.list_value_length(values).unique()) != 1:
+            raise ValueError("its rows differ in length")
+        values = values.flatten()
+    if values.null_count or len(values) != len(stamps) * count:
+        raise ValueError(f"its rows are not of {count} numbers each")
+    rows: NDArray[Any] = values.to_numpy(zero_copy_only=False).reshape(-1, count)
+    names: Any = feature.get("names")
+    if isinstance(names, dict) and len(names) == 1:
+        (names,) = names.values()
+    is_named = isinstance(names, list) and len(names) == count
+    if is_named and rows.dtype.kind == "f" and all(isinstance(name, str) for name in names):
         reader.add_joints(topic, names, stamps, rows.astype(np.float64))
     else:
-        reader.add_numbers(topic, stamps, rows, shape)
+        reader.add_numbers(topic, stamps, rows, feature["shape"])
 
 
 def _has_messages(kind: Any) -> bool:
@@ -313,27 +323,6 @@ def _has_messages(kind: Any) -> bool:
     # a column without any value is of no type, and refused later
     plain = (pa.float32(), pa.float64(), pa.bool_(), pa.string(), pa.null())
     return kind in plain or bool(pa.types.is_integer(kind))
-
-
-def _rows(column: Any, count: int, length: int) -> NDArray[Any]:
-    """Numbers or texts of a column, shape (length, count)."""
-    values = column.combine_chunks()
-    while pa.types.is_nested(values.type):
-        if len(pc.list_value_length(values).unique()) != 1:
-            raise ValueError("its rows differ in length")
-        values = values.flatten()
-    if values.null_count or len(values) != length * count:
-        raise ValueError(f"its rows are not of {count} numbers each")
-    rows: NDArray[Any] = values.to_numpy(zero_copy_only=False).reshape(length, count)
-    return rows
-
-
-def _names(given: Any, count: int) -> Sequence[str]:
-    """Names of the numbers of a feature: a list, or a mapping of one; none if there are none."""
-    if isinstance(given, dict) and len(given) == 1:
-        (given,) = given.values()
-    is_list = isinstance(given, list) and len(given) == count
-    return given if is_list and all(isinstance(name, str) for name in given) else ()
 
 
 def _add_tasks(
