@@ -53,7 +53,13 @@ def info_command(paths: Sequence[str], checksums: bool, options: SliceOptions) -
         raise OptionError("These options work with one recording or dataset only.")
     with progress_of("reading") as tell:
         if checksums:
-            show(_checksums(found[0]), _print_checksums)
+            path = found[0] / MANIFEST_NAME
+            if not path.is_file():
+                raise OptionError(f"{found[0]} is not a dataset; only datasets have checksums.")
+            known = {item.name: item.sha256 for item in load_manifest(path).files}
+            known[MANIFEST_NAME] = digest_file(path)[1]
+            lines = [f"{sha256}  {name}" for name, sha256 in known.items()]
+            show(known, lambda _: [*map(say, lines)])
         elif len(found) == 1:
             show(facts.info(found[0], options), _print_info)
         else:
@@ -106,19 +112,6 @@ def _found(paths: Sequence[str]) -> list[Path]:
         if len(paths) > 1:
             raise
         return [location(paths[0])]  # a recording's folder, or nothing
-
-
-def _checksums(path: Path) -> dict[str, str]:
-    """The hashes of a dataset's files from its manifest, and that of the manifest itself."""
-    if not (path / MANIFEST_NAME).is_file():
-        raise OptionError(f"{path} is not a dataset; only datasets have checksums.")
-    known = {item.name: item.sha256 for item in load_manifest(path / MANIFEST_NAME).files}
-    return known | {MANIFEST_NAME: digest_file(path / MANIFEST_NAME)[1]}
-
-
-def _print_checksums(found: Mapping[str, str]) -> None:
-    for name, sha256 in found.items():
-        say(f"{sha256}  {name}")
 
 
 def _print_validation(results: Sequence[Mapping[str, Any]], *, deep: bool) -> None:

@@ -10,7 +10,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any, TypeVar
@@ -289,7 +289,10 @@ class Keyboard:
         self, actions: Mapping[str, Callable[[], object]], *, fd: int | None = None
     ) -> None:
         self._actions = actions
-        self._fd = _terminal(fd)
+        self._fd: int | None = None
+        with suppress(AttributeError, OSError, ValueError):  # standard input is None or closed
+            number = sys.stdin.fileno() if fd is None else fd
+            self._fd = number if termios is not None and os.isatty(number) else None
         self._before: list[Any] | None = None
         self._is_left = False
         # reentrant, as a signal may arrive while the main thread holds it
@@ -401,12 +404,3 @@ def _is_in_foreground(fd: int) -> bool:
         return os.tcgetpgrp(fd) == os.getpgrp()
     except OSError:  # not the controlling terminal: nothing would stop the program
         return True
-
-
-def _terminal(fd: int | None) -> int | None:
-    """The terminal, if there is one."""
-    try:
-        number = sys.stdin.fileno() if fd is None else fd
-        return number if termios is not None and os.isatty(number) else None
-    except (AttributeError, OSError, ValueError):  # standard input is None, closed, or no file
-        return None

@@ -36,12 +36,7 @@ from mp4ds.cli.output import (
 from mp4ds.dataset.dataset import datasets_in
 from mp4ds.errors import OptionError, counted, path_text, size_text
 from mp4ds.options import HOW, LONG, WHERE, declared_in, seconds_text
-from mp4ds.packing.options import (
-    ImportOptions,
-    PackOptions,
-    PackProgress,
-    PackSummary,
-)
+from mp4ds.packing.options import ImportOptions, PackOptions, PackProgress, PackSummary
 from mp4ds.packing.pack import is_packed
 from mp4ds.plugins.demo import demo
 from mp4ds.plugins.exporting.export import export

@@ -28,14 +28,6 @@ _NS = 1_000_000_000
 _SLOW_S = 0.5  # warned about at once; less is only mentioned in the summary
 
 
-def _check_order(_: click.Context, __: click.Parameter, value: str | None) -> None:
-    if value not in (None, "received"):
-        raise click.UsageError(
-            f"--message-order {value} is not supported: messages are played in the order in which "
-            "they were received."
-        )
-
-
 def _refuse(_: click.Context, parameter: click.Parameter, value: object) -> None:
     if value:
         raise click.UsageError(
@@ -77,7 +69,8 @@ def _refuse(_: click.Context, parameter: click.Parameter, value: object) -> None
     metavar="TEXT",
     help="Accepted for compatibility with `ros2 bag play`; ignored.",
 )
-@option("--message-order", hidden=True, callback=_check_order, expose_value=False)
+# messages are played in the order in which they were received
+@option("--message-order", type=click.Choice(["received"]), hidden=True, expose_value=False)
 @option("--progress-bar-update-rate", "bar_rate", type=float, hidden=True)
 @accepted("--disable-loan-message", "--try-future-version")
 @accepted("--storage-config-file", "--progress-bar-separation-lines", values=1)

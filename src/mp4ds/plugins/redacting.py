@@ -163,23 +163,19 @@ class RedactedReader(ChangedReader):
         videos = [name for name, one in self._topics.items() if one.type_name.endswith(PACKETS)]
         if videos:
             self._reader = ReducedReader(reader, PackOptions(topics=videos))
-        self.is_indexed = self._reader.is_indexed and self._can_be_sent(options)
+        is_sent = False
+        with suppress(pickle.PicklingError, AttributeError, TypeError):
+            # the main module of a script or notebook is another one in other processes
+            is_sent = b"__main__" not in pickle.dumps(told.find)
+        if options.cluster and not is_sent:
+            raise OptionError(
+                f"`redact` {told.name} cannot be sent to other machines: define it in a module "
+                "that they have, too."
+            )
+        self.is_indexed = self._reader.is_indexed and is_sent
         if not told.find:
             for topic in self._topics:
                 self._check_first(topic)
-
-    def _can_be_sent(self, options: PackOptions) -> bool:
-        """Whether other processes can redact, too."""
-        is_sent = False
-        with suppress(pickle.PicklingError, AttributeError, TypeError):
-            # the main module of a script or notebook is another one there
-            is_sent = b"__main__" not in pickle.dumps(self._redaction.find)
-        if options.cluster and not is_sent:
-            raise OptionError(
-                f"`redact` {self._redaction.name} cannot be sent to other machines: define it in a "
-                "module that they have, too."
-            )
-        return is_sent
 
     # ------------------------------------------------------------ rules
 

@@ -29,14 +29,7 @@ from mp4ds.messages.serializations import (
     kind_of,
     plain_message,
 )
-from mp4ds.messages.wire import (
-    CalibrationFields,
-    CodedFields,
-    Fields,
-    Form,
-    Parts,
-    Slots,
-)
+from mp4ds.messages.wire import CalibrationFields, CodedFields, Fields, Form, Parts, Slots
 from mp4ds.options import Selection
 from mp4ds.packing.inspection import (
     CameraMessage,

@@ -149,12 +149,7 @@ def _stream_of(pair: _Pair) -> StreamSidecar:
             "frames": len(times),
             "channel": _channel(topic, "sensor_msgs/Image"),
             "wire": "ros1",
-            "image": {
-                **size,
-                "encoding": "bgr8",
-                "step": 3 * calibration.width,
-                "is_bigendian": 0,
-            },
+            "image": {**size, "encoding": "bgr8", "step": 3 * calibration.width, "is_bigendian": 0},
             "headers": [{"frame_id": calibration.frame_id}],
             "video": {
                 **size,

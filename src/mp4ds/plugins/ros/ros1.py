@@ -541,7 +541,13 @@ class Ros1Node(Node):
         """Subscribe; each connection tells its own channel."""
 
         def on_message(message: Any) -> None:
-            receive(self._channel(name, message._connection_header), message._buff, 0)
+            header: Mapping[str, str] = message._connection_header
+            key = name, tuple(sorted(header.items()))
+            with self._lock:
+                if key not in self._received:
+                    raw = {field.encode(): value.encode() for field, value in header.items()}
+                    self._received[key] = make_channel(len(self._received), name.encode(), raw)
+            receive(self._received[key], message._buff, 0)
 
         self._subscribe(topic, on_message)
 
@@ -549,14 +555,6 @@ class Ros1Node(Node):
         # 256 KB are read at a time; rospy's 64 take a third more CPU time
         how = {"buff_size": 2**18, "tcp_nodelay": True}
         self._subscribers.append(rospy.Subscriber(topic, rospy.AnyMsg, on_message, **how))
-
-    def _channel(self, topic: str, header: Mapping[str, str]) -> Channel:
-        key = topic, tuple(sorted(header.items()))
-        with self._lock:
-            if key not in self._received:
-                raw = {name.encode(): value.encode() for name, value in header.items()}
-                self._received[key] = make_channel(len(self._received), topic.encode(), raw)
-            return self._received[key]
 
     def serve(self, services: Sequence[Service]) -> None:
         """Offer what is usual of these.
