@@ -36,7 +36,7 @@ from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.times import nearest, sound_times
-from mp4ds.torch.recordings import CameraSource, Recording, each, one_of, open_source
+from mp4ds.torch.recordings import CameraSource, Recording, at_least, each, one_of, open_source
 from mp4ds.video.media import Media
 
 Dtype = Literal["native", "uint8", "float32"]
@@ -191,8 +191,7 @@ class FrameCache:
     """
 
     def __init__(self, where: str | Path, most: int, frames: int) -> None:
-        if most < 1:
-            raise OptionError(f"cache_bytes is {most}, but must be at least 1.")
+        at_least(1, cache_bytes=most)
         if not hasattr(os, "preadv"):
             raise OptionError("cache needs Linux, a BSD or macOS 11.")
         self._most, self._frames = most, frames
@@ -555,8 +554,7 @@ class OpenCameras:
             raise OptionError(
                 "backend='torchcodec' only gives format='rgb' without resize; use a transform."
             )
-        if most < 1:
-            raise OptionError(f"cache_files is {most}, but must be at least 1.")
+        at_least(1, cache_files=most)
 
     @contextmanager
     def using(self, recording: Recording, camera: int) -> Iterator[OpenCamera]:

@@ -24,6 +24,7 @@ from mp4ds.torch.recordings import (
     Pick,
     Recording,
     VectorReader,
+    at_least,
     each,
     episodes_of,
     one_of,
@@ -70,8 +71,7 @@ class Offsets:
                 raise OptionError('tolerance_ns belongs to offsets_in="seconds".')
         elif not all(abs(value) <= _MOST_SECONDS for value in given):
             raise OptionError(f"offsets are {given}, but offsets in seconds can be at most 1e9.")
-        elif tolerance_ns is not None and tolerance_ns < 0:
-            raise OptionError(f"tolerance_ns is {tolerance_ns}, but must not be negative.")
+        at_least(0, tolerance_ns=tolerance_ns)
         scale = 10**9 if self._timed else 1
         self.steps = np.array([round(value * scale) for value in given], np.int64)
         self.is_single = given == (0,) and not self._timed
@@ -293,10 +293,7 @@ class FrameDataset(Dataset):
                 )
         given = {key: one for key, one in (("state", state), ("action", action)) if one is not None}
         one_of("message", message, get_args(Pick))
-        if message_tolerance_ns is not None and message_tolerance_ns < 0:
-            raise OptionError(
-                f"message_tolerance_ns is {message_tolerance_ns}, but must not be negative."
-            )
+        at_least(0, message_tolerance_ns=message_tolerance_ns)
         for key in given.keys() & {*self.topics}:
             raise OptionError(f"a topic named {key!r} cannot be a key beside the {key}.")
         keys = [*self.topics, *(key for key in given if key != "action")]

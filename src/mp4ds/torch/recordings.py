@@ -140,8 +140,7 @@ def recordings_of(
         raise OptionError("There are no datasets: the list of paths is empty.")
     if isinstance(topics, str):
         raise OptionError(f"topics is a list of topics, such as [{topics!r}].")
-    if tolerance_ns < 0:
-        raise OptionError(f"sync_tolerance_ns is {tolerance_ns}, but must not be negative.")
+    at_least(0, sync_tolerance_ns=tolerance_ns)
     if topics is not None and not topics:
         raise OptionError("topics is empty; use None for all cameras of the first dataset.")
     given = datasets_in(paths)
@@ -452,6 +451,13 @@ def one_of(name: str, value: str, known: Sequence[str]) -> None:
     """Refuse an unknown value of an argument."""
     if value not in known:
         raise OptionError(f"{name} is {value!r}, not one of {', '.join(known)}.")
+
+
+def at_least(least: int, **numbers: float | None) -> None:
+    """Refuse numbers of arguments that are smaller."""
+    for name, value in numbers.items():
+        if value is not None and value < least:
+            raise OptionError(f"{name} is {value}, but must be at least {least}.")
 
 
 def each(name: str, given: _T | Mapping[str, _T], topics: Sequence[str], default: _T) -> list[_T]:

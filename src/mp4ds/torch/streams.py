@@ -12,7 +12,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from mp4ds.errors import OptionError, absent
 from mp4ds.torch.datasets import FrameDataset
-from mp4ds.torch.recordings import Paths
+from mp4ds.torch.recordings import Paths, at_least
 
 _T = TypeVar("_T")
 _UNREAD = object()
@@ -108,7 +108,12 @@ class FrameStream(IterableDataset):
         for name in ("offsets", "offsets_in", "tolerance_ns"):
             if name in options:
                 raise TypeError(absent(self, name))
-        _check(window=window, seed=seed, buffer=buffer, rank=rank, world_size=world_size)
+        at_least(1, window=window, world_size=world_size)
+        at_least(0, seed=seed, buffer=buffer, rank=rank)
+        if rank >= world_size:
+            raise OptionError(
+                f"rank is {rank}, but must be less than the world_size, {world_size}."
+            )
         self._frames = FrameDataset(paths, topics=topics, cache_files=cache_files, **options)
         if cache_files < len(self.topics):
             raise OptionError(
@@ -148,7 +153,7 @@ class FrameStream(IterableDataset):
         Raises:
             OptionError: It is negative.
         """
-        _check(epoch=epoch)
+        at_least(0, epoch=epoch)
         self._epoch.fill_(epoch)
 
     def state_dict(self) -> dict[str, Any]:
@@ -170,10 +175,10 @@ class FrameStream(IterableDataset):
         other = state_dict["order"]
         for name, own in self._order().items():
             if other[name] != own:
-                problem = (
-                    f"the state is from a stream with {name} {other[name]!r}, but this one has"
+                theirs = f"{name} {other[name]!r}"
+                raise OptionError(
+                    f"the state is from a stream with {theirs}, but this one has {own!r}."
                 )
-                raise OptionError(f"{problem} {own!r}.")
         self.set_epoch(state_dict["epoch"])
         self._given = self._resumed = state_dict["given"]
 
@@ -261,15 +266,3 @@ class FrameStream(IterableDataset):
     def close(self) -> None:
         """Close the videos that this process has open; they are opened again when needed."""
         self._frames.close()
-
-
-def _check(**numbers: int) -> None:
-    for name, value in numbers.items():
-        least = 1 if name in ("window", "world_size") else 0
-        if value < least:
-            raise OptionError(f"{name} is {value}, but must be at least {least}.")
-    if numbers.get("rank", 0) >= numbers.get("world_size", 1):
-        raise OptionError(
-            f"rank is {numbers['rank']}, but must be less than the world_size, "
-            f"{numbers['world_size']}."
-        )
