@@ -12,7 +12,7 @@ from mp4ds.errors import OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, Encoding, Pixels
-from mp4ds.options import ENCODING, WHAT, Options, Parsed, option, parse_number, parse_resize
+from mp4ds.options import ENCODING, Options, Parsed, option, parse_number, parse_resize, what
 from mp4ds.video.images import Renderer, encoding_as, shown_format
 from mp4ds.video.pixels import Scale
 
@@ -237,20 +237,15 @@ def _parse_size(value: str | float | tuple[int, int]) -> float | tuple[int, int]
 class Reduction(Options):
     """How to leave out images, and make them smaller."""
 
-    every: int = option(
+    every: int = what(
         "Keep only every Nth frame, starting with the first.",
         1,
-        panel=WHAT,
         metavar="N",
         least=1,
         changes=ENCODING,
     )
-    max_rate: float | None = option(
-        "Maximum frames per second.",
-        panel=WHAT,
-        metavar="HZ",
-        parse=_parse_rate,
-        changes=ENCODING,
+    max_rate: float | None = what(
+        "Maximum frames per second.", metavar="HZ", parse=_parse_rate, changes=ENCODING
     )
     resize: Parsed[float | tuple[int, int] | None] = option(
         "Scale images down, and the calibrations with them.",

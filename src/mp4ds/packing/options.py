@@ -18,7 +18,6 @@ from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import (
     ENCODING,
     LONG,
-    WHAT,
     Options,
     Parsed,
     SliceOptions,
@@ -31,6 +30,7 @@ from mp4ds.options import (
     latched,
     option,
     parse_time,
+    what,
 )
 from mp4ds.records import MAX_REASONS, OTHER_REASONS, Loss
 from mp4ds.video.codecs import (
@@ -78,10 +78,9 @@ class ImportOptions(Options):
         metavar="YAML",
         only=("plain", "video"),
     )
-    topic: str | None = option(
+    topic: str | None = what(
         "Topic of the raw images; default: /camera/image_raw. That of JPEG files ends in "
         "/compressed, that of video packets in /compressed_video.",
-        panel=WHAT,
         only=("plain", "video"),
     )
     frame_id: str | None = option(
@@ -106,11 +105,8 @@ class ImportOptions(Options):
         False,
         only=("video", "lerobot"),
     )
-    episode: int | None = option(
-        "Number of the episode; default: each becomes a dataset.",
-        panel=WHAT,
-        least=0,
-        only=("lerobot",),
+    episode: int | None = what(
+        "Number of the episode; default: each becomes a dataset.", least=0, only=("lerobot",)
     )
 
     def absolute(self) -> ImportOptions:
@@ -146,11 +142,8 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
     """How to pack."""
 
     latched: bool = latched()
-    salvage: bool = option(
-        "Pack what is still readable of a damaged recording.",
-        False,
-        panel=WHAT,
-        changes=ENCODING,
+    salvage: bool = what(
+        "Pack what is still readable of a damaged recording.", False, changes=ENCODING
     )
     redact: Parsed[Redaction | Find | Path | None] = option(
         "YAML file of boxes to fill or blur in images, by topic and time; in Python also a "
@@ -171,10 +164,9 @@ class PackOptions(Reduction, SliceOptions, TopicOptions):
         metavar="GLOB",
         changes=ENCODING,
     )
-    camera_info: Sequence[str] = option(
+    camera_info: Sequence[str] = what(
         "Pair a camera topic with its camera_info, if their names do not.",
         (),
-        panel=WHAT,
         metavar="IMAGE=INFO",
         changes=ENCODING,
     )

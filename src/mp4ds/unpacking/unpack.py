@@ -33,7 +33,7 @@ from mp4ds.errors import (
 from mp4ds.files.outputs import Owned, local_target, staged
 from mp4ds.files.urls import remote
 from mp4ds.format.sidecars import MANIFEST_NAME, FileNames
-from mp4ds.options import WHAT, Selection, SliceOptions, force, jpeg_quality, latched, option
+from mp4ds.options import Selection, SliceOptions, force, jpeg_quality, latched, option, what
 from mp4ds.processes import each
 from mp4ds.records import Attachment, Channel, Excerpt, Loss, Message, MetadataRecord, bounded
 from mp4ds.unpacking.pictures import KINDS, FrameOptions, TopicImages, image_names, shown_by_packets
@@ -51,7 +51,7 @@ class UnpackOptions(SliceOptions, FrameOptions):
     """How to unpack."""
 
     latched: bool = latched()
-    salvage: bool = option("Restore what can be read of a damaged dataset.", False, panel=WHAT)
+    salvage: bool = what("Restore what can be read of a damaged dataset.", False)
     storage: str | None = option(
         "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap.",
         choices=("sqlite3", "mcap"),

@@ -24,7 +24,7 @@ from mp4ds.files.outputs import listed_names, local_target, staged, write_listin
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.options import LONG, WHAT, Parsed, TopicOptions, force, jobs, option, parse_words
+from mp4ds.options import LONG, Parsed, TopicOptions, force, jobs, option, parse_words, what
 from mp4ds.plugins.evaluating.page import write_files
 from mp4ds.plugins.evaluating.trials import (
     PICTURES,
@@ -114,27 +114,18 @@ class EvaluateOptions(TopicOptions):
         (),
         parse=parse_words,
     )
-    start: float | None = option(
-        "Where the clips start; default: in the middle.",
-        panel=WHAT,
-        metavar="SECONDS",
-        least=0,
-        most=_MOST,
+    start: float | None = what(
+        "Where the clips start; default: in the middle.", metavar="SECONDS", least=0, most=_MOST
     )
-    frames: int = option("Frames per clip.", 150, panel=WHAT, least=1)
+    frames: int = what("Frames per clip.", 150, least=1)
     target: Parsed[QualityTarget] = option(
         "Score to reach, such as vmaf=99.5, psnr=42 or ssim=0.98.",
         "vmaf=99.5",
         parse=_parse_target,
     )
-    streams: int | None = option(
-        "Number of cameras, to estimate the size of a dataset.", panel=WHAT, least=1
-    )
-    hours: float | None = option(
-        "Hours of recording, to estimate the size of a dataset.",
-        panel=WHAT,
-        least=_LEAST,
-        most=_MOST,
+    streams: int | None = what("Number of cameras, to estimate the size of a dataset.", least=1)
+    hours: float | None = what(
+        "Hours of recording, to estimate the size of a dataset.", least=_LEAST, most=_MOST
     )
     force: bool = force()
     gop: int = option("Maximum key frame interval in frames.", LOSSY_GOP, least=1, most=100_000)

@@ -21,7 +21,7 @@ from mp4ds.format.fields import marked
 from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera
-from mp4ds.options import WHAT, Parsed, SliceOptions, force, option
+from mp4ds.options import Parsed, SliceOptions, force, option, what
 from mp4ds.times import Integers, at_most, intervals, sound_times, synchronize, usual_interval
 from mp4ds.unpacking.pictures import FrameOptions, is_inverse_depth
 from mp4ds.video.codecs import MAX_CRF
@@ -48,20 +48,16 @@ class ExportOptions(SliceOptions, Reduction, FrameOptions):
     native: bool = option(
         "Keep Bayer mosaics, as grey images, instead of interpolating.", False, only=_FOLDERS
     )
-    tolerance_ns: Parsed[int | None] = option(
+    tolerance_ns: Parsed[int | None] = what(
         "Keep only frames that all cameras have within this time of each other.",
         None,
         "--sync",
-        panel=WHAT,
         metavar="MS",
         least=0,
         parse=_nanoseconds,
     )
-    poses: str | None = option(
-        "Topic with poses, for euroc, tum and colmap.",
-        panel=WHAT,
-        metavar="TOPIC",
-        only=_FOLDERS,
+    poses: str | None = what(
+        "Topic with poses, for euroc, tum and colmap.", metavar="TOPIC", only=_FOLDERS
     )
     fps: int | None = option(
         "Frame rate for lerobot; default: that of the first camera.",
@@ -69,22 +65,17 @@ class ExportOptions(SliceOptions, Reduction, FrameOptions):
         most=1000,
         only=_LEROBOT,
     )
-    state: str | None = option(
+    state: str | None = what(
         "Topic for lerobot's observation.state, and which of its fields.",
-        panel=WHAT,
         metavar="TOPIC[:FIELD,...]",
         only=_LEROBOT,
     )
-    action: str | None = option(
-        "The same for lerobot's action.",
-        panel=WHAT,
-        metavar="TOPIC[:FIELD,...]",
-        only=_LEROBOT,
+    action: str | None = what(
+        "The same for lerobot's action.", metavar="TOPIC[:FIELD,...]", only=_LEROBOT
     )
-    task: str = option(
+    task: str = what(
         "Task description, for lerobot; or a topic of std_msgs/String with them, such as /task.",
         "",
-        panel=WHAT,
         metavar="TEXT",
         only=_LEROBOT,
     )

@@ -47,7 +47,7 @@ from mp4ds.files.outputs import (
     write_synced,
 )
 from mp4ds.files.urls import remote
-from mp4ds.options import WHERE, Options, force, option
+from mp4ds.options import Options, force, where
 from mp4ds.plugins.info import Brief, TopicInfo, brief, notes_of, topics_of
 from mp4ds.plugins.reporting.cameras import (
     ReportedCamera,
@@ -77,12 +77,8 @@ _STILL_WIDTH = 480
 class ReportOptions(Options):
     """How to make a report."""
 
-    output: Path | None = option(
-        "Folder to write to; default: the dataset itself.",
-        None,
-        "-o",
-        panel=WHERE,
-        metavar="FOLDER",
+    output: Path | None = where(
+        "Folder to write to; default: the dataset itself.", None, "-o", metavar="FOLDER"
     )
     force: bool = force("Replace an index.html that is not a report.")
 

@@ -17,7 +17,6 @@ from mp4ds.errors import FrameNotFoundError, OptionError, VideoError
 from mp4ds.files.outputs import begins_with, staged
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.options import (
-    WHAT,
     Options,
     Parsed,
     Time,
@@ -25,6 +24,7 @@ from mp4ds.options import (
     option,
     parse_resize,
     parse_time,
+    what,
 )
 from mp4ds.video.images import ImageFile, encoding_as
 
@@ -153,12 +153,11 @@ def _parse_at(value: str | float | Time) -> Time | int:
 class StillOptions(Options):
     """Which frame to save, and how."""
 
-    topic: str = option("Camera topic, if there are several.", "", "-t", panel=WHAT)
-    at: Parsed[Time | int] = option(
+    topic: str = what("Camera topic, if there are several.", "", "-t")
+    at: Parsed[Time | int] = what(
         "Seconds from the first frame or since 1970, nanoseconds since 1970, an ISO date, or #N "
         "for frame number N; default: the first frame.",
         0,
-        panel=WHAT,
         metavar="TIME",
         parse=_parse_at,
     )

@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeVar, cast, get_args
 import yaml
 
 from mp4ds.errors import OptionError, RemoteError
-from mp4ds.options import WHERE, Options, argument, option
+from mp4ds.options import Options, argument, where
 from mp4ds.records import Channel
 
 World = Literal["ros1", "ros2"]
@@ -244,12 +244,11 @@ class NodeOptions(Options):
     """How a node takes part; the options of a player and of a recorder are such options."""
 
     to: str | None = argument("ros1 or ros2; default: the ROS that is sourced.")
-    qos_overrides: Path | None = option(
+    qos_overrides: Path | None = where(
         "QoS profiles by topic (ROS 2).",
         None,
         "--qos-profile-overrides-path",
         metavar="YAML",
-        panel=WHERE,
         only=("ros2",),
     )
     names: NodeNames = argument("Name, namespace and remappings of the ROS node.", PLAIN)
