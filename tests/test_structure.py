@@ -48,6 +48,15 @@ def test_modules_are_short() -> None:
         assert lines > MAX_LINES or name not in LONGER, f"{name} is no longer long: strike it"
 
 
+def test_every_plugin_is_where_it_is_looked_for() -> None:
+    texts = "".join(path.read_text() for path in MODULES)
+    places = re.findall(r'plugin\(\s*"([\w.]+):(\w+)"', texts)
+    assert len(places) > 3
+    for module, name in places:
+        text = (SOURCE / "plugins" / f"{module.replace('.', '/')}.py").read_text()
+        assert re.search(rf"^(def|class) {name}\b", text, re.MULTILINE), f"{module}:{name}"
+
+
 @cache  # each library looks into all modules
 def imports_of(path: Path) -> frozenset[str]:
     """Top-level names of the packages that a module imports, anywhere in it."""
