@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,11 +76,11 @@ class Look:
         self.caption = ""
         self._low, self._high = 0.0, 255.0
         if not self._is_light:
-            self._low, self._high = _range(_sampled(topic), _LOW, _HIGH)
+            self._low, self._high = _range(topic, _LOW, _HIGH)
             first = "the first of its channels, " if encoding.channels > 1 else ""
             self.caption = f"in false colour: {first}{self._low:.4g} to {self._high:.4g}"
         elif self._view.dtype != np.uint8:
-            self._high = _range(_sampled(topic), _LOW, _WHITE)[1]
+            self._high = _range(topic, _LOW, _WHITE)[1]
             self.caption = f"16 bits: white is {self._high:.0f}"
 
     def picture(self, pixels: Pixels) -> Bytes:
@@ -107,19 +107,6 @@ class Look:
         return places
 
 
-def _sampled(topic: Topic) -> list[Pixels]:
-    """Pixels of a few frames, subsampled."""
-    found = []
-    for number in spread(len(topic), _SAMPLES):
-        try:
-            frame = topic.get([number])[0].data
-        except VideoError:
-            continue
-        steps = [max(1, side // _SIDE) for side in frame.shape[:2]]
-        found.append(_first(frame)[:: steps[0], :: steps[1]])
-    return found
-
-
 def _first(pixels: Pixels) -> Pixels:
     return pixels if pixels.ndim == 2 else pixels[..., 0]
 
@@ -130,9 +117,16 @@ def _is_value(numbers: Pixels) -> NDArray[np.bool_]:
     return is_value
 
 
-def _range(samples: list[Pixels], low: float, high: float) -> tuple[float, float]:
-    values = [sample[_is_value(sample)].astype(np.float64) for sample in samples]
-    known = np.concatenate(values) if values else np.empty(0)
+def _range(topic: Topic, low: float, high: float) -> tuple[float, float]:
+    """Percentiles of the values of a few frames, subsampled."""
+    values = [np.empty(0)]
+    for number in spread(len(topic), _SAMPLES):
+        with suppress(VideoError):
+            frame = topic.get([number])[0].data
+            rows, columns = (max(1, side // _SIDE) for side in frame.shape[:2])
+            sample = _first(frame)[::rows, ::columns]
+            values.append(sample[_is_value(sample)].astype(np.float64))
+    known = np.concatenate(values)
     if not len(known):
         return 0.0, 1.0
     least, most = (float(value) for value in np.percentile(known, [low, high]))
@@ -297,10 +291,6 @@ def _still(topic: Topic, number: int, options: StillOptions) -> tuple[Pixels, st
     """Pixels of one frame, and their encoding."""
     if options.exact:
         return topic.get([number])[0].data, topic.encoding
-    encoding = ENCODINGS[topic.encoding]
-    if encoding_as(encoding, "rgb") and encoding.bytes_per_sample == 1:
-        frame = topic.get([number], format="rgb", resize=options.resize)[0]
-        return frame.data, frame.encoding
     size = topic.image_size
     if options.resize is not None:
         size = size_after(topic.topic, size, options.resize)
