@@ -553,13 +553,9 @@ class Dataset:
         """Whether the messages of a time span are consecutive in each channel."""
         return all(group.is_in_time for group in self._groups)
 
-    def gaps(self) -> Iterator[tuple[str, str]]:
+    def gaps(self) -> list[tuple[str, str]]:
         """Topics with missing messages according to the columns, and what is missing."""
-        if self.manifest is None:
-            return
-        for group in self._groups:
-            if gap := group.gap:
-                yield group.channel.topic, gap
+        return [(group.channel.topic, gap) for group in self._groups if (gap := group.gap)]
 
     def recorded_messages(self, excerpt: Excerpt) -> Iterator[Message]:
         """Messages in messages.mcap, by log time, on their channels."""

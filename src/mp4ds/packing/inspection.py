@@ -408,7 +408,9 @@ def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[in
     Raises:
         OptionError: A topic is unknown or of the wrong kind, or is paired with two others.
     """
-    topics = by_topic(channels)
+    cameras, calibrations = (
+        by_topic(filter(holds, channels)) for holds in (is_camera, is_calibration)
+    )
     pairs: dict[int, int] = {}
     chosen: dict[str, str] = {}  # topics of a pair, in both directions
     for choice in dict.fromkeys(choices):
@@ -418,12 +420,14 @@ def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[in
             raise OptionError(
                 f"`camera_info` {choice!r} is not of the form IMAGE=INFO, such as {example}."
             )
-        for topic, holds, noun in (
-            (image, is_camera, "images"),
-            (info, is_calibration, "calibrations"),
-        ):
-            if not any(map(holds, topics.get(topic, ()))):
-                raise OptionError(_no_such_topic(choice, topic, topics, holds, noun))
+        kinds = (image, "images", cameras), (info, "calibrations", calibrations)
+        for topic, noun, known in kinds:
+            if topic not in known:
+                listed = ", ".join(sorted(known)[:_LISTED]) + ", ..." * (len(known) > _LISTED)
+                raise OptionError(
+                    f"`camera_info` {choice!r}: {topic!r} is not among the packed topics of {noun}."
+                    f" Topics of {noun}: {listed or 'none'}."
+                )
             if topic in chosen:
                 raise OptionError(
                     f"`camera_info` pairs {topic} with {chosen[topic]}, so {choice} cannot be: a "
@@ -431,24 +435,9 @@ def choose_pairs(choices: Sequence[str], channels: Sequence[Channel]) -> dict[in
                     "two out: all messages are kept."
                 )
         chosen[image], chosen[info] = info, image
-        infos, images = filter(is_calibration, topics[info]), filter(is_camera, topics[image])
-        pairs.update((a.id, b.id) for a, b in zip(infos, images, strict=False))
+        matches = zip(calibrations[info], cameras[image], strict=False)
+        pairs.update((own.id, shown.id) for own, shown in matches)
     return pairs
-
-
-def _no_such_topic(
-    choice: str,
-    topic: str,
-    topics: Mapping[str, list[Channel]],
-    holds: Callable[[Channel], bool],
-    noun: str,
-) -> str:
-    wanted = sorted(name for name, own in topics.items() if any(map(holds, own)))
-    listed = ", ".join(wanted[:_LISTED]) + (", ..." if len(wanted) > _LISTED else "")
-    problem = f"{topic!r} is not among the packed topics"
-    if own := topics.get(topic):
-        problem = f"{topic!r} holds {own[0].type_name or 'messages without a type'}, not {noun}"
-    return f"`camera_info` {choice!r}: {problem}. Topics of {noun}: {listed or 'none'}."
 
 
 def by_topic(channels: Iterable[Channel]) -> dict[str, list[Channel]]:
