@@ -558,21 +558,18 @@ def _joined(rows: Sequence[_Rows], models: Mapping[str, object]) -> dict[str, In
     return {name: np.concatenate(arrays) for name, arrays in columns.items()}
 
 
+_OWN = {"mp4ds", "frames", "headers", "video", "view", "camera_info", "columns", "digests"}
+
+
 def _common(sidecar: StreamSidecar) -> tuple[object, ...]:
     """What all segments of a stream have in common."""
-    videos = [video.model_dump(exclude={*FACTS, "quality"}) for video in sidecar.videos]
-    info = sidecar.camera_info
+    info, columns = sidecar.camera_info, sidecar.columns
+    optional = (sidecar.digests, sidecar.video.quality, columns.seq, columns.pts)
     return (
+        sidecar.model_dump(exclude=_OWN),
+        [video.model_dump(exclude={*FACTS, "quality"}) for video in sidecar.videos],
+        [value is None for value in optional],
         info if info and not info.messages else None,  # nothing tells when one applied
-        *(sidecar.profile, sidecar.stamps, sidecar.channel, sidecar.wire, sidecar.body),
-        *(
-            sidecar.image,
-            videos,
-            sidecar.predicted,
-            sidecar.digests is None,
-            sidecar.video.quality is None,
-        ),
-        *(sidecar.columns.seq is None, sidecar.columns.pts is None),
     )
 
 
@@ -599,11 +596,7 @@ def _write_messages(
             found=digest_file(path),
         )
         return None
-    in_videos: set[_Identity] = set()
-    for sidecar in sidecars:
-        in_videos.add(sidecar.channel.to_record(0).identity)
-        if sidecar.camera_info:
-            in_videos.add(sidecar.camera_info.channel.to_record(0).identity)
+    in_videos = identities(sidecars)
     collector = TransformCollector()
     channels = _channels(sources)
 
@@ -625,6 +618,16 @@ def _write_messages(
             for schema in source.dataset.messages_file.unused_schemas:
                 writer.add_schema(schema)
     return collector.transforms if len(sources) > 1 else None
+
+
+def identities(sidecars: Iterable[StreamSidecar]) -> set[tuple[object, ...]]:
+    """The channels whose messages are in videos, or sidecars."""
+    return {
+        model.to_record(0).identity
+        for sidecar in sidecars
+        for model in (sidecar.channel, sidecar.camera_info and sidecar.camera_info.channel)
+        if model
+    }
 
 
 def _channels(sources: Sequence[_Source]) -> list[dict[int, Channel]]:

@@ -177,24 +177,38 @@ class PartedPack:
                 f"missing: {listed}. Run their shards, or pack without `join` to pack them here."
             )
 
-    def tell(self, phase: str = "packing", note: str = "") -> None:
-        """Report progress."""
+    def tell_whole(self, part: PartRecord, done: float) -> None:
+        """Report progress of a recording that is packed in one pass.
+
+        Args:
+            part: What was packed so far.
+            done: Its share, 0 to 1.
+        """
+        topics = part.topics.values()
+        self._messages = Counter({topic.topic: topic.messages for topic in topics})
+        self._read = sum(topic.raw_bytes for topic in topics)
+        self._written = folder_size(part.folder)
+        self.tell(done=done)
+
+    def tell(self, phase: str = "packing", note: str = "", done: float | None = None) -> None:
+        """Report progress; `done` is that of the frames if it is not given."""
         if self.report is None:
             return
         messages, frames = self._messages, self.plan.frames
-        packed = sum(min(messages[topic], count or 0) for topic, count in frames.items())
         total = sum(count or 0 for count in frames.values())
+        if done is None and total:
+            done = sum(min(messages[topic], count or 0) for topic, count in frames.items()) / total
         self.report(
             PackProgress(
                 dataset=self.target,
                 phase=phase,
-                done=packed / total if total else None,
+                done=done,
                 bytes_read=self._read,
                 bytes_total=sum(source.size for source in self.plan.sources),
                 bytes_written=self._written,
                 topics={topic: (messages[topic], count) for topic, count in frames.items()},
                 tasks_done=len(self._done),
-                tasks_total=len(self.plan.pieces),
+                tasks_total=len(self.plan.pieces) if self.plan.is_divided else 0,
                 failed=len(self.failures),
                 note=note,
             )

@@ -52,7 +52,7 @@ from mp4ds.packing.manifest import (
     summarize,
     write_manifest,
 )
-from mp4ds.packing.options import NO_VIEW, PackOptions, PackProgress, PackSummary, plugin
+from mp4ds.packing.options import NO_VIEW, PackOptions, PackSummary, plugin
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
 from mp4ds.packing.parts import PartsFolder, PlanNote, digest_source
 from mp4ds.packing.planning import (
@@ -97,7 +97,7 @@ def _pack_in_one_pass(parted: PartedPack, exact: Exact) -> PackSummary:
 
 
 def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> PackSummary:
-    plan, report = parted.plan, parted.report
+    plan = parted.plan
     is_slice = plan.options.is_slice
     total = sum(map(source_size, reader.files))
     due = sum(item.count for item in reader.stats().values())
@@ -108,25 +108,12 @@ def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> 
         if not is_slice:  # close behind the reader: a store's bytes are kept for a moment only
             hasher.advance(reader.position)
         now = time.monotonic()
-        if report is not None and (done or now >= next_report):
+        if done or now >= next_report:
             next_report = now + _REPORT_SECONDS
             share = reader.position / max(1, total)
             if is_slice:
                 share = sum(topic.messages for topic in part.topics.values()) / max(1, due)
-            state = PackProgress(
-                dataset=parted.target,
-                phase="packing",
-                done=1.0 if done else min(1.0, share),
-                bytes_read=sum(topic.raw_bytes for topic in part.topics.values()),
-                bytes_total=total,
-                bytes_written=folder_size(folder),
-                topics={
-                    name: (part.topics[name].messages, count)
-                    for name, count in plan.frames.items()
-                    if name in part.topics
-                },
-            )
-            report(state)
+            parted.tell_whole(part, 1.0 if done else min(1.0, share))
 
     (piece,) = plan.pieces
     with unchanged(plan.sources), SourceHasher(reader.files) as hasher:

@@ -15,6 +15,7 @@ import xxhash
 
 from mp4ds.bags.mcap import McapWriter
 from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.concat import identities
 from mp4ds.errors import Refused
 from mp4ds.format.fields import FORMAT_VERSION, MAX_FRAMES, digests_model, exceeds_padding
 from mp4ds.format.manifest import RedactionEntry
@@ -603,12 +604,7 @@ class Packer:
 
     def _declare_rest(self) -> None:
         """Keep what the recording declares besides its messages."""
-        in_videos = {
-            model.to_record(0).identity
-            for sidecar in self.part.streams
-            for model in (sidecar.channel, sidecar.camera_info and sidecar.camera_info.channel)
-            if model
-        }
+        in_videos = identities(self.part.streams)
         for channel in self.reader.channels:
             if not self._selected(channel.topic):
                 self.part.left_out[channel.topic] = None

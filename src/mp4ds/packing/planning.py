@@ -257,22 +257,15 @@ def _lossless_plans(
     note: str = "",
 ) -> list[TrackPlan]:
     encoding = ENCODINGS[samples[0].key.encoding]
-    pixels = _pixels(samples)
-    asked = options.goal.lossless
-    if not (asked or note):
-        note = f"{encoding.name} is kept lossless"
-    tried = partial(
-        choose,
-        pixels,
-        encoding,
-        gop=options.group_frames,
-        threads=threads,
-        purpose=options.purpose,
-    )
-    codec = options.codec if asked else None  # otherwise they were meant for lossy videos
+    pixels, gop = _pixels(samples), options.group_frames
+    codec, preset = options.codec, options.preset
+    if not options.goal.lossless:
+        codec = preset = None  # they were meant for lossy videos
+        note = note or f"{encoding.name} is kept lossless"
+    tried = partial(choose, pixels, encoding, gop=gop, threads=threads, purpose=options.purpose)
     try:
         try:
-            best = tried(codec=codec, preset=options.preset if asked else None)
+            best = tried(codec=codec, preset=preset)
         except (OptionError, EncoderRefusedError) as error:
             if codec is None:
                 raise
@@ -291,11 +284,11 @@ def _lossless_plans(
                 source or difference_layouts(view.layout),
                 view,
                 least,  # which the first images make 1 to 3 % too large
-                gop=options.group_frames,
+                gop=gop,
                 h264_gop=DIFFERENCES_GOP if is_usual else None,
                 threads=threads,
                 codec=codec,
-                preset=options.preset if asked else None,
+                preset=preset,
                 purpose=options.purpose,
             )
             is_predicted = both.bytes_per_frame <= least + beside
