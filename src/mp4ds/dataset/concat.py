@@ -213,11 +213,6 @@ class _Segment:
     images: _Rows
     infos: _Rows | None
 
-    @property
-    def has_all(self) -> bool:
-        """Whether the whole video is copied."""
-        return len(self.images) == len(self.stream)
-
 
 class _Source:
     """What is copied of a dataset.
@@ -496,16 +491,17 @@ class _JoinedStream:
         """
         videos = [part.stream.videos[number] for part in self.segments]
         (source, old), part = videos[0], self.segments[0]
+        is_whole = len(videos) == 1 and len(part.images) == len(part.stream)
         if len(videos) > 1:
             join_segments([own for own, _ in videos], self._ticks(), path)
-        elif part.has_all:
+        elif is_whole:
             _copy_file(source, path)
         else:
             numbers = part.images.numbers
             frames = range(int(numbers[0]), int(numbers[-1]) + 1)
             cut_segment(source, frames, self._ticks(), path)
         facts = video_facts(path, old.codec)
-        if len(videos) == 1 and part.has_all:
+        if is_whole:
             if old.sha256 not in (None, facts["sha256"]):
                 raise VideoError(
                     "hash-mismatch", source, "does not match the SHA-256 in its sidecar"

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mp4ds.bags.formats import RECORDING_SUFFIXES
 from mp4ds.dataset.images import Images, VerbatimImages, VideoImages, verbatim_images
 from mp4ds.dataset.messages import (
     ChannelGroup,
@@ -49,7 +50,6 @@ from mp4ds.records import Channel, Excerpt, Message, Record
 from mp4ds.times import Sync, synchronize
 
 _VIDEOS = (".mp4", ".m4v", ".mov")
-_RECORDINGS = (".bag", ".mcap", ".db3")
 _MOST_TOPICS = 4  # named in a repr
 
 Ahead = Callable[[Iterator[Any]], Iterator[Any]]
@@ -101,7 +101,7 @@ class Dataset:
             remedy = "Give a folder made by `mp4ds pack`, or a sidecar next to its video."
             if video := video_at(self.path):
                 problem, remedy = f"is {video}, not a dataset", HOW_TO_OPEN
-            elif self.path.suffix in _RECORDINGS or (self.path / "metadata.yaml").exists():
+            elif self.path.suffix in RECORDING_SUFFIXES or (self.path / "metadata.yaml").exists():
                 problem = "is a recording, not a dataset"
                 remedy = f"Make a dataset of it first: mp4ds pack {shlex.quote(str(self.path))}"
             elif is_folder(self.path) and (inside := sorted(self.path.glob(f"*/{MANIFEST_NAME}"))):
@@ -327,8 +327,9 @@ class Dataset:
         Raises:
             FormatError: See `verify_file`.
         """
-        if self.manifest and not self.is_salvaged:
-            self.messages_file.verify(self.manifest)
+        path = self.messages_file.path
+        if self.manifest and path and not self.is_salvaged:
+            verify_file(path, self.manifest.file(path.name))
 
     def verify_sidecars(self, selected: Callable[[str], bool] = lambda _: True) -> None:
         """Check sidecars against their SHA-256: an edited one may look valid.

@@ -21,8 +21,6 @@ from mp4ds.dataset.rebuild import CalibrationMessages
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import FormatError, Refused, SourceError
 from mp4ds.format.fields import Choice, everything
-from mp4ds.format.manifest import Manifest
-from mp4ds.format.sidecars import verify_file
 from mp4ds.records import (
     EVERYTHING,
     Channel,
@@ -49,15 +47,6 @@ class MessagesFile:
     def __init__(self, path: Path | None, *, salvage: bool = False) -> None:
         self.path = path
         self.is_salvaged = salvage
-
-    def verify(self, manifest: Manifest) -> None:
-        """Check it against its SHA-256: not all of its contents have their own checksum.
-
-        Raises:
-            FormatError: See `verify_file`.
-        """
-        if self.path is not None:
-            verify_file(self.path, manifest.file(self.path.name))
 
     @cached_property
     def _reader(self) -> McapReader | McapSalvage | None:

@@ -409,7 +409,7 @@ def _salvaged_messages(path: Path, manifest: Manifest | None) -> tuple[MessagesF
     file = MessagesFile(path)
     with suppress(FormatError):  # it is read below as far as possible
         if manifest is not None:
-            file.verify(manifest)
+            verify_file(path, manifest.file(path.name))
             return file, []
     try:
         file = MessagesFile(path, salvage=True)

@@ -250,22 +250,19 @@ def _values(
         OptionError: They do not exist.
     """
     name, channels = encoding.name, encoding.channels
-    given = list(fill) if isinstance(fill, Sequence) else None
     is_yuv = encoding.even != (1, 1) or encoding.rows != Fraction(1)
     is_coloured = is_yuv or bool(encoding.mosaic) or name[:3] in ("rgb", "bgr")
     due = 3 if is_coloured else channels
-    if given is not None and len(given) != due:
+    colour = list(fill) if isinstance(fill, Sequence) else [fill] * due
+    if len(colour) != due:
         numbers = f"{due} values" if due > 1 else "a single value"
-        raise OptionError(f"fill {given} does not fit: {name} images need {numbers}")
-    colour = [fill] * due if given is None else given
+        raise OptionError(f"fill {colour} does not fit: {name} images need {numbers}")
     wanted = np.array(colour, np.float64)
     bounds: Any = (np.finfo if encoding.is_float else np.iinfo)(encoding.dtype)
     low, high = (0, 255) if is_yuv else (bounds.min, bounds.max)
-    is_special = encoding.is_float & ~np.isfinite(wanted)
-    is_value = (
-        (wanted >= low) & (wanted <= high) & (encoding.is_float | (wanted == np.rint(wanted)))
-    )
-    if not (is_special | is_value).all():
+    fits = (wanted >= low) & (wanted <= high)
+    fits = fits | ~np.isfinite(wanted) if encoding.is_float else fits & (wanted == np.rint(wanted))
+    if not fits.all():
         shown = f"{fill:g}" if isinstance(fill, float) else fill
         raise OptionError(f"fill {shown} is out of range for {name} images ({low} to {high})")
     made: Any = colour

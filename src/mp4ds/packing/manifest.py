@@ -210,7 +210,7 @@ def summarize(
     with Dataset(part.folder) as made:
         summary = PackSummary(
             dataset=target,
-            topics=list(_topics_in(made, part.topics).values()),
+            topics=_topics_in(made, part.topics),
             source_bytes=source_bytes,
             dataset_bytes=folder_size(part.folder),
             messages_bytes=part.messages_path.stat().st_size,
@@ -224,18 +224,16 @@ def summarize(
         return replace(summary, larger="" if is_copy else _why_larger(summary, made))
 
 
-def _topics_in(made: Dataset, known: Mapping[str, TopicSummary]) -> dict[str, TopicSummary]:
+def _topics_in(made: Dataset, known: Mapping[str, TopicSummary]) -> list[TopicSummary]:
     """What became of each topic, in the order of the known ones."""
+    types = {channel.topic: channel.type_name for channel in made.channels}
+    topics: dict[str, TopicSummary] = {}
+    for name in dict.fromkeys((*filter(types.__contains__, known), *types)):
+        old = known.get(name, TopicSummary(name, ""))
+        topics[name] = TopicSummary(name, types[name], raw_bytes=old.raw_bytes, notes=[*old.notes])
     counts = made.counts()
-    topics = {
-        channel.topic: TopicSummary(channel.topic, channel.type_name) for channel in made.channels
-    }
     for channel in made.channels:
         topics[channel.topic].messages += counts.get(channel.id, 0)
-    order = [name for name in known if name in topics]
-    for name in order:
-        topics[name].raw_bytes = known[name].raw_bytes
-        topics[name].notes += known[name].notes
     for stream in made.streams:
         topic, video = topics[stream.topic], stream.sidecar.video
         topic.frames += len(stream)
@@ -256,7 +254,7 @@ def _topics_in(made: Dataset, known: Mapping[str, TopicSummary]) -> dict[str, To
                 notes.append(note)
     for entry in made.manifest.verbatim if made.manifest else ():
         topics[entry.topic].verbatim[entry.reason] = (entry.messages, entry.first)
-    return {name: topics[name] for name in dict.fromkeys((*order, *topics))}
+    return list(topics.values())
 
 
 def _why_larger(summary: PackSummary, made: Dataset) -> str:
