@@ -68,7 +68,7 @@ def distances(dataset: Path) -> Iterator[float]:
 
 
 def pixels_of(stream: Any) -> Iterator[tuple[int, Any]]:
-    for index, picture in stream.pictures(is_strict=False):
+    for index, picture in stream.decodable_pictures(is_strict=False):
         if picture is not None:
             yield index, stream.recorded_pixels(picture)
 
