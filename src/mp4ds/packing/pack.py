@@ -108,7 +108,7 @@ def _fill(folder: Path, reader: BagReader, parted: PartedPack, exact: Exact) -> 
         if not is_slice:  # close behind the reader: a store's bytes are kept for a moment only
             hasher.advance(reader.position)
         now = time.monotonic()
-        if done or now >= next_report:
+        if parted.report is not None and (done or now >= next_report):
             next_report = now + _REPORT_SECONDS
             share = reader.position / max(1, total)
             if is_slice:
