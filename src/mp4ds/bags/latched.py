@@ -23,21 +23,18 @@ from mp4ds.messages.transforms import transform_parser
 from mp4ds.options import SliceOptions
 from mp4ds.records import QOS_KEY, Channel, Excerpt, Message
 
-_QOS = """\
+_FOREVER = """
+    sec: 9223372036
+    nsec: 854775807"""
+_QOS = f"""\
 - history: 1
-  depth: {depth}
+  depth: {{depth}}
   reliability: 1
-  durability: {durability}
-  deadline:
-    sec: 9223372036
-    nsec: 854775807
-  lifespan:
-    sec: 9223372036
-    nsec: 854775807
+  durability: {{durability}}
+  deadline:{_FOREVER}
+  lifespan:{_FOREVER}
   liveliness: 1
-  liveliness_lease_duration:
-    sec: 9223372036
-    nsec: 854775807
+  liveliness_lease_duration:{_FOREVER}
   avoid_ros_namespace_conventions: false"""
 LATCHED_QOS = _QOS.format(depth=1, durability=1)
 """Keep the last one, reliable, transient local: what ROS 1 calls latching."""

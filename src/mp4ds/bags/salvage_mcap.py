@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -401,26 +401,20 @@ class McapSalvage(FileSalvage):
 
     def _take(
         self, body: bytes | memoryview, offset: int, *, is_doubtful: bool
-    ) -> Iterator[Message]:
-        """Yield a message, or hold it until an index confirms it.
+    ) -> Sequence[Message]:
+        """A message, unless it is lost, or held until an index confirms it.
 
         Raises:
             DamageError: It is shorter than its fields.
         """
         channel_id = int.from_bytes(body[:2], "little")
         if is_doubtful and channel_id not in self._declared.channels:
-            return
+            return ()
         if not self._has_channel(channel_id) and len(body) >= MESSAGE_HEAD.size:
-            self._tally.stray(channel_id)
             problem = f"messages of channel {channel_id}, whose record is missing"
-            self._log.lost_of_kind(problem, offset, problem).add(1, ())
-            return
-        message = self._declared.message(body)
-        if is_doubtful:
-            self._tally.hold(channel_id, message)
-        else:
-            self._tally.gave(channel_id, message.log_time)
-            yield message
+            self._tally.stray(channel_id, offset, problem)
+            return ()
+        return self._tally.take(channel_id, self._declared.message(body), is_doubtful=is_doubtful)
 
     def _has_channel(self, channel_id: int) -> bool:
         """Whether a channel is known; from a damaged summary as a last resort."""

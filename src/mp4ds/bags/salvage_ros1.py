@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -262,29 +262,28 @@ class Ros1Salvage(FileSalvage):
         if body is None:
             return
         if frame.kind == Op.MESSAGE:
-            message = self._message(frame, body, offset)
-            if message:
-                self._tally.gave(frame.fields.number(b"conn"), message.log_time)
-                yield message
+            yield from self._message(frame, body, offset)
         elif frame.kind == Op.CONNECTION and not self._connect(frame, body):
             self._lose(offset, frame.size, "a connection record is damaged")
         elif frame.kind == Op.INDEX:
             self._listed(frame.fields, body, offset)
 
-    def _message(self, frame: RecordFrame, body: bytes, offset: int) -> Message | None:
-        """A message; None if it is lost."""
+    def _message(
+        self, frame: RecordFrame, body: bytes, offset: int, *, is_doubtful: bool = False
+    ) -> Sequence[Message]:
+        """A message, unless it is lost, or held until an index confirms it."""
         connection, log_time = frame.fields.number(b"conn"), frame.fields.time(b"time")
         channel = self._channels.get(connection)
         if log_time >= MAX_TIME:
             problem = "a message has a time past 2^32 seconds, which ROS cannot represent"
             self._lose(offset, frame.size, problem)
-            return None
+            return ()
         if channel is None:
-            self._tally.stray(connection)
             problem = f"messages of connection {connection}, whose record is missing"
-            self._log.lost_of_kind(connection, offset, problem).add(1, ())
-            return None
-        return Message(channel, log_time, log_time, 0, body)
+            self._tally.stray(connection, offset, problem)
+            return ()
+        message = Message(channel, log_time, log_time, 0, body)
+        return self._tally.take(connection, message, is_doubtful=is_doubtful)
 
     def _connect(self, frame: RecordFrame, body: bytes, *, is_sure: bool = False) -> bool:
         """Take a connection record; False if it is damaged."""
@@ -314,13 +313,7 @@ class Ros1Salvage(FileSalvage):
         problems = [problem] if problem else []
         for part, body in self._inside(content, problems):
             if part.kind == Op.MESSAGE:
-                message = self._message(part, body, offset)
-                connection = part.fields.number(b"conn")
-                if message and is_sound:
-                    self._tally.gave(connection, message.log_time)
-                    yield message
-                elif message:
-                    self._tally.hold(connection, message)
+                yield from self._message(part, body, offset, is_doubtful=not is_sound)
             elif part.kind == Op.CONNECTION and not self._connect(part, body, is_sure=not problems):
                 problems.append("a connection record is damaged")
         used += frame.head

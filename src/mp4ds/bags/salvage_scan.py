@@ -415,32 +415,34 @@ class Tally:
         else:
             self._expected.update(expected)
 
-    def gave(self, channel: int, time: int) -> None:
-        """Count a message that was read, with its log time in ns."""
-        self._log.gave(time)
+    def take(
+        self, channel: int, message: Message, *, is_doubtful: bool = False
+    ) -> Sequence[Message]:
+        """Count a message that was read, and return it; hold one that may not be one."""
+        if is_doubtful:
+            self.held.append((channel, message))
+            return ()
+        self._log.gave(message.log_time)
         self._read[channel] += 1
-
-    def hold(self, channel: int, message: Message) -> None:
-        """Hold a message that may not be one."""
-        self.held.append((channel, message))
+        return (message,)
 
     def settle(self) -> list[Message]:
         """Decide which of the held messages to return."""
         held, self.held = self.held, []
         left, self._listed_times = self._listed_times, Counter()
         first, last = self._span or (0, inf)
-        sound = []
+        sound: list[Message] = []
         for channel, message in held:
             key = channel, message.log_time
             is_listed = left[key] > 0
             if is_listed if self._index_is_whole else first <= message.log_time <= last:
                 left[key] -= 1
-                sound.append(message)
-                self.gave(channel, message.log_time)
+                sound += self.take(channel, message)
         return sound
 
-    def stray(self, channel: int) -> None:
+    def stray(self, channel: int, offset: int, problem: str) -> None:
         """Count a message of an unknown channel, separately from lost ones."""
+        self._log.lost_of_kind(problem, offset, problem).add(1, ())
         self._strays[channel] += 1
         self._read[channel] += 1
 
