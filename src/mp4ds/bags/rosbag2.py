@@ -454,7 +454,7 @@ class Rosbag2Writer(BagWriter):
             "starting_time": start,
             "message_count": count,
             "topics_with_message_count": [
-                _topic_entry(self._as_listed(topic), number, version)
+                {"topic_metadata": self._listed(topic, version), "message_count": number}
                 for topic, number in self._counts.items()
             ],
             "compression_format": "",
@@ -466,19 +466,25 @@ class Rosbag2Writer(BagWriter):
         }
         return _known_to(version, info)
 
-    def _as_listed(self, topic: TopicMetadata) -> TopicMetadata:
-        """The topic as listed in the source's metadata.yaml, which may differ from its files."""
+    def _listed(self, topic: TopicMetadata, version: int) -> dict[str, Any]:
+        """A topic as in the source's metadata.yaml, which may differ from its files."""
+        qos, type_hash, encoding = topic.qos, topic.type_hash, topic.serialization_format
         listed, name = self._source.topics if self._source else (), (topic.name, topic.type_name)
         found = [one for one in listed if (one.name, one.type_name) == name]
-        if len(found) != 1:
-            return topic
-        (one,) = found
-        return replace(
-            topic,
-            serialization_format=one.serialization_format,
-            qos=topic.qos if one.qos is None else one.qos,
-            type_hash=topic.type_hash if one.type_hash is None else one.type_hash,
-        )
+        if len(found) == 1:
+            (one,) = found
+            encoding = one.serialization_format
+            qos = qos if one.qos is None else one.qos
+            type_hash = type_hash if one.type_hash is None else one.type_hash
+        by_name = version >= NATIVE_QOS_VERSION
+        metadata = {
+            "name": topic.name,
+            "type": topic.type_name,
+            "serialization_format": encoding,
+            "offered_qos_profiles": native_qos(qos or "") if by_name else qos,
+            "type_description_hash": type_hash,
+        }
+        return _known_to(version, metadata)
 
     def finish(self) -> None:
         """Complete the storage, and write metadata.yaml."""
@@ -505,16 +511,3 @@ def _parsed(text: str) -> BagInfo | None:
 
 def _known_to(version: int, fields: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if version >= _SINCE.get(key, 0)}
-
-
-def _topic_entry(topic: TopicMetadata, count: int, version: int) -> dict[str, Any]:
-    by_name = version >= NATIVE_QOS_VERSION
-    metadata = {
-        "name": topic.name,
-        "type": topic.type_name,
-        "serialization_format": topic.serialization_format,
-        "offered_qos_profiles": native_qos(topic.qos or "") if by_name else topic.qos,
-        "type_description_hash": topic.type_hash,
-    }
-    metadata = _known_to(version, metadata)
-    return {"topic_metadata": metadata, "message_count": count}

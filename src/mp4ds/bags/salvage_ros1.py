@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,14 +116,6 @@ class _Scan(Scan):
 _SEARCHED = 16 * 2**20
 
 
-def _connection(frame: RecordFrame, body: bytes) -> Channel | None:
-    """The channel that a connection record declares; None if it is damaged."""
-    try:
-        return connection_of(frame.fields, body)
-    except DamageError:
-        return None
-
-
 # ---------------------------------------------------------------- the reader
 
 
@@ -213,7 +206,8 @@ class Ros1Salvage(FileSalvage):
 
     def _declare(self, frame: RecordFrame, body: bytes) -> None:
         """Take a connection of the index, unless it is damaged; the first of a number counts."""
-        if channel := _connection(frame, body):
+        with suppress(DamageError):
+            channel = connection_of(frame.fields, body)
             self._channels.setdefault(channel.id, channel)
 
     def _stats(self) -> Mapping[int, ChannelStats]:
@@ -287,8 +281,9 @@ class Ros1Salvage(FileSalvage):
 
     def _connect(self, frame: RecordFrame, body: bytes, *, is_sure: bool = False) -> bool:
         """Take a connection record; False if it is damaged."""
-        channel = _connection(frame, body)
-        if channel is None:
+        try:
+            channel = connection_of(frame.fields, body)
+        except DamageError:
             return frame.fields.number(b"conn") in self._channels
         connection = channel.id
         if self._channels.setdefault(connection, channel).identity != channel.identity:

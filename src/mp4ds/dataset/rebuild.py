@@ -14,7 +14,7 @@ from mp4ds.format.fields import Choice, DecodedColumns, decode_base64, decode_co
 from mp4ds.format.models import CameraInfo, StreamSidecar
 from mp4ds.messages import depth, png
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels, pixel_view, put_padding
-from mp4ds.messages.png import zlib_build, zlib_fingerprint
+from mp4ds.messages.png import zlib_fingerprint
 from mp4ds.messages.serializations import form_of
 from mp4ds.messages.wire import (
     CodedFields,
@@ -247,9 +247,9 @@ class MessageRebuilder:
         remark = ""
         if header.png and header.png.deflate != zlib_fingerprint():
             remark = (
-                f": its PNG file is rebuilt with zlib, and this Python has {zlib_build()}, which "
-                "compresses to different bytes. Use a Python linked with plain zlib, or unpack "
-                "with `images` raw"
+                ": its PNG file is rebuilt with zlib, and this Python has "
+                f"{zlib.ZLIB_RUNTIME_VERSION}, which compresses to different bytes. Use a Python "
+                "linked with plain zlib, or unpack with `images` raw"
             )
         raise self._failure("digest-mismatch", index, f"differs from what was recorded{remark}")
 

@@ -328,11 +328,6 @@ class PngRecipe:
     after: str
 
 
-def zlib_build() -> str:
-    """The version of the zlib in use, which may name another implementation."""
-    return zlib.ZLIB_RUNTIME_VERSION
-
-
 def zlib_fingerprint() -> str:
     """A checksum of the output of the zlib in use for a fixed input.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,7 +37,6 @@ from mp4ds.format.sidecars import (
     load_manifest,
     verify_file,
 )
-from mp4ds.messages.png import zlib_build
 from mp4ds.messages.serializations import is_camera
 from mp4ds.messages.transforms import Transform
 from mp4ds.packing.options import PackSummary, TopicSummary
@@ -181,7 +181,7 @@ def write_manifest(part: PartRecord, origin: Mapping[str, Any], profile: str) ->
             for topic in part.topics.values()
             for reason, (count, first) in topic.verbatim.items()
         ],
-        tools={**tools(), "zlib": zlib_build()},
+        tools={**tools(), "zlib": zlib.ZLIB_RUNTIME_VERSION},
         **origin,
     )
     (part.folder / MANIFEST_NAME).write_bytes(dump_document(manifest))
