@@ -153,9 +153,11 @@ def writer_of(target: str, storage: str) -> type[BagWriter]:
         target: ``bag``, ``rosbag2`` or ``mcap``.
         storage: ``sqlite3`` or ``mcap``, for ``rosbag2``.
     """
+    name = _CLASSES["bag" if target == "bag" else "mcap"][_WRITER]
     if target == "rosbag2" and storage == "sqlite3":
-        return _class("rosbag2_sqlite:SqliteWriter")  # type: ignore[no-any-return]
-    return _class(_CLASSES["bag" if target == "bag" else "mcap"][_WRITER])  # type: ignore[no-any-return]
+        name = "rosbag2_sqlite:SqliteWriter"
+    writer: type[BagWriter] = _class(name)
+    return writer
 
 
 def open_writer(
@@ -254,11 +256,8 @@ class CombinedReader(BagReader):
         return filter(excerpt.has, self._merged(EVERYTHING if excerpt.has_messages else excerpt))
 
     def _merged(self, excerpt: Excerpt) -> Iterator[Record]:
-        needed = [
-            number
-            for number, span in enumerate(self.spans)
-            if excerpt.others or excerpt.touches(*span)
-        ]
+        spans = enumerate(self.spans)
+        needed = [place for place, span in spans if excerpt.others or excerpt.touches(*span)]
         starts = [self.spans[number][0] for number in needed]
         return merged(starts, lambda place: self._records_of(needed[place], excerpt))
 
@@ -269,9 +268,8 @@ class CombinedReader(BagReader):
             try:
                 for record in self._part_records(number, part, excerpt):
                     if isinstance(record, Message):
-                        yield record.of_channel(self._share(number, record.channel))
-                    else:
-                        yield record
+                        record = record.of_channel(self._share(number, record.channel))
+                    yield record
             finally:
                 self._active.remove(part)
             self._declare(number, part)

@@ -19,7 +19,7 @@ from mp4ds.bags.protocols import (
 from mp4ds.bags.rosbag2_metadata import native_qos
 from mp4ds.errors import Refused, SourceError
 from mp4ds.messages.serializations import is_camera
-from mp4ds.messages.transforms import transform_parser
+from mp4ds.messages.transforms import is_tf_static, transform_parser
 from mp4ds.options import SliceOptions
 from mp4ds.records import QOS_KEY, Channel, Excerpt, Message
 
@@ -52,8 +52,6 @@ MOST = 1000
 MOST_BYTES = 2**28
 """Of the latched messages from before a slice."""
 
-_TF_STATIC = "tf_static"
-
 
 def is_latched(channel: Channel) -> bool:
     """Whether late subscribers get the last message: latching, or transient local."""
@@ -66,7 +64,7 @@ def is_latched(channel: Channel) -> bool:
 
 def has_late(channel: Channel) -> bool:
     """Whether late subscribers get earlier messages: /tf_static counts as latched in any case."""
-    return is_latched(channel) or _is_tf_static(channel)
+    return is_latched(channel) or is_tf_static(channel)
 
 
 def latched_depth(channel: Channel) -> int:
@@ -141,7 +139,7 @@ class LatchedMessages:
 
 def _parser(channel: Channel) -> Callable[[bytes | memoryview], frozenset[str] | None] | None:
     """A function that returns the child frames of a /tf_static message; None for other channels."""
-    parse = transform_parser(channel) if _is_tf_static(channel) else None
+    parse = transform_parser(channel) if is_tf_static(channel) else None
     if parse is None:
         return None
 
@@ -152,10 +150,6 @@ def _parser(channel: Channel) -> Callable[[bytes | memoryview], frozenset[str] |
             return None  # kept in any case
 
     return children
-
-
-def _is_tf_static(channel: Channel) -> bool:
-    return channel.topic.rpartition("/")[2] == _TF_STATIC
 
 
 def take_slice(

@@ -29,7 +29,6 @@ _MAX_MESSAGE = 1 << 20
 _MAX_IN_MESSAGE = 10 * MAX_TRANSFORMS
 _MAX_SCHEMA = 1 << 20
 _TOLERANCE = 0.01  # of a rotation's squared norm, as in tf2
-_TOPIC = "tf_static"
 # whether a message has several, and whether each has a header
 _ROS_TYPES = {
     "tf2_msgs/TFMessage": (True, True),
@@ -65,6 +64,11 @@ class Transform:
             and all(map(math.isfinite, (*self.translation, *self.rotation)))
             and abs(sum(value * value for value in self.rotation) - 1) < _TOLERANCE
         )
+
+
+def is_tf_static(channel: Channel) -> bool:
+    """Whether the last part of a channel's topic is tf_static."""
+    return channel.topic.strip("/").rpartition("/")[2] == "tf_static"
 
 
 Parser = Callable[[memoryview], list[Transform]]
@@ -237,10 +241,10 @@ class TransformCollector:
 
     @staticmethod
     def takes(channel: Channel) -> bool:
-        """Whether a channel has static transforms, that is, its topic's last part is tf_static."""
+        """Whether a channel has static transforms."""
         name = channel.type_name
         is_transform = name in _FOXGLOVE_TYPES or ros_type(name) in _ROS_TYPES
-        return is_transform and channel.topic.strip("/").rpartition("/")[2] == _TOPIC
+        return is_transform and is_tf_static(channel)
 
     def add(self, channel: Channel, data: bytes | memoryview) -> None:
         """Take a message, if it is one of static transforms."""
