@@ -332,13 +332,13 @@ class McapSalvage(FileSalvage):
         self._leave_plain(Opcode.FOOTER)
         yield from self._tally.settle()
         if not ended:
-            self._tally.lost(self._window.offset, None, "the file ends before its footer")
+            self._tally.skipped(self._window.offset, None, "the file ends before its footer")
         self._tally.close()
         for channel_id, schema_id in self._undefined.items():
             topic = self._topic_of(channel_id)
             if schema_id not in self._defined and topic is not None:
                 problem = f"the definition of its messages, schema {schema_id}, is missing"
-                self._log.lost(None, None, problem).add(0, [topic])
+                self._tally.lost(None, None, problem).add(0, [topic])
 
     def _read_header(self) -> None:
         window, frame = self._window, self._scan.here()

@@ -235,7 +235,7 @@ class Ros1Salvage(FileSalvage):
         yield from self._tally.settle()
         if (self._due or 0) > self._window.offset:
             problem = f"the file ends before its index, which should begin at byte {self._due}"
-            self._tally.lost(self._window.offset, None, problem)
+            self._tally.skipped(self._window.offset, None, problem)
         self._tally.close()
 
     def _record(self, frame: RecordFrame) -> Iterator[Message | None]:
@@ -295,7 +295,7 @@ class Ros1Salvage(FileSalvage):
             problem = f"records of connection {connection} ({channel.topic}) contradict each other"
             if connection not in self._contradicted:
                 self._contradicted.add(connection)
-                self._log.lost(None, None, problem).add(0, ())
+                self._tally.lost(None, None, problem).add(0, ())
         return True
 
     def _compressed(self, frame: RecordFrame) -> Iterator[Message]:

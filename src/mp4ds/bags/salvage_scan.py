@@ -358,14 +358,15 @@ class LossLog:
 # ---------------------------------------------------------------- tally
 
 
-class Tally:
-    """Messages read from a section of a file, usually a chunk, and those that an index lists.
+class Tally(LossLog):
+    """The losses of a file, by the messages read from each section of it, and those indexes list.
 
-    Messages of a chunk with doubtful content are held until its index is read, and only those it
-    lists are returned: damaged data may decompress to something that only looks like messages.
+    A section is usually a chunk. Messages of a chunk with doubtful content are held until its index
+    is read, and only those it lists are returned: damaged data may decompress to something that only
+    looks like messages.
 
     Args:
-        log: Where losses are recorded.
+        file: The file's name.
         topic_of: The topic of a channel, None if unknown.
 
     Attributes:
@@ -378,8 +379,8 @@ class Tally:
     _expected: Counter[int] | None = None
     _index_is_whole = False
 
-    def __init__(self, log: LossLog, topic_of: Callable[[int], str | None]) -> None:
-        self._log = log
+    def __init__(self, file: str, topic_of: Callable[[int], str | None]) -> None:
+        super().__init__(file)
         self._topic_of = topic_of
         self.held: list[tuple[int, Message]] = []
         self.open(None, None)
@@ -422,7 +423,7 @@ class Tally:
         if is_doubtful:
             self.held.append((channel, message))
             return ()
-        self._log.gave(message.log_time)
+        self.gave(message.log_time)
         self._read[channel] += 1
         return (message,)
 
@@ -442,19 +443,18 @@ class Tally:
 
     def stray(self, channel: int, offset: int, problem: str) -> None:
         """Count a message of an unknown channel, separately from lost ones."""
-        self._log.lost_of_kind(problem, offset, problem).add(1, ())
+        self.lost_of_kind(problem, offset, problem).add(1, ())
         self._strays[channel] += 1
         self._read[channel] += 1
 
-    def lost(self, offset: int, size: int | None, problem: str) -> Draft:
-        """Record skipped bytes."""
-        draft = self._log.lost(offset, size, problem)
+    def skipped(self, offset: int, size: int | None, problem: str) -> None:
+        """Record skipped bytes of the section."""
+        draft = self.lost(offset, size, problem)
         if draft not in self.losses:
             self.losses.append(draft)
         if size is None or self._end is None or offset + size > self._end:
             self._index_is_whole = False  # part of it may be lost, and that of others may follow
             self._end = None
-        return draft
 
     def listed(self, channel: int, times: NDArray[Any], offset: int) -> None:
         """Add the messages that an index at a byte lists, by their log times, ns."""
@@ -478,7 +478,7 @@ class Tally:
                 draft.add(0, ())
         elif total:
             problem = "an index does not match the messages"
-            self._log.lost(None, None, problem).add(0 if self.is_verified else total, topics)
+            self.lost(None, None, problem).add(0 if self.is_verified else total, topics)
         self.losses = []
 
     def _missing(self, expected: Counter[int]) -> tuple[int, Counter[int]]:
@@ -538,8 +538,7 @@ class FileSalvage(BagReader):
             RuntimeError: `records` was called again before this one was exhausted.
         """
         self.losses = []
-        self._log = log = LossLog(self.path.name)
-        self._tally = Tally(log, self._topic_of)
+        self._tally = tally = Tally(self.path.name, self._topic_of)
         self._found = 0  # valid records
         self._count: int | None = None  # messages that the file states
         self._earliest: int | None = None  # log time from here on; None if no message follows
@@ -558,13 +557,13 @@ class FileSalvage(BagReader):
                     held.add(record)
                 elif excerpt.has(record):
                     yield record
-                if self._log is not log:
+                if self._tally is not tally:
                     raise RuntimeError(f"{self.path} is salvaged once at a time")
             yield from filter(excerpt.has, held.release(None))
             self.position = window.offset
         if self._is_alone and not self._found and not self.channels:
             raise SourceError(self.path, f"holds no records of {self.kind}")
-        self.losses = log.finish(None if self._count is None else max(0, self._count - given))
+        self.losses = tally.finish(None if self._count is None else max(0, self._count - given))
 
     @abstractmethod
     def _scan_of(self, window: Window, lose: Lose) -> Scan:
@@ -588,9 +587,9 @@ class FileSalvage(BagReader):
 
     def _lose(self, offset: int, size: int, problem: str) -> None:
         if self._index_offset is not None and offset >= self._index_offset:
-            self._log.lost(offset, size, problem).add(0, ())
+            self._tally.lost(offset, size, problem).add(0, ())
         else:
-            self._tally.lost(offset, size, problem)
+            self._tally.skipped(offset, size, problem)
 
     def _peek_chunk(self, frame: RecordFrame) -> tuple[memoryview, bool]:
         """What there is of a chunk, and whether it is certainly all of it."""
