@@ -362,8 +362,8 @@ class Tally(LossLog):
     """The losses of a file, by the messages read from each section of it, and those indexes list.
 
     A section is usually a chunk. Messages of a chunk with doubtful content are held until its index
-    is read, and only those it lists are returned: damaged data may decompress to something that only
-    looks like messages.
+    is read, and only those it lists are returned: damaged data may decompress to what only looks
+    like messages.
 
     Args:
         file: The file's name.

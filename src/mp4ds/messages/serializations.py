@@ -56,7 +56,11 @@ _BODY = ("body", "I")  # its length
 _SIZE = (("width", "I"), ("height", "I"))
 _MATRICES = (("distortion_model", "s"), ("d", "d*"), ("k", "9d"), ("r", "9d"), ("p", "12d"))
 _BINNING = (("binning_x", "I"), ("binning_y", "I"))
+_PIXELS = (("encoding", "s"), ("step", "I"))
+_FFMPEG = (("width", "i"), ("height", "i"), ("format", "s"), ("pts", "Q"), ("flags", "B"))
 _ROI = (("roi", "4I"), ("roi_do_rectify", "B"))  # x_offset, y_offset, height, width
+
+_INFO = (*_HEADER, *_SIZE[::-1], *_MATRICES, *_BINNING, *_ROI)
 
 _Layout = tuple[tuple[str, str], ...]
 _SLOT_FIELDS = {"seq": ("seq", 4), "sec": ("stamp", 8), "pts": ("pts", 8)}  # and bytes of the slots
@@ -65,25 +69,12 @@ _PACKET = "ffmpeg_image_transport_msgs/FFMPEGPacket"
 ROS_TYPES: Mapping[str, tuple[type[Fields], _Layout]] = {
     "sensor_msgs/Image": (
         ImageFields,
-        (*_HEADER, *_SIZE[::-1], ("encoding", "s"), ("is_bigendian", "B"), ("step", "I"), _BODY),
+        (*_HEADER, *_SIZE[::-1], _PIXELS[0], ("is_bigendian", "B"), _PIXELS[1], _BODY),
     ),
     "sensor_msgs/CompressedImage": (CodedFields, (*_HEADER, ("format", "s"), _BODY)),
-    "sensor_msgs/CameraInfo": (
-        CalibrationFields,
-        (*_HEADER, *_SIZE[::-1], *_MATRICES, *_BINNING, *_ROI),
-    ),
-    _PACKET: (
-        CodedFields,
-        (
-            *_HEADER,
-            *(("width", "i"), ("height", "i"), ("format", "s"), ("pts", "Q")),
-            *(("flags", "B"), ("is_bigendian", "B"), _BODY),
-        ),
-    ),
-    "foxglove_msgs/RawImage": (
-        ImageFields,
-        (*_TIME, *_SIZE, ("encoding", "s"), ("step", "I"), _BODY),
-    ),
+    "sensor_msgs/CameraInfo": (CalibrationFields, _INFO),
+    _PACKET: (CodedFields, (*_HEADER, *_FFMPEG, ("is_bigendian", "B"), _BODY)),
+    "foxglove_msgs/RawImage": (ImageFields, (*_TIME, *_SIZE, *_PIXELS, _BODY)),
     "foxglove_msgs/CompressedImage": (CodedFields, (*_TIME, _BODY, ("format", "s"))),
     "foxglove_msgs/CompressedVideo": (CodedFields, (*_TIME, _BODY, ("format", "s"))),
     "foxglove_msgs/CameraCalibration": (CalibrationFields, (*_TIME, *_SIZE, *_MATRICES)),
@@ -91,10 +82,7 @@ ROS_TYPES: Mapping[str, tuple[type[Fields], _Layout]] = {
 """The fields of each type, in the order of its definition (spec/registry.md, "Message types")."""
 
 # ROS 1 has another type of this name, which is written only: such messages are kept verbatim
-_ROS1_PACKET = (
-    *(*_HEADER, _BODY, ("width", "i"), ("height", "i"), ("format", "s")),
-    *(("pts", "Q"), ("flags", "B")),
-)
+_ROS1_PACKET = (*_HEADER, _BODY, *_FFMPEG)
 
 
 class RosForm(Form):
@@ -215,13 +203,11 @@ Kind = Literal["time", "text", "u32", "doubles", "data", "other"]
 _STAMPED: dict[str, Kind] = {"timestamp": "time", "frame_id": "text"}
 _EXTENT: dict[str, Kind] = {"width": "u32", "height": "u32"}
 _CODED: dict[str, Kind] = {**_STAMPED, "data": "data", "format": "text"}
+_RAW: dict[str, Kind] = {**_STAMPED, **_EXTENT, "encoding": "text", "step": "u32", "data": "data"}
 _LENGTHS = {"K": 9, "R": 9, "P": 12}
 
 FOXGLOVE_TYPES: Mapping[str, tuple[type[Fields], Mapping[str, Kind]]] = {
-    "foxglove.RawImage": (
-        ImageFields,
-        {**_STAMPED, **_EXTENT, "encoding": "text", "step": "u32", "data": "data"},
-    ),
+    "foxglove.RawImage": (ImageFields, _RAW),
     "foxglove.CompressedImage": (CodedFields, _CODED),
     "foxglove.CompressedVideo": (CodedFields, _CODED),
     "foxglove.CameraCalibration": (
