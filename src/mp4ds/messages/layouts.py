@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 
 import numpy as np
@@ -389,14 +389,14 @@ class LayoutKind:
     """A layout of the registry.
 
     Attributes:
-        values: The step on values, which knows its parameters.
-        arrangement: Makes their placement.
+        arrangement: Makes the placement of values.
+        values: The step on them, which knows its parameters.
         is_exact: Whether the pixels are restored if the picture is.
         is_shown: Whether the picture looks like the image, so that its colours are tagged.
     """
 
-    values: type[Values]
     arrangement: Callable[[Encoding, LayoutParameters], Arrangement]
+    values: type[Values] = Whole
     is_exact: bool = True
     is_shown: bool = False
 
@@ -406,22 +406,14 @@ class LayoutKind:
         return self.values.parameters
 
 
-def _shown(
-    arrangement: Callable[[Encoding, LayoutParameters], Arrangement],
-    values: type[Values] = Whole,
-    *,
-    exact: bool = True,
-) -> LayoutKind:
-    return LayoutKind(values, arrangement, is_exact=exact, is_shown=True)
-
-
+_shown = partial(LayoutKind, is_shown=True)
 _COLOURS = {"rgba": "rgb24", "bgra": "bgr24"}  # without their alpha
 
 LAYOUTS: dict[str, LayoutKind] = {
     "gray8": _shown(lambda e, p: Packed()),
-    "gray16": LayoutKind(Whole, lambda e, p: Packed()),
-    "gray_bits": LayoutKind(Narrow, lambda e, p: Packed()),
-    "fold": LayoutKind(NarrowFolded, lambda e, p: _fold(p)),
+    "gray16": LayoutKind(lambda e, p: Packed()),
+    "gray_bits": LayoutKind(lambda e, p: Packed(), Narrow),
+    "fold": LayoutKind(lambda e, p: _fold(p), NarrowFolded),
     "rgb24": _shown(lambda e, p: Packed("rgb24")),
     "bgr24": _shown(lambda e, p: Packed("bgr24")),
     "rgba": _shown(lambda e, p: Packed("rgba")),
@@ -431,30 +423,29 @@ LAYOUTS: dict[str, LayoutKind] = {
     "gbr_bits": _shown(lambda e, p: PlanarRgb(_rgb_order(e)), Narrow),
     "gbra16": _shown(lambda e, p: PlanarRgb(_rgb_order(e))),
     "gbra_bits": _shown(lambda e, p: PlanarRgb(_rgb_order(e)), Narrow),
-    "mosaic8": LayoutKind(Whole, lambda e, p: Mosaic()),
-    "mosaic16": LayoutKind(Whole, lambda e, p: Mosaic()),
-    "mosaic_bits": LayoutKind(Narrow, lambda e, p: Mosaic()),
-    "mosaic_fold": LayoutKind(NarrowFolded, lambda e, p: _fold(p, Mosaic())),
-    "from_mosaic8": LayoutKind(Demosaiced, lambda e, p: Mosaic()),
+    "mosaic8": LayoutKind(lambda e, p: Mosaic()),
+    "mosaic16": LayoutKind(lambda e, p: Mosaic()),
+    "mosaic_bits": LayoutKind(lambda e, p: Mosaic(), Narrow),
+    "mosaic_fold": LayoutKind(lambda e, p: _fold(p, Mosaic()), NarrowFolded),
+    "from_mosaic8": LayoutKind(lambda e, p: Mosaic(), Demosaiced),
     "from_yuv420": _shown(lambda e, p: SemiPlanar(halved=True, first="u"), ConvertedTall),
     "from_yuv422": _shown(lambda e, p: Packed422(0), Converted),
     # demosaicing is done by the video's converter; resampling restores the mosaic
-    "demosaic8": _shown(lambda e, p: Packed(f"bayer_{e.mosaic}8"), exact=False),
-    "tone": _shown(lambda e, p: _toned(e), Tone, exact=False),
+    "demosaic8": _shown(lambda e, p: Packed(f"bayer_{e.mosaic}8"), is_exact=False),
+    "tone": _shown(lambda e, p: _toned(e), Tone, is_exact=False),
     "planar422": _shown(lambda e, p: _yuv(e)),
     "planar420": _shown(lambda e, p: _yuv(e)),
     "planar444": _shown(lambda e, p: _yuv(e)),
-    "halved420": _shown(lambda e, p: Halved(_yuv(e)), exact=False),
-    "stack8": LayoutKind(Whole, lambda e, p: Stack(e.channels)),
-    "stack16": LayoutKind(Whole, lambda e, p: Stack(e.channels)),
-    "table": LayoutKind(PatternTable, lambda e, p: _numbers(len(p.table or ()))),
+    "halved420": _shown(lambda e, p: Halved(_yuv(e)), is_exact=False),
+    "stack8": LayoutKind(lambda e, p: Stack(e.channels)),
+    "stack16": LayoutKind(lambda e, p: Stack(e.channels)),
+    "table": LayoutKind(lambda e, p: _numbers(len(p.table or ())), PatternTable),
     "palette": LayoutKind(
-        Few,
-        lambda e, p: Palette(p.entries or 0, e.bytes_per_sample, _numbers(p.entries or 0)),
+        lambda e, p: Palette(p.entries or 0, e.bytes_per_sample, _numbers(p.entries or 0)), Few
     ),
-    "metres16": LayoutKind(Metres, lambda e, p: Packed()),
-    "metres_fold": LayoutKind(Metres, lambda e, p: _fold(p)),
-    "bytes": LayoutKind(Whole, lambda e, p: Stack(e.channels, e.bytes_per_sample)),
+    "metres16": LayoutKind(lambda e, p: Packed(), Metres),
+    "metres_fold": LayoutKind(lambda e, p: _fold(p), Metres),
+    "bytes": LayoutKind(lambda e, p: Stack(e.channels, e.bytes_per_sample)),
 }
 
 
