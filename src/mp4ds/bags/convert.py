@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -38,7 +37,7 @@ from mp4ds.bags.types import (
     types_of,
 )
 from mp4ds.errors import ConversionError, OptionError, Refused
-from mp4ds.messages.serializations import decoder_of_schema
+from mp4ds.messages.serializations import decoder_of_schema, from_json
 from mp4ds.records import HASH_KEY, QOS_KEY, Channel, Schema
 
 if TYPE_CHECKING:
@@ -344,31 +343,28 @@ def decoder_of(channel: Channel) -> Decoder:
         OptionError: They cannot be decoded: for lack of a definition, or of a decoder.
     """
     make = _DECODERS.get(channel.message_encoding)
-    if make is None:
-        encoding = channel.message_encoding or "unknown"
-        raise _undecodable(channel, f"their encoding is {encoding}, not {', '.join(_DECODERS)}")
-    return make(channel)
-
-
-def _undecodable(channel: Channel, problem: str) -> OptionError:
-    return OptionError(f"messages of {channel.topic} cannot be decoded: {problem}; {_ADVICE}")
+    try:
+        if make is None:
+            encoding = channel.message_encoding or "unknown"
+            raise Refused(f"their encoding is {encoding}, not {', '.join(_DECODERS)}")
+        return make(channel)
+    except Refused as reason:
+        problem = f"messages of {channel.topic} cannot be decoded: {reason}"
+        raise OptionError(f"{problem}; {_ADVICE}") from None
 
 
 def _ros(channel: Channel) -> Decoder:
     schema = channel.schema
     if schema is None or not schema.name:
-        raise _undecodable(channel, "its message type is not known")
+        raise Refused("its message type is not known")
     is_ros1 = channel.message_encoding == "ros1"
     standard = standard_of(channel.message_encoding)
-    try:
-        types = types_of(schema, standard)
-        if has_empty_items(types, sizes_of(types)):
-            raise _undecodable(channel, f"{schema.name} has arrays of a type without fields")
-        store = make_store(types, standard)
-        # compiled now, to fail before any message
-        definition = store.get_msgdef(normalize_msgtype(schema.name))
-    except Refused as reason:
-        raise _undecodable(channel, str(reason)) from None
+    types = types_of(schema, standard)
+    if has_empty_items(types, sizes_of(types)):
+        raise Refused(f"{schema.name} has arrays of a type without fields")
+    store = make_store(types, standard)
+    # compiled now, to fail before any message
+    definition = store.get_msgdef(normalize_msgtype(schema.name))
 
     def decode(payload: memoryview) -> Any:
         start, read = 0, definition.deserialize_ros1
@@ -386,26 +382,16 @@ def _ros(channel: Channel) -> Decoder:
     return decode
 
 
-def _from_json(payload: memoryview) -> Any:
-    try:
-        return json.loads(bytes(payload))
-    except (ValueError, RecursionError):
-        raise Refused("it is not JSON") from None
-
-
 def _protobuf(channel: Channel) -> Decoder:
     schema = channel.schema
     if schema is None or schema.encoding != "protobuf":
-        raise _undecodable(channel, "they are protobuf, and their definition is unknown")
-    try:
-        return decoder_of_schema(schema.name, schema.data)
-    except Refused as error:
-        raise _undecodable(channel, str(error)) from None
+        raise Refused("they are protobuf, and their definition is unknown")
+    return decoder_of_schema(schema)
 
 
 _DECODERS: Mapping[str, Callable[[Channel], Decoder]] = {
     "ros1": _ros,
     "cdr": _ros,
-    "json": lambda channel: _from_json,
+    "json": lambda channel: from_json,
     "protobuf": _protobuf,
 }

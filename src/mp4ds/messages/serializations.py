@@ -8,6 +8,7 @@ in protobuf are read by the field numbers of the recorded schema.
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
@@ -32,7 +33,7 @@ from mp4ds.messages.wire import (
     make_fields,
     text,
 )
-from mp4ds.records import Channel, Message
+from mp4ds.records import Channel, Message, Schema
 
 # name -> the encapsulation at the start of a payload, and the byte order in struct's notation
 _ROS_WIRES = {
@@ -437,12 +438,23 @@ def _stamp(raw: memoryview) -> int:
     return stamp
 
 
-def decoder_of_schema(type_name: str, schema: bytes) -> Callable[[memoryview], Any]:
+def from_json(data: memoryview) -> Any:
+    """What a message in JSON holds.
+
+    Raises:
+        Refused: It is none.
+    """
+    try:
+        return json.loads(bytes(data))
+    except (ValueError, RecursionError) as error:
+        raise Refused(f"it is not JSON: {error}") from None
+
+
+def decoder_of_schema(schema: Schema) -> Callable[[memoryview], Any]:
     """A decoder of messages of any type; it raises Refused for invalid ones.
 
     Args:
-        type_name: Full name of the messages' type.
-        schema: A serialized FileDescriptorSet that declares it and everything it refers to.
+        schema: A serialized FileDescriptorSet that declares the type and everything it refers to.
 
     Raises:
         Refused: It does not.
@@ -455,17 +467,17 @@ def decoder_of_schema(type_name: str, schema: bytes) -> Callable[[memoryview], A
 
     try:
         pool = DescriptorPool()
-        GetMessages(FileDescriptorSet.FromString(schema).file, pool)
+        GetMessages(FileDescriptorSet.FromString(schema.data).file, pool)
         # by name, as a type may be declared inside another one
-        message_class = GetMessageClass(pool.FindMessageTypeByName(type_name))
+        message_class = GetMessageClass(pool.FindMessageTypeByName(schema.name))
     except (DecodeError, LookupError, ValueError, TypeError, RecursionError):
-        raise Refused(f"its schema does not declare {type_name}") from None
+        raise Refused(f"its schema does not declare {schema.name}") from None
 
     def decode(data: memoryview) -> Any:
         try:
             return message_class.FromString(bytes(data))
         except (DecodeError, ValueError):  # the latter by protobuf's pure Python
-            raise Refused(f"it is not a {type_name}") from None
+            raise Refused(f"it is not a {schema.name}") from None
 
     return decode
 

@@ -6,7 +6,6 @@ or makes no sense, can be left out without harm.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mp4ds.errors import Refused
-from mp4ds.messages.serializations import decoder_of_schema, ros_type, wire_of
+from mp4ds.messages.serializations import decoder_of_schema, from_json, ros_type, wire_of
 from mp4ds.messages.wire import PrimitiveReader
 from mp4ds.records import Channel, Schema
 
@@ -96,10 +95,10 @@ def transform_parser(channel: Channel) -> Parser | None:
     elif schema is None or channel.type_name not in _FOXGLOVE_TYPES:
         return None
     elif encoding == "json":
-        read = partial(_read_nodes, _parse_json, many)
+        read = partial(_read_nodes, from_json, many)
     elif encoding == "protobuf" and len(schema.data) <= _MAX_SCHEMA:
         try:
-            read = partial(_read_nodes, decoder_of_schema(schema.name, schema.data), many)
+            read = partial(_read_nodes, decoder_of_schema(schema), many)
         except Refused:
             return None
     else:
@@ -141,13 +140,6 @@ def _parse_ros(encoding: str, name: str, data: memoryview) -> list[Transform]:
 
 
 # ---------------------------------------------------------------- Foxglove
-
-
-def _parse_json(data: memoryview) -> Any:
-    try:
-        return json.loads(bytes(data))
-    except (ValueError, RecursionError) as error:
-        raise Refused(f"it is not JSON: {error}") from None
 
 
 def _read_nodes(
