@@ -278,7 +278,6 @@ class CombinedReader(BagReader):
             self._done += sum(file.stat().st_size for file in part.files)
 
     def _part_records(self, number: int, part: BagReader, excerpt: Excerpt) -> Iterator[Record]:
-        del number
         return part.records(excerpt)
 
     def _stats(self) -> Mapping[int, ChannelStats]:

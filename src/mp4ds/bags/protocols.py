@@ -251,23 +251,21 @@ class BagWriter(ABC):
         """What was left out because the format cannot hold it: a phrase -> how many."""
         return dict(self._omitted)
 
-    @staticmethod
+    @staticmethod  # noqa: B027 - most formats hold any
     def check_channel(channel: Channel) -> None:
         """Refuse a channel that the format cannot hold.
 
         Raises:
             ConversionError: Says why, and what to do.
         """
-        del channel
 
-    @staticmethod
+    @staticmethod  # noqa: B027 - likewise
     def check_message(message: Message) -> None:
         """Refuse a message that the format cannot hold.
 
         Raises:
             ConversionError: Says why, and what to do.
         """
-        del message
 
     @abstractmethod
     def add_channel(self, channel: Channel) -> None:
@@ -287,17 +285,14 @@ class BagWriter(ABC):
 
     def add_schema(self, schema: Schema) -> None:
         """Keep a definition that no channel refers to."""
-        del schema
         self._omitted["definitions that no topic uses"] += 1
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment."""
-        del attachment
         self._omitted["attachments"] += 1
 
     def add_metadata(self, record: MetadataRecord) -> None:
         """Append a metadata record."""
-        del record
         self._omitted["metadata records"] += 1
 
     @abstractmethod
