@@ -14,6 +14,7 @@ import images
 from mp4ds.messages.encodings import ENCODINGS, Encoding, pixel_view
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, fit
 from mp4ds.messages.sources import CONVERSIONS, MOSAICS
+from mp4ds.messages.wire import ImageFields
 
 Pixels = NDArray[Any]
 
@@ -75,14 +76,9 @@ def as_message(
     rows = swapped.view(np.uint8).reshape(len(pixels), -1)
     data = np.pad(rows, ((0, 0), (0, pad))).tobytes()
     width = pixels.shape[1]
-    return pixel_view(
-        memoryview(data),
-        encoding,
-        width=width,
-        height=int(len(pixels) / encoding.rows),
-        step=rows.shape[1] + pad,
-        is_bigendian=is_bigendian,
-    )
+    height, step = int(len(pixels) / encoding.rows), rows.shape[1] + pad
+    fields = ImageFields(encoding.name, width, height, step, int(is_bigendian))
+    return pixel_view(memoryview(data), fields)
 
 
 def bits_of(pixels: Pixels) -> bytes:

@@ -28,6 +28,7 @@ from mp4ds.messages.layouts import (
     why_not,
 )
 from mp4ds.messages.numbers import SCALES
+from mp4ds.messages.wire import ImageFields
 from mp4ds.video.encoder import difference_layouts
 from pixel_kinds import KINDS, PAIRS, as_message, bits_of, bound, rounded, suited, values
 
@@ -304,9 +305,7 @@ def test_a_view_is_the_message_itself(name: str) -> None:
             step = width * encoding.pixel_bytes + pad
             count = encoding.size(step, height)
             data = bytearray(np.random.default_rng(0).integers(0, 256, count, np.uint8).tobytes())
-            view = pixel_view(
-                data, encoding, width=width, height=height, step=step, is_bigendian=big
-            )
+            view = pixel_view(data, ImageFields(name, width, height, step, int(big)))
             order, size = "big" if big else "little", encoding.bytes_per_sample
             assert view.shape == encoding.shape(width, height)
             assert len(view) * step == count
@@ -352,6 +351,6 @@ def test_a_view_is_the_message_itself(name: str) -> None:
 def test_others_have_none_and_say_why(
     encoding: str, width: int, height: int, step: int, size: int, words: str
 ) -> None:
-    reason = why_not(encoding, width=width, height=height, step=step, size=size)
+    reason = why_not(ImageFields(encoding, width, height, step), size)
     assert reason is not None
     assert words in reason

@@ -336,13 +336,12 @@ def shown_by(channel: Channel, parts: Parts) -> Shown:
     """
     fields = parts.fields
     if isinstance(fields, ImageFields):
-        size = {"width": fields.width, "height": fields.height, "step": fields.step}
         raw = ENCODINGS.get(fields.encoding)
         due = raw.size(fields.step, fields.height) if raw else 0
-        reason = why_not(fields.encoding, **size, size=min(len(parts.body), due))
+        reason = why_not(fields, min(len(parts.body), due))
         if raw is None or reason:
             raise Refused(reason)
-        view = pixel_view(parts.body, raw, **size, is_bigendian=bool(fields.is_bigendian))
+        view = pixel_view(parts.body, fields)
         return Shown(raw.name, view.astype(view.dtype.newbyteorder("="), copy=False))
     if not isinstance(fields, CodedFields):
         raise Refused("it holds no image")

@@ -20,7 +20,6 @@ from mp4ds.messages.wire import (
     CodedFields,
     Fields,
     Form,
-    ImageFields,
     Slots,
     Template,
 )
@@ -219,14 +218,7 @@ class MessageRebuilder:
         head, tail = template.around(self.columns.slots(index), size)
         payload = bytearray(len(head) + size + len(tail))
         payload[: len(head)] = head
-        out = pixel_view(
-            memoryview(payload)[len(head) :],
-            self._encoding,
-            width=image.width,
-            height=image.height,
-            step=image.step,
-            is_bigendian=bool(image.is_bigendian),
-        )
+        out = pixel_view(memoryview(payload)[len(head) :], image.to_fields())
         self._write_pixels(picture, out)
         if padding is not None:
             body = memoryview(payload)[len(head) : len(head) + size]
@@ -281,13 +273,7 @@ class MessageRebuilder:
     def _make_templates(self) -> list[Template]:
         sidecar, image = self._sidecar, self._sidecar.image
         form = form_for(sidecar.channel.to_record(0), sidecar.wire, self._place)
-        raw = ImageFields(
-            encoding=image.encoding,
-            width=image.width,
-            height=image.height,
-            step=image.step,
-            is_bigendian=image.is_bigendian,
-        )
+        raw = image.to_fields()
         templates = []
         for number, header in enumerate(sidecar.headers):
             fields: Fields = raw if sidecar.body == "pixels" else CodedFields(header.format or "")

@@ -36,7 +36,7 @@ from mp4ds.messages.encodings import ENCODINGS, MAX_SIDE, NO_PARAMETERS, LayoutP
 from mp4ds.messages.layouts import LAYOUTS, Layout, bind, why_not
 from mp4ds.messages.png import PNG_ENCODINGS
 from mp4ds.messages.serializations import WIRES
-from mp4ds.messages.wire import CalibrationFields
+from mp4ds.messages.wire import CalibrationFields, ImageFields
 from mp4ds.records import Channel, Schema
 from mp4ds.times import encode_column
 from mp4ds.video.access import (
@@ -192,17 +192,13 @@ class Image(Model):
 
     @model_validator(mode="after")
     def _fits(self) -> Image:
-        encoding = ENCODINGS.get(self.encoding)
-        reason = why_not(
-            self.encoding,
-            width=self.width,
-            height=self.height,
-            step=self.step,
-            size=encoding.size(self.step, self.height) if encoding else 0,
-        )
-        if reason:
+        if reason := why_not(self.to_fields()):
             raise ValueError(reason)
         return self
+
+    def to_fields(self) -> ImageFields:
+        """The same as messages have it."""
+        return ImageFields(self.encoding, self.width, self.height, self.step, self.is_bigendian)
 
 
 class PngFile(Model):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from mp4ds.errors import Refused
+from mp4ds.messages.wire import ImageFields
 
 MAX_SIDE = 16384
 """Largest width and height of a picture in a video: what its codecs and decoders take."""
@@ -164,24 +165,12 @@ def _encodings() -> list[Encoding]:
 ENCODINGS: dict[str, Encoding] = {encoding.name: encoding for encoding in _encodings()}
 
 
-def pixel_view(
-    data: memoryview | bytearray,
-    encoding: Encoding,
-    *,
-    width: int,
-    height: int,
-    step: int,
-    is_bigendian: bool,
-) -> Pixels:
+def pixel_view(data: memoryview | bytearray, image: ImageFields) -> Pixels:
     """The pixels of an image message, without a copy.
 
     Args:
-        data: At least step * height * encoding.rows bytes.
-        encoding: The image's encoding.
-        width: Columns.
-        height: Rows.
-        step: Bytes per row, at least width * pixel bytes.
-        is_bigendian: Byte order of samples of more than one byte.
+        data: At least step * height * rows of its encoding, in bytes.
+        image: Of one of `ENCODINGS`; its step is at least width * pixel bytes.
 
     Returns:
         Array of `Encoding.shape`, of the encoding's type in the message's byte order; writable
@@ -189,30 +178,26 @@ def pixel_view(
         (height * 3 / 2, width), luma over interleaved chroma; ``nv24`` (height * 3, width), where
         two rows hold the chroma of one.
     """
-    size = encoding.bytes_per_sample
-    code = np.dtype(encoding.dtype).newbyteorder(">" if is_bigendian else "<")
-    shape = encoding.shape(width, height)
-    strides = (step, encoding.pixel_bytes, size)[: len(shape)]
+    encoding = ENCODINGS[image.encoding]
+    code = np.dtype(encoding.dtype).newbyteorder(">" if image.is_bigendian else "<")
+    shape = encoding.shape(image.width, image.height)
+    strides = (image.step, encoding.pixel_bytes, encoding.bytes_per_sample)[: len(shape)]
     pixels: Pixels = np.ndarray(shape, code, buffer=data, strides=strides)
     return pixels
 
 
-def row_padding(
-    data: memoryview, encoding: Encoding, *, width: int, height: int, step: int
-) -> bytes | None:
+def row_padding(data: memoryview, image: ImageFields) -> bytes | None:
     """The bytes after the pixels of each row; None if all rows have them, and all are zero.
 
     Args:
         data: Of an image that `why_not` accepts.
-        encoding: The image's encoding.
-        width: Columns.
-        height: Rows of the image.
-        step: Bytes per row.
+        image: Its fields.
     """
-    row_bytes = width * encoding.pixel_bytes
+    encoding, step = ENCODINGS[image.encoding], image.step
+    row_bytes = image.width * encoding.pixel_bytes
     if step == row_bytes:
         return None
-    count = encoding.shape(width, height)[0]
+    count = encoding.shape(image.width, image.height)[0]
     whole = len(data) // step  # the last row may have none
     rows = np.frombuffer(data, np.uint8, count=step * whole).reshape(whole, step)[:, row_bytes:]
     return rows.tobytes() if whole < count or rows.any() else None

@@ -37,6 +37,7 @@ from mp4ds.messages.encodings import (
 )
 from mp4ds.messages.numbers import Few, Metres, Palette, PatternTable, Tone
 from mp4ds.messages.sources import Converted, ConvertedTall, Demosaiced
+from mp4ds.messages.wire import ImageFields
 
 # ---------------------------------------------------------------- arrangements
 
@@ -593,19 +594,17 @@ def layout_for(encoding: Encoding, *, lossless: bool) -> Layout:
 
 
 @lru_cache(maxsize=256)  # the images of a stream share one geometry
-def why_not(encoding_name: str, *, width: int, height: int, step: int, size: int) -> str | None:
-    """Why no layout carries an image of this geometry, or None if one does.
+def why_not(image: ImageFields, size: int | None = None) -> str | None:
+    """Why no layout carries an image, or None if one does.
 
     Args:
-        encoding_name: As in the message.
-        width: Columns.
-        height: Rows.
-        step: Bytes per row.
-        size: Bytes of all rows; the last one may end with its pixels.
+        image: Its fields.
+        size: Bytes of all rows, the last of which may end with its pixels; None: as many as due.
     """
-    encoding = ENCODINGS.get(encoding_name)
+    width, height, step = image.width, image.height, image.step
+    encoding = ENCODINGS.get(image.encoding)
     if encoding is None:
-        return f"no layout for encoding {encoding_name!r} yet"
+        return f"no layout for encoding {image.encoding!r} yet"
     if width == 0 or height == 0:
         return f"an image of {width}x{height} pixels"
     if step < width * encoding.pixel_bytes:
@@ -613,7 +612,7 @@ def why_not(encoding_name: str, *, width: int, height: int, step: int, size: int
     if width % encoding.even[0] or height % encoding.even[1]:
         return f"an image of {width}x{height} pixels, where {encoding.name} needs even sides"
     due = encoding.size(step, height)
-    if size not in (due, due - (step - width * encoding.pixel_bytes)):
+    if size not in (None, due, due - (step - width * encoding.pixel_bytes)):
         rows = "step x height" if encoding.rows == 1 else f"step x height x {encoding.rows}"
         return f"{size} bytes of pixels where {rows} says {due}"
     if width > MAX_SIDE or height > MAX_SIDE:

@@ -8,7 +8,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -260,22 +260,12 @@ def _coded_key(
 
 
 def _raw_image(message: Message, form: Form, parts: Parts, fields: ImageFields) -> CameraMessage:
-    reason = why_not(
-        fields.encoding,
-        width=fields.width,
-        height=fields.height,
-        step=fields.step,
-        size=len(parts.body),
-    )
-    if reason:
+    if reason := why_not(fields, len(parts.body)):
         raise Refused(reason)
-    encoding = ENCODINGS[fields.encoding]
-    size = {"width": fields.width, "height": fields.height, "step": fields.step}
-    padding = row_padding(parts.body, encoding, **size)
+    padding = row_padding(parts.body, fields)
     wrap = BodyFraming() if padding is None else BodyFraming(padding=zlib.compress(padding))
-    is_bigendian = fields.is_bigendian
-    pixels = pixel_view(parts.body, encoding, **size, is_bigendian=bool(is_bigendian))
-    key = StreamKey(form.wire, "pixels", "", fields.encoding, **size, is_bigendian=is_bigendian)
+    pixels = pixel_view(parts.body, fields)
+    key = StreamKey(form.wire, "pixels", "", *astuple(fields))
     return CameraMessage(message, form, parts, key, wrap, pixels=pixels)
 
 

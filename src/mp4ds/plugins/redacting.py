@@ -434,8 +434,7 @@ def _raw(
     What is between and after its rows may show more of what was there, and is zero beside boxes.
     """
     encoding, body = image.encoding, bytearray(image.parts.body)
-    size = {"width": fields.width, "height": fields.height, "step": fields.step}
-    view = pixel_view(body, encoding, **size, is_bigendian=bool(fields.is_bigendian))
+    view = pixel_view(body, fields)
     view[...] = made
     row_bytes, rows = fields.width * encoding.pixel_bytes, view.shape[0]
     for _, (_, y, _, height) in found:

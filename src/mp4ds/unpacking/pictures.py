@@ -316,16 +316,12 @@ class Conversion:
 
     def _from_pixels(self, choice: Choice, verify: bool) -> Frames:
         """From raw images, checked against their digests."""
-        image, make = self.stream.sidecar.image, self._makers[0]
-        size = {"width": image.width, "height": image.height, "step": image.step}
-        fields = ImageFields(image.encoding, is_bigendian=image.is_bigendian, **size)
+        make, fields = self._makers[0], self.stream.sidecar.image.to_fields()
         for index, body in _bodies(self.stream, choice, verify):
             if self.kind == "raw":
                 yield index, Given(fields, body)
                 continue
-            is_bigendian = bool(image.is_bigendian)
-            pixels = pixel_view(body, ENCODINGS[image.encoding], **size, is_bigendian=is_bigendian)
-            yield index, make(pixels)
+            yield index, make(pixel_view(body, fields))
 
     def _from_pictures(self, choice: Choice, verify: bool) -> Frames:
         """From the decoded pictures of files and packets."""
