@@ -305,7 +305,7 @@ def _check(message: Message, chunk: ChunkEntry, summary: McapSummary) -> None:
 
 # ---------------------------------------------------------------- the writer
 
-CHUNK_BYTES = 2**20
+_CHUNK_BYTES = 2**20
 MAX_CHANNELS = 2**16 - 1
 _COMPRESSION = "_Writer__compression"  # no public name lets one chunk be compressed otherwise
 
@@ -320,7 +320,6 @@ class McapWriter(BagWriter):
         profile: Profile of the header.
         library: Library string of the header; if empty, this library's own.
         compression: Of the chunks: ``zstd``, ``lz4`` or ``none``.
-        chunk_size: Bytes of messages after which a chunk is closed.
 
     Raises:
         Mp4dsError: The installed mcap is too new.
@@ -328,13 +327,7 @@ class McapWriter(BagWriter):
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        profile: str,
-        library: str = "",
-        compression: str = "zstd",
-        chunk_size: int = CHUNK_BYTES,
+        self, path: Path, *, profile: str, library: str = "", compression: str = "zstd"
     ) -> None:
         super().__init__()
         self.path = path
@@ -343,9 +336,8 @@ class McapWriter(BagWriter):
         self._schema_ids: dict[Schema, int] = {}
         self._file = path.open("wb")
         try:
-            self._writer: Any = Writer(
-                self._file, chunk_size=chunk_size, compression=CompressionType[compression.upper()]
-            )
+            kind = CompressionType[compression.upper()]
+            self._writer: Any = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=kind)
             if not hasattr(self._writer, _COMPRESSION):  # else noticed at the first large message
                 remedy = f"Install an older one: pip install 'mcap<{mcap.__version__}'"
                 problem = f"mcap {mcap.__version__} is newer than this mp4ds supports"

@@ -109,7 +109,9 @@ class Rosbag2Reader(CombinedReader):
             return info, [self.path / name for name in info.file_names]
         if not self.path.exists():
             raise SourceNotFoundError(self.path)
-        return _sibling_info(self.path), [self.path]
+        sibling = self.path.parent / METADATA_FILE
+        beside = read_bag_info(sibling) if sibling.exists() else None
+        return beside if beside and self.path.name in beside.file_names else None, [self.path]
 
     def _open_storage(self) -> list[BagReader | None]:
         """The files' readers; None for one that must be decompressed or fetched first."""
@@ -297,15 +299,6 @@ def _folder_info(path: Path) -> BagInfo:
         remedy = f"Move it away, run `ros2 bag reindex` to add it, or {SALVAGE}"
         raise SourceError(path, problem, remedy)
     return info
-
-
-def _sibling_info(path: Path) -> BagInfo | None:
-    """The metadata.yaml beside a storage file, if it lists that file."""
-    sibling = path.parent / METADATA_FILE
-    if not sibling.exists():
-        return None
-    info = read_bag_info(sibling)
-    return info if path.name in info.file_names else None
 
 
 STORAGE_NAME = re.compile(r"(?P<stem>.*?)(?:_(?P<number>\d+))?\.(?:db3|mcap)(?:\.zstd)?")
