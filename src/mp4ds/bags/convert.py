@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, is_dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -44,17 +44,15 @@ if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
 
 TIME = BUILTIN[0]
-Where = Literal["nowhere", "header", "anywhere"]
 
 
-def where_times_are(types: Typesdict, name: str) -> Where:
-    """Whether messages of a type have times: none, one in the header they begin with, or others."""
+def begins_with_its_time(types: Typesdict, name: str) -> bool:
+    """Whether messages of a type begin with a header, and have no other time."""
     shapes = shapes_of(types, name)
-    is_headed = bool(shapes) and shapes[0].message == HEADER and not shapes[0].is_several
-    rest = [shape.message for shape in shapes[is_headed:] if shape.message]
-    if name == TIME or any(TIME in closure(types, part, {}) for part in rest):
-        return "anywhere"
-    return "header" if is_headed else "nowhere"
+    if not shapes or shapes[0].message != HEADER or shapes[0].is_several:
+        return False
+    rest = [shape.message for shape in shapes[1:] if shape.message]
+    return not any(TIME in closure(types, part, {}) for part in rest)
 
 
 # ---------------------------------------------------------------- convert
@@ -74,7 +72,7 @@ class _Plan:
         store: The same with the header of ROS 2, which rosbags uses to convert bytes.
         schema: Definition for the target.
         digest: md5sum for ROS 1, type hash for ROS 2.
-        times: Where its messages have times.
+        is_headed: Whether its messages `begins_with_its_time`.
         no_message: The error for a payload that is not a message of the type.
     """
 
@@ -83,7 +81,7 @@ class _Plan:
     store: Typestore
     schema: Schema
     digest: str
-    times: Where
+    is_headed: bool
     no_message: str
 
 
@@ -191,9 +189,9 @@ class Converter:
         store.get_msgdef(name)  # compiled now, to fail before any message
         encoding = SCHEMA_ENCODINGS["cdr" if to_ros2 else "ros1"]
         made_schema = Schema(new_name, encoding, definition.encode())
-        times = where_times_are(types, name)
         no_message = f"a message cannot be parsed as {schema.name}"
-        return _Plan(name, types, store, made_schema, digest, times, no_message)
+        is_headed = begins_with_its_time(types, name)
+        return _Plan(name, types, store, made_schema, digest, is_headed, no_message)
 
     def _convert(self, plan: _Plan, raw: memoryview) -> memoryview:
         to_ros1 = self._to == "ros1"
@@ -279,9 +277,7 @@ def _time_beyond(plan: _Plan, data: bytes | memoryview) -> int | None:
         plan: Of its type.
         data: The message in little-endian CDR.
     """
-    if plan.times == "nowhere":
-        return None
-    if plan.times == "header":
+    if plan.is_headed:
         seconds = struct.unpack_from("<i", data, 4)[0]
         return int(seconds) if seconds < 0 else None
     words = np.frombuffer(data, "<i4", count=len(data) // 4)
