@@ -177,9 +177,12 @@ def scene() -> list[Record]:
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
 @pytest.mark.parametrize("chunk_size", [1, 4096, 10**7])
-def test_round_trip(tmp_path: Path, compression: str, chunk_size: int) -> None:
+def test_round_trip(
+    tmp_path: Path, compression: str, chunk_size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.mcap"
-    written = write_all(path, scene(), compression=compression, chunk_size=chunk_size)
+    monkeypatch.setattr("mp4ds.bags.mcap.CHUNK_BYTES", chunk_size)
+    written = write_all(path, scene(), compression=compression)
     reader, records = read(path)
     assert list(map(fields, messages(records))) == list(map(fields, messages(written)))
     assert len({channel.id for channel in reader.channels}) == 4
@@ -216,9 +219,10 @@ def test_not_a_recording(tmp_path: Path) -> None:
     refuse(tmp_path, "cannot be read")
 
 
-def test_a_file_cut_short_anywhere(tmp_path: Path) -> None:
+def test_a_file_cut_short_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = tmp_path / "a.mcap"
-    write_all(whole, scene(), chunk_size=2000, compression="none")
+    monkeypatch.setattr("mp4ds.bags.mcap.CHUNK_BYTES", 2000)
+    write_all(whole, scene(), compression="none")
     data = whole.read_bytes()
     path = tmp_path / "cut.mcap"
     for length in [*range(9, 200), *range(200, len(data), 9973), *range(len(data) - 60, len(data))]:

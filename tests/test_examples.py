@@ -47,7 +47,7 @@ def test_other_topics(tmp_path: Path) -> None:
     assert "/cam/image_raw" not in out
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["recording", "images"])
 def test_public_data(kind: str, demo_dataset: Path, tmp_path: Path) -> None:
     source = tmp_path / "source"

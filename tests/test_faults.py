@@ -492,7 +492,7 @@ def _children(pid: int) -> list[int]:
 @pytest.mark.parametrize(
     ("signals", "code"),
     [
-        pytest.param([signal.SIGINT], 130, id="ctrl-c"),
+        pytest.param([signal.SIGINT], 130, id="ctrl-c", marks=pytest.mark.slow),
         pytest.param([signal.SIGTERM], 143, id="sigterm", marks=pytest.mark.slow),
         pytest.param([signal.SIGINT] * 4, 130, id="ctrl-c again and again", marks=pytest.mark.slow),
     ],

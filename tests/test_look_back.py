@@ -144,7 +144,7 @@ def test_nothing_is_left_without_a_trigger(drive: Path, tmp_path: Path) -> None:
     assert 0 < max(seen) < drive.stat().st_size
 
 
-@pytest.mark.parametrize("is_removed", [True, False])
+@pytest.mark.parametrize("is_removed", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_disk_that_is_full(
     is_removed: bool, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,6 +189,7 @@ def test_a_disk_that_is_full(
         assert sent[place][1] <= full - round(KEEP * S)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("what", ["its folder", "a link", "packing", "joining"])
 def test_what_cannot_be_saved(
     what: str, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

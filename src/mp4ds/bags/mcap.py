@@ -305,7 +305,7 @@ def _check(message: Message, chunk: ChunkEntry, summary: McapSummary) -> None:
 
 # ---------------------------------------------------------------- the writer
 
-_CHUNK_BYTES = 2**20
+CHUNK_BYTES = 2**20
 MAX_CHANNELS = 2**16 - 1
 _COMPRESSION = "_Writer__compression"  # no public name lets one chunk be compressed otherwise
 
@@ -337,7 +337,7 @@ class McapWriter(BagWriter):
         self._file = path.open("wb")
         try:
             kind = CompressionType[compression.upper()]
-            self._writer: Any = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=kind)
+            self._writer: Any = Writer(self._file, chunk_size=CHUNK_BYTES, compression=kind)
             if not hasattr(self._writer, _COMPRESSION):  # else noticed at the first large message
                 remedy = f"Install an older one: pip install 'mcap<{mcap.__version__}'"
                 problem = f"mcap {mcap.__version__} is newer than this mp4ds supports"
