@@ -185,7 +185,7 @@ FATES: dict[str, dict[str, str]] = {
     "raw-padded": RAW | SHOWN,
     "raw-bgr8": RAW | SHOWN,
     "raw-16UC1": RAW | DEPTH | DONE["raw"] | FFV1,
-    "raw-big-endian": RAW | {"jpeg": "JPEG files cannot hold mono16 images"} | FFV1,
+    "raw-big-endian": RAW | {"jpeg": "JPEG files cannot hold mono16 images"} | SHOWN,
     "raw-32FC1": METRES | DONE["raw"] | FFV1,
     "raw-bayer_gbrg8": RAW | MOSAIC,
     "raw-nv12": RAW | SHOWN,
@@ -268,7 +268,11 @@ def check_pictures(name: str, kind: str, found: list[Array], expected: list[Arra
             assert np.allclose(picture_, original, rtol=1e-5, equal_nan=True)
         elif is_jpeg:
             assert picture_.shape[:2] == original.shape[:2]
-            assert psnr(halved(picture_), halved(original)) > 30
+            if original.itemsize == 2:  # a view shows them by a curve
+                shown_ = picture_[..., 1].ravel()
+                assert np.corrcoef(shown_, original.ravel())[0, 1] > 0.98
+            else:
+                assert psnr(halved(picture_), halved(original)) > 30
         else:
             same = original if picture_.ndim == original.ndim else as_colour(original)
             assert picture_.dtype == original.dtype
