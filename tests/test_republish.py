@@ -268,11 +268,7 @@ def check_pictures(name: str, kind: str, found: list[Array], expected: list[Arra
             assert np.allclose(picture_, original, rtol=1e-5, equal_nan=True)
         elif is_jpeg:
             assert picture_.shape[:2] == original.shape[:2]
-            if original.itemsize == 2:  # a view shows them by a curve
-                shown_ = picture_[..., 1].ravel()
-                assert np.corrcoef(shown_, original.ravel())[0, 1] > 0.98
-            else:
-                assert psnr(halved(picture_), halved(original)) > 30
+            assert psnr(halved(picture_), halved(original)) > 31
         else:
             same = original if picture_.ndim == original.ndim else as_colour(original)
             assert picture_.dtype == original.dtype
@@ -332,8 +328,24 @@ def test_every_camera_as_every_kind(packed: Pack, name: str, kind: str, to: str)
     check_times(made, found, to)
     if name in COMPARED:
         is_view = any("those of its view" in note for note in summary.notes)
-        told = "jpeg" if is_view else kind  # which is as lossy
-        check_pictures(name, told, shown(found), truth(rvl_as_png(name, made.cameras)))
+        if is_view:
+            check_view(made, shown(found))
+        else:
+            check_pictures(name, kind, shown(found), truth(rvl_as_png(name, made.cameras)))
+
+
+def check_view(made: Packed, found: list[Array]) -> None:
+    """Pictures are those of the view, by another decoder, and look like the images."""
+    with mp4ds.open(made.folder / "dataset", layer="view") as dataset:
+        frames = dataset[made.topic].get(range(len(found)), format="rgb")
+    assert len(found) == len(made.cameras)
+    for picture_, frame, original in zip(found, frames, truth(made.cameras), strict=True):
+        if original.itemsize == 2:  # which the view shows by a curve
+            assert np.corrcoef(picture_[..., 1].ravel(), original.ravel())[0, 1] > 0.98
+        else:
+            assert psnr(halved(picture_), halved(frame.data)) > 40
+            # the noise of so small a scene costs a view more than a JPEG file
+            assert psnr(halved(picture_), halved(original)) > 30
 
 
 def rvl_as_png(name: str, records: Sequence[Record]) -> Sequence[Record]:
@@ -377,7 +389,7 @@ def test_jpeg_files_with_a_view_become_its_packets(packed: Pack) -> None:
     now = summary.republished[made.topic].topic
     found = shown([message for message in messages if message.topic == now])
     for picture_, original in zip(found, truth(made.cameras), strict=True):
-        assert psnr(halved(picture_), halved(original)) > 30
+        assert psnr(halved(picture_), halved(original)) > 31
     summary, messages = made.unpack("mcap", None)
     assert [m.payload for m in kept(made, messages)] == [r.payload("cdr") for r in made.cameras]
 
