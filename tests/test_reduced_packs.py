@@ -245,6 +245,15 @@ def test_what_was_done_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "options",
+    [{"every": True}, {"every": 1.5}, {"max_rate": True}, {"resize": True}, {"resize": (True, 2)}],
+)
+def test_what_is_no_number(options: dict[str, Any]) -> None:
+    with pytest.raises(mp4ds.OptionError, match=f"^`{next(iter(options))}` .* is not a "):
+        PackOptions(**options)
+
+
+@pytest.mark.parametrize(
     ("options", "problem"),
     [
         (

@@ -193,7 +193,7 @@ def parse_resize(value: str | float | tuple[int, int]) -> float | tuple[int, int
 def parse_number(value: str | float) -> float:
     """A number; NaN if it is none."""
     try:
-        return float(value)
+        return math.nan if isinstance(value, bool) else float(value)
     except ValueError:
         return math.nan
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from operator import index as as_integer
 
@@ -225,12 +226,13 @@ def _parse_rate(value: str | float) -> float:
 
 def _parse_size(value: str | float | tuple[int, int]) -> float | tuple[int, int]:
     size = parse_resize(value)
-    try:
+    sides = size if isinstance(size, tuple) else (size,)
+    with suppress(OptionError):
         size_after("", (1, 1), size)
-    except OptionError:
-        sides = f"width and height of 1 to {MAX_SIDE} pixels"
-        raise OptionError(f"{value} is not a size. Use a factor such as 0.5, or {sides}.") from None
-    return size
+        if not any(isinstance(side, bool) for side in sides):
+            return size
+    known = f"width and height of 1 to {MAX_SIDE} pixels"
+    raise OptionError(f"{value} is not a size. Use a factor such as 0.5, or {known}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,7 +258,7 @@ class Reduction(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.every, int):
+        if type(self.every) is not int:  # nor a bool
             raise OptionError(f"`every` {self.every!r} is not a number of frames: use 1 or more.")
 
     @property
