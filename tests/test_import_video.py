@@ -64,10 +64,7 @@ def listed(tmp_path: Path, text: str) -> str:
 VIDEOS = [
     ("a.mp4", "libx264", {"bf": "0"}, "h264"),
     ("a.mov", "libx265", {"x265-params": "bframes=0:log-level=error"}, "h265"),
-    ("a.mkv", "libx264", {"bf": "0"}, "h264"),
-    ("a.mkv", "libsvtav1", {"preset": "12", "svtav1-params": "fast-decode=1"}, "av1"),
-    ("a.webm", "libsvtav1", {"preset": "12"}, "av1"),
-    ("a.mkv", "mjpeg", {}, "mjpeg"),
+    ("a.mp4", "libsvtav1", {"preset": "12", "svtav1-params": "fast-decode=1"}, "av1"),
     ("a.mov", "mjpeg", {}, "mjpeg"),
 ]
 
@@ -124,11 +121,10 @@ def test_times_of_a_list(
     assert [stamp(message) for _, message in found["/camera/camera_info"]] == expected
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
 def test_frames_coded_in_another_order_are_decoded_on_request(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    video = write_video(tmp_path / name, "libx264", **REORDERED)
+    video = write_video(tmp_path / "a.mp4", "libx264", **REORDERED)
     with pytest.raises(mp4ds.SourceError, match=r"another order.*B-frames.*Give `decode`"):
         mp4ds.pack(video, tmp_path / "ds", mp4ds.PackOptions(images=mp4ds.ImportOptions()))
     assert not (tmp_path / "ds").exists()
@@ -136,7 +132,7 @@ def test_frames_coded_in_another_order_are_decoded_on_request(
     executor = use(monkeypatch, InlineExecutor())
     options = mp4ds.PackOptions(images=chosen, codec="ffv1", window=3, gop=3)
     mp4ds.pack(video, tmp_path / "ds", options)
-    assert len(executor.ran) == (3 if name == "a.mp4" else 0)  # the other has no index
+    assert len(executor.ran) == 3
     assert mp4ds.validate(tmp_path / "ds", deep=True) == []
     with mp4ds.open(tmp_path / "ds") as dataset:
         stream = dataset[TOPIC]
@@ -174,29 +170,20 @@ def test_what_is_no_such_video_is_refused(tmp_path: Path) -> None:
     data = video.read_bytes()
     (tmp_path / "text.mp4").write_text("no video")
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
-    (tmp_path / "other.mkv").write_bytes(data)
     (tmp_path / "a.exact.mp4").write_bytes(data)
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive" / "a.mp4").write_bytes(data)
     (tmp_path / "drive" / "dataset.yaml").touch()
-    write_video(tmp_path / "whole.mkv", "libx264", bf="0")
-    whole = bytearray((tmp_path / "whole.mkv").read_bytes())
-    (tmp_path / "cut.mkv").write_bytes(whole[:-200])
-    with av.open(str(tmp_path / "whole.mkv")) as container:
-        last = [bytes(packet) for packet in container.demux(video=0) if packet.size][-1]
-    whole[whole.rindex(b"\xa3", 0, whole.index(last) - 4)] ^= 1  # what ffmpeg passes over
-    (tmp_path / "damaged.mkv").write_bytes(whole)
+    write_video(tmp_path / "a.mkv", "libx264", bf="0")
     write_twice(tmp_path / "twice.mp4", video)
     write_video(tmp_path / "a.avi", "mjpeg")
     write_video(tmp_path / "mpeg4.mp4", "mpeg4")
     for name, problem in (
         ("text.mp4", ["is not an mp4"]),
         ("cut.mp4", ["was cut short"]),
-        ("other.mkv", ["other.mkv: "]),
-        ("cut.mkv", ["was cut short", "keeps the rest"]),
-        ("damaged.mkv", ["is damaged at byte", "keeps the rest"]),
+        ("a.mkv", ["is not an mp4", "ffmpeg -i FILE -c copy NEW.mp4"]),
         ("twice.mp4", ["cannot be copied", "Give --decode"]),
-        ("a.avi", ["is not an mp4", "Give an mp4, mov, mkv or webm file"]),
+        ("a.avi", ["is not an mp4", "Give an mp4, m4v or mov file"]),
         ("mpeg4.mp4", ["is coded as mpeg4, not h264", "Give --decode"]),
         ("a.exact.mp4", ["is a video of a dataset", "Use the dataset itself"]),
         ("drive/a.mp4", ["is a video of a dataset", "Use the dataset itself"]),
@@ -233,7 +220,6 @@ def write_twice(path: Path, video: Path) -> None:
     [
         ("carnd_solidWhiteRight.mp4", {"audio tracks": 1}),
         ("decord_rotated90.mov", {"turn by 270 degrees, which players apply": 1}),
-        ("av1_video.mkv", {}),
     ],
 )
 def test_real_videos(name: str, left_out: dict[str, int], tmp_path: Path) -> None:

@@ -366,7 +366,7 @@ def images_command(folder: str, output: str, images: ImportOptions, options: Pac
 
 
 @command("video")
-@argument("video", "VIDEO", "An mp4, mov, mkv or webm file.")
+@argument("video", "VIDEO", "An mp4, m4v or mov file.")
 @output_option("DATASET", "Folder to create.", required=True)
 @_imports("video")
 def video_command(video: str, output: str, images: ImportOptions, options: PackOptions) -> None:

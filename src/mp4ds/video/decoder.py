@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import FormatError, Refused, SourceError, VideoError, reason_of
 from mp4ds.messages.encodings import MAX_SIDE, Picture
 from mp4ds.records import MetadataRecord
-from mp4ds.video.codecs import CODECS, COPIED_CODECS
+from mp4ds.video.codecs import CODECS, COPIED_CODECS, check_pyav
 from mp4ds.video.coded import REORDERED, StreamParser
 from mp4ds.video.media import Media, most_pixels, raise_if_scarce
 from mp4ds.video.mp4 import SampleTable
@@ -391,17 +391,15 @@ def _shown_from(
 _SECOND = 1_000_000_000
 _LATEST = 2**63 // _SECOND - 1  # seconds
 _TRIES = 3
-_MATROSKA = (".mkv", ".webm")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class VideoFile:
-    """A video track of an mp4, MOV, Matroska or WebM file without a sidecar, of any known codec.
+    """A video track of an mp4 or MOV file without a sidecar, of any known codec.
 
     Attributes:
         path: The video.
         track: Which video track, from 0; None: there is only one.
-        container: ffmpeg's name of its demuxer.
         codec: Name in the registry, or ffmpeg's.
         size: Width and height of its frames, as coded.
         ticks: Presentation times in ticks of the track, int64, shape (frames,), in order.
@@ -414,7 +412,6 @@ class VideoFile:
 
     path: Path
     track: int | None
-    container: str
     codec: str
     size: tuple[int, int]
     ticks: NDArray[np.int64]
@@ -426,7 +423,7 @@ class VideoFile:
 
     def open(self) -> Media:
         """Open it once more."""
-        return Media(self.path, self.track, size=self.size, container=self.container)
+        return Media(self.path, self.track, size=self.size)
 
     def maker(self, picture_format: str = "rgb24") -> PictureMaker:
         """Makes 8-bit RGB of its frames, by its colour tags; or of another format what they are."""
@@ -452,8 +449,7 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
         OptionError: It has no such track.
     """
     advice = "; `mp4ds.open` takes the number of one as `track`"
-    container = "matroska" if path.suffix.lower() in _MATROSKA else "mp4"
-    with closing(Media(path, track, advice, container=container)) as media:
+    with closing(Media(path, track, advice)) as media:
         context = media.track.codec_context
         width, height = context.width, context.height
         if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
@@ -472,7 +468,6 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
         return VideoFile(
             path,
             track,
-            container,
             codec,
             (width, height),
             ticks,
@@ -495,14 +490,7 @@ def _times_and_keys(table: SampleTable) -> tuple[NDArray[np.int64], NDArray[np.i
 # ---------------------------------------------------------------- their frames as messages
 
 _DECODE = "Give `decode`: its pictures then become images, which `quality` visual keeps small."
-_KINDS = "Give an mp4, mov, mkv or webm file; `ffmpeg -i FILE -c copy NEW.mkv` makes one."
-_SEGMENT, _CLUSTER = "18538067", "1f43b675"
-_ELEMENTS = {  # of Matroska: at the top, in a segment, and in a cluster
-    *("1a45dfa3", _SEGMENT, "ec", "bf"),
-    *("114d9b74", "1549a966", "1654ae6b", _CLUSTER, "1c53bb6b", "1941a469", "1043a770", "1254c367"),
-    *("e7", "a3", "a0", "a7", "ab", "5854", "af"),
-}
-_LONGEST_HEAD = 12
+_KINDS = "Give an mp4, m4v or mov file; `ffmpeg -i FILE -c copy NEW.mp4` makes one."
 _MOST_DELAY = 16  # frames, by which decoding times may precede those of showing
 
 
@@ -513,36 +501,9 @@ def open_video(path: Path) -> VideoFile:
         SourceError: It cannot be read; says what to do.
     """
     try:
-        file = read_video_file(path)
+        return read_video_file(path)
     except FormatError as error:
         raise SourceError(path, error.problem, _KINDS) from None
-    if file.container == "matroska" and (problem := _damage(path)):
-        raise SourceError(path, problem, "`ffmpeg -i FILE -c copy NEW.mkv` keeps the rest.")
-    return file
-
-
-def _damage(path: Path) -> str:
-    """Why ffmpeg would pass over a part of a Matroska or WebM file (RFC 9559); else empty."""
-    place, end = 0, path.stat().st_size
-    with path.open("rb") as file:
-        while place < end:
-            file.seek(place)
-            head = file.read(_LONGEST_HEAD)
-            after = 9 - head[0].bit_length()
-            kind = head[:after].hex()
-            sized = 9 - head[after].bit_length() if after < len(head) else 9
-            if kind not in _ELEMENTS or sized > 8:
-                return f"is damaged at byte {place}"
-            unknown = (1 << 7 * sized) - 1
-            size = int.from_bytes(head[after : after + sized], "big") & unknown
-            place += after + sized
-            if kind == _SEGMENT and size != unknown:
-                if place + size > end:
-                    break
-                end = place + size
-            if kind not in (_SEGMENT, _CLUSTER):  # what is in these is walked through
-                place += size
-    return "" if place == end else "was cut short"
 
 
 class Clip:
@@ -577,7 +538,7 @@ class Clip:
         self._parser: type[StreamParser] = StreamParser
         self._units: list[bytes] = []
         # an index that is read has one description of all packets
-        self._may_change = not (pictures or file.is_indexed) and file.container == "mp4"
+        self._may_change = not (pictures or file.is_indexed)
         if not pictures:
             self._check_packets()
         with self._reading(), closing(self.file.open()) as media:
@@ -594,15 +555,13 @@ class Clip:
 
     def _count_lost_samples(self, media: Media) -> None:
         """Count what neither packets nor pictures hold of the pixels."""
-        has_alpha = media.track.metadata.get("alpha_mode") == "1"  # VP9 has it beside its packets
         if self.is_decoded and media.track.codec_context.format:
             own = media.track.codec_context.format.components
-            has_alpha = has_alpha or any(one.is_alpha for one in own)
+            if any(one.is_alpha for one in own):
+                self.left_out["alpha channels"] = 1
             bits = max(one.bits for one in av.VideoFormat(self._pictures).components)
             if (lost := max(one.bits for one in own) - bits) > 0:
                 self.left_out[f"low bits of each sample, which {bits} bits do not hold"] = lost
-        if has_alpha:
-            self.left_out["alpha channels"] = 1
 
     def _check_packets(self) -> None:
         """Refuse a video whose packets cannot be messages."""
@@ -611,8 +570,7 @@ class Clip:
             raise self._refusal(f"is coded as {file.codec}, not {', '.join(COPIED_CODECS)}")
         if file.is_reordered:
             raise self._refusal(f"cannot be copied: {REORDERED}")
-        if self._may_change and not hasattr(av.Packet, "has_sidedata"):
-            raise self._refusal("cannot be copied: what its index is like takes PyAV 16 to follow")
+        check_pyav()  # older ones do not tell changes of parameters, and could not write the copy
         self._parser = CODECS[file.codec].parser
         with self._reading(), closing(file.open()) as media:
             extradata = bytes(media.track.codec_context.extradata or b"")

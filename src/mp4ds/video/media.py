@@ -71,7 +71,6 @@ class Media:
         track: Which of its video tracks, from 0; None: it has only one.
         advice: What to do where it has several, for errors.
         size: Width and height of its frames, if they should be known; see `most_pixels`.
-        container: See `open_input`.
 
     Attributes:
         container: PyAV's.
@@ -89,21 +88,20 @@ class Media:
         track: int | None = None,
         advice: str = "",
         size: tuple[int, int] | None = None,
-        container: str = "mp4",
     ) -> None:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
-        self._path, self._number, self._is_mp4 = path, track, container == "mp4"
+        self._path, self._number = path, track
         self._file: _Source | None = None
         try:
             if remote(path):
                 self._file = _Source(path.open("rb"))
             source = self._file or str(path.absolute())
-            self.container: Any = open_input(source, container, size=size)
+            self.container: Any = open_input(source, size=size)
         except (FFmpegError, OSError) as error:
             self._close_file()
             raise_if_scarce(error)
-            problem = self._why() or f"cannot be read: {error.strerror or error}"
+            problem = why_unreadable(path) or f"cannot be read: {error.strerror or error}"
             raise VideoError("video-unreadable", path, problem) from None
         except BaseException:
             self._close_file()
@@ -115,9 +113,6 @@ class Media:
             self.close()
             raise
 
-    def _why(self) -> str:
-        return why_unreadable(self._path) if self._is_mp4 else ""
-
     def _chosen(self, number: int | None, advice: str) -> Any:
         # a picture of the cover comes as one more track
         streams = self.container.streams.video
@@ -127,7 +122,7 @@ class Media:
             problem = f"has {len(tracks)} video tracks, not one"
             if tracks:
                 problem += f" ({listed}){advice}"
-            problem = self._why() or problem
+            problem = why_unreadable(self._path) or problem
             raise VideoError("video-unreadable", self._path, problem)
         if number is not None and not 0 <= number < len(tracks):
             raise OptionError(
@@ -135,20 +130,18 @@ class Media:
             )
         track = tracks[number or 0]
         if track.codec_context is None or track.codec_context.codec is None:
-            problem = self._why() or "has a video track with an unknown codec"
+            problem = why_unreadable(self._path) or "has a video track with an unknown codec"
             raise VideoError("video-unreadable", self._path, problem)
         return track
 
     @cached_property
     def table(self) -> SampleTable:
-        """The index of the track; for fragments and Matroska, of all packets, with an empty entry.
+        """The index of the track; for fragments, of all packets, with an empty entry.
 
         Raises:
             VideoError: ``video-unreadable``.
         """
         try:
-            if not self._is_mp4:
-                raise Refused("it is no mp4")
             return sample_table_of(self._path, self._number)
         except Refused:  # ffmpeg reads more, though only by all packets
             return self._table_of_packets()
