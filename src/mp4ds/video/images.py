@@ -43,18 +43,6 @@ def png_file(rgb: NDArray[np.uint8]) -> bytes:
     return _file(rgb, "PNG", optimize=True)
 
 
-def jpeg_bytes(rgb: NDArray[np.uint8], quality: int, *, is_grey: bool = False) -> int:
-    """A JPEG file as ROS's image transport and OpenCV write it: with halved chroma.
-
-    Args:
-        rgb: Shape (H, W, 3).
-        quality: 1 to 100.
-        is_grey: Whether it shows a grey image, whose file has no chroma.
-    """
-    pixels = rgb[:, :, 1] if is_grey else rgb
-    return len(_file(pixels, "JPEG", quality=quality))
-
-
 def _file(pixels: NDArray[np.uint8], kind: str, **options: int) -> bytes:
     from PIL import Image
 

@@ -16,14 +16,11 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
 from mp4ds._version import __version__
 from mp4ds.errors import OptionError, Refused, ScoringError, SourceError, counted
 from mp4ds.files.outputs import listed_names, local_target, staged, write_listing
 from mp4ds.files.urls import location
 from mp4ds.format.sidecars import FileNames
-from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.options import LONG, Parsed, TopicOptions, force, jobs, option, parse_words, what
 from mp4ds.plugins.evaluating.page import write_files
 from mp4ds.plugins.evaluating.trials import (
@@ -34,7 +31,6 @@ from mp4ds.plugins.evaluating.trials import (
     Clip,
     Evaluation,
     Setting,
-    StorageRow,
     chosen,
     make_clip,
     mean_score,
@@ -54,8 +50,6 @@ from mp4ds.video.codecs import (
     parse_quality,
 )
 from mp4ds.video.encoder import tool_versions
-from mp4ds.video.images import jpeg_bytes
-from mp4ds.video.pixels import rgb_of
 from mp4ds.video.scores import ffmpeg_version, find_ffmpeg, scores_of, summary_of
 
 _DEFAULT_PRESETS = {
@@ -64,7 +58,7 @@ _DEFAULT_PRESETS = {
     "h265": ("medium",),
 }
 _MOST_CELLS = 10_000
-_LEAST, _MOST = 0.001, 1_000_000  # of seconds, hours and hertz
+_MOST = 1_000_000  # seconds
 _CRF = re.compile(r"(?P<first>[0-9]{1,4})(:(?P<last>[0-9]{1,4})(:(?P<step>[0-9]{1,4}))?)?")
 
 
@@ -123,10 +117,6 @@ class EvaluateOptions(TopicOptions):
         "vmaf=99.5",
         parse=_parse_target,
     )
-    streams: int | None = what("Number of cameras, to estimate the size of a dataset.", least=1)
-    hours: float | None = what(
-        "Hours of recording, to estimate the size of a dataset.", least=_LEAST, most=_MOST
-    )
     force: bool = force()
     gop: int = option("Maximum key frame interval in frames.", LOSSY_GOP, least=1, most=100_000)
     threads: int | None = option(
@@ -181,8 +171,6 @@ def _has(codec: str, preset: str) -> bool:
 
 _SHORT = 30  # frames
 _CEILING_MARGIN = 0.2  # of VMAF: what is closer to the ceiling is indistinguishable from noise
-_JPEG_FRAMES = 20
-_DAY = 86_400
 
 
 def evaluate(
@@ -330,7 +318,7 @@ def _evaluated(
             raise ScoringError(f"{camera.topic}: no setting could be tried. {why}")
         notes = [f"not tried: {', '.join(names)}: {why}" for why, names in failures.items()]
         notes += _notes(clip, cells, goal, reachable, camera.lossy, options.jobs)
-        found = CameraEvaluation(
+        return CameraEvaluation(
             topic=camera.topic,
             name=name,
             clip=clip,
@@ -342,51 +330,6 @@ def _evaluated(
             ground_truth=truth,
             notes=notes,
         )
-        if camera.rate is not None:
-            streams, hours = options.streams or 1, options.hours or 1.0
-            count = streams * hours * 3600 * camera.rate
-            found.data_set = (
-                f"{counted(streams, 'camera')} for {hours:g} hour{'s' * (hours != 1)} "
-                f"at {camera.rate:.2f} Hz, {count:.0f} frames"
-            )
-            found.storage = _storage(found, folder, count)
-    return found
-
-
-def _storage(found: CameraEvaluation, folder: Path, count: float) -> list[StorageRow]:
-    """The cost of storing so many frames, in several forms."""
-    clip, (width, height) = found.clip, found.clip.image_size
-    encoding = ENCODINGS[clip.encoding]
-    best = max(found.cells, key=lambda cell: mean_score(cell.scores, found.target)).setting
-    setting = found.recommended[0].setting if found.recommended else best
-    cell = next(cell for cell in found.cells if cell.setting == setting)
-    sizes = {
-        "raw": float(encoding.size(width * encoding.pixel_bytes, height)),
-        "YUV 4:4:4": 3.0 * width * height,
-        "RGB": 3.0 * width * height,
-        **{f"JPEG {quality}": _jpeg_bytes(clip, folder, quality) for quality in (90, 75)},
-    }
-    days = count / clip.frames / _DAY
-    return [
-        *(StorageRow(form, size, size * count / 1e9) for form, size in sizes.items()),
-        StorageRow(
-            setting.name,
-            cell.frame_bytes,
-            cell.frame_bytes * count / 1e9,
-            days=cell.encode_seconds * days,
-            cpu_days=cell.encode_cpu_seconds * days,
-        ),
-    ]
-
-
-def _jpeg_bytes(clip: Clip, folder: Path, quality: int) -> float:
-    """Mean bytes of JPEG files of some frames of a clip."""
-    recipe, is_grey = clip.recipe, clip.picture_format == "gray"
-    numbers = np.unique(np.linspace(0, clip.frames - 1, _JPEG_FRAMES).round().astype(int))
-    with closing(clip.open(folder)) as frames:
-        pictures = (rgb_of(frames.frame(number), recipe) for number in numbers.tolist())
-        sizes = [jpeg_bytes(picture, quality, is_grey=is_grey) for picture in pictures]
-    return sum(sizes) / len(sizes)
 
 
 def _notes(
@@ -407,6 +350,5 @@ def _notes(
         "encoding, or that cannot be read": clip.left_out > 0,
         f"a clip of {clip.frames} frames says little: give more --frames": clip.frames < _SHORT,
         "times were measured with several settings running at once": jobs > 1,
-        "has no frame rate, so no storage estimate is given": clip.rate is None,
     }
     return [note for note, applies in notes.items() if applies]

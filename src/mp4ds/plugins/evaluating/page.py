@@ -20,7 +20,6 @@ from mp4ds.plugins.evaluating.trials import (
     CameraEvaluation,
     Cell,
     Evaluation,
-    StorageRow,
     mean_score,
 )
 from mp4ds.unpacking.pictures import csv_cell
@@ -103,9 +102,6 @@ def findings_of(camera: CameraEvaluation) -> Iterator[str | list[Row]]:
     yield [_cell_row(camera, cell) for cell in camera.cells]
     scores = ", ".join(f"{name} {value.mean:.2f}" for name, value in camera.ceiling.items())
     yield f"ceiling, the clip scored against itself: {scores}"
-    if camera.storage:
-        yield f"{camera.data_set}:"
-        yield [_storage_row(row) for row in camera.storage]
     yield from (f"note: {note}" for note in camera.notes)
     for item in camera.recommended:
         yield f"{item.why}: {item.options} ({camera.target.metric} {item.score:.2f})"
@@ -142,16 +138,6 @@ def _cell_row(camera: CameraEvaluation, cell: Cell) -> Row:
 def why_of(camera: CameraEvaluation, cell: Cell) -> str:
     """Why a cell is recommended; empty if it is not."""
     return " ".join(item.why for item in camera.recommended if item.setting == cell.setting)
-
-
-def _storage_row(row: StorageRow) -> Row:
-    return {
-        "stored as": row.form,
-        "B/frame": f"{row.frame_bytes:.0f}",
-        "size": f"{row.gigabytes:.1f} GB",
-        "days": "" if row.days is None else f"{row.days:.2f}",
-        "CPU days": "" if row.cpu_days is None else f"{row.cpu_days:.2f}",
-    }
 
 
 def _time_text(seconds: float) -> str:

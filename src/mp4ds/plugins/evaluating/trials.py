@@ -271,25 +271,6 @@ def mean_size(sizes: Sequence[int], keyframes: Sequence[int], gop: int) -> float
 
 
 @dataclass(frozen=True, slots=True)
-class StorageRow:
-    """The cost of one way of storing frames.
-
-    Attributes:
-        form: ``raw``, ``YUV 4:4:4``, ``RGB``, ``JPEG 90``, ``JPEG 75`` or a setting.
-        frame_bytes: Bytes of a frame.
-        gigabytes: Size of the data set, in units of 10^9 bytes.
-        days: Time to encode it here, one camera after another; None if not encoded.
-        cpu_days: CPU time of that.
-    """
-
-    form: str
-    frame_bytes: float
-    gigabytes: float
-    days: float | None = None
-    cpu_days: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Recommendation:
     """A setting that reaches the target.
 
@@ -320,8 +301,6 @@ class CameraEvaluation:
         cells: By setting, in the order of the grid.
         recommended: The smallest and the fastest setting that reach the target; empty if none.
         ground_truth: Name of the PNG file of the clip's detail.
-        data_set: The data set that `storage` is for, in words.
-        storage: The cost of storing it, in several forms; empty if there is no frame rate.
         notes: Anything else worth knowing.
     """
 
@@ -334,8 +313,6 @@ class CameraEvaluation:
     cells: Sequence[Cell]
     recommended: Sequence[Recommendation]
     ground_truth: str
-    data_set: str = ""
-    storage: Sequence[StorageRow] = ()
     notes: list[str] = field(default_factory=list)
 
 
