@@ -9,7 +9,7 @@ both in the environment of PYTHON (which has LeRobot and mp4ds), give windows of
 that end at a random one, as bytes, and one at a time: in a shuffled training on many recordings,
 two samples of a batch are hardly ever close together. CPU time is of all threads of the process,
 opening left out; all take turns in short runs, of which the median is given. ``kept`` is a later
-epoch with ``cache="ram"``. PSNR is of the first camera, in RGB, against the frames of the recording
+epoch with ``cache=``. PSNR is of the first camera, in RGB, against the frames of the recording
 in that size.
 
 Files stay in ``--folder``.
@@ -207,7 +207,7 @@ def opened(name: str, window: int, asked: dict[str, Any]) -> Any:
         return Theirs("local/drive", root=path, return_uint8=True, **deltas)
     options: dict[str, Any] = {"resize": asked["size"]} if name == FULL else {}
     if name == KEPT:
-        options["cache"] = "ram"
+        options["cache"] = f"{path}-kept"
     return LeRobotDataset(
         path, topics=asked["topics"], fps=HERTZ, return_uint8=True, **options, **deltas
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import shutil
 from collections.abc import Callable
@@ -13,7 +12,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-import mp4ds.torch.cameras as caches  # noqa: E402
 from mp4ds.torch import FrameDataset, FrameStream  # noqa: E402
 from mp4ds.video.access import FrameReader  # noqa: E402
 from test_torch import BOTH, FRAMES, LEFT, RIGHT, camera, loader, packed  # noqa: E402
@@ -152,30 +150,3 @@ def test_a_full_disk_is_told_once(
         found = frames(dataset)
     assert len(told) == 1
     assert equal(found, frames(FrameDataset(drive, topics=[LEFT])))
-
-
-def test_shared_memory_is_freed_by_its_last_user(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(caches, "_SHARED_MEMORY", tmp_path)
-    first, second = (FrameDataset(drive, topics=[LEFT], cache="ram") for _ in range(2))
-    assert equal(frames(first), frames(second))
-    (folder,) = tmp_path.iterdir()
-    for _ in loader(first, 2, "fork", batch_size=4):
-        pass
-    del first
-    gc.collect()
-    assert len(list(folder.glob("*.frames"))) == 1
-    del second
-    gc.collect()
-    assert not folder.exists()
-
-
-def test_shared_memory_of_others_is_not_used(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(caches, "_SHARED_MEMORY", tmp_path)
-    (tmp_path / f"mp4ds-{os.getuid()}").mkdir(mode=0o777)
-    (tmp_path / f"mp4ds-{os.getuid()}").chmod(0o777)
-    with pytest.raises(ValueError, match="belongs to somebody else; give a folder"):
-        FrameDataset(drive, cache="ram")

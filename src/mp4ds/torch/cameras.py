@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import gc
 import os
-import shutil
 import threading
 import warnings
-import weakref
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from functools import cached_property
 from hashlib import sha256
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -31,7 +29,6 @@ from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.vectors import Statistics, sampled_statistics
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, SampleError, VideoError
-from mp4ds.files.outputs import lock
 from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.layouts import LAYOUTS
@@ -162,13 +159,9 @@ class TorchcodecReader:
 
 # ---------------------------------------------------------------- frames kept for later
 
-RAM = "ram"
-"""Names the folder of this user in shared memory."""
-
 CACHE_BYTES = 8 << 30
 """What a cache may take unless told otherwise."""
 
-_SHARED_MEMORY = Path("/dev/shm")
 _SUM_BYTES = 8
 
 
@@ -178,11 +171,8 @@ class FrameCache:
     A file has a place for each frame, with a checksum of its pixels. So processes need no lock, and
     what a killed one wrote half counts as missing, as does what a crash of the machine took.
 
-    The folder in shared memory is removed by the last process that made a cache there, unless it is
-    killed: then by the last one of a later training.
-
     Args:
-        where: A folder, which is made, or `RAM`.
+        where: A folder, which is made.
         most: Maximum of bytes, over all cameras.
         frames: Of all cameras: a camera gets a share for each of its frames.
 
@@ -196,30 +186,10 @@ class FrameCache:
             raise OptionError("cache needs Linux, a BSD or macOS 11.")
         self._most, self._frames = most, frames
         self._folder = Path(where).absolute()
-        self._users: BinaryIO | None = None
         try:
-            if where == RAM:
-                self._use_shared_memory()
-            else:
-                self._folder.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OptionError(f"cache {self._folder} cannot be used: {error.strerror}.") from None
-
-    def _use_shared_memory(self) -> None:
-        if not _SHARED_MEMORY.is_dir():
-            raise OptionError("cache='ram' needs /dev/shm; give a folder instead.")
-        self._folder = _SHARED_MEMORY / f"mp4ds-{os.getuid()}"
-        while self._users is None:
-            self._folder.mkdir(mode=0o700, exist_ok=True)
-            found = self._folder.lstat()
-            if found.st_uid != os.getuid() or found.st_mode & 0o77:
-                raise OptionError(f"cache {self._folder} belongs to somebody else; give a folder.")
-            with suppress(FileNotFoundError, BlockingIOError):  # its last user removes it just now
-                self._users = _used(self._folder / "users")
-        weakref.finalize(self, _leave, self._folder, self._users, os.getpid())
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_users": None}
 
     def camera(self, topic: Topic, view: dict[str, Any], like: Pixels) -> CachedFrames:
         """The frames of a camera, as they are returned.
@@ -262,31 +232,6 @@ def _facts(part: Any) -> list[object]:
 def _state(path: Path) -> list[object]:
     found = path.stat()
     return [str(path), found.st_size, found.st_mtime_ns]
-
-
-def _used(path: Path) -> BinaryIO:
-    """A file that is locked as one of several users.
-
-    Raises:
-        FileNotFoundError: It was removed meanwhile.
-        BlockingIOError: It is being removed.
-    """
-    with ExitStack() as stack:
-        file = stack.enter_context(path.open("ab"))
-        lock(file, shared=True)
-        if os.fstat(file.fileno()).st_ino != path.stat().st_ino:
-            raise FileNotFoundError
-        stack.pop_all()
-        return file
-
-
-def _leave(folder: Path, users: BinaryIO, process: int) -> None:
-    """Remove the folder if nobody else uses it; a fork is no user."""
-    with users:
-        if os.getpid() == process:
-            with suppress(BlockingIOError):
-                lock(users)
-                shutil.rmtree(folder, ignore_errors=True)
 
 
 class CachedFrames:

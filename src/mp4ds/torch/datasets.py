@@ -220,7 +220,7 @@ class FrameDataset(Dataset):
         rename: What some recordings call a topic -> what it is called here:
             ``{"/cam_left/image": "/left/image_raw"}``.
         cache: Where to keep frames as they are returned, for later epochs: a folder that all
-            workers and processes of a machine share, or ``ram``. None: nowhere.
+            workers and processes of a machine share. None: nowhere.
         cache_bytes: Maximum size of that, over all cameras; other frames are decoded each time.
         cache_files: Maximum number of open videos per process.
         backend: ``torchcodec`` decodes with torchcodec, whose colours differ slightly.
