@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from mp4ds.errors import VideoError
 from mp4ds.video.access import FrameReader
+from mp4ds.video.decoder import VideoDecoder, read_video_file
 from test_references import (
     FRAMES,
     HEIGHT,
@@ -84,6 +85,15 @@ def test_it_is_the_same_frame(name: str, tmp_path: Path) -> None:
             for number, picture in found:
                 assert picture == expected[number], (numbers, number)
         assert access.seeking is None
+
+
+def test_frames_smaller_than_their_sequence_header_says(tmp_path: Path) -> None:
+    path = written(tmp_path, RECIPES["svt-switch-frames"])
+    file = read_video_file(path)
+    assert file.size == (WIDTH, HEIGHT)
+    maker: Any = Samples()
+    with VideoDecoder(path, codec="av1", frames=FRAMES, maker=maker, file=file) as decoder:
+        assert [picture for _, picture in decoder.pictures_at(range(FRAMES))] == whole(path)
 
 
 @settings(deadline=None, max_examples=60)

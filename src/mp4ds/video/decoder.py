@@ -107,7 +107,8 @@ def open_packet_decoder(codec: str, size: tuple[int, int], configuration: bytes 
     context.width, context.height = size
     context.thread_count = 1
     context.thread_type = "SLICE"
-    if configuration:
+    # AV1 has it before key frames, too; ffmpeg would refuse it for the largest size it allows
+    if configuration and codec != "av1":
         context.extradata = configuration
     context.options = most_pixels(size)
     if codec == "av1":
@@ -234,6 +235,8 @@ class VideoDecoder:
         try:
             self._media.check(codec, maker.coded_size)
             self._stream = self._media.track
+            if codec == "av1":  # as in `open_packet_decoder`
+                self._stream.codec_context.extradata = None
             self._stream.thread_type = "AUTO" if sequential else "SLICE"
             if not sequential:
                 self._stream.thread_count = 1  # threads inherited over a fork would never end
@@ -451,12 +454,17 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
     advice = "; `mp4ds.open` takes the number of one as `track`"
     with closing(Media(path, track, advice)) as media:
         context = media.track.codec_context
+        table, entry = media.table, media.table.entry
         width, height = context.width, context.height
+        if entry.codec == "av01" and (entry.width, entry.height) != (width, height):
+            # its sequence header tells the largest size: SVT-AV1 16384x8704 with switch frames
+            with suppress(FFmpegError, StopIteration):
+                frame = next(media.container.decode(media.track))
+                width, height = frame.width, frame.height
         if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
             raise VideoError("video-unreadable", path, f"has frames of {width}x{height} pixels")
         name = context.codec.canonical_name
         codec = next((key for key, value in CODECS.items() if value.ffmpeg == name), name)
-        table = media.table
         ticks, keys = _times_and_keys(table)
         if not len(ticks):
             raise VideoError("video-unreadable", path, "has no frames")
