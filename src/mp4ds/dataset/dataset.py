@@ -577,9 +577,7 @@ class Dataset:
         self.close()
 
 
-def open_dataset(
-    path: Path | str, *, layer: Layer | None = None, track: int | None = None
-) -> Dataset:
+def open_dataset(path: Path | str, *, layer: Layer | None = None) -> Dataset:
     """Open a dataset, or one video with its sidecar. See `Dataset`.
 
     A video without a sidecar or dataset can be opened, too: its topic is the file name without
@@ -589,22 +587,17 @@ def open_dataset(
     Args:
         path: See `Dataset`.
         layer: See `Dataset`.
-        track: Which video track of a video without a sidecar, from 0, if it has several.
 
     Raises:
-        OptionError: There is no such track, or it is not such a video. See `Dataset` for others.
+        Mp4dsError: See `Dataset`.
     """
     place = location(path)
     is_half = place.name.endswith(EXACT_SUFFIX)  # of two videos: differences show nothing
     if place.suffix.lower() in _VIDEOS and not is_half and place.is_file():
         beside = (sidecar_of(place), place.parent / MANIFEST_NAME)
         if not any(path.exists() for path in beside):
-            return Dataset.of(place, None, [], MessagesFile(None), VideoImages(place, track))
-    dataset = Dataset(place, layer=layer)
-    if track is not None:
-        dataset.close()
-        raise OptionError(f"{place}: `track` is for videos without a sidecar.")
-    return dataset
+            return Dataset.of(place, None, [], MessagesFile(None), VideoImages(place))
+    return Dataset(place, layer=layer)
 
 
 # ---------------------------------------------------------------- many datasets

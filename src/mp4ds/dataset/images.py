@@ -272,21 +272,19 @@ class VideoImages(Images):
 
     Args:
         path: The video.
-        track: Which of several video tracks, from 0.
 
     Raises:
-        VideoError: It cannot be read, or has several video tracks and none was chosen.
-        OptionError: It has no such track.
+        VideoError: It cannot be read, or has several video tracks.
     """
 
     channel = None
     encoding = "rgb8"
     shows_colours = True
 
-    def __init__(self, path: Path, track: int | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = self.video_path = path
         self.topic = path.stem
-        self._file = file = read_video_file(path, track)
+        self._file = file = read_video_file(path)
         self.image_size = file.size
         self._columns = DecodedColumns.of_frames(file.times, file.times)
 

@@ -504,8 +504,7 @@ class FrameReader:
     def _read_table(self) -> SampleTable:
         try:
             size = self._path.stat().st_size
-            track = self._video.track if self._video else None
-            table = read_sample_table(self._file, size, str(self._path), track)
+            table = read_sample_table(self._file, size, str(self._path))
         except Refused as error:
             raise UnknownStructure(f"its index cannot be used: {error}") from None
         known = CODECS.get(self._codec)

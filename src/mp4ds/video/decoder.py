@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mp4ds.errors import FormatError, Refused, SourceError, VideoError, reason_of
 from mp4ds.messages.encodings import MAX_SIDE, Picture
 from mp4ds.records import MetadataRecord
-from mp4ds.video.codecs import CODECS, COPIED_CODECS, check_pyav
+from mp4ds.video.codecs import CODECS, COPIED_CODECS
 from mp4ds.video.coded import REORDERED, StreamParser
 from mp4ds.video.media import Media, most_pixels, raise_if_scarce
 from mp4ds.video.mp4 import SampleTable
@@ -402,31 +402,27 @@ class VideoFile:
 
     Attributes:
         path: The video.
-        track: Which video track, from 0; None: there is only one.
         codec: Name in the registry, or ffmpeg's.
         size: Width and height of its frames, as coded.
         ticks: Presentation times in ticks of the track, int64, shape (frames,), in order.
         keys: Numbers of the frames at which decoding can begin.
         times: Presentation times, nanoseconds, rounded down, int64, shape (frames,).
         is_reordered: Whether frames are coded in another order than they are shown.
-        is_indexed: Whether all of this is in the file's index, so that little is read of it.
         hidden: How many coded frames its edit list hides.
     """
 
     path: Path
-    track: int | None
     codec: str
     size: tuple[int, int]
     ticks: NDArray[np.int64]
     keys: NDArray[np.int64]
     times: NDArray[np.int64]
     is_reordered: bool
-    is_indexed: bool
     hidden: int
 
     def open(self) -> Media:
         """Open it once more."""
-        return Media(self.path, self.track, size=self.size)
+        return Media(self.path, self.size)
 
     def maker(self, picture_format: str = "rgb24") -> PictureMaker:
         """Makes 8-bit RGB of its frames, by its colour tags; or of another format what they are."""
@@ -440,19 +436,13 @@ class VideoFile:
         )
 
 
-def read_video_file(path: Path, track: int | None = None) -> VideoFile:
+def read_video_file(path: Path) -> VideoFile:
     """Find out what is in a video without a sidecar.
-
-    Args:
-        path: The video.
-        track: Which video track, from 0; None: there is only one.
 
     Raises:
         VideoError: It cannot be read, or has several video tracks; lists them.
-        OptionError: It has no such track.
     """
-    advice = "; `mp4ds.open` takes the number of one as `track`"
-    with closing(Media(path, track, advice)) as media:
+    with closing(Media(path)) as media:
         context = media.track.codec_context
         table, entry = media.table, media.table.entry
         width, height = context.width, context.height
@@ -466,8 +456,6 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
         name = context.codec.canonical_name
         codec = next((key for key, value in CODECS.items() if value.ffmpeg == name), name)
         ticks, keys = _times_and_keys(table)
-        if not len(ticks):
-            raise VideoError("video-unreadable", path, "has no frames")
         base = media.track.time_base
         if np.abs(ticks[[0, -1]]).max() * base >= _LATEST or base.numerator != 1:
             raise VideoError("video-unreadable", path, "has times beyond 64 bits")
@@ -475,16 +463,13 @@ def read_video_file(path: Path, track: int | None = None) -> VideoFile:
         times = whole * _SECOND + part * _SECOND // base.denominator
         return VideoFile(
             path,
-            track,
             codec,
             (width, height),
             ticks,
             keys,
             times,
             is_reordered=bool(np.any(np.diff(table.order) < 0)),
-            is_indexed=bool(table.entry.codec),
-            # ffmpeg may list none of those after the last that is shown
-            hidden=max(len(table.sizes), media.track.frames) - len(ticks),
+            hidden=len(table.sizes) - len(ticks),
         )
 
 
@@ -545,8 +530,6 @@ class Clip:
         self._due = -1
         self._parser: type[StreamParser] = StreamParser
         self._units: list[bytes] = []
-        # an index that is read has one description of all packets
-        self._may_change = not (pictures or file.is_indexed)
         if not pictures:
             self._check_packets()
         with self._reading(), closing(self.file.open()) as media:
@@ -578,7 +561,6 @@ class Clip:
             raise self._refusal(f"is coded as {file.codec}, not {', '.join(COPIED_CODECS)}")
         if file.is_reordered:
             raise self._refusal(f"cannot be copied: {REORDERED}")
-        check_pyav()  # older ones do not tell changes of parameters, and could not write the copy
         self._parser = CODECS[file.codec].parser
         with self._reading(), closing(file.open()) as media:
             extradata = bytes(media.track.codec_context.extradata or b"")
@@ -638,7 +620,7 @@ class Clip:
         """The packets from a frame to the last one; they are in the order of the frames."""
         ticks = self.file.ticks
         with closing(self.file.open()) as media:
-            if number:  # without an index, they are read from the first
+            if number:
                 with suppress(FFmpegError):
                     before = int(ticks[max(0, number - _MOST_DELAY)])
                     media.container.seek(before, stream=media.track)
@@ -647,8 +629,6 @@ class Clip:
                     continue
                 if packet.pts != ticks[number]:
                     raise Refused(f"the packet of frame {number} is not where its index says")
-                if self._may_change and packet.has_sidedata("new_extradata"):
-                    raise Refused(f"the parameters of its decoder change at frame {number}")
                 yield packet
                 number += 1
                 if number > self.numbers[-1]:

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
 import av
-import numpy as np
 from av.error import FFmpegError
 from av.stream import Disposition
 
-from mp4ds.errors import Mp4dsError, OptionError, Refused, RemoteError, VideoError
+from mp4ds.errors import Mp4dsError, Refused, RemoteError, VideoError
 from mp4ds.files.urls import remote
 from mp4ds.messages.encodings import MAX_SIDE
 from mp4ds.times import TIMESCALE
 from mp4ds.video.codecs import AV_VERSION, CODECS, check_pyav
-from mp4ds.video.mp4 import SampleEntry, SampleTable, sample_table_of, why_unreadable
+from mp4ds.video.mp4 import SampleTable, sample_table_of, why_unreadable
 
 _Writer = TypeVar("_Writer", bound="Mp4Writer")
 
@@ -68,8 +67,6 @@ class Media:
 
     Args:
         path: The video.
-        track: Which of its video tracks, from 0; None: it has only one.
-        advice: What to do where it has several, for errors.
         size: Width and height of its frames, if they should be known; see `most_pixels`.
 
     Attributes:
@@ -78,20 +75,13 @@ class Media:
 
     Raises:
         VideoError: ``file-missing`` or ``video-unreadable``.
-        OptionError: It has no such track.
         RemoteError: It is at a URL, and cannot be read there.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        track: int | None = None,
-        advice: str = "",
-        size: tuple[int, int] | None = None,
-    ) -> None:
+    def __init__(self, path: Path, size: tuple[int, int] | None = None) -> None:
         if not path.is_file():
             raise VideoError("file-missing", path, "does not exist")
-        self._path, self._number = path, track
+        self._path = path
         self._file: _Source | None = None
         try:
             if remote(path):
@@ -107,28 +97,24 @@ class Media:
             self._close_file()
             raise
         try:
-            self.track = self._chosen(track, advice)
+            self.track = self._only_track()
             self.track.codec_context.options = most_pixels(size)
         except Mp4dsError:
             self.close()
             raise
 
-    def _chosen(self, number: int | None, advice: str) -> Any:
+    def _only_track(self) -> Any:
         # a picture of the cover comes as one more track
         streams = self.container.streams.video
         tracks = [one for one in streams if not one.disposition & Disposition.attached_pic]
-        listed = ", ".join(f"{place}: {_described(one)}" for place, one in enumerate(tracks))
-        if number is None and len(tracks) != 1:
+        if len(tracks) != 1:
             problem = f"has {len(tracks)} video tracks, not one"
             if tracks:
-                problem += f" ({listed}){advice}"
+                listed = ", ".join(map(_described, tracks))
+                problem += f" ({listed}); `ffmpeg -i FILE -map 0:v:0 -c copy NEW.mp4` takes one out"
             problem = why_unreadable(self._path) or problem
             raise VideoError("video-unreadable", self._path, problem)
-        if number is not None and not 0 <= number < len(tracks):
-            raise OptionError(
-                f"{self._path}: there is no `track` {number}; there are {listed or 'none'}."
-            )
-        track = tracks[number or 0]
+        (track,) = tracks
         if track.codec_context is None or track.codec_context.codec is None:
             problem = why_unreadable(self._path) or "has a video track with an unknown codec"
             raise VideoError("video-unreadable", self._path, problem)
@@ -136,45 +122,20 @@ class Media:
 
     @cached_property
     def table(self) -> SampleTable:
-        """The index of the track; for fragments, of all packets, with an empty entry.
+        """The index of the track.
 
         Raises:
             VideoError: ``video-unreadable``.
         """
         try:
-            return sample_table_of(self._path, self._number)
-        except Refused:  # ffmpeg reads more, though only by all packets
-            return self._table_of_packets()
+            return sample_table_of(self._path)
+        except Refused as reason:
+            problem = f"cannot be read: {reason}; `ffmpeg -i FILE -c copy NEW.mp4` writes it anew"
+            raise VideoError("video-unreadable", self._path, problem) from None
         except OSError as error:
-            raise self._unreadable(error) from None
-
-    def _table_of_packets(self) -> SampleTable:
-        try:
-            packets = [
-                (p.pos or 0, p.size, p.dts, p.pts, p.is_keyframe, p.is_discard)
-                for p in self.container.demux(self.track)
-                if p.pts is not None  # as of the packet that ends a video
-            ]
-        except (FFmpegError, OSError) as error:
-            raise self._unreadable(error) from None
-        given = [(*p[:2], p[3] if p[2] is None else p[2], *p[3:]) for p in packets]
-        rows = np.array(given, np.int64).reshape(-1, 6)
-        places, sizes, decoding, presentation, sync, hidden = rows.T
-        shown = np.flatnonzero(hidden == 0)
-        return SampleTable(
-            entry=SampleEntry("", b"", ()),
-            timescale=self.track.time_base.denominator,
-            places=places,
-            sizes=sizes,
-            decoding=decoding,
-            presentation=presentation,
-            sync=sync.astype(np.bool_),
-            order=shown[np.argsort(presentation[shown], kind="stable")],
-        )
-
-    def _unreadable(self, error: Exception) -> VideoError:
-        raise_if_scarce(error)
-        return VideoError("video-unreadable", self._path, f"cannot be read: {error}")
+            raise_if_scarce(error)
+            problem = f"cannot be read: {error}"
+            raise VideoError("video-unreadable", self._path, problem) from None
 
     def check(self, codec: str, coded_size: tuple[int, int] | None) -> None:
         """Compare the header with what a sidecar says.

@@ -326,16 +326,14 @@ class _Movie:
         return np.frombuffer(self._data, row, count, box.start + at)
 
 
-def sample_table_of(path: Path, track: int | None = None) -> SampleTable:
-    """The index of a video track of a file: see `read_sample_table`."""
+def sample_table_of(path: Path) -> SampleTable:
+    """The index of the video track of a file: see `read_sample_table`."""
     with path.open("rb") as file:
-        return read_sample_table(file, path.stat().st_size, str(path), track)
+        return read_sample_table(file, path.stat().st_size, str(path))
 
 
-def read_sample_table(
-    stream: BinaryIO, size: int, place: str, track: int | None = None
-) -> SampleTable:
-    """Read the index of a video track of an mp4.
+def read_sample_table(stream: BinaryIO, size: int, place: str) -> SampleTable:
+    """Read the index of the video track of an mp4.
 
     Only the headers of its outermost boxes and its movie box are read, the latter at once.
 
@@ -345,7 +343,6 @@ def read_sample_table(
             have one size.
         size: Its bytes.
         place: Its name, for errors.
-        track: Which video track, from 0; None: there is only one.
 
     Raises:
         VideoError: ``video-unreadable``: there is no index, it contradicts itself or the file's
@@ -357,11 +354,9 @@ def read_sample_table(
     try:
         movie = _read_movie(stream, size)
         tracks = movie.tracks()
-        if track is None and len(tracks) != 1:
+        if len(tracks) != 1:
             raise VideoError("video-unreadable", place, f"has {len(tracks)} video tracks, not one")
-        if track is not None and track >= len(tracks):
-            raise Refused("ffmpeg finds more tracks")
-        return _parse_track(movie, tracks[track or 0], size)
+        return _parse_track(movie, tracks[0], size)
     except DamagedBoxError as error:
         raise VideoError("video-unreadable", place, f"has no readable index: {error}") from None
 

@@ -223,8 +223,6 @@ class PacketReader:
             self.pixel_format = pixel_format_of(context)
             table = media.table
         count = len(table.order)
-        if not count:
-            raise VideoError("frame-count", path, "has no frames")
         if frames is not None and count != frames:
             raise VideoError("frame-count", path, f"has {count} frames, not {frames}")
         if table.sizes.sum() > path.stat().st_size:
@@ -461,8 +459,6 @@ def _last_duration(path: Path) -> int:
     """How long the last frame lasts, in ticks; all others last until the next one."""
     with closing(Media(path)) as source:
         ticks = source.table.decoding
-        if not len(ticks):
-            raise VideoError("frame-count", path, "has no frames")
         return max(int(source.track.duration or 0) - int(ticks[-1] - ticks[0]), 1)
 
 
@@ -534,8 +530,4 @@ def entry_of(path: Path) -> SampleEntry:
         VideoError: ``file-missing`` or ``video-unreadable``.
     """
     with closing(Media(path)) as media:
-        entry = media.table.entry
-    if entry.codec:
-        return entry
-    problem = "has an index without frames, or of a kind that mp4ds does not write"
-    raise VideoError("video-unreadable", path, problem)
+        return media.table.entry

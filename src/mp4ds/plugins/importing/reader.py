@@ -234,8 +234,6 @@ class ImagesReader(BagReader):
         self._add_calibration(topic, frame_id, stamps, calibration)
         self._metadata.append(clip.metadata)
         self.left_out.update(clip.left_out)
-        # otherwise, each of the pieces would read all of the file to know its frames
-        self.is_indexed &= clip.file.is_indexed or kind == "compressed-video"
 
     def add_joints(
         self,
