@@ -75,6 +75,13 @@ def read_video(path, told):
     return packets, names.pop() if len(names) == 1 else "", [planes for _, planes in pictures]
 
 
+def has_grain(path):
+    """Whether a decoder may add film grain to a picture."""
+    with av.open(str(path)) as container:
+        container.streams.video[0].codec_context.options = {"export_side_data": "film_grain"}
+        return any("FILM_GRAIN_PARAMS" in frame.side_data for frame in container.decode(video=0))
+
+
 def planes_of(frame):
     """Format and planes of a picture; packed colours as if they were planar."""
     name = frame.format.name.replace("yuvj", "yuv")

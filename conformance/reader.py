@@ -19,7 +19,7 @@ import numpy as np
 import xxhash
 
 from documents import RefusedError, columns, load
-from images import pixels, read_video
+from images import has_grain, pixels, read_video
 from payloads import filled, messages_by_channel, packet_body, png_file, rows, rvl_image, template
 
 
@@ -56,6 +56,8 @@ def stream(path):
     of_view, predicted = {}, None
     if view:
         of_view, _, shown = decoded(path, side, view)
+        if view["codec"] == "av1" and has_grain(path.parent / view["file"]):
+            raise RefusedError("codec-mismatch", path.parent / view["file"])
         predicted = [pixels(image, view, picture) for picture in shown]
         of_view = {"view": {**of_view, "pixels": hashes_of(predicted)}}
     if not side.get("predicted", True):

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mp4ds.dataset.stream import Layer, Stream
 from mp4ds.errors import VideoError
 from mp4ds.video.access import FrameReader
 from mp4ds.video.decoder import VideoDecoder, read_video_file
@@ -33,6 +34,7 @@ class Samples:
     """Gives the samples of frames in the place of pictures."""
 
     coded_size = WIDTH, HEIGHT
+    is_view = False
 
     def make(self, frame: Any, number: int | None = None, *_: Any) -> Any:
         assert number is not None
@@ -126,6 +128,14 @@ def test_a_file_that_was_cut_short_meanwhile(tmp_path: Path) -> None:
         list(access.pictures_of([25]))
     assert [number for number, _ in access.pictures_of([5])] == [5]
     access.close()
+
+
+@pytest.mark.parametrize("layer", ["exact", "view"])
+def test_a_view_with_film_grain(layer: Layer) -> None:
+    path = Path(__file__).parents[1] / "conformance/cases/sidecars/invalid/view-grain.yaml"
+    access = Stream(path, layer=layer).open_reader()
+    with closing(access), pytest.raises(VideoError, match="film grain"):
+        list(access.pictures_of([1]))
 
 
 def test_it_counts_the_frames(tmp_path: Path) -> None:

@@ -252,6 +252,7 @@ class Stream(Images):
             picture_size=self.layout.picture_size(image.width, image.height),
             matrix=video.matrix,
             full_range=video.full_range,
+            is_view=self.layer == "view",
         )
         return {"codec": video.codec, "frames": self.sidecar.frames, "maker": maker}
 

@@ -644,6 +644,8 @@ class FrameReader:
         if self._codec != "av1":
             # concealed damage would depend on which frames were decoded before
             context.options = {**context.options, "err_detect": "explode"}
+        elif self._maker.is_view:
+            context.options["export_side_data"] = "film_grain"
         return context
 
     def _announce(self, samples: Iterable[int]) -> None:

@@ -237,6 +237,8 @@ class VideoDecoder:
             self._stream = self._media.track
             if codec == "av1":  # as in `open_packet_decoder`
                 self._stream.codec_context.extradata = None
+                if maker.is_view:
+                    self._stream.codec_context.options["export_side_data"] = "film_grain"
             self._stream.thread_type = "AUTO" if sequential else "SLICE"
             if not sequential:
                 self._stream.thread_count = 1  # threads inherited over a fork would never end

@@ -367,6 +367,7 @@ class PictureMaker:
         picture_size: Width and height of the pictures wanted, at most those of the frames.
         matrix: Matrix coefficients of the video's colours; None to use the video's own tags.
         full_range: Whether its samples use their full range, unless the video is tagged.
+        is_view: Whether film grain is refused, which decoders may leave out.
     """
 
     def __init__(
@@ -378,9 +379,10 @@ class PictureMaker:
         picture_size: tuple[int, int],
         matrix: str | None = "bt709",
         full_range: bool = True,
+        is_view: bool = False,
     ) -> None:
         self._path = path
-        self.coded_size = coded_size
+        self.coded_size, self.is_view = coded_size, is_view
         self._picture_format = picture_format
         self._picture_size = picture_size
         self._is_tagged, self._full_range = matrix is None, full_range
@@ -412,6 +414,9 @@ class PictureMaker:
             width, height = self.coded_size
             problem = f"has {frame.width}x{frame.height} pixels, others have {width}x{height}"
             raise VideoError("geometry-mismatch", self._path, problem, frame=number)
+        if self.is_view and "FILM_GRAIN_PARAMS" in frame.side_data:
+            problem = "has film grain, which decoders may leave out; a view must have none"
+            raise VideoError("codec-mismatch", self._path, problem)
         if scale is not None:
             return (self._converter.scale(frame, scale, out),)
         is_mosaic = self._picture_format.startswith("bayer_")
