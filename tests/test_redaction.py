@@ -298,6 +298,8 @@ def test_a_function_that_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     mp4ds.pack(source, target, options)
     with mp4ds.open(target, layer="exact") as made:
         assert all(not frame.data[8:24, 8:24].any() for frame in made[TOPIC])
+    with pytest.raises(Mp4dsError, match="already exists"):
+        mp4ds.pack_each([source], target.parent, options)
     with pytest.raises(OptionError, match="`redact` is a function"):
         mp4ds.pack_share(source, tmp_path / "parts", (1, 2), options)
 
@@ -336,8 +338,9 @@ def test_datasets_and_reductions(tmp_path: Path) -> None:
     with mp4ds.open(tmp_path / "visual") as made:
         assert made[TOPIC].get([4], format="rgb")[0].data[INSIDE][4:-4, 4:-4].max() < 40
     assert len(mp4ds.pack_each([source], tmp_path / "all", PackOptions(redact=told))) == 1
+    assert mp4ds.pack_each([source], tmp_path / "all", PackOptions(redact=told)) == []
     with pytest.raises(Mp4dsError, match="already exists"):
-        mp4ds.pack_each([source], tmp_path / "all", PackOptions(redact=told))
+        mp4ds.pack_each([source], tmp_path / "all")
 
 
 def test_what_it_says(tmp_path: Path) -> None:

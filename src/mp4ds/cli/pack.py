@@ -86,19 +86,10 @@ def pack_command(
             summaries = mp4ds.pack_each(sources, into, options, progress=progress)
         else:
             summaries = [mp4ds.pack(sources, output, options, progress=progress)]
-    asked = len(sources) if into else 1
-    show(summaries if into else summaries[0], lambda _: _print_packs(summaries, asked))
+    show(summaries if into else summaries[0], lambda _: [*map(print_pack, summaries)])
 
 
 repack_command = pack_command
-
-
-def _print_packs(summaries: Sequence[PackSummary], asked: int) -> None:
-    """Print what became of several recordings, and how many were packed before."""
-    for summary in summaries:
-        print_pack(summary)
-    if kept := asked - len(summaries):
-        say(f"left as they are: {counted(kept, 'dataset')} packed before; --force replaces them")
 
 
 def print_pack(summary: PackSummary) -> None:
@@ -409,10 +400,11 @@ def lerobot_command(folder: str, output: str, images: ImportOptions, options: Pa
         for number in numbers:
             target = Path(output) / f"episode_{number:06d}"
             chosen = replace(options, images=replace(images, episode=number))
-            if not is_packed(target, chosen):
+            # those that an earlier run made are left as they are
+            if options.force or not is_packed(Path(folder), target, chosen):
                 target.parent.mkdir(exist_ok=True)
                 summaries.append(mp4ds.pack(folder, target, chosen, progress=progress))
-    show(summaries, lambda _: _print_packs(summaries, len(numbers)))
+    show(summaries, lambda _: [*map(print_pack, summaries)])
 
 
 @command("ros-mp4")

@@ -148,6 +148,12 @@ class RedactionEntry(Model):
         told = (f"{one.changed} of {one.images} of {one.topic}" for one in self.topics)
         return ", ".join(told) or "none"
 
+    @property
+    def told(self) -> dict[str, str]:
+        """What was done, by the file of rules or the function."""
+        values = {"rules_sha256": self.rules_sha256, "function": self.function}
+        return {key: value for key, value in values.items() if value}
+
     def proving(self, is_proven: Callable[[str], bool] = lambda _: False) -> RedactionEntry:
         """The same, with digests of the topics of which all images are as they were."""
         topics = [

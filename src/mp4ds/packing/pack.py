@@ -30,7 +30,7 @@ from mp4ds.errors import (
     advising,
     path_text,
 )
-from mp4ds.files.outputs import check_target, local_target, staged
+from mp4ds.files.outputs import check_target, digest_file, local_target, staged
 from mp4ds.files.sources import (
     SourceHasher,
     is_unfinished,
@@ -39,10 +39,11 @@ from mp4ds.files.sources import (
     unchanged,
 )
 from mp4ds.files.urls import RemotePath, location, remote
-from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about
+from mp4ds.format.manifest import ReductionEntry
+from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS
-from mp4ds.options import ENCODING
+from mp4ds.options import CONTENT, ENCODING
 from mp4ds.packing.long_packs import PartedPack, Report, pack_parts
 from mp4ds.packing.manifest import (
     PartRecord,
@@ -297,8 +298,8 @@ def pack_each(
         progress: Called several times a second.
 
     Returns:
-        The result for each one packed now, in the order of the sources. Datasets that exist are
-        left as they are, so that the same call goes on after an interruption.
+        The result for each one packed now, in the order of the sources; existing datasets of the
+        same recordings are left as they are.
 
     Raises:
         Mp4dsError: As for `pack`.
@@ -318,7 +319,11 @@ def pack_each(
             )
         targets[target] = source
     parent.mkdir(exist_ok=True)
-    missing = {target: source for target, source in targets.items() if not is_packed(target, asked)}
+    missing = {
+        target: source
+        for target, source in targets.items()
+        if asked.force or not is_packed(source, target, asked)
+    }
     made: dict[Path, PackSummary] = {}
     parted = []
     for target, source in missing.items():
@@ -332,19 +337,46 @@ def pack_each(
     return [made[target] for target in missing if target in made]
 
 
-def is_packed(target: Path, options: PackOptions) -> bool:
-    """Whether a dataset that is to be made is there already, as of a run that was interrupted.
+def is_packed(source: Path, target: Path, options: PackOptions) -> bool:
+    """Whether a dataset of a recording already exists.
 
     Args:
+        source: The recording.
         target: The dataset.
-        options: How it is to be packed.
+        options: How it is packed.
 
     Raises:
-        TargetExistsError: Something else is there, or what may not be redacted as it should be.
+        TargetExistsError: Something else is there.
     """
-    if options.force or not os.path.lexists(target):
+    if not os.path.lexists(target):
         return False
-    if options.redact is not None or not (target / MANIFEST_NAME).is_file():
+    try:
+        manifest = load_manifest(target / MANIFEST_NAME)
+    except FormatError:
+        raise TargetExistsError(target) from None
+    folder = dataset_at(source)
+    plain = PackOptions(**options.changing(CONTENT), salvage=options.salvage, images=options.images)
+    with open_recording([source], replace(plain, latched=False)) as reader:
+        span = reader.slice.span
+        sizes = sorted(map(source_size, reader.files))
+    reductions = [ReductionEntry.model_validate(options.reduction)] if options.derives else []
+    hidden = [options.redaction.told] if options.redaction else []
+    if folder:
+        known = load_manifest(folder / MANIFEST_NAME)
+        reductions = [*known.reductions, *reductions]
+        hidden = [*(one.told for one in known.redactions), *hidden]
+        due = [item.within(span) for item in known.sources]
+        earlier = [item.sha256 for item in manifest.derived_from[-1:]]
+        is_same = earlier == [digest_file(folder / MANIFEST_NAME)[1]] and manifest.sources == due
+    else:
+        is_same = sorted(item.size for item in manifest.sources) == sizes and all(
+            item.within(span) == item.model_copy(update={"excerpt": None}).within(span)
+            for item in manifest.sources
+        )
+    done = [entry.model_copy(update={"images": []}) for entry in manifest.reductions]
+    asked = [entry.model_copy(update={"images": []}) for entry in reductions]
+    hides = [one.told for one in manifest.redactions]
+    if options.finds or not (is_same and done == asked and hides == hidden):
         raise TargetExistsError(target)
     return True
 
