@@ -11,7 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import cached_property
 from hashlib import sha256
+from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -27,17 +29,132 @@ from mp4ds.dataset.topic import Topic
 from mp4ds.dataset.vectors import Statistics, sampled_statistics
 from mp4ds.dataset.views import FORMATS, Crop, Resize, size_after
 from mp4ds.errors import FormatError, Mp4dsError, OptionError, SampleError, VideoError
-from mp4ds.messages.encodings import Pixels
+from mp4ds.files.urls import remote
+from mp4ds.messages.encodings import ENCODINGS, Pixels
+from mp4ds.messages.layouts import LAYOUTS
 from mp4ds.times import nearest, sound_times
 from mp4ds.torch.recordings import CameraSource, Recording, at_least, each, one_of, open_source
 from mp4ds.video.media import Media
 
 Dtype = Literal["native", "uint8", "float32"]
+Backend = Literal["mp4ds", "torchcodec"]
 
 # A worker must not free what its parent left to the garbage collector: a PyAV container is always
 # in a reference cycle, and freeing its decoder waits for threads that a fork does not copy.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=gc.freeze)
+
+
+# ---------------------------------------------------------------- torchcodec
+
+
+_SCANNED = 32 * 2**20
+"""Bytes of a video that torchcodec scans as quickly as it reads our index."""
+
+
+class TorchcodecReader:
+    """Decodes a stream's video by ``torchcodec.decoders.VideoDecoder``.
+
+    Args:
+        topic: The stream's frames.
+        crop: x, y, width, height, pixels; None: all.
+        device: Such as ``cpu`` or ``cuda``.
+
+    Raises:
+        OptionError: torchcodec is missing or misinterprets the video's range or beginning, or the
+            video's pictures are not the images.
+        VideoError: It cannot open the video.
+    """
+
+    def __init__(self, topic: Topic, crop: Crop, device: str) -> None:
+        self._path = topic.parts[0].video_path
+        for stream in topic.streams:
+            image, video = stream.sidecar.image, stream.sidecar.video
+            if stream.sidecar.is_predicted:
+                raise OptionError(
+                    f"topic {stream.topic}: its exact frames are made of two videos, which "
+                    "torchcodec cannot do. Use backend='mp4ds', or layer='view'."
+                )
+            is_deep = ENCODINGS[image.encoding].bytes_per_sample > 1
+            if is_deep or not LAYOUTS[video.layout].is_shown:
+                raise OptionError(
+                    f"topic {stream.topic}: {image.encoding} images are stored in the layout "
+                    f"{video.layout}, which torchcodec cannot convert to colour. Use "
+                    "backend='mp4ds'."
+                )
+            if stream.hides_frames:
+                raise OptionError(
+                    f"topic {stream.topic}: torchcodec returns wrong frames at the beginning of a "
+                    "video cut out of another. Use backend='mp4ds', or a dataset packed with a "
+                    "`codec`."
+                )
+        if remote(self._path):
+            raise OptionError(f"{self._path}: backend='torchcodec' only reads local files.")
+        columns, rows = topic.image_size
+        x, y, width, height = crop or (0, 0, columns, rows)
+        if not (0 <= x < x + width <= columns and 0 <= y < y + height <= rows):
+            raise OptionError(f"topic {topic.topic}: crop {crop} is not inside {columns}x{rows}.")
+        self._rows, self._columns = slice(y, y + height), slice(x, x + width)
+        self._device = device
+        if find_spec("torchcodec") is None:
+            raise OptionError(
+                "backend='torchcodec' needs torchcodec. Install it with: pip install torchcodec"
+            )
+        try:
+            module = import_module("torchcodec.decoders")
+        except (ImportError, OSError, RuntimeError) as error:
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise OptionError(
+                f"torchcodec is installed but cannot be used: {reason} If it finds no FFmpeg, "
+                "install that."
+            ) from None
+        # either way, frame n is the n-th shown, whatever its presentation time
+        how: dict[str, Any] = {"seek_mode": "exact"}  # which reads the whole file
+        if topic.streams and self._path.stat().st_size > _SCANNED:
+            how = {"custom_frame_mappings": topic.streams[0].frame_mappings()}
+        how |= {"dimension_order": "NHWC", "device": device}
+        try:
+            self._decoder = module.VideoDecoder(str(self._path), **how)
+        except (RuntimeError, ValueError) as error:
+            raise self._refused(error) from None
+        self._check_range(topic)
+
+    def _check_range(self, topic: Topic) -> None:
+        """Refuse a video whose range torchcodec misinterprets.
+
+        On a CPU, torchcodec 0.13 treats full-range AV1 as limited (0.17 does not): contrast is then
+        too high by 255 / 219, and dark and bright details are clipped.
+        """
+        with closing(topic):  # it reopens its video when needed
+            first = topic.read([0], format="rgb")[0]
+        ours = first[self._rows, self._columns].astype(np.int16)
+        mistaken = ((ours - 16) * (255 / 219)).clip(0, 255)
+        theirs = self.read([0])[0].cpu().numpy()
+        if np.abs(theirs - mistaken).mean() < np.abs(theirs - ours).mean():
+            raise OptionError(
+                f"topic {topic.topic}: torchcodec decodes its full-range video as limited-range, "
+                "so the contrast would be wrong. Use backend='mp4ds', or a dataset packed with "
+                "`codec` h264."
+            )
+
+    def _refused(self, error: Exception) -> VideoError:
+        reason = " ".join(str(error).split()[:40])
+        return VideoError("decode-failed", self._path, f"torchcodec cannot decode it: {reason}")
+
+    def read(self, frames: Sequence[int]) -> Tensor:
+        """Frames in the requested order, with repetitions; shape (N, H, W, 3), uint8.
+
+        Raises:
+            VideoError: One cannot be decoded.
+        """
+        if not frames:
+            height, width = (part.stop - part.start for part in (self._rows, self._columns))
+            return torch.empty((0, height, width, 3), dtype=torch.uint8, device=self._device)
+        try:
+            pixels: Tensor = self._decoder.get_frames_at(list(frames)).data
+        except (RuntimeError, IndexError, ValueError) as error:
+            raise self._refused(error) from None
+        return pixels[:, self._rows, self._columns]
 
 
 # ---------------------------------------------------------------- frames kept for later
@@ -184,6 +301,9 @@ class OpenCamera:
         if len(self._topic) != source.frames:
             problem = f"has {len(self._topic)} frames, not {source.frames}"
             raise FormatError("frame-count", source.place, problem)
+        self._torchcodec = None
+        if cameras.backend == "torchcodec":
+            self._torchcodec = TorchcodecReader(self._topic, view["crop"], cameras.device)
         self._cached = None
         if cameras.cache is not None:
             self._cached = cameras.cache.camera(self._topic, view, self._topic.read([], **view))
@@ -253,7 +373,7 @@ class OpenCamera:
             OptionError: They cannot be returned as requested.
         """
         try:
-            if self._dtype != "float32":
+            if self._torchcodec is None and self._dtype != "float32":
                 # arrays share the memory of tensors; those of grey images have no channels
                 rows = [(out.squeeze(-1) if out.shape[-1] == 1 else out).numpy() for out in outs]
                 self._fill(frames, rows)
@@ -274,6 +394,8 @@ class OpenCamera:
 
     def _pixels(self, frames: Sequence[int]) -> Tensor:
         """Frames as decoded, shape (N, H, W) or (N, H, W, C)."""
+        if self._torchcodec is not None:
+            return self._torchcodec.read(frames)
         like = self._topic.read([], **self._view)
         pixels = np.empty((len(frames), *like.shape[1:]), like.dtype)
         self._fill(frames, list(pixels))
@@ -306,6 +428,7 @@ class OpenCamera:
 
     def close(self) -> None:
         """Close the video."""
+        self._torchcodec = None
         self._topic.close()
         if self._cached:
             self._cached.close()
@@ -324,6 +447,8 @@ class OpenCameras:
         resize: Factor, or width and height.
         crop: x, y, width, height.
         dtype: ``native``, ``uint8`` or ``float32``.
+        backend: The decoding backend.
+        device: Where the tensors are.
 
     Attributes:
         views: Format, size and crop of each camera, as `Topic.read` takes them.
@@ -342,6 +467,8 @@ class OpenCameras:
         resize: Resize | Mapping[str, Resize],
         crop: Crop | Mapping[str, Crop],
         dtype: str,
+        backend: str,
+        device: str,
     ) -> None:
         # by process: what a parent opened is kept as it is, since closing or freeing its decoders
         # could hang, and its lock may be held by a thread that a fork did not copy
@@ -349,7 +476,9 @@ class OpenCameras:
         self._most = most
         self.cache: FrameCache | None = None
         self.dtype = str(dtype).removeprefix("torch.")
+        self.backend, self.device = backend, device
         one_of("dtype", self.dtype, get_args(Dtype))
+        one_of("backend", backend, get_args(Backend))
         self.views: list[dict[str, Any]] = [
             {"format": name, "resize": size, "crop": area}
             for name, size, area in zip(
@@ -363,6 +492,13 @@ class OpenCameras:
             one_of("format", view["format"], FORMATS)
             if view["resize"] is not None:  # now, rather than in a worker
                 size_after(topic, (1, 1), view["resize"])
+        if backend == "mp4ds" and device != "cpu":
+            raise OptionError(f"device={device!r} needs backend='torchcodec'.")
+        is_changed = any(view["format"] != "rgb" or view["resize"] for view in self.views)
+        if backend == "torchcodec" and is_changed:
+            raise OptionError(
+                "backend='torchcodec' only gives format='rgb' without resize; use a transform."
+            )
         at_least(1, cache_files=most)
 
     @contextmanager

@@ -18,7 +18,7 @@ from mp4ds.dataset.stream import Layer
 from mp4ds.dataset.vectors import Fields
 from mp4ds.dataset.views import Crop, Resize
 from mp4ds.errors import OptionError, absent, counted
-from mp4ds.torch.cameras import CACHE_BYTES, Dtype, FrameCache, OpenCamera, OpenCameras
+from mp4ds.torch.cameras import CACHE_BYTES, Backend, Dtype, FrameCache, OpenCamera, OpenCameras
 from mp4ds.torch.recordings import (
     Paths,
     Pick,
@@ -147,12 +147,12 @@ def _whole(rows: Sequence[Any]) -> Any:
 
 def _kind(row: torch.Tensor) -> tuple[object, ...]:
     """What all rows of one tensor share."""
-    return row.untyped_storage().data_ptr(), row.dtype, row.shape, row.stride()
+    return row.untyped_storage().data_ptr(), row.dtype, row.device, row.shape, row.stride()
 
 
 def _new(like: torch.Tensor, *shape: int, shared: bool = False) -> torch.Tensor:
-    """A new tensor of a type; shared with other processes if asked for."""
-    if not shared:
+    """A new tensor of a type and place; shared with other processes if asked for."""
+    if not shared or like.device.type != "cpu":
         return like.new_empty(shape)
     # as torch's own collate does in a worker
     storage = torch.UntypedStorage._new_shared(prod(shape) * like.itemsize)
@@ -223,6 +223,8 @@ class FrameDataset(Dataset):
             workers and processes of a machine share. None: nowhere.
         cache_bytes: Maximum size of that, over all cameras; other frames are decoded each time.
         cache_files: Maximum number of open videos per process.
+        backend: ``torchcodec`` decodes with torchcodec, whose colours differ slightly.
+        device: With ``torchcodec``, where to decode and keep the tensors, such as ``cuda``.
 
     Attributes:
         topics: The cameras of a sample.
@@ -261,6 +263,8 @@ class FrameDataset(Dataset):
         cache: str | Path | None = None,
         cache_bytes: int = CACHE_BYTES,
         cache_files: int = 16,
+        backend: Backend = "mp4ds",
+        device: str = "cpu",
         **others: NoReturn,
     ) -> None:
         for name in others:  # of other libraries, too
@@ -320,8 +324,12 @@ class FrameDataset(Dataset):
             resize=resize,
             crop=crop,
             dtype=dtype,
+            backend=backend,
+            device=device,
         )
         if cache is not None:
+            if backend != "mp4ds":
+                raise OptionError("cache needs backend='mp4ds'.")
             sources = {one for recording in self.recordings for one in recording.sources}
             frames = max(sum(one.frames for one in sources), 1)
             self._cameras.cache = FrameCache(cache, cache_bytes, frames)

@@ -139,7 +139,7 @@ class LeRobotDataset(FrameDataset):
         return_uint8: Whether frames are bytes instead of float32 from 0 to 1.
         rename: As for `FrameDataset`.
         layer: As for `FrameDataset`.
-        **options: Others of `FrameDataset`: resize, crop, message, cache, cache_files.
+        **options: Others of `FrameDataset`: resize, crop, message, cache_files, backend, device.
 
     Attributes:
         episodes: The argument.
