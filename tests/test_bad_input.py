@@ -408,16 +408,16 @@ def test_unpacking_into_the_dataset(
 
 # ---------------------------------------------------------------- a disk that is full
 
-UNPACK_TARGETS = {
-    "bag": ("--to", "bag", "-o", "x.bag"),
-    "mcap": ("--to", "mcap", "-o", "x.mcap"),
-    "rosbag2-sqlite3": ("--to", "rosbag2", "--storage", "sqlite3", "-o", "x"),
-    "rosbag2-mcap": ("--to", "rosbag2", "--storage", "mcap", "-o", "x"),
-    "images": ("--to", "images", "-o", "x"),
+TARGETS = {
+    "bag": ("unpack", "--to", "bag", "-o", "x.bag"),
+    "mcap": ("unpack", "--to", "mcap", "-o", "x.mcap"),
+    "rosbag2-sqlite3": ("unpack", "--to", "rosbag2", "--storage", "sqlite3", "-o", "x"),
+    "rosbag2-mcap": ("unpack", "--to", "rosbag2", "--storage", "mcap", "-o", "x"),
+    "images": ("export", "images", "-o", "x"),
 }
 
 
-@pytest.mark.parametrize("job", ["pack", "pack-lossy", "demo", *UNPACK_TARGETS])
+@pytest.mark.parametrize("job", ["pack", "pack-lossy", "demo", *TARGETS])
 def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> None:
     with disk_of(tmp_path / "disk", "size=512k") as disk, unchanged(demo):
         if job == "demo":
@@ -428,8 +428,8 @@ def test_a_disk_that_is_full_half_way(job: str, demo: Path, tmp_path: Path) -> N
             lossy = ("--quality", "crf=1", "--codec", "h264", "--preset", "ultrafast")
             result = call("pack", demo / "drive.bag", "-o", disk / "x", *lossy)
         else:
-            *options, name = UNPACK_TARGETS[job]
-            result = call("unpack", demo / "drive", *options, disk / name)
+            *words, name = TARGETS[job]
+            result = call(*words, disk / name, demo / "drive")
         refused(result, 1, str(disk / "x"), "No space left")
         assert tree(disk) == {}
 
@@ -490,12 +490,12 @@ def test_a_lost_terminal_leaves_nothing(
         refused(result, code, "terminated; no partial output was left behind")  # nor is any kept
 
 
-def test_interrupting_an_unpack(long_demo: Path, tmp_path: Path) -> None:
+def test_interrupting_an_export(long_demo: Path, tmp_path: Path) -> None:
     fast = ("--quality", "crf=40", "--codec", "h264", "--preset", "ultrafast")
     assert call("pack", long_demo, "-o", tmp_path / "dataset", *fast).code == 0
     with unchanged(tmp_path):
         target = tmp_path / "images"
-        arguments = ("unpack", tmp_path / "dataset", "--to", "images", "-o", target)
+        arguments = ("export", "images", tmp_path / "dataset", "-o", target)
         refused(interrupted(tmp_path, *arguments), 130, "interrupted")
 
 
@@ -516,9 +516,10 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         ("unpack", "DATASET", "--to", "rosbag2", "--storage", "zip", "-o", "OUT"),
         "sqlite3, mcap",
     ),
-    "image-format": (
-        ("unpack", "DATASET", "--to", "images", "--image-format", "gif", "-o", "OUT"),
-        "png, jpeg",
+    "to images": (("unpack", "DATASET", "--to", "images", "-o", "OUT"), "`mp4ds export images`"),
+    "to images twice": (
+        ("unpack", "DATASET", "DATASET", "--to", "images", "-o", "OUT"),
+        "`mp4ds export images`",
     ),
     "unpack-topics": (("unpack", "DATASET", "--to", "bag", "-o", "OUT", "-t", "/no"), "/imu"),
     "unpack-exclude": (("unpack", "DATASET", "--to", "bag", "-o", "OUT", "-x", "/no"), "/imu"),
@@ -553,10 +554,6 @@ BAD_OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
             ("pack", "BAG", "-o", "OUT", "--every"),
         )
     },
-    "images-twice": (
-        ("unpack", "DATASET", "--to", "images", "--images", "raw", "-o", "OUT"),
-        "--image-format",
-    ),
 }
 
 

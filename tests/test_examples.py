@@ -51,12 +51,12 @@ def test_other_topics(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["recording", "images"])
 def test_public_data(kind: str, demo_dataset: Path, tmp_path: Path) -> None:
     source = tmp_path / "source"
-    camera = {"topics": ["/right/image_raw"]}
     if kind == "recording":
         source = source.with_suffix(".mcap")
         mp4ds.unpack(demo_dataset, "mcap", source)
     else:
-        mp4ds.unpack(demo_dataset, "images", source, mp4ds.UnpackOptions(**camera))
+        camera = mp4ds.ExportOptions(topics=["/right/image_raw"])
+        mp4ds.export(demo_dataset, "images", source, camera)
         source = source / "right_image_raw"
         (source / "stamps.csv").unlink()
     script = str(ROOT / "examples/public_data.py")

@@ -366,6 +366,19 @@ def test_what_png_cannot_hold(tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
 
 
+def test_names_from_the_recording_do_no_harm(tmp_path: Path) -> None:
+    made, name = scene("mono8", frames=2), "=1+1,\n../x"
+    for place, item in enumerate(made.messages):
+        if item.topic == "/cam/image_raw":
+            fields = {**item.values, "header": {**item.values["header"], "frame_id": name}}
+            made.messages[place] = replace(item, topic="/../../image,=1", values=fields)
+    mp4ds.export(pack_drive(tmp_path, made), "images", tmp_path / "out")
+    (folder,) = (path for path in (tmp_path / "out").iterdir() if path.is_dir())
+    assert sorted(path.name for path in folder.iterdir()) == ["0.png", "1.png", "stamps.csv"]
+    with (folder / "stamps.csv").open(newline="") as file:
+        assert [row[3] for row in csv.reader(file)][1:] == [f"'{name}"] * 2
+
+
 # ---------------------------------------------------------------- LeRobot
 
 

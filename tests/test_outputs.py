@@ -16,10 +16,10 @@ from mp4ds.errors import Mp4dsError, TargetError, TargetExistsError
 from mp4ds.files.outputs import (
     PAGE_SIGN,
     check_target,
+    csv_cell,
     staged,
     write_listing,
 )
-from mp4ds.unpacking.pictures import csv_cell
 
 
 def anything(path: Path) -> set[str]:

@@ -131,7 +131,7 @@ def test_compressed_depths(name: str, tmp_path: Path) -> None:
     packed(source, tmp_path / "out", file)
     assert mp4ds.validate(tmp_path / "out", deep=True) == []
     with mp4ds.open(tmp_path / "whole") as whole, mp4ds.open(tmp_path / "out") as made:
-        (topic,) = made.camera_topics
+        (topic,) = made.topics
         before, after = (one[topic].read(range(8), format="native") for one in (whole, made))
     is_changed = (before != after).any((1, 2))
     assert 2 < is_changed.sum() < 8
@@ -220,7 +220,7 @@ def test_nothing_of_changed_images_is_left(name: str, tmp_path: Path) -> None:
     if name == "video-h264":  # no packet refers to what was there
         assert not any(found)
     with mp4ds.open(tmp_path / "out", layer="view") as views:
-        (topic,) = views.camera_topics
+        (topic,) = views.topics
         frames = views[topic].get(range(8), format="rgb")
     for frame, is_changed in zip(frames, changed, strict=True):
         assert (frame.data[INSIDE][4:-4, 4:-4].max() < 40) == is_changed

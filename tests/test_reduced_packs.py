@@ -89,8 +89,8 @@ def test_what_becomes_of_images(name: str, tmp_path: Path) -> None:
     whole = mp4ds.open(tmp_path / "whole", layer="exact")
     small = mp4ds.open(tmp_path / "small", layer="exact")
     with whole, small:
-        (topic,) = small.camera_topics
-        assert whole.camera_topics == [topic]
+        (topic,) = (name for name in small.all_topics if name in small)
+        assert [name for name in whole.all_topics if name in whole] == [topic]
         before, after = whole[topic], small[topic]
         assert others(tmp_path / "small", topic) == others(tmp_path / "whole", topic)
         assert (after.stamps == before.stamps).all()
@@ -131,7 +131,7 @@ def test_in_parts(name: str, tmp_path: Path) -> None:
     assert manifest(tmp_path / "parts").reductions == manifest(tmp_path / "whole").reductions
     mp4ds.pack(sources, tmp_path / "all")
     with mp4ds.open(tmp_path / "all") as whole:
-        (topic,) = whole.camera_topics
+        (topic,) = whole.topics
     before, after = (
         [row for row in rows(tmp_path / folder) if row[0] == topic] for folder in ("all", "parts")
     )
@@ -147,7 +147,7 @@ def test_packets_of_which_some_are_left_out(name: str, tmp_path: Path) -> None:
     mp4ds.pack(sources, tmp_path / "all")
     mp4ds.pack(sources, tmp_path / "half", PackOptions(every=2))
     with mp4ds.open(tmp_path / "all") as whole:
-        (topic,) = whole.camera_topics
+        (topic,) = whole.topics
     before = [row for row in rows(tmp_path / "all") if row[0] == topic]
     after = [row for row in rows(tmp_path / "half") if row[0] == topic]
     assert [row[1] for row in after] == [row[1] for row in before][::2]
@@ -165,7 +165,7 @@ def test_a_slice_that_does_not_begin_with_a_key_frame(tmp_path: Path) -> None:
     small = PackOptions(resize=0.5)
     mp4ds.pack(sources, tmp_path / "small", small)
     with mp4ds.open(tmp_path / "small") as dataset:
-        (topic,) = dataset.camera_topics
+        (topic,) = dataset.topics
     due = [row for row in rows(tmp_path / "small") if row[0] == topic]
     assert {row[2] for row in due} == {IMAGE}
     start = due[2][1]
@@ -208,7 +208,7 @@ def test_foxglove_in_protobuf_becomes_ros(name: str, tmp_path: Path) -> None:
     mp4ds.pack(sources, tmp_path / "whole")
     mp4ds.pack(sources, tmp_path / "small", PackOptions(resize=0.5))
     with mp4ds.open(tmp_path / "whole") as whole, mp4ds.open(tmp_path / "small") as small:
-        (topic,) = small.camera_topics
+        (topic,) = small.topics
         before, after = whole[topic].get([0], resize=0.5)[0], small[topic].get([0])[0]
         assert after.intrinsics == before.intrinsics
         assert psnr(after.data, before.data) > 30

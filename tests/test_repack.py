@@ -219,15 +219,14 @@ def test_no_manifest_vouches_for_what_was_changed(
 @pytest.mark.parametrize(
     "options", [UnpackOptions(), UnpackOptions(start=0.2)], ids=["whole", "slice"]
 )
-@pytest.mark.parametrize("to", ["bag", "images"])
 def test_a_changed_sidecar_is_not_unpacked(
-    to: str, options: UnpackOptions, lossy: Path, tmp_path: Path
+    options: UnpackOptions, lossy: Path, tmp_path: Path
 ) -> None:
     changed = edit_sidecar(Path(shutil.copytree(lossy, tmp_path / "changed")))
     with pytest.raises(mp4ds.FormatError, match=f"{changed}.*manifest"):
-        mp4ds.unpack(tmp_path / "changed", to, tmp_path / "again", options)
+        mp4ds.unpack(tmp_path / "changed", "bag", tmp_path / "again", options)
     with pytest.raises(mp4ds.FormatError, match=f"{changed}.*manifest"):
-        mp4ds.export(tmp_path / "changed", "euroc", tmp_path / "again")
+        mp4ds.export(tmp_path / "changed", "images", tmp_path / "again")
     assert not (tmp_path / "again").exists()
 
 

@@ -491,21 +491,6 @@ def test_files_stay_byte_for_byte(packed: Pack, name: str, source: str, kind: st
     assert found == [record.values["data"] for record in made.cameras]
 
 
-@pytest.mark.parametrize("name", ["jpeg-exif-trailing", "ffmpeg-mjpeg-yuvj420p-bgr8-bgr8"])
-def test_unpacked_images_are_the_recorded_files(packed: Pack, name: str, tmp_path: Path) -> None:
-    made = packed(name, "mcap-ros2-zstd")
-    mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "images")
-    (folder,) = (tmp_path / "images").iterdir()
-    found = [path.read_bytes() for path in sorted(folder.glob("*.jpg"))]
-    assert found == [record.values["data"] for record in made.cameras]
-    rows = (folder / "stamps.csv").read_text("utf-8").splitlines()[1:]
-    for row, record in zip(rows, made.cameras, strict=True):
-        header = record.values["header"]
-        name, *rest = row.split(",")
-        assert name in {path.name for path in folder.glob("*.jpg")}
-        assert rest == [str(header["stamp"]), str(record.log_time), "cam"]
-
-
 JPEG_KINDS = [
     *("jpeg-rgb", "jpeg-420", "jpeg-422", "jpeg-444", "jpeg-gray", "jpeg-progressive"),
     *("jpeg-restart", "jpeg-no-huffman-tables", "jpeg-exif-trailing"),
@@ -533,8 +518,7 @@ def test_jpeg_pixels_are_those_of_opencv(packed: Pack, name: str) -> None:
     raw = made.unpack("mcap", "raw", topics=[made.topic])[1]
     assert [bytes(message.value.data) for message in raw] == [image.tobytes() for image in rgb]
     target = made.folder / "as_png"
-    options = UnpackOptions(image_format="png", force=True)
-    mp4ds.unpack(made.folder / "dataset", "images", target, options)
+    mp4ds.export(made.folder / "dataset", "euroc", target, mp4ds.ExportOptions(force=True))
     for path, image in zip(sorted(target.rglob("*.png")), due, strict=True):
         assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), image)
 
@@ -651,7 +635,7 @@ def test_verbatim_messages_stay_and_are_counted(packed: Pack) -> None:
     assert order == [record.values["header"]["stamp"] for record in made.cameras]
 
 
-def test_packets_that_do_not_decode_stay(packed: Pack) -> None:
+def test_packets_that_do_not_decode_stay(packed: Pack, tmp_path: Path) -> None:
     """Those that refer to a lost one."""
     made = packed("video-h265-lost", "mcap-ros2-zstd")
     summary, messages = made.unpack("mcap", "raw")
@@ -668,6 +652,12 @@ def test_packets_that_do_not_decode_stay(packed: Pack) -> None:
     assert summary.messages == {
         topic: len([m for m in messages if m.topic == topic]) for topic in summary.messages
     }
+    told = mp4ds.export(made.folder / "dataset", "images", tmp_path / "images")
+    assert told.left_out[made.topic] == {reason: count}
+    (path,) = tmp_path.rglob("stamps.csv")
+    times = [int(row.split(",")[1]) for row in path.read_text().splitlines()[1:]]
+    assert times == [time for time in stamps if time not in {one.stamp for one in stayed}]
+    assert len([*tmp_path.rglob("*.png")]) == len(made.cameras) - count
 
 
 def test_a_camera_that_changes(packed: Pack, tmp_path: Path) -> None:
@@ -705,26 +695,45 @@ def test_other_topics_stay_byte_for_byte(packed: Pack) -> None:
     assert len(found[1]) == len(found[0])
 
 
-@pytest.mark.parametrize("image_format", ["png", "jpeg"])
-@pytest.mark.parametrize("name", ["raw-mono8", "png-rgb", "jpeg-rgb", "video-h264"])
-def test_folders_of_images(packed: Pack, name: str, image_format: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "suffix", "every"),
+    [
+        ("raw-mono8", "", 2),
+        ("ffmpeg-libx264", "", 1),
+        ("jpeg-exif-trailing", "jpg", 2),
+        ("jpeg-mixed-sizes", "jpg", 1),
+        ("ffmpeg-mjpeg-yuvj420p-bgr8-bgr8", "jpg", 1),
+        ("png-rgb", "png", 2),
+        ("depth-16UC1-png", "png", 1),
+        ("depth-32FC1-png", "png", 1),
+    ],
+)
+def test_folders_of_images(
+    packed: Pack, name: str, suffix: str, every: int, tmp_path: Path
+) -> None:
+    """Files are those recorded, whose suffix is given; others have the exact pixels."""
     made = packed(name, "mcap-ros2-zstd")
-    options = UnpackOptions(image_format=image_format)
-    summary = mp4ds.unpack(made.folder / "dataset", "images", tmp_path / "out", options)
+    chosen = mp4ds.ExportOptions(topics=[made.topic], every=every)
+    summary = mp4ds.export(made.folder / "dataset", "images", tmp_path / "out", chosen)
     with mp4ds.open(made.folder / "dataset") as dataset:
-        frames = list(dataset[made.topic])
+        frames = list(dataset[made.topic])[::every]
     assert summary.messages == {made.topic: len(frames)}
-    (folder,) = (tmp_path / "out").iterdir()
-    with (folder / "stamps.csv").open() as file:
+    assert any("quantised" in note for note in summary.notes) == ("32FC1" in name)
+    ((place, topic),) = summary.places.items()
+    folder = tmp_path / "out" / place
+    with (folder / "stamps.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    for number, (row, frame) in enumerate(zip(rows, frames, strict=True)):
-        assert int(row["file"].partition(".")[0]) == number
-        assert int(row["stamp_ns"]) == frame.stamp_ns
-        image = file_picture((folder / row["file"]).read_bytes())
-        if image_format == "png":
-            assert np.array_equal(image, frame.data)
-        else:
-            assert psnr(image, frame.data) > 30
+    for row, frame in zip(rows, frames, strict=True):
+        record = made.cameras[frame.index]
+        times = (record.values["header"]["stamp"], record.log_time)
+        assert (int(row["stamp_ns"]), int(row["log_time_ns"])) == times
+        assert (topic, row["frame_id"]) == (made.topic, "cam")
+        assert row["file"] == f"{frame.index:0{len(str(len(made.cameras) - 1))}d}.{suffix or 'png'}"
+        data = (folder / row["file"]).read_bytes()
+        if suffix:
+            assert bytes(record.values["data"]).endswith(data)
+        if suffix != "jpg":
+            assert np.array_equal(file_picture(data), frame.data)
 
 
 # ---------------------------------------------------------------- channels
@@ -826,7 +835,7 @@ def test_a_damaged_video_is_refused(name: str, kind: str, with_sum: bool, tmp_pa
         without_sum(video.with_suffix(".yaml"))
         agreed(tmp_path / "dataset")
     makes: dict[str, Callable[[], Any]] = {
-        "files": lambda: mp4ds.unpack(tmp_path / "dataset", "images", tmp_path / "again"),
+        "files": lambda: mp4ds.export(tmp_path / "dataset", "images", tmp_path / "again"),
         "export": lambda: mp4ds.export(tmp_path / "dataset", "euroc", tmp_path / "again"),
     }
     with pytest.raises(FormatError) as caught:

@@ -136,7 +136,7 @@ def test_equal_times_in_different_files(tmp_path: Path) -> None:
     for output in (unpacked(tmp_path / "part", "bag"), unpacked(tmp_path / "whole", "bag", **span)):
         assert compare(paths, output, **between) == []
     with pytest.raises(OptionError, match=r"cannot be sliced: .* Pack the slice first"):
-        mp4ds.unpack(tmp_path / "whole", "images", options=UnpackOptions(**span))
+        mp4ds.export(tmp_path / "whole", "images", tmp_path / "no", mp4ds.ExportOptions(**span))
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from PIL import Image
 import mp4ds
 from coded_scenes import CODED
 from definitions import COMPRESSED, IMAGE
-from mp4ds import UnpackOptions
+from mp4ds import ExportOptions
 from mp4ds.messages.depth import encode_rvl
 from scenes import Record, Scene
 from sources import SOURCES, scene
@@ -64,11 +64,13 @@ def rows_of(folder: Path) -> list[list[str]]:
 def test_all_images_are_written(tmp_path: Path) -> None:
     made = mixed()
     dataset = packed(tmp_path, made)
-    summary = mp4ds.unpack(dataset, "images", tmp_path / "images")
+    together = ExportOptions(tolerance_ns=0)  # a single camera, wherever its images are
+    summary = mp4ds.export(dataset, "images", tmp_path / "images", together)
     assert summary.messages == {TOPIC: FRAMES}
-    assert not summary.unconvertible
+    assert TOPIC not in summary.left_out
     folder = tmp_path / "images" / "cam_image_raw"
-    assert [path.name for path in (tmp_path / "images").iterdir()] == [folder.name]
+    names = {path.name for path in (tmp_path / "images").iterdir()}
+    assert names == {folder.name, "mp4ds_export.json"}
     expected = pictures(made)
     for number, pixels in enumerate(expected):
         found = cv2.imread(str(folder / f"{number:02d}.png"), cv2.IMREAD_UNCHANGED)
@@ -97,15 +99,17 @@ def depths(seed: int) -> NDArray[np.uint16]:
     return np.random.default_rng(seed).integers(0, 2**16, (48, 64), np.uint16)
 
 
-CODED_FILES: dict[str, tuple[str, Callable[[int], bytes], str]] = {
-    "palette": ("png", lambda _: palette(), "rgb8"),
-    "depth-png": ("16UC1; compressedDepth png", lambda n: bytes(12) + png(depths(n)), "16UC1"),
+# format, what makes the data, encoding, and the bytes before the file as which it is written
+CODED_FILES: dict[str, tuple[str, Callable[[int], bytes], str, int | None]] = {
+    "palette": ("png", lambda _: palette(), "rgb8", 0),
+    "depth-png": ("16UC1; compressedDepth png", lambda n: bytes(12) + png(depths(n)), "16UC1", 12),
     "depth-rvl": (
         "16UC1; compressedDepth rvl",
         lambda n: bytes(12) + encode_rvl(depths(n)) + bytes(4),
         "16UC1",
+        None,
     ),
-    "webp": ("webp", lambda _: webp(), "rgb8"),
+    "webp": ("webp", lambda _: webp(), "rgb8", None),
 }
 
 
@@ -117,7 +121,7 @@ def webp() -> bytes:
 
 @pytest.mark.parametrize("name", CODED_FILES)
 def test_files_that_no_video_holds(name: str, tmp_path: Path) -> None:
-    told, make, encoding = CODED_FILES[name]
+    told, make, encoding, start = CODED_FILES[name]
     made = scene("mono8", frames=3, with_info=False)
     for place, item in enumerate(made.messages):
         if item.topic == TOPIC:
@@ -126,18 +130,21 @@ def test_files_that_no_video_holds(name: str, tmp_path: Path) -> None:
             made.messages[place] = Record("/cam/coded", COMPRESSED, item.log_time, fields)
     dataset = packed(tmp_path, made)
     assert [entry.messages for entry in mp4ds.open(dataset).manifest.verbatim] == [3]
-    summary = mp4ds.unpack(dataset, "images", tmp_path / "images")
+    summary = mp4ds.export(dataset, "images", tmp_path / "images")
     assert summary.messages == {"/cam/coded": 3}
     assert {path.suffix for path in (tmp_path / "images").rglob("[0-9]*")} == {".png"}
     with mp4ds.open(dataset) as opened:
         frames = opened["/cam/coded"]
         assert (len(frames), frames.encoding, frames.image_size) == (3, encoding, (64, 48))
         pixels = frames[1].data
+    files = sorted((tmp_path / "images" / "cam_coded").glob("*.png"))
+    if start is not None:
+        sent = [bytes(m.values["data"])[start:] for m in made.messages if m.topic == "/cam/coded"]
+        assert [path.read_bytes() for path in files] == sent
     if encoding == "16UC1":
         expected = depths([n for n, item in enumerate(made.messages) if "coded" in item.topic][1])
         assert np.array_equal(pixels, expected)
-        found = cv2.imread(str(tmp_path / "images" / "cam_coded" / "1.png"), cv2.IMREAD_UNCHANGED)
-        assert np.array_equal(found, expected)
+        assert np.array_equal(cv2.imread(str(files[1]), cv2.IMREAD_UNCHANGED), expected)
 
 
 @pytest.mark.parametrize("name", ["jpeg-cmyk", "jpeg-cut-one", "garbage", "video-h264-mid-gop"])
@@ -147,10 +154,14 @@ def test_what_has_no_picture_is_counted(name: str, tmp_path: Path) -> None:
     images = [item for item in made.messages if item.msgtype != IMAGE and "cam" in item.topic]
     (topic,) = {item.topic for item in images if "camera_info" not in item.topic}
     total = sum(item.topic == topic for item in made.messages)
-    summary = mp4ds.unpack(dataset, "images", tmp_path / "images")
+    if name == "garbage":
+        with pytest.raises(mp4ds.OptionError, match=f"cannot hold any topic.*{topic}: "):
+            mp4ds.export(dataset, "images", tmp_path / "images")
+        return
+    summary = mp4ds.export(dataset, "images", tmp_path / "images")
     written = len([*(tmp_path / "images").glob("*/[0-9]*")])
-    assert summary.messages.get(topic, 0) == written
-    without = summary.unconvertible.get(topic, {})
+    assert summary.messages[topic] == written
+    without = summary.left_out.get(topic, {})
     assert written + sum(without.values()) == total
     assert all(reason.startswith("no picture: ") for reason in without)
     if name == "jpeg-cmyk":
@@ -189,15 +200,11 @@ def test_all_frames_are_there_in_their_place(tmp_path: Path) -> None:
 
 
 def test_verbatim_images_of_a_damaged_dataset(tmp_path: Path) -> None:
-    """Those that can be read."""
     folder = packed(tmp_path, mixed())
     path = folder / "messages.mcap"
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 1
     path.write_bytes(data)
-    with pytest.raises(mp4ds.FormatError, match=r"messages\.mcap: .* `salvage` restores"):
-        mp4ds.unpack(folder, "images", tmp_path / "images")
-    options = UnpackOptions(salvage=True)
-    summary = mp4ds.unpack(folder, "images", tmp_path / "images", options)
-    assert FRAMES - 4 <= summary.messages[TOPIC] <= FRAMES
-    assert summary.losses
+    with pytest.raises(mp4ds.FormatError, match=r"messages\.mcap: .*unpack --salvage` restores"):
+        mp4ds.export(folder, "images", tmp_path / "images")
+    assert not (tmp_path / "images").exists()

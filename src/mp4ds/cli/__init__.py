@@ -30,11 +30,11 @@ from mp4ds.errors import Mp4dsError, sentence_of
 COMMANDS = {
     "pack": ("pack", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
     "repack": ("pack", "Pack a recording into a dataset of mp4 files, or repack a dataset."),
-    "unpack": ("pack", "Turn a dataset back into a recording: a bag, rosbag2, MCAP or images."),
+    "unpack": ("pack", "Turn a dataset back into a recording: a bag, rosbag2 or MCAP."),
     "import": ("pack", "Make a dataset from images, from a video, or from a LeRobotDataset."),
     "export": (
         "pack",
-        "Export a dataset to another tool's format, keeping what that format supports.",
+        "Export a dataset to image files or another tool's format, keeping what that supports.",
     ),
     "play": ("play", "Play back datasets, publishing to ROS 1 or ROS 2."),
     "record": ("record", "Record topics of a live robot, ROS 1 or ROS 2, into a dataset."),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -239,7 +238,7 @@ def pack_progress(*, whole: bool = True) -> Iterator[Callable[[PackProgress], No
     "--to",
     panel=WHERE,
     metavar="TEXT",
-    help="bag, rosbag2, mcap or images; default: by the suffix of OUT, else as recorded.",
+    help="bag, rosbag2 or mcap; default: by the suffix of OUT, else as recorded.",
 )
 @output_option(
     "OUT", "Output, or a folder for the outputs of several datasets; default: NAME_unpacked."
@@ -253,17 +252,16 @@ def unpack_command(
     jobs: int | None,
     options: UnpackOptions,
 ) -> None:
-    """Turn a dataset back into a recording: a bag, rosbag2, MCAP or images.
+    """Turn a dataset back into a recording: a bag, rosbag2 or MCAP.
 
     Messages are converted between ROS 1 and ROS 2 if the output format requires it.
     """
-    noun = "image" if to == "images" else "message"
     found = datasets_in(datasets)
     with progress_of("unpacking") as tell:
 
         def progress(state: UnpackProgress) -> None:
             total = state.messages_total
-            unit = noun if len(found) == 1 else "dataset"
+            unit = "message" if len(found) == 1 else "dataset"
             done = f"{state.messages} of {total}" if total else f"{state.messages}"
             tell(f"{done} {unit}s", state.messages / total if total else None)
 
@@ -272,14 +270,14 @@ def unpack_command(
         else:
             summaries = unpack_each(found, to, output, options, jobs=jobs, progress=progress)
     result = summaries[0] if len(found) == 1 else summaries
-    show(result, lambda _: [*map(partial(_print_unpack, noun=noun), summaries)])
+    show(result, lambda _: [*map(_print_unpack, summaries)])
 
 
-def _print_unpack(summary: UnpackSummary, noun: str) -> None:
-    """Print what was written, of things of that name, and what the target could not hold."""
+def _print_unpack(summary: UnpackSummary) -> None:
+    """Print what was written, and what the target could not hold."""
     total = sum(summary.messages.values())
     topics = counted(len(summary.messages), "topic")
-    say(f"{path_text(summary.output)}: {counted(total, noun)} of {topics}")
+    say(f"{path_text(summary.output)}: {counted(total, 'message')} of {topics}")
     for topic, now in summary.republished.items():
         taken = f" (the name {now.instead_of} is taken)" if now.instead_of else ""
         say(f"{topic}: written as {now.topic}, {now.type_name}{taken}")
@@ -449,7 +447,7 @@ def demo_command(output: Path, seconds: float, force: bool) -> None:
 
 
 @command()
-@argument("to", "FORMAT", "euroc, tum, colmap or lerobot.")
+@argument("to", "FORMAT", "images, euroc, tum, colmap or lerobot.")
 @argument(
     "datasets",
     "DATASET...",
@@ -460,11 +458,12 @@ def demo_command(output: Path, seconds: float, force: bool) -> None:
 @output_option("OUT", "Folder to create.", required=True)
 @takes(ExportOptions)
 def export_command(to: str, datasets: Sequence[str], output: str, options: ExportOptions) -> None:
-    """Export a dataset to another tool's format, keeping what that format supports.
+    """Export a dataset to image files or another tool's format, keeping what that supports.
 
-    Folders of images get the exact pixels, or with --quality visual those of the views of lossless
-    cameras; lerobot's videos are made of the views. What is left out is counted by topic and
-    listed, here and in mp4ds_export.json.
+    FORMAT images makes a folder for each camera: JPEG and PNG files as recorded, other images as
+    PNG files, and their times in stamps.csv. Folders of images get the exact pixels, or with
+    --quality visual those of the views of lossless cameras; lerobot's videos are made of the
+    views. What is left out is counted by topic and listed, here and in mp4ds_export.json.
     """
     with progress_of("exporting") as tell:
         summary = export(datasets, to, output, options, progress=tell)

@@ -308,18 +308,8 @@ class Dataset:
     def all_topics(self) -> list[str]:
         """The topics of all channels, and of streams of which a sidecar is lost."""
         topics = (channel.topic for channel in self.channels)
-        return list(dict.fromkeys([*topics, *self._listed_topics]))
-
-    @property
-    def camera_topics(self) -> list[str]:
-        """Topics with images, in videos or stored verbatim; also if a sidecar is lost."""
-        listed = self.manifest.verbatim if self.manifest else []
-        verbatim = [entry.topic for entry in listed if self._verbatim_cameras(entry.topic)]
-        return list(dict.fromkeys([*self.topics, *self._listed_topics, *verbatim]))
-
-    @property
-    def _listed_topics(self) -> list[str]:
-        return [entry.topic for entry in self.manifest.streams] if self.manifest else []
+        listed = [entry.topic for entry in self.manifest.streams] if self.manifest else []
+        return list(dict.fromkeys([*topics, *listed]))
 
     def verify_messages(self) -> None:
         """Check messages.mcap against its SHA-256: not all of its contents have their own checksum.

@@ -44,7 +44,7 @@ class Images(ABC):
         video_path: The file with the images: a video, or messages.mcap.
         encoding: ROS image encoding of the frames as recorded.
         image_size: Width and height of the images, pixels.
-        are_jpeg_files: Whether the messages hold JPEG files that are stored as they are.
+        file_suffix: ``jpg`` or ``png`` if messages hold such files, which can be had byte for byte.
         is_lossy: Whether they differ from those recorded.
         shows_colours: Whether the decoder can make RGB directly, in any size; see
             `mp4ds.video.pixels.shows_colours`.
@@ -57,7 +57,7 @@ class Images(ABC):
     _columns: DecodedColumns
     encoding: str
     image_size: tuple[int, int]
-    are_jpeg_files = False
+    file_suffix = ""
     is_lossy = False
     shows_colours = False
 
@@ -112,11 +112,12 @@ class Images(ABC):
         """A separate decoder for frames by number, to be closed."""
 
     def pictures(
-        self, choice: Choice = everything, scale: Scale | None = None
+        self, choice: Choice = everything, scale: Scale | None = None, *, is_strict: bool = True
     ) -> Iterator[tuple[int, Picture]]:
         """The wanted pictures in order, each with its number, from a separate decoder.
 
-        Each is valid until the next one is requested.
+        Each is valid until the next one is requested. One that cannot be decoded is an error; or is
+        left out if it was recorded as a packet, and `is_strict` is not set.
         """
         with closing(self.open_reader()) as reader:
             yield from reader.pictures_of(list(choice(self.columns)), scale)
@@ -301,7 +302,7 @@ class VideoImages(Images):
 Recorded = Callable[[Excerpt], Iterator[Message]]
 """Yields the messages of a channel within an excerpt, by log time."""
 
-_JPEG = b"\xff\xd8\xff"
+_SUFFIXES = {b"\xff\xd8\xff": "jpg", png.SIGNATURE[:3]: "png"}  # by how a file begins
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,18 +313,18 @@ class Shown:
         encoding: ROS image encoding.
         pixels: Shape `Encoding.shape`, native byte order.
         header: Of quantised depths, what gives them in metres; else empty.
-        file: The message's JPEG file; None if it has none.
+        file: The message's file; empty if it has none.
     """
 
     encoding: str
     pixels: Pixels
     header: bytes = b""
-    file: memoryview | None = None
+    file: bytes | memoryview = b""
 
     @property
-    def kind(self) -> tuple[str, tuple[int, ...], bool]:
+    def kind(self) -> tuple[str, tuple[int, ...], str]:
         """What frames have in common that are together in one `VerbatimImages`."""
-        return self.encoding, self.pixels.shape, self.file is not None
+        return self.encoding, self.pixels.shape, _SUFFIXES.get(bytes(self.file[:3]), "")
 
 
 def shown_by(channel: Channel, parts: Parts) -> Shown:
@@ -352,10 +353,8 @@ def shown_by(channel: Channel, parts: Parts) -> Shown:
         if pixels.dtype != np.uint16 or pixels.ndim != 2:
             raise Refused("its depth image is not grey with 16 bits")
         is_inverse = depth.is_quantised(fields.format, header)
-        return Shown("16UC1", pixels, header if is_inverse else b"")
-    encoding, pixels = coded_pixels(parts.body)
-    is_jpeg = bytes(parts.body[: len(_JPEG)]) == _JPEG
-    return Shown(encoding, pixels, file=parts.body if is_jpeg else None)
+        return Shown("16UC1", pixels, header if is_inverse else b"", body)
+    return Shown(*coded_pixels(parts.body), file=parts.body)
 
 
 _Entry = tuple[int, int, int, int, str]
@@ -381,14 +380,14 @@ class VerbatimImages(Images):
         self,
         path: Path,
         channel: Channel,
-        kind: tuple[str, tuple[int, ...], bool],
+        kind: tuple[str, tuple[int, ...], str],
         entries: Sequence[_Entry],
         recorded: Recorded,
         calibrated: Images | None,
     ) -> None:
         self.path = self.video_path = path
         self.channel, self.topic = channel, channel.topic
-        self.encoding, (rows, width, *_), self.are_jpeg_files = kind
+        self.encoding, (rows, width, *_), self.file_suffix = kind
         self.image_size = width, int(rows / ENCODINGS[self.encoding].rows)
         self._recorded, self._calibrated = recorded, calibrated
         numbers = np.array([entry[:4] for entry in entries], np.int64).reshape(-1, 4)
@@ -426,29 +425,9 @@ class VerbatimImages(Images):
         if message is None:
             error = VideoError("decode-failed", self.path, "was not found", frame=index)
             raise self.named(error)
-        return self._shown(index, MessageSplitter(self.channel), message)
-
-    def all_shown(self) -> Iterator[tuple[int, Shown]]:
-        """What all messages show, each with its number, in one pass: by log time.
-
-        Raises:
-            VideoError: ``decode-failed``: one cannot be decoded.
-            FormatError: messages.mcap is damaged.
-        """
-        places = zip(self.log_times.tolist(), self._ties.tolist(), strict=True)
-        numbers = {place: number for number, place in enumerate(places)}
-        splitter, ties = MessageSplitter(self.channel), Counter[int]()
-        for message in self._recorded(Excerpt(topics=frozenset([self.topic]), others=False)):
-            index = numbers.get((message.log_time, ties[message.log_time]))
-            ties[message.log_time] += 1
-            if index is not None:
-                yield index, self._shown(index, splitter, message)
-
-    def _shown(self, index: int, splitter: MessageSplitter, message: Message) -> Shown:
         with self.naming_frames():
             try:
-                _, parts = splitter.split(message)
-                return shown_by(self.channel, parts)
+                return shown_by(self.channel, MessageSplitter(self.channel).split(message)[1])
             except Refused as error:
                 raise VideoError("decode-failed", self.path, str(error), frame=index) from None
 
@@ -496,7 +475,7 @@ def verbatim_images(
         The frames of each size and encoding, and how many messages have no picture, by reason.
     """
     splitter, ties = MessageSplitter(channel), Counter[int]()
-    entries: dict[tuple[str, tuple[int, ...], bool], list[_Entry]] = {}
+    entries: dict[tuple[str, tuple[int, ...], str], list[_Entry]] = {}
     without = Counter[str]()
     for ordinal, message in numbered:
         time = message.log_time

@@ -88,8 +88,9 @@ class Stream(Images):
         self.video_path = self.videos[0][0]
         image = self.sidecar.image
         self.encoding, self.image_size = image.encoding, (image.width, image.height)
-        is_packet = self.sidecar.body == "packet"
-        self.are_jpeg_files = is_packet and self.sidecar.video.codec == "mjpeg"
+        self.file_suffix = "png" if self.sidecar.body == "png" else ""
+        if self.sidecar.body == "packet" and self.sidecar.video.codec == "mjpeg":
+            self.file_suffix = "jpg"
         self.is_lossy = self.sidecar.profile != LOSSLESS
         self.shows_colours = self.sidecar.shows_colours and not self.sidecar.is_predicted
 
@@ -319,13 +320,14 @@ class Stream(Images):
         return prefix
 
     def pictures(
-        self, choice: Choice = everything, scale: Scale | None = None
+        self, choice: Choice = everything, scale: Scale | None = None, *, is_strict: bool = True
     ) -> Iterator[tuple[int, Picture]]:
         """The wanted pictures in order, each with its number, from a separate decoder.
 
         Args:
             choice: Which are wanted.
             scale: See `PictureMaker.make`.
+            is_strict: Whether a packet that cannot be decoded is an error, and not left out.
 
         Yields:
             Views that are valid until the next one is requested.
@@ -333,7 +335,8 @@ class Stream(Images):
         Raises:
             VideoError: See `VideoDecoder.pictures_at`.
         """
-        for index, picture in self.decodable_pictures(choice, scale, is_strict=True):
+        is_strict = is_strict or not self.sidecar.keeps_packets
+        for index, picture in self.decodable_pictures(choice, scale, is_strict=is_strict):
             if picture is not None:
                 yield index, picture
 

@@ -173,6 +173,16 @@ def listed_names(folder: Path, listing: str = LISTING_NAME) -> set[str] | None:
     return {listing, *names}
 
 
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+_NUMBER = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?")
+
+
+def csv_cell(text: str) -> str:
+    """Text of a recording for a CSV file: what a spreadsheet takes for a formula follows a '."""
+    is_formula = text.startswith(_FORMULA) and not _NUMBER.fullmatch(text)
+    return f"'{text}" if is_formula else text
+
+
 def begins_with(path: Path, *starts: bytes) -> bool:
     """Whether a file is of a kind, by its first bytes; or is empty, so that nothing is lost."""
     try:

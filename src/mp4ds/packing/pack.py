@@ -416,7 +416,7 @@ def _has_views(folder: Path, options: PackOptions) -> bool:
 def _is_encoded(stream: Stream, options: PackOptions) -> bool:
     """Whether images of a stream become lossy ones where a lossy quality is asked for."""
     sidecar, name = stream.sidecar, stream.sidecar.image.encoding
-    is_kept = sidecar.keeps_packets and not (options.transcode and stream.are_jpeg_files)
+    is_kept = sidecar.keeps_packets and not (options.transcode and stream.file_suffix == "jpg")
     return not is_kept and ENCODINGS[name].lossy is not None and name not in DEPTHS
 
 

@@ -1,26 +1,19 @@
-"""The images of a stream in another form, frame by frame, and as folders of files."""
+"""The images of a stream in another form, frame by frame."""
 
 from __future__ import annotations
 
-import csv
-import io
-import re
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mp4ds.dataset.images import Images, VerbatimImages
 from mp4ds.dataset.rebuild import form_for
 from mp4ds.dataset.stream import Layer, Stream
-from mp4ds.dataset.topic import Topic
 from mp4ds.errors import OptionError, Refused
-from mp4ds.format.fields import Choice, everything, unbroken
+from mp4ds.format.fields import Choice, unbroken
 from mp4ds.format.models import Header, StreamSidecar
 from mp4ds.messages.depth import (
     DEPTHS,
@@ -167,6 +160,13 @@ def _is_depth(sidecar: StreamSidecar, header: Header) -> bool:
 def is_inverse_depth(sidecar: StreamSidecar, header: Header) -> bool:
     """Whether its depths are quantised inverse metres."""
     return _is_depth(sidecar, header) and is_quantised(header.format, bytes.fromhex(header.prefix))
+
+
+def has_inverse_depths(stream: Images) -> bool:
+    """Whether depths of a stream are quantised inverse metres."""
+    return isinstance(stream, Stream) and any(
+        is_inverse_depth(stream.sidecar, header) for header in stream.sidecar.headers
+    )
 
 
 def raw_image(
@@ -349,26 +349,26 @@ def shown_by_packets(stream: Stream) -> Stream:
 
 def holds_files(stream: Stream, kind: str) -> bool:
     """Whether the messages of a stream hold JPEG or PNG files already."""
-    if kind == "jpeg":
-        return stream.are_jpeg_files
-    sidecar = stream.sidecar
-    is_metres = any(is_inverse_depth(sidecar, header) for header in sidecar.headers)
-    return kind == "png" and sidecar.body == "png" and not is_metres
+    is_alike = (kind, stream.file_suffix) in (("jpeg", "jpg"), ("png", "png"))
+    return is_alike and not has_inverse_depths(stream)
 
 
 def files_of(
-    stream: Stream, choice: Choice = everything, verify: bool = True
-) -> Iterator[tuple[int, memoryview]]:
-    """The files of a stream that `holds_files`, byte for byte, each with its number.
+    stream: Stream | VerbatimImages, choice: Choice, verify: bool = True
+) -> Iterator[tuple[int, bytes | memoryview]]:
+    """The files in messages that hold some, byte for byte, each with its number.
 
     Args:
-        stream: The stream.
+        stream: Images with a `file_suffix`.
         choice: Which are wanted.
         verify: Check the whole video first, if messages have no digests.
 
     Raises:
         FormatError: A message differs from what was recorded.
     """
+    if isinstance(stream, VerbatimImages):
+        yield from ((index, stream.shown(index).file) for index in choice(stream.columns))
+        return
     variants = stream.columns.variant
     starts = [len(header.prefix) // 2 for header in stream.sidecar.headers]
     for index, body in _bodies(stream, choice, verify):
@@ -384,120 +384,3 @@ def _bodies(stream: Stream, choice: Choice, verify: bool) -> Iterator[tuple[int,
         stream.verify_video()
     for index, payload in stream.payloads(choice):
         yield index, form.split(memoryview(payload)).body
-
-
-# ---------------------------------------------------------------- folders of image files
-
-_STAMPS_NAME = "stamps.csv"
-_HEAD = ["file", "stamp_ns", "log_time_ns", "frame_id"]
-_NOT_DECODED = "its picture cannot be decoded"
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
-_NUMBER = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?")
-
-
-def csv_cell(text: str) -> str:
-    """Text of a recording for a CSV file: what a spreadsheet takes for a formula follows a '."""
-    is_formula = text.startswith(_FORMULA) and not _NUMBER.fullmatch(text)
-    return f"'{text}" if is_formula else text
-
-
-class TopicImages:
-    """The images of a topic, in videos and verbatim, about to be written.
-
-    Args:
-        frames: The topic.
-        image_format: ``png`` or ``jpeg``; None: JPEG files as recorded, others as png.
-        jpeg_quality: Of new JPEG files, 1 to 100.
-
-    Attributes:
-        topic: The topic.
-        count: How many are written, unless some cannot be decoded.
-        refused: How many cannot be written, by reason.
-
-    Raises:
-        FormatError: The dataset is damaged.
-    """
-
-    def __init__(self, frames: Topic, image_format: str | None, jpeg_quality: int) -> None:
-        self.topic = frames.topic
-        self.count, self.refused = 0, Counter[str]()
-        self._digits = len(str(len(frames) - 1))
-        # each with the numbers of its frames in the topic, and what encodes them; None: they are
-        # JPEG files, written as recorded
-        self._parts: list[tuple[Images, NDArray[np.int64], ImageFile | None]] = []
-        for place, part in enumerate(frames.parts):
-            try:
-                file = None
-                if not part.are_jpeg_files or image_format == "png":
-                    kind = image_format or "png"
-                    file = ImageFile(part.encoding, kind, quality=jpeg_quality)
-            except OptionError as error:
-                self.refused[str(error).rstrip(".")] += part.count()
-            else:
-                self._parts.append((part, frames.numbers_of(place), file))
-                self.count += part.count()
-
-    def write(self, folder: Path, on_file: Callable[[], None]) -> int:
-        """Write one file per frame, named by its number in the topic, and stamps.csv.
-
-        Args:
-            folder: To make.
-            on_file: Called after each file.
-
-        Returns:
-            How many were written; the others are added to `refused`.
-
-        Raises:
-            FormatError: The dataset is damaged.
-        """
-        folder.mkdir()
-        rows: dict[int, list[str | int]] = {}
-        for part, numbers, encoder in self._parts:
-            suffix = encoder.suffix if encoder else "jpg"
-            for index, data in _files_of(part, encoder):
-                if data is None:
-                    self.refused[_NOT_DECODED] += 1
-                    continue
-                number = int(numbers[index])
-                name = f"{number:0{self._digits}d}.{suffix}"
-                (folder / name).write_bytes(data)
-                stamp, log_time = int(part.stamps[index]), int(part.log_times[index])
-                rows[number] = [name, stamp, log_time, csv_cell(part.frame_id(index))]
-                on_file()
-        with (folder / _STAMPS_NAME).open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([_HEAD, *(rows[number] for number in sorted(rows))])
-        return len(rows)
-
-
-def _files_of(
-    part: Images, encoder: ImageFile | None
-) -> Iterator[tuple[int, bytes | memoryview | None]]:
-    """The files of images, each with its number; None: it has no picture."""
-    if isinstance(part, VerbatimImages):
-        for index, shown in part.all_shown():
-            yield index, encoder.encode(shown.pixels) if encoder else shown.file
-    elif isinstance(part, Stream):
-        part.verify_pictures()
-        if encoder is None:
-            yield from files_of(part)
-            return
-        for index, picture in part.decodable_pictures(is_strict=not part.sidecar.keeps_packets):
-            made = None
-            if picture is not None:
-                made = encoder.encode(part.recorded_pixels(picture))
-            yield index, made
-
-
-def image_names(folder: Path) -> set[str] | None:
-    """Names of the files of image folders, by their stamps.csv; None if there is none."""
-    if not folder.is_dir():
-        return None
-    names: set[str] = set()
-    for place in filter(Path.is_dir, folder.iterdir()):
-        with suppress(OSError, ValueError, csv.Error):
-            stamps = (place / _STAMPS_NAME).read_bytes().decode()
-            rows = csv.reader(io.StringIO(stamps, newline=""))
-            if next(rows, None) == _HEAD:
-                files = [_STAMPS_NAME, *(row[0] for row in rows if row)]
-                names.update(f"{place.name}/{name}" for name in files)
-    return names or None

@@ -1,4 +1,4 @@
-"""Dataset -> bag, rosbag2, MCAP or images."""
+"""Dataset -> bag, rosbag2 or MCAP."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from mp4ds.errors import (
     advising,
     interrupted,
 )
-from mp4ds.files.outputs import Owned, local_target, staged
+from mp4ds.files.outputs import local_target, staged
 from mp4ds.files.urls import remote
-from mp4ds.format.sidecars import MANIFEST_NAME, FileNames
+from mp4ds.format.sidecars import MANIFEST_NAME
 from mp4ds.options import Selection, SliceOptions, force, jpeg_quality, latched, option, what
 from mp4ds.processes import each
 from mp4ds.records import Attachment, Channel, Excerpt, Loss, Message, MetadataRecord, bounded
-from mp4ds.unpacking.pictures import KINDS, FrameOptions, TopicImages, image_names, shown_by_packets
+from mp4ds.unpacking.pictures import KINDS, FrameOptions, shown_by_packets
 from mp4ds.unpacking.republish import Republished, Republisher
 
-SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap", "images": "_images"}
+SUFFIXES = {"bag": ".bag", "rosbag2": "", "mcap": ".mcap"}
 """How the default name of an output ends, by what it is unpacked to."""
 
 _WORLDS = {"bag": "ros1", "rosbag2": "ros2"}
@@ -55,10 +55,6 @@ class UnpackOptions(SliceOptions, FrameOptions):
     storage: str | None = option(
         "Storage of rosbag2: sqlite3 or mcap; default: as recorded, else mcap.",
         choices=("sqlite3", "mcap"),
-    )
-    image_format: str | None = option(
-        "png (exact) or jpeg, for `to` images; default: JPEG files as recorded, others as png.",
-        choices=("png", "jpeg"),
     )
     images: str | None = option(
         "Convert all cameras to raw, jpeg, png, compressed-video or ffmpeg messages; "
@@ -86,7 +82,7 @@ class UnpackSummary:
     """The result of an unpack.
 
     Attributes:
-        output: The recording or folder made.
+        output: The recording made.
         messages: Messages written, by topic.
         converted: Types converted between ROS 1 and ROS 2, by topic.
         omitted: What the target cannot hold and was left out: a phrase -> how many.
@@ -132,9 +128,8 @@ def unpack(
 
     Args:
         dataset: A dataset, or one video with its sidecar; or its URL.
-        to: ``bag``, ``rosbag2``, ``mcap`` or ``images``; None for what the suffix of the output
-            says (``.bag`` or ``.mcap``), else the recording's own format, or ``mcap`` for a single
-            video.
+        to: ``bag``, ``rosbag2`` or ``mcap``; None for what the suffix of the output says (``.bag``
+            or ``.mcap``), else the recording's own format, or ``mcap`` for a single video.
         output: The file or folder to make; None for the dataset's name, next to it, or in the
             current folder if the dataset is at a URL.
         options: How.
@@ -160,11 +155,11 @@ def unpack(
             to = next(named, None) or _own_format(dataset, chosen)
         _check(to, chosen)
         given = local_target(output) if output else None
-        whole, losses = _opened(dataset, chosen, verify=to != "images" and not chosen.is_slice)
+        whole, losses = _opened(dataset, chosen, verify=not chosen.is_slice)
         stack.enter_context(whole)
         target = given or local_target(default_output(whole.path, to))
         path = stack.enter_context(
-            staged(target, force=chosen.force, owned=_owned(to), sources=[whole.path])
+            staged(target, force=chosen.force, owned=recording_names, sources=[whole.path])
         )
         try:
             for stream in whole.streams if chosen.salvage else ():
@@ -172,15 +167,11 @@ def unpack(
                     losses += examine(stream)
             if not chosen.salvage:
                 whole.verify_sidecars(chosen.selected)
-            if to == "images":  # some of which are verbatim
-                verbatim = whole.manifest.verbatim if whole.manifest and not chosen.is_slice else ()
-                reads_all = any(chosen.selected(item.topic) for item in verbatim)
-            else:  # a slice is filtered out where log times do not tell the order
-                reads_all = chosen.is_slice and not whole.is_in_time
-            if reads_all:
+            if chosen.is_slice and not whole.is_in_time:  # filtered out of all, not found by time
                 whole.verify_messages()
             summary = UnpackSummary(target, losses=losses)
-            summary.left_out.extend(_left_out(whole, chosen.selected, to))
+            chosen.selected.check(whole.all_topics)
+            summary.left_out.extend(item for item in whole.all_topics if not chosen.selected(item))
             part = slice_of(whole, chosen, chosen.selected)
             # messages with packets of a view instead of those recorded are converted, too
             is_replaced = any(
@@ -188,21 +179,17 @@ def unpack(
                 for stream in whole.streams
                 if chosen.selected(stream.topic)
             )
-            if to == "images" or chosen.images or is_replaced:
+            if chosen.images or is_replaced:
                 # whose frames are counted from the slice's first one
                 with sliced(whole, part, path.parent, chosen.selected) as opened:
-                    if to == "images":
-                        _unpack_images(opened, path, chosen, summary, progress)
-                    else:
-                        _unpack_recording(opened, path, to, chosen, summary, progress)
+                    _unpack_recording(opened, path, to, chosen, summary, progress)
             else:
                 if chosen.is_slice:
                     whole.verify_lossy_videos(chosen.selected)
                 _unpack_recording(whole, path, to, chosen, summary, progress, part)
-            if to != "images":
-                latched = (item.channel.topic for item in part.latched)
-                summary.latched.update(Counter(filter(chosen.selected, latched)))
-                summary.latched_left_out.extend(filter(chosen.selected, part.left_out))
+            latched = (item.channel.topic for item in part.latched)
+            summary.latched.update(Counter(filter(chosen.selected, latched)))
+            summary.latched_left_out.extend(filter(chosen.selected, part.left_out))
             summary.notes.extend(_notes(whole, chosen))
             summary.losses[:] = bounded(summary.losses)
             return summary
@@ -226,20 +213,6 @@ def _opened(
     if layer is None:
         opened.require_exact(selected)
     return opened, losses
-
-
-def _left_out(dataset: Dataset, selected: Selection, to: str) -> list[str]:
-    """Topics of a dataset that are left out.
-
-    Raises:
-        OptionError: A pattern matches no topic.
-    """
-    if to == "images":
-        selected.check(dataset.camera_topics)
-        others = set(dataset.all_topics) - set(dataset.camera_topics)
-        return sorted({*others, *(one for one in dataset.camera_topics if not selected(one))})
-    selected.check(dataset.all_topics)
-    return [topic for topic in dataset.all_topics if not selected(topic)]
 
 
 def _notes(dataset: Dataset, options: UnpackOptions) -> Iterator[str]:
@@ -286,6 +259,7 @@ def unpack_each(
     outputs: dict[Path, Path | None] = {}
     for dataset in datasets_in(datasets):
         kind = to or _own_format(dataset, options or UnpackOptions())
+        _check(kind, options or UnpackOptions())
         stem = dataset.name if dataset.is_dir() else dataset.stem
         outputs[dataset] = local_target(folder) / f"{stem}{SUFFIXES[kind]}" if folder else None
     named = [output for output in outputs.values() if output is not None]
@@ -327,11 +301,12 @@ def _check(to: str, options: UnpackOptions) -> None:
         OptionError: Says which, and lists the valid ones.
     """
     if to not in SUFFIXES:
-        raise OptionError(f"`to` {to!r} is not known. Use {', '.join(SUFFIXES)}.")
+        known = ", ".join(SUFFIXES)
+        raise OptionError(
+            f"`to` {to!r} is not known. Use {known}; `mp4ds export images` writes images as files."
+        )
     if options.storage and to != "rosbag2":
         raise OptionError(f"`storage` works with `to` rosbag2, not with `to` {to}.")
-    if options.images and to == "images":
-        raise OptionError("`images` is for recordings; with `to` images, use `image_format`.")
     if options.salvage and options.is_slice:
         raise OptionError(
             "`salvage` restores a whole dataset: pack what it restores, and unpack a slice of that."
@@ -345,10 +320,6 @@ def default_output(dataset: Path, to: str) -> Path:
         return Path(f"{stem}_unpacked{SUFFIXES[to]}")
     stem = dataset.resolve().name if dataset.is_dir() else dataset.stem
     return dataset.resolve().parent / f"{stem}_unpacked{SUFFIXES[to]}"
-
-
-def _owned(to: str) -> Owned:
-    return image_names if to == "images" else recording_names
 
 
 def _unpack_recording(
@@ -517,40 +488,3 @@ def _refusal(problems: dict[str, str]) -> ConversionError:
         + ", leave out and count with `skip_unconvertible`, or unpack to mcap, which keeps "
         "everything unchanged.",
     )
-
-
-def _unpack_images(
-    dataset: Dataset,
-    path: Path,
-    options: UnpackOptions,
-    summary: UnpackSummary,
-    progress: Callable[[UnpackProgress], None] | None,
-) -> None:
-    found: list[TopicImages] = []
-    refused: dict[str, str] = {}
-    for topic in filter(options.selected, dataset.camera_topics):
-        without = dataset.verbatim(topic)[1]
-        if topic in dataset:
-            images = TopicImages(dataset[topic], options.image_format, options.jpeg_quality)
-            found.append(images)
-            if images.refused:
-                refused[topic] = "; ".join(images.refused)
-        if without:
-            summary.unconvertible[topic] = {f"no picture: {why}": n for why, n in without.items()}
-    if refused and not options.skip_unconvertible:
-        raise _refusal(refused)
-    path.mkdir()
-    names, total, done = FileNames(), sum(images.count for images in found), 0
-
-    def tell() -> None:
-        nonlocal done
-        done += 1
-        if progress:
-            progress(UnpackProgress(done, total))
-
-    for images in found:
-        if images.count:
-            stem = names.name_for(images.topic)
-            summary.messages[images.topic] = images.write(path / stem, tell)
-        for reason, count in images.refused.items():
-            summary.unconvertible.setdefault(images.topic, {})[reason] = count

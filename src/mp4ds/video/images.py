@@ -253,9 +253,6 @@ class ImageFile:
         image_format: ``png`` or ``jpeg``.
         quality: Of JPEG, 1 to 100, libjpeg's scale.
 
-    Attributes:
-        suffix: Of the files' names.
-
     Raises:
         OptionError: The format cannot hold the encoding, or the quality is out of range.
     """
@@ -272,7 +269,6 @@ class ImageFile:
             raise OptionError(f"JPEG cannot hold {encoding} images, but PNG can.")
         if not 1 <= quality <= 100:
             raise OptionError(f"JPEG quality is {quality}: use 1 to 100")
-        self.suffix = "jpg" if self._jpeg else "png"
         self._quality = quality
         self._layout = _layout(known, demosaic=self._jpeg)
         self._is_yuv = self._layout.pixel_format in CHROMA_SHIFTS

@@ -16,13 +16,13 @@ from string import Template
 from typing import Any
 
 from mp4ds.errors import size_text
+from mp4ds.files.outputs import csv_cell
 from mp4ds.plugins.evaluating.trials import (
     CameraEvaluation,
     Cell,
     Evaluation,
     mean_score,
 )
-from mp4ds.unpacking.pictures import csv_cell
 from mp4ds.video.scores import METRICS, ScoreSummary
 
 PLOTS = "plots"

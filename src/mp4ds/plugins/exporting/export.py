@@ -1,4 +1,4 @@
-"""Dataset -> the formats of other tools, keeping what each supports; the rest is counted."""
+"""Dataset -> image files and the formats of other tools, which keep what they support."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ from mp4ds.errors import OptionError, advising
 from mp4ds.files.outputs import listed_names, local_target, staged
 from mp4ds.format.fields import document_of
 from mp4ds.packing.options import plugin
-from mp4ds.plugins.exporting.folders import write_colmap, write_euroc, write_tum
+from mp4ds.plugins.exporting.folders import (
+    write_colmap,
+    write_euroc,
+    write_images,
+    write_tum,
+)
 from mp4ds.plugins.exporting.job import ExportJob, ExportOptions, ExportSummary
 
 NOTE_NAME = "mp4ds_export.json"
@@ -24,6 +29,7 @@ NOTE_NAME = "mp4ds_export.json"
 
 
 _FORMATS: dict[str, tuple[str, Callable[..., None]]] = {
+    "images": ("a folder of images", write_images),
     "euroc": ("EuRoC", write_euroc),
     "tum": ("TUM", write_tum),
     "colmap": ("COLMAP", write_colmap),
@@ -40,12 +46,12 @@ def export(
     *,
     progress: Callable[[str, float | None], None] | None = None,
 ) -> ExportSummary:
-    """Export a dataset to another tool's format, keeping what that format supports.
+    """Export a dataset to image files or another tool's format, keeping what that supports.
 
     Args:
         datasets: A dataset, or one video with its sidecar, or its URL; for lerobot also several,
             each of which becomes an episode.
-        to: ``euroc``, ``tum``, ``colmap`` or ``lerobot``.
+        to: ``images``, ``euroc``, ``tum``, ``colmap`` or ``lerobot``.
         output: The folder to make.
         options: How.
         progress: Called now and then with a phrase, and the share of frames done if known.
@@ -98,6 +104,7 @@ def export(
                 progress or (lambda *_: None),
                 where=f"{one.path.name}: " if len(opened) > 1 else "",
                 in_colour=in_colour,
+                as_recorded=to == "images",
                 views=[part.topic for part in one.streams if part.layer == "view"],
             )
             jobs.append(job)

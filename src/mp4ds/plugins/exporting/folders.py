@@ -1,7 +1,8 @@
-"""EuRoC, TUM RGB-D and COLMAP: folders of PNG files and text."""
+"""Image files with their stamps, EuRoC, TUM RGB-D and COLMAP: folders of images and text."""
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from mp4ds.dataset.dataset import Dataset
 from mp4ds.dataset.views import lens_of
 from mp4ds.errors import OptionError
+from mp4ds.files.outputs import csv_cell
 from mp4ds.format.models import Calibration
 from mp4ds.format.sidecars import FileNames
 from mp4ds.messages.transforms import TransformCollector, quaternion_of
@@ -99,6 +101,32 @@ def _imus(job: ExportJob) -> list[Measures]:
     return [Measures(job.dataset, topic) for topic in own]
 
 
+# ---------------------------------------------------------------- images
+
+_STAMPS_HEAD = ["file", "stamp_ns", "log_time_ns", "frame_id"]
+
+
+def write_images(job: ExportJob) -> None:
+    """Write a folder for each topic: its images, named by their numbers, and their times."""
+    names, cameras = FileNames(), dict[str, list[ExportedCamera]]()
+    for camera in job.png_cameras():
+        cameras.setdefault(camera.topic, []).append(camera)
+    for topic, parts in cameras.items():
+        frames, place = job.dataset[topic], names.name_for(topic)
+        digits = len(str(len(frames) - 1))
+        rows: list[tuple[str | int, ...]] = []
+        for camera in parts:
+            stream, suffix = camera.stream, camera.recorded_suffix or "png"
+            numbers = frames.numbers_of(frames.parts.index(stream))[camera.numbers]
+            files = [f"{number:0{digits}d}.{suffix}" for number in numbers.tolist()]
+            for n in job.write_files(camera, place, [f"{place}/{file}" for file in files]):
+                index = int(camera.numbers[n])
+                times = int(stream.stamps[index]), int(stream.log_times[index])
+                rows.append((files[n], *times, csv_cell(stream.frame_id(index))))
+        with (job.path / place / "stamps.csv").open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([_STAMPS_HEAD, *sorted(rows)])
+
+
 # ---------------------------------------------------------------- euroc
 
 _IMU_HEAD = (
@@ -136,7 +164,7 @@ def write_euroc(job: ExportJob) -> None:
         place = f"mav0/cam{number}"
         pose = pose_of(camera.frame_id, camera.topic)
         names = [f"{time}.png" for time in camera.times.tolist()]
-        job.write_png_files(camera, place, [f"{place}/data/{name}" for name in names])
+        job.write_files(camera, place, [f"{place}/data/{name}" for name in names])
         lines = [f"{time},{name}" for time, name in zip(camera.times.tolist(), names, strict=True)]
         job.write_lines(f"{place}/data.csv", ["#timestamp [ns],filename", *lines])
         write_sensor(place, "camera", camera.topic, pose, _described(job, camera))
@@ -222,7 +250,7 @@ def _is_depth(camera: ExportedCamera) -> bool:
 def _write_tum_images(job: ExportJob, kind: str, camera: ExportedCamera) -> None:
     times = [seconds_text(time) for time in camera.times.tolist()]
     names = [f"{kind}/{time}.png" for time in times]
-    job.write_png_files(camera, kind, names)
+    job.write_files(camera, kind, names)
     heads = ["color images" if kind == "rgb" else "depth maps", f"file: {camera.topic}"]
     if kind == "depth":
         unit = "as recorded, in ROS one millimetre (depth factor 1000, not TUM's 5000)"
@@ -266,7 +294,7 @@ def write_colmap(job: ExportJob) -> None:
     for camera in job.png_cameras():
         place = names.name_for(camera.topic)
         files = [f"{place}/{time}.png" for time in camera.times.tolist()]
-        job.write_png_files(camera, f"images/{place}", [f"images/{file}" for file in files])
+        job.write_files(camera, f"images/{place}", [f"images/{file}" for file in files])
         model = colmap_model(camera.calibration) if camera.calibration else None
         if model is None:
             why = "not calibrated"

@@ -14,20 +14,21 @@ from typing import Any
 import numpy as np
 
 from mp4ds.dataset.dataset import Dataset
+from mp4ds.dataset.images import VerbatimImages
 from mp4ds.dataset.stream import Stream
 from mp4ds.dataset.views import Reduction, View, adapted
 from mp4ds.errors import OptionError
-from mp4ds.format.fields import marked
+from mp4ds.format.fields import DecodedColumns
 from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Pixels
 from mp4ds.messages.serializations import is_camera
 from mp4ds.options import Parsed, SliceOptions, force, option, what
 from mp4ds.times import Integers, at_most, intervals, sound_times, synchronize, usual_interval
-from mp4ds.unpacking.pictures import FrameOptions, is_inverse_depth
+from mp4ds.unpacking.pictures import FrameOptions, files_of, has_inverse_depths
 from mp4ds.video.codecs import MAX_CRF
 from mp4ds.video.images import ImageFile, encoding_as
 
-_FOLDERS, _LEROBOT = ("euroc", "tum", "colmap"), ("lerobot",)
+_POSED, _LEROBOT = ("euroc", "tum", "colmap"), ("lerobot",)
 _NS_PER_MS = 1_000_000
 
 
@@ -46,7 +47,9 @@ class ExportOptions(SliceOptions, Reduction, FrameOptions):
     """How to export."""
 
     native: bool = option(
-        "Keep Bayer mosaics, as grey images, instead of interpolating.", False, only=_FOLDERS
+        "Keep Bayer mosaics, as grey images, instead of interpolating.",
+        False,
+        only=("images", *_POSED),
     )
     tolerance_ns: Parsed[int | None] = what(
         "Keep only frames that all cameras have within this time of each other.",
@@ -57,7 +60,7 @@ class ExportOptions(SliceOptions, Reduction, FrameOptions):
         parse=_nanoseconds,
     )
     poses: str | None = what(
-        "Topic with poses, for euroc, tum and colmap.", metavar="TOPIC", only=_FOLDERS
+        "Topic with poses, for euroc, tum and colmap.", metavar="TOPIC", only=_POSED
     )
     fps: int | None = option(
         "Frame rate for lerobot; default: that of the first camera.",
@@ -141,13 +144,13 @@ class ExportedCamera:
     """The exported frames of a stream, by time.
 
     Attributes:
-        stream: The stream.
+        stream: The stream, or the images that are stored verbatim.
         numbers: Numbers of the frames, int64, shape (frames,).
         times: When they were taken, nanoseconds, increasing or equal; shape (frames,).
         view: How they look.
     """
 
-    stream: Stream
+    stream: Stream | VerbatimImages
     numbers: Integers
     times: Integers
     view: View
@@ -163,7 +166,7 @@ class ExportedCamera:
     @property
     def frame_id(self) -> str:
         """Coordinate frame of the first image."""
-        return self.stream.sidecar.headers[0].frame_id
+        return self.stream.frame_id(0)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -193,8 +196,18 @@ class ExportedCamera:
         """The camera with some of its frames only."""
         return replace(self, numbers=self.numbers[places], times=self.times[places])
 
-    def pictures(self) -> Iterator[tuple[int, Pixels]]:
+    @cached_property
+    def _places(self) -> Mapping[int, int]:
+        return {number: place for place, number in enumerate(self.numbers.tolist())}
+
+    def _choice(self, _: DecodedColumns) -> Iterator[int]:
+        return iter(sorted(self._places))
+
+    def pictures(self, *, is_strict: bool = True) -> Iterator[tuple[int, Pixels]]:
         """The exported pixels of each frame, in the order of the video.
+
+        Args:
+            is_strict: Whether a packet that cannot be decoded is an error, and not left out.
 
         Yields:
             Index into `numbers`, and pixels of `view.encoding` owned by the caller.
@@ -202,12 +215,31 @@ class ExportedCamera:
         Raises:
             FormatError: The stream is damaged.
         """
-        self.stream.verify_pictures()
-        place_of = np.full(len(self.stream), -1, np.int64)
-        place_of[self.numbers] = np.arange(len(self))
-        # strictly: cameras are matched, and rows counted, before any picture is decoded
-        for index, picture in self.stream.pictures(marked(place_of >= 0), self.view.scale):
-            yield int(place_of[index]), self.stream.pixels(picture, self.view, index)
+        if isinstance(self.stream, Stream):
+            self.stream.verify_pictures()
+        found = self.stream.pictures(self._choice, self.view.scale, is_strict=is_strict)
+        for index, picture in found:
+            yield self._places[index], self.stream.pixels(picture, self.view, index)
+
+    @property
+    def recorded_suffix(self) -> str:
+        """Of the recorded files, ``jpg`` or ``png``; empty if others have to be made."""
+        return self.stream.file_suffix if self.view.is_plain else ""
+
+    def files(self, *, as_recorded: bool) -> Iterator[tuple[int, bytes | memoryview]]:
+        """The file of each frame, as `pictures` gives its pixels.
+
+        Args:
+            as_recorded: Whether recorded files are given instead of new PNG files, and packets that
+                cannot be decoded are left out.
+        """
+        if as_recorded and self.recorded_suffix:
+            for index, data in files_of(self.stream, self._choice):
+                yield self._places[index], data
+            return
+        file = ImageFile(self.view.encoding.name, "png")
+        for place, pixels in self.pictures(is_strict=not as_recorded):
+            yield place, file.encode(pixels)
 
 
 # ---------------------------------------------------------------- numbers
@@ -331,6 +363,8 @@ class ExportJob:
         tell: Called now and then with a phrase, and the share of frames done.
         where: What notes begin with, if there are several datasets.
         in_colour: Whether all images with colours become RGB.
+        as_recorded: Whether all images are wanted that there are: also those that are stored
+            verbatim, of equal times, or without a picture, and files as recorded.
         views: Topics with the images of views, of which a slice does not tell.
 
     Attributes:
@@ -356,20 +390,31 @@ class ExportJob:
         *,
         where: str,
         in_colour: bool,
+        as_recorded: bool,
         views: Sequence[str],
     ) -> None:
         self.dataset, self.path, self.options, self.tell = dataset, path, options, tell
         self.places, self._summary, self._where = summary.places, summary, where
         self._counted: Counter[str] = Counter()
-        self._in_colour, self._views, self._written = in_colour, views, 0
+        self._in_colour, self._as_recorded = in_colour, as_recorded
+        self._views, self._written = views, 0
         if dataset.damage:
             self.note(dataset.damage)
+        if dataset.manifest and dataset.manifest.reduced:
+            self.note(dataset.manifest.reduced)
         options.selected.check(dataset.all_topics)
         dataset.verify_sidecars(options.chosen)
-        streams = [stream for stream in dataset.streams if options.selected(stream.topic)]
+        streams: list[Stream | VerbatimImages] = [
+            stream for stream in dataset.streams if options.selected(stream.topic)
+        ]
+        for topic in filter(options.selected, dataset.all_topics if as_recorded else ()):
+            verbatim, without = dataset.verbatim(topic)
+            streams += verbatim
+            for why, count in without.items():
+                self.leave_out(topic, f"no picture: {why}", count)
         found = [camera for stream in streams for camera in self._camera(stream)]
         found.sort(key=lambda camera: (camera.calibration is None, camera.topic))
-        if options.tolerance_ns is not None and len(found) > 1:
+        if options.tolerance_ns is not None and found:
             found = self._matched(found, options.tolerance_ns)
         self.cameras = [camera for camera in found if len(camera)]
 
@@ -392,7 +437,7 @@ class ExportJob:
             self._summary.notes.append(self._where + sentence)
 
     def leave_out_rest(self, name: str) -> None:
-        """Count the remaining messages with their reason, and note which kept ones are of views.
+        """Count the remaining messages with their reason, and note which kept ones differ.
 
         Args:
             name: Of the format.
@@ -412,27 +457,33 @@ class ExportJob:
         for topic in self._views:
             if topic in self._summary.messages:
                 self.note(f"{topic}: its pixels are those of its view")
+        for stream in self.dataset.streams:
+            if stream.is_lossy and stream.topic in {*self._summary.messages} - {*self._views}:
+                why = f"it was packed with quality {stream.sidecar.profile}"
+                self.note(f"{stream.topic}: its pixels differ from those recorded: {why}")
 
     # ------------------------------------------------ cameras
 
-    def _camera(self, stream: Stream) -> Iterator[ExportedCamera]:
+    def _camera(self, stream: Stream | VerbatimImages) -> Iterator[ExportedCamera]:
         """The camera of a stream; none if its images cannot be exported."""
-        sidecar = stream.sidecar
-        if any(is_inverse_depth(sidecar, header) for header in sidecar.headers):
-            self.leave_out(stream.topic, _INVERSE, len(stream))
-            return
+        if has_inverse_depths(stream):
+            if not self._as_recorded:
+                self.leave_out(stream.topic, _INVERSE, len(stream))
+                return
+            self.note(f"{stream.topic}: its pixels are {_INVERSE}")
         columns = stream.columns
         times = sound_times(columns.stamp, columns.log_time)
         kept = np.arange(0, len(stream), self.options.every)
         if self.options.max_rate is not None:
             kept = kept[at_most(self.options.max_rate, times[kept])]
         self.leave_out(stream.topic, _THINNED, len(stream) - len(kept))
-        if times is not columns.stamp:
+        uses_times = (self.options.max_rate, self.options.tolerance_ns) != (None, None)
+        if times is not columns.stamp and (uses_times or not self._as_recorded):
             self.note(f"{stream.topic}: its stamps do not increase, so log times are used instead")
         kept = kept[np.argsort(times[kept], kind="stable")]
         yield ExportedCamera(stream, kept, times[kept], self._view(stream))
 
-    def _view(self, stream: Stream) -> View:
+    def _view(self, stream: Stream | VerbatimImages) -> View:
         known = ENCODINGS[stream.encoding]
         is_native = known.mosaic and self.options.native
         is_converted = not known.is_plain and (self._in_colour or not is_native)
@@ -447,22 +498,37 @@ class ExportJob:
 
     def _matched(self, cameras: list[ExportedCamera], tolerance_ns: int) -> list[ExportedCamera]:
         """The frames that every camera has, frame n of each taken at the same time."""
-        times = {str(number): camera.times for number, camera in enumerate(cameras)}
+        times: dict[str, Integers] = {}
+        first = []  # of each camera among the frames of its topic, which may have several streams
+        for camera in cameras:
+            others = times.get(camera.topic, camera.times[:0])
+            first.append(len(others))
+            times[camera.topic] = np.concatenate([others, camera.times])
         matches = synchronize(times, tolerance_ns=tolerance_ns)
-        for number, camera in enumerate(cameras):
+        for topic, unmatched in matches.unmatched.items():
             reason = "not every camera has a frame at this time (--sync)"
-            self.leave_out(camera.topic, reason, len(matches.unmatched[str(number)]))
-        columns = zip(cameras, matches.indices.T, strict=True)
-        return [camera.at(places) for camera, places in columns]
+            self.leave_out(topic, reason, len(unmatched))
+        columns = dict(zip(times, matches.indices.T, strict=True))
+        found = []
+        for camera, start in zip(cameras, first, strict=True):
+            places = columns[camera.topic] - start
+            found.append(camera.at(places[(places >= 0) & (places < len(camera))]))
+        return found
 
     def png_cameras(self) -> Iterator[ExportedCamera]:
-        """The cameras whose images PNG files can hold, with one frame per time to name it by."""
+        """The cameras whose images PNG files can hold, with one frame per time to name it by.
+
+        With those of equal times if images are wanted as recorded.
+        """
         for camera in self.cameras:
             name = camera.view.encoding.name
             try:
                 ImageFile(name, "png")
             except OptionError:
                 self.leave_out(camera.topic, f"PNG cannot hold {name} images", len(camera))
+                continue
+            if self._as_recorded:
+                yield camera
                 continue
             is_new = np.diff(camera.times, prepend=camera.times[:1] - 1) != 0
             reason = "another frame has the same time, and therefore the same name"
@@ -471,14 +537,11 @@ class ExportJob:
 
     def export_calibration(self, camera: ExportedCamera) -> Calibration | None:
         """The calibration of a camera, counted as exported once: formats cannot hold its times."""
-        info = camera.stream.sidecar.camera_info
-        if info is None or camera.calibration is None:
-            return None
-        topic = info.channel.topic
-        if camera.stream.infos is not None:
-            columns = camera.stream.infos.columns
-            used = camera.stream.calibration_at(int(camera.stream.log_times[camera.numbers[0]]))
-            same = [number for number, item in enumerate(info.calibrations) if item is used]
+        stream = camera.stream
+        if camera.calibration and isinstance(stream, Stream) and stream.infos is not None:
+            columns, topic = stream.infos.columns, stream.infos.channel.topic
+            used = stream.calibration_at(int(stream.log_times[camera.numbers[0]]))
+            same = [number for number, item in enumerate(stream.calibrations) if item is used]
             is_same = np.isin(columns.variant, same)
             self.keep(topic)
             self.leave_out(topic, "repeats the exported calibration", int(is_same.sum()) - 1)
@@ -488,25 +551,31 @@ class ExportJob:
 
     # ------------------------------------------------ files
 
-    def write_png_files(self, camera: ExportedCamera, place: str, names: Sequence[str]) -> None:
-        """Write the frames of a camera as PNG files, and count them.
+    def write_files(self, camera: ExportedCamera, place: str, names: Sequence[str]) -> list[int]:
+        """Write the frames of a camera as PNG files, or as recorded, and count them.
 
         Args:
             camera: The camera.
             place: The part of the output they are listed under.
             names: Path of each frame's file from the output's folder.
+
+        Returns:
+            Index of each that was written; others have no picture.
         """
         (self.path / names[0]).parent.mkdir(parents=True, exist_ok=True)
-        file = ImageFile(camera.view.encoding.name, "png")
-        due = sum(len(camera) for camera in self.cameras)
-        for number, (position, pixels) in enumerate(camera.pictures()):
+        due, written = sum(len(camera) for camera in self.cameras), list[int]()
+        for number, (position, data) in enumerate(camera.files(as_recorded=self._as_recorded)):
             if number % _TELL_EVERY == 0:
                 done = (self._written + number) / due
                 self.tell(f"{camera.topic} as {place}: frame {number} of {len(camera)}", done)
-            (self.path / names[position]).write_bytes(file.encode(pixels))
+            (self.path / names[position]).write_bytes(data)
+            written.append(position)
         self._written += len(camera)
         self.places[place] = camera.topic
-        self.keep(camera.topic, len(camera))
+        self.keep(camera.topic, len(written))
+        reason = "its picture cannot be decoded"
+        self.leave_out(camera.topic, reason, len(camera) - len(written))
+        return written
 
     def write_lines(
         self, name: str, lines: Iterable[str], *, place: str = "", topic: str = ""

@@ -20,6 +20,7 @@ from mp4ds.bags.convert import ros2_channel
 from mp4ds.bags.latched import LATCHED_QOS
 from mp4ds.bags.protocols import BagReader
 from mp4ds.errors import OptionError, SourceError
+from mp4ds.files.outputs import csv_cell
 from mp4ds.files.sources import source_name, source_size
 from mp4ds.messages.encodings import ENCODINGS
 from mp4ds.messages.serializations import plain_message
@@ -42,7 +43,7 @@ from mp4ds.records import (
     Record,
     Schema,
 )
-from mp4ds.unpacking.pictures import KINDS, csv_cell
+from mp4ds.unpacking.pictures import KINDS
 from mp4ds.unpacking.republish import Types
 from mp4ds.video.decoder import Clip
 from mp4ds.video.images import read_image

@@ -158,7 +158,9 @@ class StillOptions(Options):
     resize: Parsed[float | tuple[int, int] | None] = option(
         "Size of the image.", metavar="0.5|WxH", parse=parse_resize
     )
-    exact: bool = option("Keep the pixel values as recorded, as unpack --to images does.", False)
+    exact: bool = option(
+        "Keep the pixel values as recorded, as export images --native does.", False
+    )
     force: bool = force()
 
     def __post_init__(self) -> None:
