@@ -353,9 +353,6 @@ MISTAKES: dict[str, tuple[type[Exception], str]] = {
     "stream.at(7, mode='first')": (mp4ds.OptionError, "nearest, before, after, exact"),
     "stream.at(0.5)": (TypeError, "an integer, in nanoseconds, not 0.5: half a second after"),
     "dataset.sync(tolerance_ns=1e6)": (TypeError, "tolerance_ns is an integer, in nanoseconds"),
-    "stream.get_frames_at([1])": (AttributeError, "here it is dataset[topic].get([0, 5])"),
-    "dataset.get_frame_at(1)": (AttributeError, "here it is dataset[topic][7]"),
-    "stream.frames": (AttributeError, "'Topic' object has no attribute 'frames'"),
 }
 
 

@@ -317,30 +317,3 @@ class SampleError(Mp4dsError, RuntimeError):
 
 class EncoderRefusedError(Mp4dsError):
     """The encoder does not support pictures of this kind or size; the message says why."""
-
-
-_ELSEWHERE = {
-    "get_frame_at": "dataset[topic][7]",
-    "get_frames_at": "dataset[topic].get([0, 5]), or read([0, 5]) for one array",
-    "get_frames_in_range": "dataset[topic][2:12:3]",
-    "get_frame_played_at": "dataset[topic].at(stamp_ns)",
-    "get_frames_played_in_range": "dataset[topic].between(start_ns, end_ns)",
-    "get_batch": "dataset[topic].read([0, 5])",
-    "delta_timestamps": 'offsets=(-0.1, 0), offsets_in="seconds", or use LeRobotDataset',
-    "tolerance_s": "tolerance_ns",
-    "image_transforms": "transform",
-}
-"""Names of torchcodec, decord and LeRobot -> what does it here."""
-
-
-def absent(owner: object, name: str) -> str:
-    """What is wrong with a name that an object or a function does not have."""
-    hint = f"; here it is {_ELSEWHERE[name]}" if name in _ELSEWHERE else ""
-    return f"{type(owner).__name__} has no {name!r}{hint}"
-
-
-def missing(owner: object, name: str) -> Any:
-    """For ``__getattr__``: raises AttributeError."""
-    if name in _ELSEWHERE:
-        raise AttributeError(absent(owner, name))
-    return object.__getattribute__(owner, name)  # again, for the error of a property

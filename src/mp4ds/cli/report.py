@@ -110,7 +110,7 @@ def print_evaluation(result: Evaluation) -> None:
         if isinstance(item, str):
             say(item)
         else:
-            print_table(item, {"stored as": "text"}, spare=_SPARE)
+            print_table(item, {}, spare=_SPARE)
     for topic, reason in result.left_out.items():
         say(f"{topic}: left out: {reason}")
     if len(result.cameras) > 1:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,6 @@ from mp4ds.errors import (
     SourceError,
     SourceNotFoundError,
     counted,
-    missing,
     size_text,
 )
 from mp4ds.files.sources import HOW_TO_OPEN, is_folder, refuse_unfinished, video_at
@@ -136,11 +135,6 @@ class Dataset:
         dataset.path, dataset.manifest, dataset.streams = path, manifest, list(streams)
         dataset.messages_file, dataset._video = file, video
         return dataset
-
-    if not TYPE_CHECKING:  # else every name would pass for known
-
-        def __getattr__(self, name: str) -> Any:
-            return missing(self, name)
 
     def __repr__(self) -> str:
         topics = ", ".join(self.topics[:_MOST_TOPICS]) or "no camera"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from operator import index as as_integer
 from reprlib import repr as shortened
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mp4ds.dataset.images import Images, Integers, PredictedFrames, VerbatimImages
 from mp4ds.dataset.stream import Layer, Stream
 from mp4ds.dataset.views import Crop, Resize, View, output
-from mp4ds.errors import Mp4dsError, OptionError, missing
+from mp4ds.errors import Mp4dsError, OptionError
 from mp4ds.format.models import Calibration
 from mp4ds.messages.encodings import ENCODINGS, Picture, Pixels
 from mp4ds.times import StampIndex
@@ -104,11 +104,6 @@ class Topic:
         # What other processes opened stays in it, for the reason given at `_Opened`.
         self._processes: dict[int, _Opened] = {}
         self._layers: dict[Layer, Topic] = {}
-
-    if not TYPE_CHECKING:  # else every name would pass for known
-
-        def __getattr__(self, name: str) -> Any:
-            return missing(self, name)
 
     def __repr__(self) -> str:
         found = [f"{len(self)} frame{'s' * (len(self) != 1)}"]

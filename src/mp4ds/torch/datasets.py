@@ -7,7 +7,7 @@ from math import prod
 from operator import index as as_integer
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import Any, Literal, NoReturn, SupportsIndex, get_args
+from typing import Any, Literal, SupportsIndex, get_args
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch.utils.data import Dataset, default_collate, get_worker_info
 from mp4ds.dataset.stream import Layer
 from mp4ds.dataset.vectors import Fields
 from mp4ds.dataset.views import Crop, Resize
-from mp4ds.errors import OptionError, absent, counted
+from mp4ds.errors import OptionError, counted
 from mp4ds.torch.cameras import CACHE_BYTES, Backend, Dtype, FrameCache, OpenCamera, OpenCameras
 from mp4ds.torch.recordings import (
     Paths,
@@ -265,10 +265,7 @@ class FrameDataset(Dataset):
         cache_files: int = 16,
         backend: Backend = "mp4ds",
         device: str = "cpu",
-        **others: NoReturn,
     ) -> None:
-        for name in others:  # of other libraries, too
-            raise TypeError(absent(self, name))
         if fps is not None and not (isinstance(fps, int) and 1 <= fps <= _MOST_FPS):
             raise OptionError(f"fps is {fps!r}, but must be a whole number from 1 to {_MOST_FPS}.")
         names = rename or {}

@@ -28,7 +28,7 @@ from mp4ds.dataset.vectors import (
     vector_feature,
     video_feature,
 )
-from mp4ds.errors import OptionError, absent
+from mp4ds.errors import OptionError
 from mp4ds.files.urls import location
 from mp4ds.torch.datasets import FrameDataset, Offsets, Sample
 from mp4ds.torch.recordings import Paths, open_source, usual_rate
@@ -171,7 +171,7 @@ class LeRobotDataset(FrameDataset):
     ) -> None:
         for name in _OTHERS:
             if name in options:
-                raise TypeError(absent(self, name))
+                raise TypeError(f"LeRobotDataset has no {name!r}: it gives what LeRobot does")
         rate = usual_rate(paths, topics, layer, rename or {}) if fps is None else fps
         options.setdefault("message_tolerance_ns", _EVER)  # LeRobot marks what is beyond an episode
         super().__init__(

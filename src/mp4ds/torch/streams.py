@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
-from mp4ds.errors import OptionError, absent
+from mp4ds.errors import OptionError
 from mp4ds.torch.datasets import FrameDataset
 from mp4ds.torch.recordings import Paths, at_least
 
@@ -107,7 +107,7 @@ class FrameStream(IterableDataset):
     ) -> None:
         for name in ("offsets", "offsets_in", "tolerance_ns"):
             if name in options:
-                raise TypeError(absent(self, name))
+                raise TypeError(f"FrameStream has no {name!r}: its samples have one frame each")
         at_least(1, window=window, world_size=world_size)
         at_least(0, seed=seed, buffer=buffer, rank=rank)
         if rank >= world_size:
