@@ -107,6 +107,7 @@ with Keyboard({" ": lambda: print("toggled", flush=True)}):
 # tell by lines on standard error what happens
 SHELL = """
 import fcntl, os, resource, signal, sys, termios
+usual = termios.tcgetattr(0)
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 signal.signal(signal.SIGTTOU, signal.SIG_IGN)
@@ -125,6 +126,7 @@ while True:
     if not os.WIFSTOPPED(status):
         say(f"ended {os.waitstatus_to_exitcode(status)}")
         break
+    termios.tcsetattr(0, termios.TCSANOW, usual)
     say("stopped")
     while (command := sys.stdin.readline().strip()) in ("bg", "fg"):
         if command == "fg":

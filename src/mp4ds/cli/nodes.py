@@ -244,8 +244,6 @@ _POLL_S = 0.2
 """How often to check whether the command is in the foreground again."""
 
 _KEY = re.compile(rb"\x1b[\[O][\x20-\x3f]*[^\x20-\x3f]?|.", re.DOTALL)
-_CUT = re.compile(rb"\x1b(?:[\[O][\x20-\x3f]*)?\Z")  # the rest of which will come
-_MOST_CUT = 32
 _ARROWS = {
     b"\x1b" + kind + letter: name
     for kind in (b"[", b"O")
@@ -258,8 +256,9 @@ class Keyboard:
 
     It does nothing if standard input is not a terminal.
 
-    The terminal is set to deliver each key at once, without echo. Its settings are restored at the
-    end, and while the program is stopped (Ctrl-Z) or in the background, where it reads nothing.
+    The terminal is set to deliver each key at once, without echo, also when the program comes back
+    to the foreground. In the background it reads nothing. Its settings are restored at the end;
+    while the program is stopped (Ctrl-Z), by the shell.
 
     Args:
         actions: The action of each key, named as by `keys_in`; other keys are ignored.
@@ -274,19 +273,12 @@ class Keyboard:
         with suppress(AttributeError, OSError, ValueError):  # standard input is None or closed
             number = sys.stdin.fileno() if fd is None else fd
             self._fd = number if termios is not None and os.isatty(number) else None
-        self._before: list[Any] | None = None
-        self._is_left = False
-        # reentrant, as a signal may arrive while the main thread holds it
-        self._lock = threading.RLock()
-        self._handles_stop = False
+        self._before: list[Any] = []
 
     def __enter__(self) -> Keyboard:
         if self._fd is not None:
-            is_main = threading.current_thread() is threading.main_thread()  # who can handle one
-            if is_main and signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL:
-                signal.signal(signal.SIGTSTP, self._on_stop)
-                self._handles_stop = True
-            self._take(self._fd)
+            self._before = termios.tcgetattr(self._fd)
+            _take(self._fd)
             self._wake = os.pipe()
             arguments = (self._fd, self._wake[0])
             self._thread = threading.Thread(
@@ -299,22 +291,18 @@ class Keyboard:
         """Restore the terminal, and end the thread."""
         if self._fd is None:
             return
-        self._leave(self._fd)
         os.close(self._wake[1])
         self._thread.join(_POLL_S * 5)  # not for long: the action of a key may be stuck
         if not self._thread.is_alive():
             os.close(self._wake[0])
-        if self._handles_stop:
-            signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+        if _is_in_foreground(self._fd):
+            with suppress(termios.error):  # it was closed
+                termios.tcsetattr(self._fd, termios.TCSANOW, self._before)
 
     def _read(self, fd: int, wake: int) -> None:
-        cut = b""
-        while True:
-            watched = [wake, fd] if self._take(fd) else [wake]
-            ready, _, _ = select.select(watched, [], [], _POLL_S)
-            if wake in ready:
-                return
-            if fd not in ready:
+        while not select.select([wake], [], [], 0)[0]:
+            watched = [wake, fd] if _take(fd) else [wake]
+            if fd not in select.select(watched, [], [], _POLL_S)[0]:
                 continue
             try:
                 data = os.read(fd, 256)
@@ -322,49 +310,19 @@ class Keyboard:
                 return
             if not data:
                 return
-            data = cut + data
-            match = _CUT.search(data)
-            cut = match[0][-_MOST_CUT:] if match else b""
-            for key in keys_in(data[: len(data) - len(cut)]):
+            for key in keys_in(data):
                 if action := self._actions.get(key):
                     action()
 
-    def _on_stop(self, number: int, _: FrameType | None) -> None:
-        """Stop as usual; after the program has continued, the thread sets the terminal again."""
-        if self._fd is not None:
-            self._leave(self._fd)
-        signal.signal(number, signal.SIG_DFL)
-        signal.raise_signal(number)
-        signal.signal(number, self._on_stop)
-        with self._lock:
-            self._is_left = False
 
-    # ------------------------------------------------------------ terminal
-
-    def _take(self, fd: int) -> bool:
-        """Switch to single keys if the program is in the foreground; returns whether it is."""
-        with self._lock:
-            if self._is_left or not _is_in_foreground(fd):
-                return False
-            if self._before is None:
-                try:
-                    before = termios.tcgetattr(fd)
-                    tty.setcbreak(fd, termios.TCSANOW)
-                except termios.error:  # it was closed
-                    return False
-                self._before = before
-            return True
-
-    def _leave(self, fd: int) -> None:
-        """Restore the settings, and leave them alone."""
-        with self._lock:
-            self._is_left = True
-            before, self._before = self._before, None
-            if before is not None and _is_in_foreground(fd):
-                try:
-                    termios.tcsetattr(fd, termios.TCSANOW, before)
-                except termios.error:  # it was closed
-                    return
+def _take(fd: int) -> bool:
+    """Have a terminal deliver single keys if the program is in the foreground; returns that."""
+    is_ours = _is_in_foreground(fd)
+    if is_ours:
+        with suppress(termios.error):  # it was closed
+            if termios.tcgetattr(fd)[3] & termios.ICANON:
+                tty.setcbreak(fd, termios.TCSANOW)
+    return is_ours
 
 
 def keys_in(data: bytes) -> Iterator[str]:
