@@ -133,8 +133,10 @@ def test_signals(drive: Path, number: signal.Signals, code: int) -> None:
     ("arguments", "words"),
     [
         (["{}", "--ros1", "--ros2"], "--ros1 contradicts --ros2"),
+        (["{}", "--ros2", "-s", "3"], "'3' is not one of 'sqlite3', 'mcap'"),
         (["{}", "--ros2", "--log-level", "loud"], "--log-level 'loud'"),
-        (["{}", "--ros2", "--publish-service-requests"], "No such option"),
+        (["{}", "--ros2", "--publish-service-requests"], "services are not called"),
+        (["{}", "--ros2", "--message-order", "sent"], "'sent' is not 'received'"),
         (["{}", "--ros1", "--wait-for-all-acked", "5"], "works with ros2, not with ros1"),
         (["{}", "--ros2", "--queue", "5"], "works with ros1, not with ros2"),
         (["{}", "--ros2", "--ros-args", "-r", "__node:=a/b"], "'a/b' is not a valid node name"),

@@ -41,7 +41,7 @@ def words(typed: str) -> str:
         ("bag --clock --hz 7", "bag --clock 100 --hz 7"),
         ("--ros2 --clock bag", "--ros2 --clock 40 bag"),
         ("--ros2 bag --clock 7", "--ros2 bag --clock 7"),
-        ("--ros2 bag -x a", "--ros2 bag --exclude-regex a"),
+        ("--ros2 bag -x a -s mcap", "--ros2 bag --exclude-regex a --storage mcap"),
         ("--ros1 bag -p /a -s 3", "--ros1 bag --prefix /a -s 3"),
         ("--ros1 bag -p/a", "--ros1 bag --prefix /a"),
         ("bag -x a -p -s 3", "bag -x a -p -s 3"),

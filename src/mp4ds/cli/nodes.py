@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import click
 
 from mp4ds.cli import DEBUG, ending_signals
-from mp4ds.cli.options import Command
+from mp4ds.cli.options import Command, option
 from mp4ds.cli.output import QUIET, Row, complain, display
 from mp4ds.errors import OptionError
 from mp4ds.options import WHERE, Options
@@ -236,6 +236,25 @@ class NodeCommand(Command):
             return ":=" in word
         is_path = "://" in word or os.path.exists(word)  # noqa: PTH110 - is no argument yet
         return not (self._takes_paths and is_path and not has_arguments)
+
+
+def accepted(*flags: str, values: int = 0) -> Callable[[Any], Any]:
+    """Options of ROS's own tools that have no meaning here.
+
+    Args:
+        flags: The options.
+        values: How many values each takes.
+    """
+    kind: dict[str, Any] = {"nargs": values, "type": str} if values else {"is_flag": True}
+
+    def decorate(function: Any) -> Any:
+        for flag in flags:
+            function = option(
+                f"ignored{flag.replace('-', '_')}", flag, hidden=True, expose_value=False, **kind
+            )(function)
+        return function
+
+    return decorate
 
 
 # ---------------------------------------------------------------- the keyboard

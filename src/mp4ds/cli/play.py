@@ -12,11 +12,12 @@ import click
 from mp4ds.cli.nodes import (
     NodeCommand,
     RosOptions,
+    accepted,
     node_controls,
     node_names,
     node_progress,
 )
-from mp4ds.cli.options import argument, command, takes
+from mp4ds.cli.options import argument, command, option, takes
 from mp4ds.cli.output import QUIET, Row, complain, is_set, say, say_counts, show, shown
 from mp4ds.plugins.playing.options import PlayOptions
 from mp4ds.plugins.playing.player import Player, PlayProgress, PlaySummary, open_player
@@ -25,6 +26,14 @@ from mp4ds.plugins.ros.node import SERVICE_EVENTS
 _FASTER = 1.1
 _NS = 1_000_000_000
 _SLOW_S = 0.5  # warned about at once; less is only mentioned in the summary
+
+
+def _refuse(_: click.Context, parameter: click.Parameter, value: object) -> None:
+    if value:
+        raise click.UsageError(
+            f"{parameter.opts[0]} is not supported: services are not called. Unpack the events of "
+            "services (--topics '*/_service_event') for `ros2 bag play`, which calls them."
+        )
 
 
 @command(
@@ -44,7 +53,7 @@ _SLOW_S = 0.5  # warned about at once; less is only mentioned in the summary
     },
     letters={
         "ros1": {"-p": "--prefix"},
-        "ros2": {"-x": "--exclude-regex", "-i": "--input"},
+        "ros2": {"-x": "--exclude-regex", "-s": "--storage", "-i": "--input"},
     },
     defaults={"--clock": {"": "100", "ros2": "40"}},
     remaps=("--remap", "-m"),
@@ -53,20 +62,40 @@ _SLOW_S = 0.5  # warned about at once; less is only mentioned in the summary
 @argument(
     "datasets", "DATASET...", "Datasets; several are merged by time.", nargs=-1, required=True
 )
+@option(
+    "--storage",
+    type=click.Choice(["sqlite3", "mcap"]),
+    expose_value=False,
+    metavar="TEXT",
+    help="Accepted for compatibility with `ros2 bag play`; ignored.",
+)
+# messages are played in the order in which they were received
+@option("--message-order", type=click.Choice(["received"]), hidden=True, expose_value=False)
+@option("--progress-bar-update-rate", "bar_rate", type=float, hidden=True)
+@accepted("--disable-loan-message", "--try-future-version")
+@accepted("--storage-config-file", "--progress-bar-separation-lines", values=1)
+@option(
+    "--publish-service-requests", is_flag=True, hidden=True, callback=_refuse, expose_value=False
+)
+@option("--service-requests-source", hidden=True, callback=_refuse, expose_value=False)
 @takes(RosOptions, "ros")
 @takes(PlayOptions)
-def play_command(datasets: Sequence[str], ros: RosOptions, options: PlayOptions) -> None:
+def play_command(
+    datasets: Sequence[str], bar_rate: float | None, ros: RosOptions, options: PlayOptions
+) -> None:
     """Play back datasets, publishing to ROS 1 or ROS 2.
 
     Keys: space pauses or resumes, right publishes the next message, up and down play faster or
     slower.
 
     Options can be written as for `rosbag play` or `ros2 bag play`, such as --topics /a /b. With
-    --ros2, -x means --exclude-regex, and -i names a dataset; with --ros1, -p means --prefix.
+    --ros2, -x means --exclude-regex, -s means --storage, and -i names a dataset; with --ros1, -p
+    means --prefix.
     """
     options = replace(options, to=ros.to, names=node_names(ros))
+    is_shown = ros.progress and bar_rate != 0
     with ExitStack() as stack:
-        report = stack.enter_context(node_progress(_rows, _warnings, is_shown=ros.progress))
+        report = stack.enter_context(node_progress(_rows, _warnings, is_shown=is_shown))
         player = stack.enter_context(open_player(datasets, options, progress=report))
         if not is_set(QUIET):
             complain(f"publishing to {player.address}")

@@ -11,6 +11,7 @@ import click
 from mp4ds.cli.nodes import (
     NodeCommand,
     RosOptions,
+    accepted,
     node_controls,
     node_names,
     node_progress,
@@ -27,6 +28,9 @@ from mp4ds.plugins.ros.node import SERVICE_EVENTS
 
 _SHOWN = 20  # topics
 _UNTIMED = "their log time is negative or too large"
+_MB = 10**6
+_KEPT_S = 60.0
+"""What --snapshot-mode keeps."""
 
 
 @command(
@@ -45,7 +49,7 @@ _UNTIMED = "their log time is negative or too large"
     },
     letters={
         "ros1": {"-e": "--match", "--regex": "--match"},
-        "ros2": {"-b": "--max-size"},
+        "ros2": {"-b": "--max-size", "-s": "--storage"},
     },
 )
 @argument("topics", "TOPIC...", "Topic names, or globs in quotes; -a records all.", nargs=-1)
@@ -59,12 +63,27 @@ _UNTIMED = "their log time is negative or too large"
     help="Folder to create; default: named after the time.",
 )
 @option("--match", is_flag=True, hidden=True)
+@option("--split", is_flag=True, hidden=True)
+@option("--size", type=int, hidden=True)
+@option("--snapshot-mode", "snapshots", is_flag=True, hidden=True)
+@option("--max-cache-size", "cache", type=int, hidden=True)
+@option("--max-cache-duration", "kept", type=float, default=_KEPT_S, hidden=True)
+@accepted("-j", "--bz2", "--lz4", "--tcpnodelay")
+@accepted("--storage", "--storage-preset-profile", "--storage-config-file", values=1)
+@accepted("--compression-mode", "--compression-format", "--chunksize", values=1)
+@accepted("--compression-queue-size", "--compression-threads", values=1)
+@accepted("--compression-threads-priority", "--serialization-format", values=1)
 @takes(RosOptions, "ros")
 @takes(RecordOptions)
 def record_command(
     topics: Sequence[str],
     output: str | None,
     match: bool,
+    split: bool,
+    size: int | None,
+    snapshots: bool,
+    cache: int | None,
+    kept: float,
     ros: RosOptions,
     options: RecordOptions,
 ) -> None:
@@ -82,6 +101,14 @@ def record_command(
         topics, options = (), replace(options, regex=_whole(topics))
     if ros.ros1 and options.exclude_regex:  # where ROS 2 searches, ROS 1 matches
         options = replace(options, exclude_regex=_whole([options.exclude_regex.pattern]))
+    if split:
+        options = replace(options, duration=None, max_duration=options.duration)
+    if size is not None:
+        options = replace(options, max_size=f"{size}M")
+    if cache is not None:
+        options = replace(options, buffer=max(1, cache // _MB))
+    if snapshots and options.keep_last is None:
+        options = replace(options, keep_last=kept)
     with ExitStack() as stack:
         report = stack.enter_context(node_progress(_rows, _warnings, is_shown=ros.progress))
         # a launch file cannot leave out an argument: an empty one is none
