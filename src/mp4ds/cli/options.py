@@ -48,12 +48,21 @@ class Option(click.Option):
     Args:
         *args: As for click.
         panel: Its name.
+        alone: What it means without one of its choices after it; empty where it takes any word.
+        choices: These.
         **values: As for click.
     """
 
-    def __init__(self, *args: Any, panel: str = "Options", **values: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        panel: str = "Options",
+        alone: str = "",
+        choices: Collection[str] = (),
+        **values: Any,
+    ) -> None:
         super().__init__(*args, **values)
-        self.panel = panel
+        self.panel, self.alone, self.choices = panel, alone, choices
 
     def get_help_extra(self, ctx: click.Context) -> Any:
         """What follows the help text: no bounds."""
@@ -75,7 +84,23 @@ class Command(click.Command):
         ctx.meta[_COMMAND] = self
         if "--json" in args:  # for errors of the others, too
             ctx.meta[JSON] = True
-        return super().parse_args(ctx, self.translated(ctx, args))
+        return super().parse_args(ctx, self._completed(self.translated(ctx, args)))
+
+    def _completed(self, words: list[str]) -> list[str]:
+        """The words, in which an option that means something alone is not taken for half a pair."""
+        alone = {
+            flag: item
+            for item in self.params
+            if isinstance(item, Option) and item.alone
+            for flag in item.opts
+        }
+        pairs = zip(words, [*words[1:], ""], strict=False)
+        return [
+            f"{word}={alone[word].alone}"
+            if word in alone and following not in alone[word].choices
+            else word
+            for word, following in pairs
+        ]
 
     def translated(self, ctx: click.Context, words: list[str]) -> list[str]:
         """The arguments as this command has them, of those that users type."""
@@ -197,8 +222,7 @@ def _option_of(field: str, declared: Declared, hint: Any, default: Any) -> Calla
     if declared.parse or base is str:
         values["type"] = str
         if declared.alone:
-            kind = click.Choice([*declared.choices])
-            values |= {"type": kind, "is_flag": False, "flag_value": declared.alone}
+            values |= {"alone": declared.alone, "choices": declared.choices}
     elif base is bool:
         values = {"is_flag": True}
     elif base in (int, float):
