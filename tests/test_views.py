@@ -389,6 +389,22 @@ def test_views_come_and_go(case: str, tmp_path: Path) -> None:
     assert compare(made.sources, unpacked(tmp_path, "mcap")) == []
 
 
+@pytest.mark.parametrize("window", [None, 4])
+def test_views_are_added_only_where_they_are_missing(window: int | None, tmp_path: Path) -> None:
+    (raw,) = SOURCES[ROS2](tmp_path / "raw", scene("bgr8"))
+    (jpeg,) = SOURCES[ROS2](tmp_path / "jpeg", CODED["jpeg-rgb"]())
+    first = tmp_path / "first"
+    mp4ds.pack([raw, jpeg], first, PackOptions(gop=5))  # encoded again, its packets would differ
+    assert codecs(first) == [None, "av1"]
+    mp4ds.pack(first, tmp_path / "dataset", PackOptions(view="av1", window=window))
+    assert codecs(tmp_path / "dataset") == ["av1", "av1"]
+    own = [*first.glob("cam_image_raw.*")]
+    assert len(own) == 3
+    assert all(path.read_bytes() == (tmp_path / "dataset" / path.name).read_bytes() for path in own)
+    assert mp4ds.validate(tmp_path / "dataset", deep=True) == []
+    assert compare([raw, jpeg], unpacked(tmp_path, "mcap")) == []
+
+
 KEPT: dict[str, tuple[dict[str, Any], list[str | None], int]] = {
     "as it is": ({}, ["av1"], 1),
     "a slice": ({"start": "0.1", "duration": "0.1"}, ["av1"], 1),

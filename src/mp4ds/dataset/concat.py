@@ -82,6 +82,7 @@ def concat(
     *,
     part: RecordingSlice = WHOLE,
     selected: Callable[[str], bool] = lambda _: True,
+    others: bool = True,
     changes: dict[str, Any] | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
@@ -98,6 +99,7 @@ def concat(
         folder: The folder to fill, empty.
         part: What to copy of the only dataset; the topics of its span are ignored.
         selected: Whether a topic is to be copied.
+        others: Whether attachments and metadata records are.
         changes: Fields of the manifest that differ from those of the first dataset.
         report: Called with the name of each file when it is begun, perhaps in another thread.
 
@@ -125,7 +127,8 @@ def concat(
             source.dataset.verify_messages()
     made = _write_streams(streams, folder, report, is_one=len(sources) == 1)
     report(MESSAGES_NAME)
-    transforms = _write_messages(sources, folder / MESSAGES_NAME, list(made.values()))
+    path = folder / MESSAGES_NAME
+    transforms = _write_messages(sources, path, list(made.values()), others=others)
     old = sources[0].manifest
     ranges = [source.range for source in sources if source.range]
     losses = [entry.to_record() for source in sources for entry in source.manifest.losses]
@@ -579,7 +582,7 @@ def _copy_file(path: Path, to: Path) -> None:
 
 
 def _write_messages(
-    sources: Sequence[_Source], path: Path, sidecars: Sequence[StreamSidecar]
+    sources: Sequence[_Source], path: Path, sidecars: Sequence[StreamSidecar], *, others: bool
 ) -> Sequence[Transform] | None:
     """Write messages.mcap; returns the static transforms of several datasets."""
     first = sources[0]
@@ -602,8 +605,8 @@ def _write_messages(
 
     starts = [source.range[0] if source.range else 0 for source in sources]
     with McapWriter(path, profile=dataset.profile) as writer:
-        others = (source.dataset.messages_file.others() for source in sources)
-        for record in chain(chain.from_iterable(others), merged(starts, messages)):
+        kept = (source.dataset.messages_file.others() for source in sources if others)
+        for record in chain(chain.from_iterable(kept), merged(starts, messages)):
             write_record(writer, record)
             if isinstance(record, Message):
                 collector.add(record.channel, record.data)

@@ -243,7 +243,7 @@ def sliced(
     path = folder / "slice" / dataset.path.name
     path.mkdir(parents=True)
     try:
-        kept = _with_shared(dataset, selected).__contains__
+        kept = with_shared(dataset, selected).__contains__
         copy_part(dataset, path, part=part, selected=kept)
     except Refused as reason:
         raise OptionError(
@@ -257,7 +257,7 @@ def sliced(
         shutil.rmtree(path.parent, ignore_errors=True)
 
 
-def _with_shared(dataset: Dataset, selected: Callable[[str], bool]) -> set[str]:
+def with_shared(dataset: Dataset, selected: Callable[[str], bool]) -> set[str]:
     """The selected topics, and those that share a stream with them."""
     kept = {channel.topic for channel in dataset.channels if selected(channel.topic)}
     shared = [set(stream.topics) for stream in dataset.streams]

@@ -353,7 +353,7 @@ class TopicSummary:
         type_name: Its message type.
         messages: Messages packed.
         frames: Messages of these that are frames of a video or entries of its camera_info.
-        raw_bytes: Payload bytes of all messages.
+        raw_bytes: Payload bytes of all messages; 0 where its videos were copied.
         packed_bytes: Bytes of its videos and sidecars; 0 for one that is in messages.mcap.
         files: Its videos.
         verbatim: Reason -> (messages, number of the first) for camera messages stored verbatim.

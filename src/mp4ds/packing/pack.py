@@ -18,7 +18,7 @@ from pathlib import Path
 from mp4ds.bags.protocols import BagReader
 from mp4ds.dataset.checks import validate
 from mp4ds.dataset.dataset import Dataset
-from mp4ds.dataset.recording import copy_part, dataset_at, slice_of
+from mp4ds.dataset.recording import copy_part, dataset_at, slice_of, with_shared
 from mp4ds.dataset.stream import Stream
 from mp4ds.errors import (
     FormatError,
@@ -40,6 +40,7 @@ from mp4ds.files.sources import (
 )
 from mp4ds.files.urls import RemotePath, location, remote
 from mp4ds.format.manifest import ReductionEntry
+from mp4ds.format.models import StreamSidecar
 from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_about, load_manifest
 from mp4ds.messages.depth import DEPTHS
 from mp4ds.messages.encodings import ENCODINGS
@@ -404,13 +405,38 @@ def _is_copy(paths: Sequence[Path], options: PackOptions) -> bool:
 def _has_views(folder: Path, options: PackOptions) -> bool:
     """Whether the streams of a dataset have the views that are asked for already."""
     chosen = [one.sidecar for one in Dataset(folder).streams if options.selected(one.topic)]
-    if options.view == NO_VIEW:
-        return all(one.view is None for one in chosen)
-    return all(
-        one.view.codec == options.view if one.view else not ENCODINGS[one.image.encoding].lossy
-        for one in chosen
-        if one.profile == LOSSLESS
-    ) and any(one.view for one in chosen)
+    has_some = options.view == NO_VIEW or any(one.view for one in chosen)
+    return has_some and all(_has_view(one, options) for one in chosen)
+
+
+def _has_view(sidecar: StreamSidecar, options: PackOptions) -> bool:
+    """Whether a stream has the view that is asked for already, or can have none."""
+    view = sidecar.view
+    if options.view == NO_VIEW or view:
+        return (view.codec if view else NO_VIEW) == options.view
+    return sidecar.profile != LOSSLESS or not ENCODINGS[sidecar.image.encoding].lossy
+
+
+def _copied_topics(paths: Sequence[Path], options: PackOptions) -> frozenset[str]:
+    """Topics of streams that have the view already, if all that is asked for is that others do.
+
+    Args:
+        paths: What is to be packed.
+        options: As completed.
+    """
+    folder = dataset_at(paths[0]) if len(paths) == 1 else None
+    kept = {name: getattr(options, name) for name in ("view", "quality", "window")}
+    is_usual = options.changing(CONTENT, ENCODING) == {**_USUAL.changing(CONTENT, ENCODING), **kept}
+    if not (folder and is_usual and options.view and options.goal.lossless):
+        return frozenset()
+    with Dataset(folder) as dataset:
+        lacking = {
+            one.topic
+            for one in dataset.streams
+            if one.sidecar.profile != LOSSLESS or not _has_view(one.sidecar, options)
+        }
+        topics = {topic for one in dataset.streams if lacking for topic in one.topics}
+        return frozenset(topics - with_shared(dataset, lacking.__contains__))
 
 
 def _is_encoded(stream: Stream, options: PackOptions) -> bool:
@@ -528,7 +554,7 @@ def _planned(
             "first."
         )
     with open_recording(paths, options) as reader:
-        plan = divide(reader, paths, options, recordings)
+        plan = divide(reader, paths, options, recordings, _copied_topics(paths, options))
         if note is not None:
             folder.check(PlanNote.of(plan), shared=is_shared)
         if not options.join:

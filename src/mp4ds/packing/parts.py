@@ -30,12 +30,15 @@ from platform import node
 from typing import Any
 
 from mp4ds.bags.protocols import BagReader
+from mp4ds.dataset.concat import concat
+from mp4ds.dataset.dataset import Dataset
 from mp4ds.errors import (
     Mp4dsError,
     OptionError,
     SourceError,
     TargetError,
     WriteError,
+    advising,
     counted,
 )
 from mp4ds.files.outputs import (
@@ -49,11 +52,11 @@ from mp4ds.files.outputs import (
 from mp4ds.files.sources import SourceState, source_digest, unchanged
 from mp4ds.files.urls import location, spelled
 from mp4ds.format.fields import document_of, json_parser
-from mp4ds.format.sidecars import MANIFEST_NAME, load_manifest
+from mp4ds.format.sidecars import COPY_AGAIN, MANIFEST_NAME, load_manifest
 from mp4ds.options import CONTENT, ENCODING
 from mp4ds.packing.manifest import Digest, origin_of, tools, write_manifest
 from mp4ds.packing.packer import Exact, Packer, until_in_reach
-from mp4ds.packing.planning import PIECE_NAME, Piece, Plan
+from mp4ds.packing.planning import COPIED, PIECE_NAME, Piece, Plan
 from mp4ds.processes import release_memory
 
 _SUFFIX = ".mp4ds-part"
@@ -428,6 +431,9 @@ class PartPacker:
     def _pack(self, piece: Piece, into: Path, exact: Exact) -> None:
         for path in into.iterdir():
             path.unlink()
+        if piece.name == COPIED:
+            self._copy(piece, into)
+            return
         if self._reader is None:
             self._reader = self._plan.open()
         part = Packer(self._reader, into, self._plan, piece, exact).run()
@@ -439,6 +445,13 @@ class PartPacker:
         )
         (into / FACTS_NAME).write_text(json.dumps(asdict(facts)))
         write_manifest(part, origin_of(self._reader, part), str(self._plan.options.quality))
+
+    def _copy(self, piece: Piece, into: Path) -> None:
+        told: dict[str, Any] = {"losses": [], "topics_left_out": [], "redactions": []}
+        with advising(COPY_AGAIN), Dataset(location(self._plan.paths[0])) as dataset:
+            selected = piece.excerpt.has_topic
+            concat([dataset], into, selected=selected, others=False, changes=told)
+        (into / FACTS_NAME).write_text(json.dumps(asdict(PartFacts({}, {}, {}))))
 
     def close(self) -> None:
         """Close the recording."""

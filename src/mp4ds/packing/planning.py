@@ -41,7 +41,7 @@ from mp4ds.packing.options import NO_VIEW, PackOptions, plugin
 from mp4ds.packing.tracks import TrackPlan
 from mp4ds.packing.windows import WindowCoder
 from mp4ds.processes import available_cores
-from mp4ds.records import EVERYTHING, Channel, Excerpt, Message
+from mp4ds.records import Channel, Excerpt, Message
 from mp4ds.times import cut_times
 from mp4ds.video.codecs import (
     AV1,
@@ -364,7 +364,10 @@ def _refuse_few(samples: Sequence[CameraMessage], video_size: float) -> None:
 
 # ---------------------------------------------------------------- plan and pieces
 
-PIECE_NAME = r"all|whole-[0-9]{1,9}|[0-9]{5,9}"
+COPIED = "copied"
+"""Name of the piece whose streams are copied from the dataset that is packed."""
+
+PIECE_NAME = rf"all|{COPIED}|whole-[0-9]{{1,9}}|[0-9]{{5,9}}"
 """Pattern of the names of pieces, which are also folder names."""
 
 _USUAL = PackOptions()
@@ -402,6 +405,7 @@ class Plan:
         tools: Versions of what packs: parts made by different ones may not fit together.
         decisions: How images of a camera channel, by its id, are stored in all pieces; none before
             `surveyed`, and for a single piece.
+        copied: Topics of streams that are not encoded, but copied as a piece.
     """
 
     paths: Sequence[str]
@@ -415,6 +419,7 @@ class Plan:
     workers: int
     tools: Mapping[str, str]
     decisions: Mapping[int, Sequence[Decision]] = field(default_factory=dict)
+    copied: frozenset[str] = frozenset()
 
     @property
     def is_divided(self) -> bool:
@@ -524,7 +529,11 @@ LEAST_WINDOW = 300
 
 
 def divide(
-    reader: BagReader, paths: Sequence[Path], options: PackOptions, recordings: int = 1
+    reader: BagReader,
+    paths: Sequence[Path],
+    options: PackOptions,
+    recordings: int = 1,
+    copied: frozenset[str] = frozenset(),
 ) -> Plan:
     """Divide a recording into pieces.
 
@@ -533,6 +542,7 @@ def divide(
         paths: What it was opened from.
         options: How to pack.
         recordings: How many are packed at the same time.
+        copied: See `Plan`.
 
     Returns:
         The plan, without its survey.
@@ -543,11 +553,11 @@ def divide(
     selected = options.selected
     selected.check(channel.topic for channel in reader.channels)
     channels = [channel for channel in reader.channels if selected(channel.topic)]
-    packed = [channel for channel in channels if is_camera(channel)]
+    packed = [one for one in channels if is_camera(one) and one.topic not in copied]
     pairs = reader.pairs
     if pairs is None:
         pairs = pair_camera_infos(channels, chosen=choose_pairs(options.camera_info, channels))
-    pieces = _pieces(reader, channels, pairs, options) if reader.is_indexed else []
+    pieces = _pieces(reader, channels, pairs, options, copied) if reader.is_indexed else []
     cores = max(1, available_cores() // recordings)
     stats = reader.stats()
     frames: dict[str, int | None] = {}
@@ -562,10 +572,12 @@ def divide(
         workers = min(spare, len(packed))
         threads = max(1, spare // workers)
     else:
-        pieces = [Piece("all", EVERYTHING)]
+        pieces = [Piece("all", Excerpt(without=copied), is_solo=bool(copied))]
         cores = options.jobs or cores if recordings == 1 else cores
         workers = min(cores, len(list(filter(is_camera, reader.channels))) or 1)
         threads = max(1, -(-cores // workers))
+    if copied:
+        pieces.append(Piece(COPIED, Excerpt(topics=copied, others=False), is_solo=True))
     return Plan(
         paths=list(map(spelled, paths)),
         sources=[SourceState.of(path) for path in reader.files],
@@ -577,15 +589,20 @@ def divide(
         threads=threads,
         workers=workers,
         tools=tools(),
+        copied=copied,
     )
 
 
 def _pieces(
-    reader: BagReader, channels: Sequence[Channel], pairs: Mapping[int, int], options: PackOptions
+    reader: BagReader,
+    channels: Sequence[Channel],
+    pairs: Mapping[int, int],
+    options: PackOptions,
+    copied: frozenset[str],
 ) -> list[Piece]:
     """The pieces of an indexed recording; fewer than two where it is packed at once."""
-    cameras = [channel for channel in channels if is_camera(channel)]
-    free = _independent(reader, options)
+    cameras = [one for one in channels if is_camera(one) and one.topic not in copied]
+    free = _independent(reader, cameras)
     if not free:
         return []
     window = options.window or GOPS_PER_WINDOW * options.group_frames
@@ -599,7 +616,7 @@ def _pieces(
     topics = {channel.topic for channel in free}
     by_id = {channel.id: channel.topic for channel in channels}
     pieces: list[Piece] = []
-    without: set[str] = set()
+    without = set(copied)
     for topic in dict.fromkeys(camera.topic for camera in cameras if camera.topic not in topics):
         own = {topic, *(by_id[info] for info, image in pairs.items() if by_id[image] == topic)}
         excerpt = Excerpt(topics=frozenset(own), others=False)
@@ -611,9 +628,8 @@ def _pieces(
     return pieces
 
 
-def _independent(reader: BagReader, options: PackOptions) -> list[Channel]:
-    """The packed camera channels that can be cut anywhere."""
-    cameras = [one for one in reader.channels if options.selected(one.topic) and is_camera(one)]
+def _independent(reader: BagReader, cameras: Sequence[Channel]) -> list[Channel]:
+    """The camera channels that can be cut anywhere."""
     firsts = [(camera, reader.first(camera)) for camera in cameras]
     bound = {camera.topic for camera, one in firsts if one and depends_on_others(camera, one)}
     return [camera for camera in cameras if camera.topic not in bound]
@@ -636,7 +652,9 @@ def surveyed(plan: Plan, reader: BagReader) -> Plan:
     starts = [piece.excerpt.start for piece in plan.pieces if not piece.is_solo]
     starts = starts[:: -(-len(starts) // _MAX_LOOKS) or 1]
     decisions: dict[int, Sequence[Decision]] = {}
-    for channel in _independent(reader, plan.options):
+    chosen = [one for one in reader.channels if plan.options.selected(one.topic)]
+    cameras = [one for one in chosen if is_camera(one) and one.topic not in plan.copied]
+    for channel in _independent(reader, cameras):
         inspector = MessageInspector(channel, transcode=plan.options.transcode)
         stats = reader.stats().get(channel.id)
         found: dict[StreamKey, Decision] = {}
