@@ -19,7 +19,7 @@ from mp4ds.bags.protocols import BagReader, BagWriter, merged
 from mp4ds.bags.rosbag2_metadata import METADATA_FILE, read_bag_info
 from mp4ds.errors import OptionError, SourceError, SourceNotFoundError
 from mp4ds.files.outputs import begins_with
-from mp4ds.files.sources import HOW_TO_OPEN, refuse_unfinished, video_at
+from mp4ds.files.sources import HOW_TO_OPEN, is_video, refuse_unfinished
 from mp4ds.files.urls import remote
 from mp4ds.records import (
     EVERYTHING,
@@ -80,8 +80,8 @@ def format_of(path: Path) -> str:
     if path.suffix in RECORDING_SUFFIXES:
         return RECORDING_SUFFIXES[path.suffix]
     remedy = "Give a ROS 1 .bag, a rosbag2 folder or an .mcap file."
-    if video := video_at(path):
-        raise SourceError(path, f"is {video}, not a recording", f"{remedy} {HOW_TO_OPEN}")
+    if is_video(path):
+        raise SourceError(path, "is a video, not a recording", f"{remedy} {HOW_TO_OPEN}")
     raise SourceError(path, "is not in a recording format that mp4ds supports", remedy)
 
 

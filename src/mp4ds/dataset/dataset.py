@@ -38,7 +38,7 @@ from mp4ds.errors import (
     counted,
     size_text,
 )
-from mp4ds.files.sources import HOW_TO_OPEN, is_folder, refuse_unfinished, video_at
+from mp4ds.files.sources import HOW_TO_OPEN, is_folder, is_video, refuse_unfinished
 from mp4ds.files.urls import RemotePath, location
 from mp4ds.format.fields import MESSAGES_NAME, Choice, everything, within
 from mp4ds.format.manifest import Manifest
@@ -98,8 +98,8 @@ class Dataset:
         if not is_one and not (self.path / MANIFEST_NAME).exists():
             problem = "is not a dataset"
             remedy = "Give a folder made by `mp4ds pack`, or a sidecar next to its video."
-            if video := video_at(self.path):
-                problem, remedy = f"is {video}, not a dataset", HOW_TO_OPEN
+            if is_video(self.path):
+                problem, remedy = "is a video, not a dataset", HOW_TO_OPEN
             elif self.path.suffix in RECORDING_SUFFIXES or (self.path / "metadata.yaml").exists():
                 problem = "is a recording, not a dataset"
                 remedy = f"Make a dataset of it first: mp4ds pack {shlex.quote(str(self.path))}"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import shlex
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,17 +26,7 @@ _SIDES = ("-wal", "-journal")
 """Files that sqlite keeps next to a database in use: its latest changes."""
 
 
-_CONTAINERS = [
-    (re.compile(start, re.DOTALL), name)
-    for start, name in (
-        (rb"RIFF.{4}AVI ", "an AVI video"),
-        (rb"\x1a\x45\xdf\xa3", "a Matroska or WebM video"),
-        (rb".{4}ftyp(?!avi|hei|hev|mif|msf)", "an MP4 video"),
-        (rb"FLV\x01", "an FLV video"),
-        (rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11", "a WMV video"),
-        (rb"\x00\x00\x01\xba", "an MPEG video"),
-    )
-]
+_VIDEOS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi")
 HOW_TO_OPEN = (
     "`mp4ds.open` reads frames of an .mp4 or .mov without packing; to convert other videos, run "
     "`ffmpeg -i VIDEO -c copy VIDEO.mp4`."
@@ -75,14 +64,9 @@ def refuse_unfinished(folder: Path) -> None:
         raise SourceError(folder, "is being recorded, or was cut off", remedy)
 
 
-def video_at(path: Path) -> str:
-    """What kind of video a file is, with its article; empty if it is none or cannot be read."""
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(16)
-    except OSError:
-        return ""
-    return next((name for begin, name in _CONTAINERS if begin.match(start)), "")
+def is_video(path: Path) -> bool:
+    """Whether a file is a video, by its name."""
+    return path.suffix.lower() in _VIDEOS and path.is_file()
 
 
 def is_folder(path: Path) -> bool:
