@@ -409,12 +409,3 @@ def test_a_robot_with_many_cameras(source: str, tmp_path: Path) -> None:
     with mp4ds.open(done.dataset) as dataset:
         assert len(dataset.streams) == len(scenes)
         assert all(stream.sidecar.camera_info for stream in dataset.streams)
-
-
-@pytest.mark.parametrize(("frames", "are_files"), [(1, True), (6, False)])
-def test_a_few_small_files_stay_files(frames: int, are_files: bool, tmp_path: Path) -> None:
-    """109 bytes of PNG would become a video and a sidecar of 4 kB."""
-    recorded = CODED["png-gray-cv2"](frames=frames, width=16, height=12)
-    done = journey(tmp_path, SOURCES["mcap-ros2-zstd"], recorded, "mcap")
-    reasons = done.reasons("/cam/image_raw/compressed")
-    assert any("take less than a video" in reason for reason in reasons) == are_files

@@ -77,8 +77,6 @@ _MAX_LOOKS = 64
 _KEPT_JPEG = "JPEG files are kept as they are; --transcode re-encodes them"
 _PLAYED = ("yuv420p", "yuvj420p")
 """Pixel formats that any player of a codec shows."""
-_MANY = 6  # files, after which any number may follow
-_STREAM_BYTES = 3_000  # bytes of a video without frames, and of its sidecar
 _LARGER = 1.05
 """How much larger than without a view images may become by having one."""
 _NEGLIGIBLE = 1 / 50
@@ -302,8 +300,6 @@ def _lossless_plans(
                 best, least = both if is_predicted else best, min(least, size)
                 plan = TrackPlan(best, view, is_predicted, note=note)
     _refuse_noise(samples, least)
-    if codec is None:
-        _refuse_few(samples, least)
     if plan.view is None and best.layout.name == encoding.general:
         return [plan]
     return [plan, _general_plan(samples[0].key, options)]
@@ -346,20 +342,6 @@ def _refuse_noise(samples: Sequence[CameraMessage], video_size: float) -> None:
         raise Refused(
             f"a video would not be smaller: about {video_size / verbatim:.2f} times as large"
         )
-
-
-def _refuse_few(samples: Sequence[CameraMessage], video_size: float) -> None:
-    """Refuse a few files that are smaller than their video with its index and sidecar.
-
-    Raises:
-        Refused: They are.
-    """
-    is_file = samples[0].key.body in ("png", "rvl")
-    if not is_file or len(samples) >= _MANY:
-        return
-    stored = sum(len(seen.parts.body) for seen in samples)
-    if stored < _STREAM_BYTES + len(samples) * video_size:
-        raise Refused("so few small files take less than a video with its sidecar")
 
 
 # ---------------------------------------------------------------- plan and pieces
